@@ -1,0 +1,169 @@
+"""The parameters of §6 as typed, frozen objects; ``parameters_xml`` reads and writes them.
+
+Text is "" and numbers are None where the server did not send them. Ids are the server's own texts:
+numbering starts from anything (field note 9), and an event's id may be hexadecimal.
+"""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class General:
+    """§6.1: the server and its average streaming performance during a session."""
+
+    name: str = ""
+    version: str = ""
+    address: str = ""
+    port: int | None = None
+    frames_sent: int | None = None
+    frames_per_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Marker:
+    """One marker of §6.2."""
+
+    id: str
+    label: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters3D:
+    """§6.2: the markers in the order in which the 3D component has them."""
+
+    frequency_hz: float | None = None
+    unit: str = "mm"
+    markers: tuple[Marker, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Tool:
+    """One tool of §6.3; ``marker_ids`` refer to the 3D markers, in the order of the tool's definition."""
+
+    id: str
+    label: str = ""
+    description: str = ""
+    marker_ids: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters6D:
+    """§6.3: the tools in the order in which the 6D component has them."""
+
+    frequency_hz: float | None = None
+    tools: tuple[Tool, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class AnalogChannel:
+    """One channel of §6.4."""
+
+    id: str
+    label: str = ""
+    description: str = ""
+    unit: str = "mV"
+    frequency_hz: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ParametersAnalog:
+    """§6.4: the channels in the order in which the Analog component has them."""
+
+    channels: tuple[AnalogChannel, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Point:
+    """A position in §6.5, in ``unit``."""
+
+    x: float
+    y: float
+    z: float
+    unit: str = "mm"
+
+
+@dataclass(frozen=True, slots=True)
+class ForceChannel:
+    """One force or moment channel of a plate (§6.5)."""
+
+    id: str
+    label: str = ""
+    unit: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Plate:
+    """One force plate of §6.5.
+
+    ``corners`` are the plate's four corners in the laboratory, ``origin`` the transducer's origin.
+    ``analog_channel_ids`` refer to the raw analog channels. ``calibration_matrix`` is a tuple of rows.
+    """
+
+    id: str
+    label: str = ""
+    frequency_hz: float | None = None
+    corners: tuple[Point, ...] = ()
+    origin: Point | None = None
+    channels: tuple[ForceChannel, ...] = ()
+    analog_channel_ids: tuple[str, ...] = ()
+    excitation_voltage_v: float | None = None
+    amplifier_gain: float | None = None
+    calibration_unit: str = ""
+    calibration_matrix: tuple[tuple[float, ...], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ParametersForce:
+    """§6.5: the plates in the order in which the Force component has them."""
+
+    plates: tuple[Plate, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedValue:
+    """One of the values that an event's parameter can have (§6.6)."""
+
+    id: str
+    value: str = ""
+    label: str = ""
+    description: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class EventParameter:
+    """One of up to three parameters of an event (§6.6); ``type`` is int, float or string (4 characters)."""
+
+    id: str
+    type: str = "int"
+    description: str = ""
+    expected_values: tuple[ExpectedValue, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class EventDefinition:
+    """One kind of event of §6.6; ``id`` is the server's text, decimal or 0x…."""
+
+    id: str
+    label: str = ""
+    description: str = ""
+    parameters: tuple[EventParameter, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ParametersEvents:
+    """§6.6: the events that the server is ready to send."""
+
+    events: tuple[EventDefinition, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Parameters:
+    """What one XML reply held; a section that it lacked is None. The sections are named as in SECTIONS."""
+
+    general: General | None = None
+    markers: Parameters3D | None = None
+    tools: Parameters6D | None = None
+    analog: ParametersAnalog | None = None
+    force: ParametersForce | None = None
+    events: ParametersEvents | None = None
