@@ -1,0 +1,106 @@
+"""Messages for people: any of our LCM messages as an object, as JSON values, as one line of text."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, Final
+
+import rtc3d
+
+from gateway.errors import ProtocolError
+
+_TYPES: Final[dict[bytes, type[Any]]] = {
+    message_type._get_packed_fingerprint(): message_type  # noqa: SLF001 - lcm-gen offers no other way
+    for message_type in (
+        rtc3d.markers_t,
+        rtc3d.tools_t,
+        rtc3d.analog_t,
+        rtc3d.forces_t,
+        rtc3d.events_t,
+        rtc3d.tool_pose_t,
+        rtc3d.status_t,
+    )
+}
+
+
+def decode(message: bytes) -> Any:
+    """Return the message as the object of its LCM type, told by its fingerprint.
+
+    Raises ProtocolError for bytes that are none of our messages.
+    """
+    message_type = _TYPES.get(message[:8])
+    if message_type is None:
+        raise ProtocolError(
+            f"{len(message)} bytes with the fingerprint {message[:8].hex()} are no message of this gateway; "
+            "is another program, or another version of the gateway, publishing here?"
+        )
+    try:
+        return message_type.decode(message)
+    except Exception as error:  # lcm-gen's decoders raise whatever comes
+        raise ProtocolError(f"a {message_type.__name__} of {len(message)} bytes is cut short") from error
+
+
+def to_json(value: Any) -> Any:
+    """Return an LCM object, or a list or value in it, as what ``json`` can write; NaN becomes None."""
+    if hasattr(value, "__slots__"):
+        return {name: to_json(getattr(value, name)) for name in value.__slots__}
+    if isinstance(value, list | tuple):
+        return [to_json(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def one_line(message: Any) -> str:
+    """Return what a person wants to see first of a decoded message."""
+    if isinstance(message, rtc3d.status_t):
+        return _status_line(message)
+    text = _contents(message)
+    return f"#{message.sequence} frame {message.frame_number} at {message.timestamp / 1e6:.4f} s: {text}"
+
+
+def _contents(message: Any) -> str:
+    match message:
+        case rtc3d.tool_pose_t(visible=False):
+            text = "out of view"
+        case rtc3d.tool_pose_t():
+            position, orientation = _numbers(message.position_m), _numbers(message.orientation_xyzw)
+            text = f"position {position} m, orientation xyzw {orientation}"
+        case rtc3d.markers_t():
+            text = f"{message.num_markers} markers, {_positions(message.markers)}"
+        case rtc3d.tools_t():
+            text = f"{message.num_tools} tools, {_positions(message.tools)}"
+        case rtc3d.analog_t():
+            text = f"{message.num_channels} channels, {_numbers(message.voltages[:4])} …"
+        case rtc3d.forces_t():
+            loads = "; ".join(_numbers((plate.fx, plate.fy, plate.fz)) for plate in message.plates[:4])
+            text = f"{message.num_plates} plates, forces {loads}"
+        case _:
+            events = "; ".join(
+                f"id {event.id:#x} ({event.param1}, {event.param2}, {event.param3})"
+                for event in message.events[:4]
+            )
+            text = f"{message.num_events} events: {events}"
+    return text
+
+
+def _positions(items: Sequence[Any]) -> str:
+    seen = [(item.x, item.y, item.z) for item in items if not math.isnan(item.x)]
+    first = f", the first seen at {_numbers(seen[0])}" if seen else ""
+    return f"{len(items) - len(seen)} missing{first}"
+
+
+def _numbers(values: Sequence[float]) -> str:
+    return "(" + ", ".join(f"{value:.4g}" for value in values) + ")"
+
+
+def _status_line(status: Any) -> str:
+    streams = "; ".join(
+        f"[{stream.components}] {stream.state} {stream.frame_rate_hz:.1f} Hz, {stream.frames_in} frames, "
+        f"{stream.reconnects} reconnects"
+        + (f", last error: {stream.last_error}" if stream.last_error else "")
+        for stream in status.streams
+    )
+    outputs = "; ".join(
+        f"{output.name} {'ok' if output.connected else output.problem}" for output in status.outputs
+    )
+    return f"#{status.sequence} {status.source} at {status.server}: {streams}; outputs: {outputs}"

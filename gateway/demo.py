@@ -1,0 +1,211 @@
+"""``rtc3d-gateway demo``: simulator, gateway and a subscriber on each side, in one process.
+
+Nothing leaves the machine: Zenoh on loopback TCP without scouting, LCM in memory (or multicast with
+``udpm``). The measurement starts when both subscribers hear the gateway and stops before they do, so
+every component sent can be accounted for.
+"""
+
+import asyncio
+import contextlib
+import socket
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+import zenoh
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+
+from gateway.config import LcmSettings, Settings, Source, Stream, ZenohSettings
+from gateway.daemon import Gateway
+from gateway.decode import decode, one_line
+from gateway.errors import OutputError
+from gateway.listening import LcmListener, ZenohListener, channel_pattern, key_pattern, open_zenoh
+from gateway.outputs.lcm_output import LcmOutput, open_lcm
+from gateway.outputs.zenoh_output import ZenohOutput
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.simulator.scene import Scene
+from gateway.simulator.server import Simulator
+
+SOURCE: Final = "demo"
+_SIDES: Final = ("zenoh", "lcm")
+_READY_S: Final = 10.0
+_DRAIN_S: Final = 3.0
+_REFRESH_S: Final = 0.5
+_SHOWN: Final = 60
+
+
+@dataclass
+class _Heard:
+    """What one subscriber received, by component; filled in its thread, read in the loop."""
+
+    received: Counter[str] = field(default_factory=Counter)
+    newest: dict[str, bytes] = field(default_factory=dict)
+
+    def take(self, name: str, message: bytes) -> None:
+        """Count a message; ``name`` is mocap/demo/3d or MOCAP_DEMO_3D."""
+        component = name.replace("_", "/").rsplit("/", 1)[-1].lower()
+        self.received[component] += 1
+        self.newest[component] = message
+
+
+async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool) -> bool:
+    """Run for ``seconds`` showing rates and values; return whether everything sent was received.
+
+    Raises OutputError if Zenoh or LCM do not open on this machine.
+    """
+    heard = {side: _Heard() for side in _SIDES}
+    endpoint = f"tcp/127.0.0.1:{_free_port()}"
+    lcm_settings = LcmSettings(url=None if udpm else "memq://")
+    shared = open_lcm(lcm_settings.effective_url)
+    async with Simulator(scene) as simulator:
+        simulator.stop_measurement()
+        settings = _settings(simulator.port, endpoint, lcm_settings)
+        gateway = Gateway(
+            settings,
+            [ZenohOutput(settings.zenoh), LcmOutput(lcm_settings, shared=None if udpm else shared)],
+        )
+        stop = asyncio.Event()
+        running = asyncio.create_task(gateway.run(stop))
+        listener = LcmListener(shared, channel_pattern("MOCAP", SOURCE, None), heard["lcm"].take)
+        session = await _open_when_there(endpoint)
+        try:
+            ZenohListener(session, key_pattern("mocap", SOURCE, None), heard["zenoh"].take)
+            await _until(
+                lambda: all(each.received["status"] for each in heard.values()), _READY_S,
+                "the gateway's status did not come on both sides",
+            )  # fmt: skip
+            simulator.start_measurement()
+            await _show(heard, seconds, console)
+            simulator.stop_measurement()
+            lost = await _settle(simulator, heard)
+        finally:
+            stop.set()
+            await running
+            session.close()
+            listener.close()
+    console.print(_report(simulator.sent, heard))
+    console.print("[green]Nothing was lost.[/]" if not lost else f"[red]{lost} messages were lost.[/]")
+    return not lost
+
+
+def _settings(port: int, endpoint: str, lcm_settings: LcmSettings) -> Settings:
+    slow = tuple(component for component in WIRE_ORDER if component is not ComponentType.ANALOG)
+    return Settings(
+        sources=(
+            Source(
+                name=SOURCE,
+                host="127.0.0.1",
+                port=port,
+                # Analog runs at its own, higher rate on a stream of its own (§5.3.5).
+                streams=(Stream(components=slow), Stream(components=(ComponentType.ANALOG,))),
+            ),
+        ),
+        zenoh=ZenohSettings(
+            config={
+                "listen": {"endpoints": [endpoint]},
+                "scouting": {"multicast": {"enabled": False}},
+            }
+        ),
+        lcm=lcm_settings,
+    )
+
+
+def _free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+async def _open_when_there(endpoint: str) -> zenoh.Session:
+    """Return a session connected to the gateway, which opens its own a moment after its start."""
+    deadline_s = asyncio.get_running_loop().time() + _READY_S
+    while True:
+        try:
+            return await asyncio.to_thread(open_zenoh, endpoint)
+        except OutputError:
+            if asyncio.get_running_loop().time() > deadline_s:
+                raise
+            await asyncio.sleep(0.1)
+
+
+async def _until(condition: Callable[[], bool], timeout_s: float, failure: str) -> None:
+    try:
+        async with asyncio.timeout(timeout_s):
+            while not condition():  # noqa: ASYNC110 - the conditions change in other threads
+                await asyncio.sleep(0.02)
+    except TimeoutError:
+        raise OutputError(f"{failure} within {timeout_s:g} s", cause="demo") from None
+
+
+async def _show(heard: dict[str, _Heard], seconds: float, console: Console) -> None:
+    """Show the table live for ``seconds``; not where the output is no terminal."""
+    loop = asyncio.get_running_loop()
+    start_s = loop.time()
+    before: dict[str, Counter[str]] = {side: Counter() for side in _SIDES}
+    with Live(console=console, auto_refresh=False, transient=True) as live:
+        while (elapsed_s := loop.time() - start_s) < seconds:
+            await asyncio.sleep(min(_REFRESH_S, seconds - elapsed_s))
+            now_s = loop.time() - start_s
+            rates = {
+                side: {
+                    key: (each.received[key] - before[side][key]) / (now_s - elapsed_s)
+                    for key in each.received
+                }
+                for side, each in heard.items()
+            }
+            before = {side: Counter(each.received) for side, each in heard.items()}
+            if console.is_terminal:
+                live.update(_table(heard, rates, now_s, seconds), refresh=True)
+
+
+async def _settle(simulator: Simulator, heard: dict[str, _Heard]) -> int:
+    """Wait until what is under way has arrived; return how many messages are missing."""
+
+    def missing() -> int:
+        return sum(
+            max(0, sent - each.received[key])
+            for key, sent in simulator.sent.items()
+            for each in heard.values()
+        )
+
+    with contextlib.suppress(OutputError):
+        await _until(lambda: not missing(), _DRAIN_S, "messages are missing")
+    return missing()
+
+
+def _table(
+    heard: dict[str, _Heard], rates: dict[str, dict[str, float]], now_s: float, seconds: float
+) -> Table:
+    table = Table(title=f"RTC3D simulator → gateway → subscribers, {now_s:.0f} of {seconds:.0f} s")
+    table.add_column("component")
+    for side in _SIDES:
+        table.add_column(f"{side} Hz", justify="right")
+    table.add_column("newest message", width=_SHOWN, no_wrap=True, overflow="ellipsis")
+    for component in WIRE_ORDER:
+        newest = heard["zenoh"].newest.get(component.key)
+        text = "" if newest is None else one_line(decode(newest))
+        table.add_row(
+            component.key,
+            *(f"{rates[side].get(component.key, 0.0):.1f}" for side in _SIDES),
+            text,
+        )
+    return table
+
+
+def _report(sent: Counter[str], heard: dict[str, _Heard]) -> Table:
+    table = Table(title="What was sent, received and lost")
+    for heading in (
+        "component",
+        "sent",
+        *(f"{side} {what}" for side in _SIDES for what in ("received", "lost")),
+    ):
+        table.add_column(heading, justify="left" if heading == "component" else "right")
+    for component in WIRE_ORDER:
+        cells = []
+        for side in _SIDES:
+            received = heard[side].received[component.key]
+            cells += [str(received), str(sent[component.key] - received)]
+        table.add_row(component.key, str(sent[component.key]), *cells)
+    return table

@@ -1,0 +1,158 @@
+"""From one source's frames to every output: splice each component once, hand it to all."""
+
+import logging
+from collections import Counter
+from collections.abc import Collection, Iterable, Sequence
+from typing import Final
+
+import rtc3d
+
+from gateway.errors import OutputError
+from gateway.log import FailureLog
+from gateway.message import MESSAGE_TYPES, Stamp, metres_per_unit, splice, tool_poses, type_name
+from gateway.names import Topic, unique_name
+from gateway.outputs.contract import Output, Publisher
+from gateway.rtc3d.components import Component, ComponentType, Frame
+from gateway.rtc3d.parameters import Parameters
+from gateway.status import OutputStatus
+
+_MAX_TOOLS: Final = 256
+"""How many tools get a key of their own; the count in a frame is the server's word."""
+
+logger = logging.getLogger(__name__)
+
+
+class _Way:
+    """One output as one source sees it."""
+
+    def __init__(self, source: str, output: Output) -> None:
+        self.output = output
+        self.status = OutputStatus(output.name)
+        self._failures = FailureLog(logger, f"{source} to {output.name}")
+
+    def send(self, publisher: Publisher, name: str, message: bytes) -> None:
+        """Publish and count; what an output raises is its own affair, never the reader's."""
+        try:
+            publisher.publish(message)
+        except OutputError as error:
+            self._dropped(error.cause, str(error))
+        except Exception as error:  # noqa: BLE001 - a defect in one output must not stop the others
+            self._dropped(type(error).__name__, f"{type(error).__name__}: {error}")
+        else:
+            self.status.messages[name] += 1
+            if self._failures.failing:
+                self._failures.recovered("messages go out")
+
+    def _dropped(self, cause: str, text: str) -> None:
+        self.status.drops[cause] += 1
+        self._failures.failed(text)
+
+
+_Sending = list[tuple[_Way, Publisher]]
+
+
+def _declare(ways: Iterable[_Way], topic: Topic) -> _Sending:
+    return [(way, way.output.publisher(topic)) for way in ways]
+
+
+class FanOut:
+    """Publishes what one source sends. ``tool_outputs`` are the names of outputs with a key per tool."""
+
+    def __init__(self, source: str, outputs: Sequence[Output], tool_outputs: Collection[str] = ()) -> None:
+        self._ways = [_Way(source, output) for output in outputs]
+        self._publishers = {
+            component: _declare(self._ways, Topic(source, (component.key,), type_name(message_type)))
+            for component, message_type in MESSAGE_TYPES.items()
+        }
+        self._status_publishers = _declare(self._ways, Topic(source, ("status",), "rtc3d.status_t"))
+        self._sequences: Counter[ComponentType | str] = Counter()
+        self._tools = _ToolPoses(source, [way for way in self._ways if way.output.name in tool_outputs])
+        for output in outputs:
+            output.announce(source)
+
+    @property
+    def outputs(self) -> list[tuple[Output, OutputStatus]]:
+        """Each output with what it did for this source."""
+        return [(way.output, way.status) for way in self._ways]
+
+    def publish(self, frame: Frame, stamp: Stamp, wanted: Collection[ComponentType]) -> None:
+        """Publish the frame's components that are ``wanted``; never raises for an output's sake."""
+        for component in frame.components:
+            kind = component.type
+            if kind not in wanted:
+                continue
+            sequence = self._sequences[kind]
+            self._sequences[kind] = sequence + 1
+            message = splice(component, stamp, sequence)
+            for way, publisher in self._publishers[kind]:
+                way.send(publisher, kind.key, message)
+            if kind is ComponentType.TOOLS:
+                self._tools.publish(component, stamp)
+
+    def publish_status(self, message: bytes) -> None:
+        """Publish an encoded ``status_t``."""
+        for way, publisher in self._status_publishers:
+            way.send(publisher, "status", message)
+
+    def next_status_sequence(self) -> int:
+        """Return the sequence number of the next status message."""
+        self._sequences["status"] += 1
+        return self._sequences["status"] - 1
+
+    def set_parameters(self, parameters: Parameters) -> None:
+        """Take the tools' labels (§6.3) and the unit of length (§6.2) for the messages per tool."""
+        self._tools.set_parameters(parameters)
+
+
+class _ToolPoses:
+    """The messages per tool: SI poses, on keys that carry the tools' labels."""
+
+    def __init__(self, source: str, ways: list[_Way]) -> None:
+        self._source = source
+        self._ways = ways
+        self._labels: tuple[str, ...] = ()
+        self._metres = 1e-3
+        self._sending: list[_Sending] = []  # per tool
+        self._sequences: list[int] = []
+
+    def set_parameters(self, parameters: Parameters) -> None:
+        labels = () if parameters.tools is None else tuple(tool.label for tool in parameters.tools.tools)
+        if labels != self._labels:
+            self._labels = labels
+            self._close()
+        unit = "mm" if parameters.markers is None else parameters.markers.unit
+        metres = metres_per_unit(unit)
+        if metres is None and self._ways:
+            logger.warning("%s: unit of length %r is unknown; taken for mm per tool", self._source, unit)
+        self._metres = metres or 1e-3
+
+    def publish(self, component: Component, stamp: Stamp) -> None:
+        if not self._ways or component.num_items > _MAX_TOOLS:
+            return
+        if len(self._sending) != component.num_items:
+            self._open(component.num_items)
+        if not any(publisher.wanted for sending in self._sending for _, publisher in sending):
+            return
+        messages = tool_poses(component, stamp, self._sequences, self._metres)
+        for tool, message in enumerate(messages):
+            for way, publisher in self._sending[tool]:
+                if publisher.wanted:
+                    way.send(publisher, "6d/tool", message)
+            self._sequences[tool] += 1
+
+    def _open(self, count: int) -> None:
+        """Declare ``count`` tools; those beyond the parameters are numbered, doubled labels too."""
+        self._close()
+        taken: set[str] = set()
+        for index in range(count):
+            label = self._labels[index].strip() if index < len(self._labels) else ""
+            taken.add(label := unique_name(label or f"tool {index + 1}", taken))
+            topic = Topic(self._source, (ComponentType.TOOLS.key, label), type_name(rtc3d.tool_pose_t))
+            self._sending.append(_declare(self._ways, topic))
+        self._sequences = [0] * count
+
+    def _close(self) -> None:
+        for sending in self._sending:
+            for _, publisher in sending:
+                publisher.close()
+        self._sending.clear()

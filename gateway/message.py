@@ -1,0 +1,123 @@
+"""Component → LCM message: the type's fingerprint, a prefix of ours, the component's own bytes.
+
+LCM writes big-endian without padding and RTC3D sends big-endian, so the message types of lcm_types/
+have the component's own fields in its own order, and no value is decoded or encoded.
+"""
+
+import math
+import struct
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+import rtc3d
+
+from gateway.rtc3d.components import (
+    ITEM_DTYPES,
+    LONG_EVENT,
+    SHORT_EVENT,
+    Component,
+    ComponentType,
+    Items,
+    big_endian_content,
+)
+
+MESSAGE_TYPES: Final[dict[ComponentType, type[Any]]] = {
+    ComponentType.MARKERS: rtc3d.markers_t,
+    ComponentType.TOOLS: rtc3d.tools_t,
+    ComponentType.ANALOG: rtc3d.analog_t,
+    ComponentType.FORCE: rtc3d.forces_t,
+    ComponentType.EVENT: rtc3d.events_t,
+}
+"""The LCM type of each component's messages."""
+
+PREFIX: Final = struct.Struct(">8sqqqi")
+"""36 bytes: fingerprint, utime, capture_utime, sequence, session."""
+
+MESSAGE_HEADER_BYTES: Final = PREFIX.size + 16
+"""Where the items begin: after the prefix, frame number, time stamp and count."""
+
+_FINGERPRINTS: Final[dict[ComponentType, bytes]] = {
+    component: message_type._get_packed_fingerprint()  # noqa: SLF001 - lcm-gen offers no other way
+    for component, message_type in MESSAGE_TYPES.items()
+}
+_POSE_FINGERPRINT: Final[bytes] = rtc3d.tool_pose_t._get_packed_fingerprint()  # noqa: SLF001 - as above
+# Frame number, time stamp, visible, position, orientation, error.
+_POSE: Final = struct.Struct(">iq?8f")
+_METRES: Final = {"m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "in": 0.0254}
+
+
+class Stamp(NamedTuple):
+    """When a frame came and was captured (µs since the Unix epoch), and in which connection."""
+
+    utime: int
+    capture_utime: int
+    session: int
+
+
+def type_name(message_type: type[Any]) -> str:
+    """Return the LCM type's name as lcm-gen and Zenoh's encoding schema have it: rtc3d.markers_t."""
+    return f"rtc3d.{message_type.__name__}"
+
+
+def splice(component: Component, stamp: Stamp, sequence: int) -> bytes:
+    """Return the component's LCM message; sizes and counts were checked by ``split_frame``."""
+    content = component.content
+    if component.byte_order == "little" or component.type is ComponentType.EVENT:
+        content = _canonical_content(component)
+    prefix = PREFIX.pack(
+        _FINGERPRINTS[component.type], stamp.utime, stamp.capture_utime, sequence, stamp.session
+    )
+    return b"".join((prefix, content))
+
+
+def _canonical_content(component: Component) -> bytes | memoryview:
+    """Return the content in big-endian form, events with 24 bytes each (field note 6)."""
+    if component.type is not ComponentType.EVENT or component.item_bytes != SHORT_EVENT.itemsize:
+        return big_endian_content(component)
+    short = component.items()
+    events = np.empty(len(short), LONG_EVENT)
+    for name in SHORT_EVENT.names or ():
+        events[name] = short[name]
+    events["timestamp"] = component.timestamp_us
+    header = struct.pack(">iqI", component.frame_number, component.timestamp_us, len(events))
+    return header + events.tobytes()
+
+
+def metres_per_unit(unit: str) -> float | None:
+    """Return how many metres one ``unit`` of the 3D parameters is (§6.2); None for an unknown unit."""
+    return _METRES.get(unit.strip().lower() or "mm")
+
+
+def tool_poses(
+    component: Component, stamp: Stamp, sequences: Sequence[int], metres: float = 1e-3
+) -> list[bytes]:
+    """Return one ``tool_pose_t`` message per tool of a 6D component: SI units, scalar last.
+
+    ``sequences`` holds one sequence number per tool; ``metres`` is the size of the component's unit.
+    """
+    return [
+        PREFIX.pack(_POSE_FINGERPRINT, stamp.utime, stamp.capture_utime, sequence, stamp.session)
+        + _pose(component, tool, metres)
+        for tool, sequence in zip(component.items().tolist(), sequences, strict=True)
+    ]
+
+
+def _pose(component: Component, tool: tuple[float, ...], metres: float) -> bytes:
+    q0, qx, qy, qz, x, y, z, error = tool
+    # Any NaN means missing (field note 7); a robot is never given half a pose.
+    visible = not any(map(math.isnan, (q0, qx, qy, qz, x, y, z)))
+    if not visible:
+        pose = (math.nan,) * 8
+    else:
+        pose = (x * metres, y * metres, z * metres, qx, qy, qz, q0, error * metres)
+    return _POSE.pack(component.frame_number, component.timestamp_us, visible, *pose)
+
+
+def message_items(message: bytes, component: ComponentType) -> Items:
+    """Return the items of a component's message, shape (num_items,), as a read-only view of it.
+
+    The dtype is that of ITEM_DTYPES. For subscribers that do without lcm-gen; the message must come
+    from a gateway.
+    """
+    return np.frombuffer(message, ITEM_DTYPES[component], offset=MESSAGE_HEADER_BYTES)

@@ -1,0 +1,1 @@
+"""Where messages go: one contract (``contract.Output``), one module per kind of output."""

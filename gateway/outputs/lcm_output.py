@@ -1,0 +1,145 @@
+"""Messages out on LCM: one channel per topic."""
+
+import logging
+import socket
+import time
+from typing import Final
+from urllib.parse import urlsplit
+
+import lcm
+
+from gateway.config import LcmSettings
+from gateway.errors import OutputError
+from gateway.log import FailureLog
+from gateway.names import Topic, lcm_channel, unique_name
+from gateway.status import OutputHealth
+
+_RETRY_S: Final = 1.0
+
+logger = logging.getLogger(__name__)
+
+
+def multicast_problem(url: str) -> str:
+    """Return why datagrams to a ``udpm:`` URL would not leave this machine; "" if they would.
+
+    LCM says so on C's stderr only and raises a bare RuntimeError, so it is found out before.
+    """
+    parts = urlsplit(url)
+    if parts.scheme != "udpm":
+        return ""
+    try:
+        host, port = parts.hostname or "239.255.76.67", parts.port or 7667
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+            probe.connect((host, port))
+    except (OSError, ValueError) as error:
+        return (
+            f"no multicast to {url}: {error}; bring a network interface up, or give it a multicast route: "
+            "ip route add 224.0.0.0/4 dev INTERFACE"
+        )
+    return ""
+
+
+def open_lcm(url: str) -> lcm.LCM:
+    """Return an LCM object on ``url``; raises OutputError with the reason and the remedy."""
+    problem = multicast_problem(url)
+    if problem:
+        raise OutputError(problem, cause="not open")
+    try:
+        return lcm.LCM(url)
+    except RuntimeError as error:
+        raise OutputError(f"LCM does not open {url}: {error}; check lcm.url", cause="not open") from error
+
+
+class LcmPublisher:
+    """Sends the messages of one topic on ``channel``."""
+
+    wanted = True  # LCM has no way to know who listens
+
+    def __init__(self, output: "LcmOutput", channel: str) -> None:
+        self.channel = channel
+        self._output = output
+
+    def publish(self, message: bytes) -> None:
+        """Send one message; raises OutputError if the network did not take it."""
+        self._output.send(self.channel, message)
+
+    def close(self) -> None:
+        """Free the channel's name."""
+        self._output.forget(self)
+
+
+class LcmOutput:
+    """One LCM object. ``shared`` is one that exists already: memq:// reaches no other."""
+
+    name = "lcm"
+
+    def __init__(self, settings: LcmSettings, shared: lcm.LCM | None = None) -> None:
+        self.settings = settings
+        self._shared = shared
+        self._lcm: lcm.LCM | None = None
+        self._channels: set[str] = set()
+        self._problem = "LCM is not open yet"
+        self._retry_at_s = 0.0
+        self._failures = FailureLog(logger, self.name)
+
+    def start(self) -> None:
+        """Open LCM; what fails is tried again by ``maintain``."""
+        try:
+            self._lcm = self._shared or open_lcm(self.settings.effective_url)
+        except OutputError as error:
+            self._failed(str(error))
+            self._retry_at_s = time.monotonic() + _RETRY_S
+        else:
+            self._sent()
+
+    def publisher(self, topic: Topic) -> LcmPublisher:
+        """Return a new publisher of ``topic`` on a channel that no other publisher of ours has."""
+        name = lcm_channel(self.settings.prefix, topic.source, *topic.parts)
+        channel = unique_name(name, self._channels)
+        self._channels.add(channel)
+        return LcmPublisher(self, channel)
+
+    def forget(self, publisher: LcmPublisher) -> None:
+        """Free the channel of a closed publisher."""
+        self._channels.discard(publisher.channel)
+
+    def send(self, channel: str, message: bytes) -> None:
+        """Publish on ``channel``; raises OutputError if it failed. The next message is tried again."""
+        if self._lcm is None:
+            raise OutputError(self._problem, cause="not open")
+        if channel not in self._channels:
+            raise OutputError(f"LCM channel {channel} is closed", cause="closed")
+        try:
+            self._lcm.publish(channel, message)
+        except OSError as error:
+            problem = multicast_problem(self.settings.effective_url) or str(error)
+            self._failed(problem)
+            raise OutputError(problem, cause="send failed") from error
+        if self._problem:
+            self._sent()
+
+    def _failed(self, problem: str) -> None:
+        self._problem = problem
+        self._failures.failed(problem)
+
+    def _sent(self) -> None:
+        self._problem = ""
+        self._failures.recovered("sending")
+
+    def announce(self, source: str) -> None:
+        """LCM has nothing of the kind; the status messages show who serves ``source``."""
+
+    def maintain(self) -> None:
+        """Open LCM if it is not open and the last try is a while ago."""
+        if self._lcm is None and time.monotonic() >= self._retry_at_s:
+            self.start()
+
+    def health(self) -> OutputHealth:
+        """Return whether the last message could be sent."""
+        return OutputHealth(not self._problem, self._problem)
+
+    def close(self) -> None:
+        """Let LCM go: it has no close, deleting the object frees its sockets and thread."""
+        self._lcm = None
+        self._problem = "LCM is closed"
+        self._retry_at_s = float("inf")

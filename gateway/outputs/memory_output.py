@@ -1,0 +1,62 @@
+"""An output that keeps messages in memory, for tests and measurements of the gateway itself."""
+
+from collections import deque
+
+from gateway.errors import OutputError
+from gateway.names import Topic
+from gateway.status import OutputHealth
+
+
+class MemoryPublisher:
+    """Appends the messages of one topic to the output's queue."""
+
+    wanted = True
+
+    def __init__(self, output: "MemoryOutput", topic: Topic) -> None:
+        self._output = output
+        self._topic = topic
+        self._closed = False
+
+    def publish(self, message: bytes) -> None:
+        """Keep ``message``; raises OutputError while the output is not open."""
+        if self._closed or not self._output.is_open:
+            raise OutputError("memory output is closed; start it first", cause="closed")
+        self._output.messages.append((self._topic, message))
+
+    def close(self) -> None:
+        """Give up the topic."""
+        self._closed = True
+
+
+class MemoryOutput:
+    """Keeps the newest ``capacity`` messages, oldest out first, as (topic, message) in ``messages``."""
+
+    name = "memory"
+
+    def __init__(self, capacity: int = 100_000) -> None:
+        self.messages: deque[tuple[Topic, bytes]] = deque(maxlen=capacity)
+        self.announced: set[str] = set()
+        self.is_open = False
+
+    def start(self) -> None:
+        """Open the output."""
+        self.is_open = True
+
+    def publisher(self, topic: Topic) -> MemoryPublisher:
+        """Return a new publisher of ``topic``."""
+        return MemoryPublisher(self, topic)
+
+    def announce(self, source: str) -> None:
+        """Note that ``source`` is served."""
+        self.announced.add(source)
+
+    def maintain(self) -> None:
+        """Nothing needs looking after."""
+
+    def health(self) -> OutputHealth:
+        """Return whether the output is open."""
+        return OutputHealth(True) if self.is_open else OutputHealth(False, "memory output is closed")
+
+    def close(self) -> None:
+        """Close the output; what it kept stays readable."""
+        self.is_open = False

@@ -1,0 +1,235 @@
+"""Messages out on Zenoh: one publisher per key, a liveliness token per source.
+
+Opened in a thread of its own, because ``zenoh.open`` blocks; see docs/design.md for what was measured.
+"""
+
+import json
+import logging
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, cast
+
+import zenoh
+
+from gateway.config import ZenohSettings
+from gateway.errors import ConfigError, OutputError
+from gateway.log import FailureLog
+from gateway.names import Topic, zenoh_key
+from gateway.status import OutputHealth
+
+LCM_ENCODING: Final = "application/x-lcm"
+"""The Zenoh encoding of every message; its schema is the LCM type: ``application/x-lcm;rtc3d.markers_t``."""
+
+_DEFAULTS: Final = {
+    # 16 MB of /dev/shm, and files left behind after a kill, for messages of a few kB.
+    "transport": {"shared_memory": {"enabled": False}},
+    # A lost router is found again within half a second instead of up to 4 s.
+    "connect": {"retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}},
+}
+"""What the gateway wants other than Zenoh's own defaults, where an inline configuration is silent."""
+
+_RETRY_S: Final = 1.0
+_JOIN_S: Final = 1.0
+
+logger = logging.getLogger(__name__)
+
+
+def zenoh_config(config: Path | Mapping[str, Any]) -> zenoh.Config:
+    """Return Zenoh's configuration from a JSON5 file, as it stands, or from keys given inline.
+
+    Raises ConfigError with Zenoh's own reason.
+    """
+    try:
+        if isinstance(config, Path):
+            return zenoh.Config.from_file(str(config))
+        return zenoh.Config.from_json5(json.dumps(_merged(_DEFAULTS, config)))
+    except (zenoh.ZError, TypeError, ValueError) as error:
+        where = f"file {config}" if isinstance(config, Path) else "inline zenoh.config"
+        raise ConfigError(f"Zenoh does not accept the {where}: {error}") from error
+
+
+def _merged(defaults: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(defaults)
+    for key, value in given.items():
+        default = merged.get(key)
+        if isinstance(default, Mapping) and isinstance(value, Mapping):
+            merged[key] = _merged(default, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+class ZenohPublisher:
+    """Sends the messages of one topic, DROP on congestion: a stalled subscriber delays nobody."""
+
+    def __init__(self, output: "ZenohOutput", topic: Topic) -> None:
+        self._output = output
+        self._topic = topic
+        self._publisher: zenoh.Publisher | None = None
+        self._matched = False
+
+    @property
+    def wanted(self) -> bool:
+        """Whether a subscriber matches the key now."""
+        return self._matched
+
+    def bind(self, session: zenoh.Session) -> None:
+        """Declare the publisher on an open session."""
+        settings = self._output.settings
+        publisher = session.declare_publisher(
+            zenoh_key(settings.prefix, self._topic.source, *self._topic.parts),
+            encoding=zenoh.Encoding(LCM_ENCODING).with_schema(self._topic.type_name),
+            congestion_control=zenoh.CongestionControl.DROP,
+            express=settings.express,
+        )
+        publisher.declare_matching_listener(self._on_matching)
+        # Zenoh's type stub says bool here; it is the same MatchingStatus that listeners get.
+        self._matched = cast(zenoh.MatchingStatus, publisher.matching_status).matching
+        self._publisher = publisher
+
+    def _on_matching(self, status: zenoh.MatchingStatus) -> None:
+        self._matched = status.matching  # from Zenoh's thread; setting a flag is all it does
+
+    def publish(self, message: bytes) -> None:
+        """Hand ``message`` to Zenoh; raises OutputError while not open, or a client without a router."""
+        if self._publisher is None:
+            raise OutputError(self._output.health().problem, cause="not open")
+        if self._output.lacks_router:
+            raise OutputError(self._output.health().problem, cause="no router")
+        try:
+            self._publisher.put(message)
+        except zenoh.ZError as error:
+            raise OutputError(f"Zenoh did not take a message: {error}", cause="put failed") from error
+
+    def close(self) -> None:
+        """Undeclare the publisher."""
+        publisher, self._publisher = self._publisher, None
+        self._matched = False
+        self._output.forget(self)
+        if publisher is not None:
+            try:
+                publisher.undeclare()
+            except zenoh.ZError as error:
+                logger.debug("undeclaring %s: %s", self._topic, error)
+
+
+class ZenohOutput:
+    """One Zenoh session and its publishers. Raises ConfigError if Zenoh refuses the configuration."""
+
+    name = "zenoh"
+
+    def __init__(self, settings: ZenohSettings) -> None:
+        self.settings = settings
+        self._config = zenoh_config(settings.config)
+        self._is_client = json.loads(self._config.get_json("mode") or "null") == "client"
+        self._lock = threading.Lock()  # of _session, _publishers and _sources, shared with _opener
+        self._session: zenoh.Session | None = None
+        self._publishers: list[ZenohPublisher] = []
+        self._sources: list[str] = []
+        self._tokens: list[zenoh.LivelinessToken] = []
+        self._transports = 0
+        self._problem = "the Zenoh session is not open yet"
+        self._closing = threading.Event()
+        self._opener = threading.Thread(target=self._open, name="zenoh-open", daemon=True)
+        self._failures = FailureLog(logger, self.name)
+        self._links = FailureLog(logger, self.name)
+
+    @property
+    def session(self) -> zenoh.Session | None:
+        """The open session; None before it opens and after ``close``."""
+        return self._session
+
+    @property
+    def lacks_router(self) -> bool:
+        """Whether this is a client (it reaches others through a router only) without its router."""
+        return self._is_client and self._transports == 0
+
+    def start(self) -> None:
+        """Begin to open the session, again and again until it opens or ``close`` is called."""
+        self._opener.start()
+
+    def _open(self) -> None:
+        while not self._closing.is_set():
+            try:
+                session = zenoh.open(self._config)
+            except zenoh.ZError as error:
+                self._problem = (
+                    f"the Zenoh session does not open: {error}; "
+                    "is the router running, are zenoh.config's endpoints right and free?"
+                )
+                self._failures.failed(self._problem)
+                self._closing.wait(_RETRY_S)
+                continue
+            session.info.declare_transport_events_listener(self._on_transport, history=True)
+            with self._lock:
+                if self._closing.is_set():
+                    session.close()
+                    return
+                self._session = session
+                for publisher in self._publishers:
+                    publisher.bind(session)
+                self._tokens = [self._token(session, source) for source in self._sources]
+            self._problem = ""
+            self._failures.recovered("the session is open")
+            return
+
+    def _on_transport(self, event: zenoh.TransportEvent) -> None:
+        self._transports += 1 if event.kind == zenoh.SampleKind.PUT else -1
+
+    def _token(self, session: zenoh.Session, source: str) -> zenoh.LivelinessToken:
+        return session.liveliness().declare_token(zenoh_key(self.settings.prefix, source, "alive"))
+
+    def publisher(self, topic: Topic) -> ZenohPublisher:
+        """Return a new publisher of ``topic``; it sends as soon as the session is open."""
+        publisher = ZenohPublisher(self, topic)
+        with self._lock:
+            self._publishers.append(publisher)
+            if self._session is not None:
+                publisher.bind(self._session)
+        return publisher
+
+    def forget(self, publisher: ZenohPublisher) -> None:
+        """Drop a closed publisher."""
+        with self._lock:
+            if publisher in self._publishers:
+                self._publishers.remove(publisher)
+
+    def announce(self, source: str) -> None:
+        """Hold the liveliness token PREFIX/SOURCE/alive."""
+        with self._lock:
+            self._sources.append(source)
+            if self._session is not None:
+                self._tokens.append(self._token(self._session, source))
+
+    def maintain(self) -> None:
+        """Tell of a router lost or found; Zenoh itself reconnects."""
+        if self._session is None:
+            return
+        if self.lacks_router:
+            self._links.failed(self.health().problem)
+        else:
+            self._links.recovered("connected to the router")
+
+    def health(self) -> OutputHealth:
+        """Return whether messages can leave."""
+        if self._session is None:
+            return OutputHealth(False, self._problem)
+        if self.lacks_router:
+            return OutputHealth(
+                False,
+                "no Zenoh router is connected: start zenohd, or correct zenoh.config's connect/endpoints",
+            )
+        return OutputHealth(True)
+
+    def close(self) -> None:
+        """Close the session: without it a process with callbacks never ends."""
+        self._closing.set()
+        if self._opener.is_alive():
+            self._opener.join(_JOIN_S)  # an open() that blocks is left behind; it closes what it opens
+        with self._lock:
+            session, self._session = self._session, None
+            self._tokens.clear()
+            self._problem = "the Zenoh session is closed"
+        if session is not None:
+            session.close()
