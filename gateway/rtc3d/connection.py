@@ -40,7 +40,8 @@ from gateway.rtc3d.packets import (
     encode_packet,
     text_of,
 )
-from gateway.rtc3d.parameters_xml import parse_parameters, sections_of
+from gateway.rtc3d.parameters import sections_of
+from gateway.rtc3d.parameters_xml import parse_parameters
 
 
 class State(Enum):
@@ -286,6 +287,7 @@ class Connection:
         elif packet.type == PacketType.ERROR:
             self.under_way = None
             self._owed.clear()
+            self._answered.append(command)
             if isinstance(command, StreamFrames):
                 self._move(Input.REFUSED)
             events.append(Refused(command, ServerError(text_of(packet.body) or "no reason given")))
@@ -314,20 +316,26 @@ class Connection:
         return None
 
     def _on_xml(self, packet: Packet, events: list[Event]) -> None:
-        command = self.under_way
-        owed = [late for late in self._owed if isinstance(late, SendParameters)]
-        if not isinstance(command, SendParameters):
-            for late in owed[:1]:
-                self._owed.remove(late)
-            events.append(Stray(packet))
+        meant = self._parameters_meant(packet)
+        if meant is not None and meant is self.under_way:
+            self._owed.clear()
+            self._answer(packet, events)
             return
-        others = [late for late in owed if late != command]
-        if others and not _fits(packet.body, command):
-            self._owed.remove(next((late for late in others if _fits(packet.body, late)), others[0]))
-            events.append(Stray(packet))
-            return
-        self._owed.clear()
-        self._answer(packet, events)
+        if meant is not None and meant in self._owed:
+            self._owed.remove(meant)
+        events.append(Stray(packet))
+
+    def _parameters_meant(self, packet: Packet) -> Command | None:
+        """Return the SendParameters that the XML answers: under way, owed, answered, or None."""
+        asked = [self.under_way] if isinstance(self.under_way, SendParameters) else []
+        owed, answered = (
+            [command for command in commands if isinstance(command, SendParameters) and command not in asked]
+            for commands in (self._owed, self._answered)
+        )
+        if not owed and not answered:
+            return asked[0] if asked else None
+        present = _sections_in(packet.body)
+        return max((*owed, *asked, *answered), key=lambda command: _fit(present, command))
 
     def _answer(self, packet: Packet, events: list[Event]) -> None:
         """End the command under way with ``packet``."""
@@ -337,10 +345,17 @@ class Connection:
             self.under_way = None
 
 
-def _fits(xml: bytes, command: SendParameters) -> bool:
-    """Whether the XML holds just the sections that ``command`` asked for."""
+def _sections_in(xml: bytes) -> frozenset[str]:
     try:
-        present = sections_of(parse_parameters(xml).parameters)
+        return sections_of(parse_parameters(xml).parameters)
     except ParametersError:
-        return False
-    return present == frozenset(command.sections or SECTIONS)
+        return frozenset()
+
+
+def _fit(present: frozenset[str], command: SendParameters) -> int:
+    """Return how well the sections that came fit those asked for: 2 exactly, 1 some are left out, 0 not.
+
+    Servers leave out sections that they do not have (field note 9).
+    """
+    asked = frozenset(command.sections or SECTIONS)
+    return 2 if present == asked else int(present < asked)

@@ -1,0 +1,109 @@
+"""Whatever a server sends, the connection gives events, and the replies stay with their commands."""
+
+import struct
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.rtc3d.commands import (
+    AllFrames,
+    Command,
+    FrequencyDivisor,
+    SendCurrentFrame,
+    SendParameters,
+    SetByteOrder,
+    StopStreaming,
+    StreamFrames,
+    Version,
+)
+from gateway.rtc3d.connection import Answered, Connection, Refused
+from tests.strategies import damaged, pieces_of
+from tests.vectors import FULL_FRAME
+
+
+def packet(packet_type: int, body: bytes) -> bytes:
+    return struct.pack(">II", 8 + len(body), packet_type) + body
+
+
+FRAME = packet(3, FULL_FRAME["big"])
+COMMANDS: list[Command] = [
+    Version(),
+    SetByteOrder("big"),
+    SetByteOrder("little"),
+    SendParameters(),
+    SendParameters(("3d",)),
+    SendCurrentFrame(),
+    StreamFrames(),
+    StreamFrames(AllFrames()),
+    StreamFrames(FrequencyDivisor(2)),
+    StopStreaming(),
+]
+SECTIONS = {(): b"<The_3D/><The_6D/>", ("3d",): b"<The_3D/>"}
+
+server_packets = st.lists(
+    st.sampled_from(
+        [FRAME, packet(4, b""), packet(2, b"<RT_Parameters/>"), packet(5, b"x"), packet(9, b"?")]
+        + [packet(kind, f"OK-{command}".encode()) for kind in (0, 1) for command in COMMANDS]
+        + [packet(kind, b"OK") for kind in (0, 1)]
+    ),
+    max_size=12,
+).map(b"".join)
+
+
+@given(st.data())
+def test_no_bytes_make_it_raise(data: st.DataObject) -> None:
+    stream = data.draw(st.one_of(server_packets, damaged(server_packets), st.binary(max_size=300)))
+    connection = Connection(max_packet_bytes=4096)
+    for piece in data.draw(pieces_of(stream)):
+        if connection.under_way is None and connection.state.value not in {"closed", "closing"}:
+            connection.send(data.draw(st.sampled_from(COMMANDS)))
+        connection.receive(piece)
+
+
+@given(st.data())
+def test_splits_do_not_change_the_events(data: st.DataObject) -> None:
+    stream = data.draw(server_packets)
+    whole, cut = Connection(), Connection()
+    expected = whole.receive(stream)
+    got = [event for piece in data.draw(pieces_of(stream)) for event in cut.receive(piece)]
+    assert [type(event) for event in got] == [type(event) for event in expected]
+
+
+@given(st.data())
+def test_each_command_gets_its_own_reply_from_a_server_that_names_commands(data: st.DataObject) -> None:
+    """Acknowledgements may be doubled, late (after give_up) or missing; frames come in between."""
+    connection = Connection()
+    late: list[bytes] = []
+    for _ in range(data.draw(st.integers(1, 8))):
+        command = data.draw(st.sampled_from(COMMANDS))
+        refused = data.draw(st.booleans())
+        behaviour = data.draw(st.sampled_from(["once", "twice", "late", "missing"]))
+        reply = _reply(command, refused=refused)
+        connection.send(command)
+        arrived = b"".join(late) + data.draw(st.sampled_from([b"", FRAME]))
+        late = []
+        if behaviour in {"once", "twice"}:
+            arrived += reply
+        if behaviour == "twice" and not refused:
+            late.append(reply)
+        if behaviour == "late":
+            late.append(reply)
+        for event in connection.receive(arrived):
+            if isinstance(event, Answered | Refused):
+                # A reply to an equal question is as good; one to another question never is.
+                assert event.command == command
+                if isinstance(event, Refused):
+                    assert str(event.error) == f"Error-{command}"
+                elif event.packet.type != 3:
+                    assert event.packet.body == _reply(command, refused=False)[8:]
+        connection.give_up()
+
+
+def _reply(command: Command, *, refused: bool) -> bytes:
+    if refused:
+        return packet(0, f"Error-{command}".encode())
+    if isinstance(command, SendParameters):
+        return packet(2, b"<RT_Parameters>" + SECTIONS[command.sections] + b"</RT_Parameters>")
+    if isinstance(command, SendCurrentFrame):
+        return FRAME
+    return packet(1, f"OK-{command}".encode())
