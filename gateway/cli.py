@@ -22,7 +22,7 @@ from gateway.errors import ConfigError, GatewayError
 from gateway.simulator.scene import Scene
 from gateway.simulator.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.simulator.take import load_take
+from gateway.simulator.take import Take
 
 _DEFAULT_PORT = 3020
 
@@ -146,7 +146,7 @@ def _scene(  # one place for the options that simulate and demo share
     c3d: Path | None, markers: int, tools: int, analog: int, plates: int, rate: float, analog_rate: float
 ) -> Scene:
     if c3d is not None:
-        return load_take(c3d)
+        return Take(c3d)
     return SyntheticScene(
         markers=markers, tools=tools, analog=analog, plates=plates, rate_hz=rate, analog_rate_hz=analog_rate
     )

@@ -1,6 +1,7 @@
 """One TCP connection to an RT server, used once: asyncio's shell over ``rtc3d.connection``."""
 
 import asyncio
+import contextlib
 import logging
 import socket
 from collections.abc import Callable
@@ -235,12 +236,11 @@ class Session(asyncio.Protocol):
             self._flush()
             # The rest of the stream is read on: closing with data unread would reset the connection,
             # and the server might never see the Bye.
-            self._transport.write_eof()
-            try:
+            # OSError: the server has just reset the connection, and asyncio has yet to say so.
+            with contextlib.suppress(TimeoutError, OSError):
+                self._transport.write_eof()
                 async with asyncio.timeout(_BYE_S):
                     await self._lost.wait()
-            except TimeoutError:
-                pass
         self._transport.abort()
 
     # What asyncio calls.

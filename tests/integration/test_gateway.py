@@ -1,0 +1,383 @@
+"""A whole gateway with an output in memory, against servers as the field notes tell of them."""
+
+import asyncio
+import logging
+import struct
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+import rtc3d
+
+from gateway.config import Reconnect, Source, Stream
+from gateway.config import Settings as GatewaySettings
+from gateway.daemon import Gateway
+from gateway.decode import decode
+from gateway.outputs.memory_output import MemoryOutput
+from gateway.rtc3d.commands import FrequencyDivisor
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.simulator.server import Simulator
+from gateway.simulator.synthetic import SyntheticScene
+from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
+
+FRAME = markers_frame(7, (1.0, 2.0, 3.0))
+XML = packet(2, "<RT_Parameters Ver='1.00'><The_3D><Frequency>100</Frequency></The_3D></RT_Parameters>")
+
+
+class Running:
+    """A gateway of one source that publishes into memory."""
+
+    def __init__(self, gateway: Gateway, output: MemoryOutput) -> None:
+        self.gateway = gateway
+        self.output = output
+        [self.source] = gateway.sources
+        self.status = self.source.statuses[0]
+
+    def messages(self, component: str) -> list[Any]:
+        return [decode(data) for topic, data in self.output.messages if topic.parts == (component,)]
+
+    async def until(self, condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(10):
+            while not condition():  # noqa: ASYNC110 - any state of the gateway can be waited for
+                await asyncio.sleep(0.005)
+
+    async def heard(self, component: str, count: int = 1) -> list[Any]:
+        await self.until(lambda: len(self.messages(component)) >= count)
+        return self.messages(component)
+
+
+@asynccontextmanager
+async def gateway_to(port: int, **settings: Any) -> AsyncIterator[Running]:
+    source = {
+        "name": "lab",
+        "host": "127.0.0.1",
+        "port": port,
+        "reconnect": Reconnect(first_delay_s=0.01, max_delay_s=0.05),
+        "reply_timeout_s": 0.3,
+        "stall_timeout_s": 1.0,
+    }
+    output = MemoryOutput()
+    gateway = Gateway(GatewaySettings(sources=(Source(**(source | settings)),)), [output])
+    stop = asyncio.Event()
+    task = asyncio.create_task(gateway.run(stop))
+    try:
+        yield Running(gateway, output)
+    finally:
+        stop.set()
+        async with asyncio.timeout(5):
+            await task
+
+
+def obliging(command: str) -> bytes:
+    """Answer as a server that knows everything, with one frame after StreamFrames."""
+    if command.startswith("SendParameters"):
+        return XML
+    if command.startswith("StreamFrames"):
+        return ok(f"OK-{command}") + FRAME
+    return ok(f"OK-{command}")
+
+
+async def test_every_component_of_the_simulator_is_published() -> None:
+    scene = SyntheticScene(markers=5, tools=1, analog=3, plates=1, rate_hz=200, analog_rate_hz=200)
+    async with Simulator(scene) as simulator, gateway_to(simulator.port) as running:
+        for component, field, count in (
+            ("3d", "num_markers", 5),
+            ("6d", "num_tools", 1),
+            ("analog", "num_channels", 3),
+            ("force", "num_plates", 1),
+            ("event", "num_events", 1),
+        ):
+            messages = await running.heard(component)
+            assert getattr(messages[0], field) == count
+        markers = await running.heard("3d", 20)
+        assert [message.sequence for message in markers] == list(range(len(markers)))
+        assert {message.session for message in markers} == {1}
+        assert running.status.state == "streaming"
+        assert running.status.byte_order == "big"
+        assert running.status.rate == "AllFrames"
+
+
+async def test_streams_have_connections_of_their_own() -> None:
+    scene = SyntheticScene(markers=2, tools=0, analog=2, plates=0, rate_hz=100, analog_rate_hz=1000)
+    streams = (Stream(components=(ComponentType.MARKERS,)), Stream(components=(ComponentType.ANALOG,)))
+    async with Simulator(scene) as simulator, gateway_to(simulator.port, streams=streams) as running:
+        analog = await running.heard("analog", 100)
+        numbers = [message.frame_number for message in analog]
+        assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
+        await running.heard("3d", 5)
+        assert len(simulator.connections) == 2
+
+
+async def test_the_rate_asked_for_reaches_the_server() -> None:
+    scene = SyntheticScene(markers=1, rate_hz=200)
+    stream = Stream(components=(ComponentType.MARKERS,), rate=FrequencyDivisor(4))
+    async with Simulator(scene) as simulator, gateway_to(simulator.port, streams=(stream,)) as running:
+        numbers = [message.frame_number for message in await running.heard("3d", 10)]
+        assert {after - before for before, after in pairwise(numbers)} == {4}
+        assert running.status.rate == "FrequencyDivisor:4"
+
+
+async def test_little_endian_sessions_give_the_same_messages() -> None:
+    scene = SyntheticScene(markers=3, tools=1, analog=0, plates=0, rate_hz=200)
+    async with Simulator(scene) as simulator, gateway_to(simulator.port, byte_order="little") as running:
+        for message in (await running.heard("3d", 10))[:10]:
+            # A scene is a function of time; frames are numbered from 1.
+            [expected] = scene.items(ComponentType.MARKERS, np.array([message.frame_number - 1]))
+            assert [marker.x for marker in message.markers] == expected["x"].tolist()
+        assert running.status.byte_order == "little"
+
+
+async def test_bye_is_said_on_the_way_out() -> None:
+    commands: list[str] = []
+
+    async def script(client: Client) -> None:
+        def answer(command: str) -> bytes | None:
+            commands.append(command)
+            return None if command == "Bye" else obliging(command)
+
+        await client.commands(answer)
+
+    async with ScriptedServer(script) as server:
+        async with gateway_to(server.port) as running:
+            await running.heard("3d")
+        await running.until(lambda: commands[-1:] == ["Bye"])
+    assert commands == ["Version 1.0", "SendParameters", "StreamFrames AllFrames", "Bye"]
+
+
+async def test_a_server_that_knows_stream_frames_alone_streams() -> None:
+    commands: list[str] = []
+
+    async def script(client: Client) -> None:
+        def answer(command: str) -> bytes:
+            commands.append(command)
+            return FRAME if command == "StreamFrames" else error("err-unknown command")
+
+        await client.commands(answer)
+
+    stream = Stream(components=(ComponentType.MARKERS,))
+    async with ScriptedServer(script) as server, gateway_to(server.port, streams=(stream,)) as running:
+        await running.heard("3d")
+        assert commands[:5] == [
+            "Version 1.0",
+            "SendParameters",
+            "StreamFrames AllFrames 3D",
+            "StreamFrames AllFrames",
+            "StreamFrames FrequencyDivisor:1",
+        ]
+        assert len(running.status.limitations) == 5
+        assert "the server refused Version 1.0: err-unknown command" in running.status.limitations
+
+
+async def test_a_server_that_answers_no_command_but_streams_is_used() -> None:
+    async def script(client: Client) -> None:
+        await client.commands(lambda command: FRAME if command.startswith("StreamFrames") else None)
+
+    async with ScriptedServer(script) as server, gateway_to(server.port) as running:
+        await running.heard("3d")
+        assert "the server did not answer Version 1.0" in running.status.limitations
+
+
+async def test_doubled_acknowledgements_do_no_harm() -> None:
+    async def script(client: Client) -> None:
+        await client.commands(lambda command: obliging(command) + obliging(command))
+
+    async with ScriptedServer(script) as server, gateway_to(server.port, byte_order="little") as running:
+        await running.heard("3d", 2)
+        assert running.status.session == 1
+
+
+async def test_an_acknowledged_and_ignored_byte_order_is_noticed(caplog: pytest.LogCaptureFixture) -> None:
+    async def script(client: Client) -> None:
+        await client.commands(obliging)
+
+    async with ScriptedServer(script) as server, gateway_to(server.port, byte_order="little") as running:
+        [first, *_] = await running.heard("3d")
+        assert (first.markers[0].x, first.markers[0].y, first.markers[0].z) == (1.0, 2.0, 3.0)
+        assert running.status.byte_order == "big"
+    assert sum("big-endian" in record.message for record in caplog.records) == 1
+
+
+async def test_components_that_were_not_asked_for_are_not_published() -> None:
+    stream = Stream(components=(ComponentType.TOOLS,))
+    served = asyncio.Event()
+
+    async def script(client: Client) -> None:
+        def answer(command: str) -> bytes:
+            served.set()
+            return obliging(command)
+
+        await client.commands(answer)
+
+    async with ScriptedServer(script) as server, gateway_to(server.port, streams=(stream,)) as running:
+        await served.wait()
+        await running.until(lambda: running.status.frames_in > 0)
+        assert running.messages("3d") == []
+
+
+async def test_bad_frames_are_counted_and_the_next_good_one_is_published() -> None:
+    async def script(client: Client) -> None:
+        def answer(command: str) -> bytes:
+            broken = packet(3, FRAME[8:-4]) + packet(3, b"\xff" * 12) + packet(3, b"")
+            return obliging(command) + (broken + markers_frame(8) if "Stream" in command else b"")
+
+        await client.commands(answer)
+
+    async with ScriptedServer(script) as server, gateway_to(server.port) as running:
+        messages = await running.heard("3d", 2)
+        assert [message.frame_number for message in messages] == [7, 8]
+        assert running.status.drops == {"frame rejected": 3}
+        assert "frame rejected" in running.status.last_error
+
+
+async def test_unknown_components_are_counted_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    unknown = struct.pack(">IIII", 1, 12, 9, 0)
+
+    async def script(client: Client) -> None:
+        def answer(command: str) -> bytes:
+            return obliging(command) + (2 * packet(3, unknown) + FRAME if "Stream" in command else b"")
+
+        await client.commands(answer)
+
+    async with ScriptedServer(script) as server, gateway_to(server.port) as running:
+        await running.heard("3d", 2)
+        assert running.status.drops == {"unknown component": 2}
+    assert sum("unknown type [9]" in record.message for record in caplog.records) == 1
+
+
+@pytest.mark.parametrize(
+    ("first_words", "reason"),
+    [
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n", "no RTC3D server"),
+        (b"SSH-2.0-OpenSSH_9.2\r\n", "no RTC3D server"),
+        (b"\0\0\0\0\0\0\0\0", "less than the header"),
+        (packet(3)[:4] + b"\0\0", "the connection to"),  # cut in the middle of a header
+        (b"\0\xff\0\0\0\0\0\3" + b"x" * 50, "the connection to"),  # cut in the middle of a body
+        (b"", "the connection to"),
+    ],
+)
+async def test_after_a_server_that_talks_nonsense_the_next_connection_streams(
+    first_words: bytes, reason: str
+) -> None:
+    async def script(client: Client) -> None:
+        if server.connections == 1:
+            client.send(first_words)
+        else:
+            await client.commands(obliging)
+
+    async with ScriptedServer(script) as server, gateway_to(server.port) as running:
+        [message, *_] = await running.heard("3d")
+        assert reason in running.status.last_error
+        assert str(server.port) in running.status.last_error
+        assert (message.session, message.sequence) == (running.status.session, 0)
+        assert running.status.reconnects >= 1
+
+
+async def test_a_server_that_is_not_there_is_waited_for() -> None:
+    async with ScriptedServer(lambda client: client.commands(obliging)) as taken:
+        port = taken.port
+    async with gateway_to(port) as running:
+        await running.until(lambda: running.status.reconnects >= 2)
+        assert f"refused by 127.0.0.1:{port}" in running.status.last_error
+        async with ScriptedServer(lambda client: client.commands(obliging), port):
+            await running.heard("3d")
+
+
+async def test_a_host_that_does_not_exist_is_told_by_name() -> None:
+    async with gateway_to(3020, host="no-such-host.invalid") as running:
+        await running.until(lambda: bool(running.status.last_error))
+        assert "'no-such-host.invalid' is not known" in running.status.last_error
+
+
+async def test_a_server_that_goes_silent_in_a_measurement_is_left() -> None:
+    async def script(client: Client) -> None:
+        await client.commands(lambda command: obliging(command) if server.connections < 3 else None)
+
+    async with ScriptedServer(script) as server, gateway_to(server.port, stall_timeout_s=0.4) as running:
+        messages = await running.heard("3d", 2)
+        assert [message.session for message in messages] == [1, 2]
+        assert [message.sequence for message in messages] == [0, 1]
+        assert "although a measurement runs" in running.status.last_error
+
+
+async def test_silence_without_a_measurement_is_no_fault_if_the_server_answers() -> None:
+    probes = asyncio.Event()
+
+    async def script(client: Client) -> None:
+        seen: list[str] = []
+
+        def answer(command: str) -> bytes:
+            seen.append(command)
+            if seen.count("Version 1.0") == 3:
+                probes.set()
+            return packet(4) if command.startswith("StreamFrames") else obliging(command)
+
+        await client.commands(answer)
+
+    async with ScriptedServer(script) as server, gateway_to(server.port, stall_timeout_s=0.3) as running:
+        await probes.wait()
+        assert running.status.state == "no measurement"
+        assert server.connections == 1
+
+
+async def test_silence_without_a_measurement_and_without_answers_is_a_fault() -> None:
+    async def script(client: Client) -> None:
+        streaming = False
+
+        def answer(command: str) -> bytes | None:
+            nonlocal streaming
+            if streaming:
+                return None
+            streaming = command.startswith("StreamFrames")
+            return packet(4) if streaming else obliging(command)
+
+        await client.commands(answer)
+
+    async with ScriptedServer(script) as server, gateway_to(server.port, stall_timeout_s=0.3) as running:
+        await running.until(lambda: server.connections >= 2)
+        assert "sends no frames" in running.status.last_error
+
+
+async def test_a_measurement_that_starts_later_is_streamed() -> None:
+    scene = SyntheticScene(markers=1, rate_hz=200)
+    async with Simulator(scene) as simulator:
+        simulator.stop_measurement()
+        async with gateway_to(simulator.port) as running:
+            await running.until(lambda: running.status.state == "no measurement")
+            simulator.start_measurement()
+            await running.heard("3d", 5)
+            assert running.status.session == 1
+
+
+async def test_the_status_tells_what_the_gateway_knows() -> None:
+    async def script(client: Client) -> None:
+        await client.commands(obliging)
+
+    async with ScriptedServer(script) as server, gateway_to(server.port, stall_timeout_s=60) as running:
+        await running.heard("3d")
+        [status, *_] = await running.heard("status")
+        assert isinstance(status, rtc3d.status_t)
+        assert (status.source, status.server) == ("lab", f"127.0.0.1:{server.port}")
+        [stream] = status.streams
+        assert stream.components == " ".join(component.key for component in WIRE_ORDER)
+        assert (stream.frames_in, stream.session, stream.reconnects) == (1, 1, 0)
+        [output] = status.outputs
+        assert (output.name, output.connected) == ("memory", True)
+        assert [(count.name, count.count) for count in output.messages] == [("3d", 1)]
+
+
+async def test_a_failure_is_told_once_and_its_end(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    async with ScriptedServer(lambda client: client.commands(obliging)) as taken:
+        port = taken.port
+    async with gateway_to(port) as running:
+        await running.until(lambda: running.status.reconnects >= 3)
+        async with ScriptedServer(lambda client: client.commands(obliging), port):
+            await running.heard("3d")
+    refused = [record for record in caplog.records if "refused by" in record.message]
+    assert [record.levelname for record in refused[:3]] == ["WARNING", "DEBUG", "DEBUG"]
+    [recovered] = [record for record in caplog.records if "streaming from" in record.message]
+    assert recovered.levelname == "INFO"
+    assert "failures" in recovered.message

@@ -1,0 +1,95 @@
+"""RT servers that the simulator is not: scripted, as odd as the field notes tell."""
+
+import asyncio
+import struct
+from collections.abc import Awaitable, Callable
+from types import TracebackType
+from typing import Self
+
+
+def packet(packet_type: int, body: bytes | str = b"") -> bytes:
+    data = body.encode() if isinstance(body, str) else body
+    return struct.pack(">II", 8 + len(data), packet_type) + data
+
+
+def ok(text: str) -> bytes:
+    return packet(1, text)
+
+
+def error(text: str) -> bytes:
+    return packet(0, text)
+
+
+def markers_frame(number: int, *positions: tuple[float, float, float], order: str = ">") -> bytes:
+    """Return a type-3 packet with one 3D component: ``number`` is its frame number, and ms its time."""
+    items = b"".join(struct.pack(order + "4f", *position, 0.1) for position in positions)
+    component = (
+        struct.pack(order + "IIiqI", 24 + len(items), 1, number, 1000 * number, len(positions)) + items
+    )
+    return packet(3, struct.pack(order + "I", 1) + component)
+
+
+Script = Callable[["Client"], Awaitable[None]]
+
+
+class Client:
+    """One connection, as a script sees it."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._reader = reader
+        self._writer = writer
+
+    async def command(self) -> str:
+        """Return the next command's text; raises IncompleteReadError once the client is gone."""
+        size, packet_type = struct.unpack(">II", await self._reader.readexactly(8))
+        body = await self._reader.readexactly(size - 8)
+        assert packet_type == 1
+        return body.decode("ascii")
+
+    def send(self, data: bytes) -> None:
+        self._writer.write(data)
+
+    async def commands(self, answer: Callable[[str], bytes | None]) -> None:
+        """Answer every command with what ``answer`` returns, until the client is gone."""
+        while True:
+            reply = answer(await self.command())
+            if reply is not None:
+                self.send(reply)
+
+    def cut(self) -> None:
+        """End the connection at once."""
+        self._writer.transport.abort()
+
+
+class ScriptedServer:
+    """Runs ``script`` for every connection, on a free port; ``commands`` are all that were received."""
+
+    def __init__(self, script: Script, port: int = 0) -> None:
+        self._script = script
+        self.port = port
+        self.connections = 0
+        self._writers: set[asyncio.StreamWriter] = set()
+
+    async def __aenter__(self) -> Self:
+        self._server = await asyncio.start_server(self._serve, "127.0.0.1", self.port)
+        self.port = self._server.sockets[0].getsockname()[1]
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._server.close()
+        for writer in self._writers:
+            writer.transport.abort()
+        await self._server.wait_closed()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self.connections += 1
+        self._writers.add(writer)
+        try:
+            await self._script(Client(reader, writer))
+        except (asyncio.IncompleteReadError, ConnectionError):
+            pass
+        finally:
+            writer.close()
+            self._writers.discard(writer)
