@@ -13,7 +13,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-import zenoh
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
@@ -63,14 +62,13 @@ async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool
     async with Simulator(scene) as simulator:
         simulator.stop_measurement()
         settings = _settings(simulator.port, endpoint, lcm_settings)
-        gateway = Gateway(
-            settings,
-            [ZenohOutput(settings.zenoh), LcmOutput(lcm_settings, shared=None if udpm else shared)],
-        )
+        zenoh_output = ZenohOutput(settings.zenoh)
+        gateway = Gateway(settings, [zenoh_output, LcmOutput(lcm_settings, None if udpm else shared)])
         stop = asyncio.Event()
         running = asyncio.create_task(gateway.run(stop))
         listener = LcmListener(shared, channel_pattern("MOCAP", SOURCE, None), heard["lcm"].take)
-        session = await _open_when_there(endpoint)
+        await _until(lambda: zenoh_output.session is not None, _READY_S, "Zenoh did not open")
+        session = open_zenoh(endpoint)
         try:
             ZenohListener(session, key_pattern("mocap", SOURCE, None), heard["zenoh"].take)
             await _until(
@@ -116,18 +114,6 @@ def _settings(port: int, endpoint: str, lcm_settings: LcmSettings) -> Settings:
 def _free_port() -> int:
     with socket.create_server(("127.0.0.1", 0)) as probe:
         return int(probe.getsockname()[1])
-
-
-async def _open_when_there(endpoint: str) -> zenoh.Session:
-    """Return a session connected to the gateway, which opens its own a moment after its start."""
-    deadline_s = asyncio.get_running_loop().time() + _READY_S
-    while True:
-        try:
-            return await asyncio.to_thread(open_zenoh, endpoint)
-        except OutputError:
-            if asyncio.get_running_loop().time() > deadline_s:
-                raise
-            await asyncio.sleep(0.1)
 
 
 async def _until(condition: Callable[[], bool], timeout_s: float, failure: str) -> None:

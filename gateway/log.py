@@ -5,7 +5,7 @@ import time
 
 
 class FailureLog:
-    """Logs one kind of failure: the first WARNING, its repeats DEBUG with a count, recovery INFO.
+    """Logs whether one thing works: the first failure WARNING, its repeats DEBUG, success INFO.
 
     ``subject`` begins every line: "lab", "lcm".
     """
@@ -31,10 +31,9 @@ class FailureLog:
             self._logger.debug("%s: %s (failure %d in a row)", self._subject, text, self._times)
 
     def recovered(self, text: str) -> None:
-        """Tell that it works again; says nothing if it had not failed."""
+        """Tell that it works, and if it had failed, for how long it had not."""
         if self._times:
             seconds = time.monotonic() - self._since_s
-            self._logger.info(
-                "%s: %s, after %.1f s and %d failures", self._subject, text, seconds, self._times
-            )
+            text = f"{text}, after {seconds:.1f} s and {self._times} failures"
             self._times = 0
+        self._logger.info("%s: %s", self._subject, text)

@@ -124,7 +124,7 @@ class LcmOutput:
 
     def _sent(self) -> None:
         self._problem = ""
-        self._failures.recovered("sending")
+        self._failures.recovered(f"sending to {self.settings.effective_url}")
 
     def announce(self, source: str) -> None:
         """LCM has nothing of the kind; the status messages show who serves ``source``."""

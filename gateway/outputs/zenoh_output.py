@@ -208,7 +208,7 @@ class ZenohOutput:
             return
         if self.lacks_router:
             self._links.failed(self.health().problem)
-        else:
+        elif self._links.failing:
             self._links.recovered("connected to the router")
 
     def health(self) -> OutputHealth:

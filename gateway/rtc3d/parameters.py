@@ -5,6 +5,7 @@ numbering starts from anything (field note 9), and an event's id may be hexadeci
 """
 
 from dataclasses import dataclass
+from math import nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +76,11 @@ class ParametersAnalog:
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A position in §6.5, in ``unit``."""
+    """A position in §6.5, in ``unit``; a coordinate that the server did not send is NaN."""
 
-    x: float
-    y: float
-    z: float
+    x: float = nan
+    y: float = nan
+    z: float = nan
     unit: str = "mm"
 
 
@@ -97,7 +98,8 @@ class Plate:
     """One force plate of §6.5.
 
     ``corners`` are the plate's four corners in the laboratory, ``origin`` the transducer's origin.
-    ``analog_channel_ids`` refer to the raw analog channels. ``calibration_matrix`` is a tuple of rows.
+    ``analog_channel_ids`` refer to the raw analog channels. ``calibration_matrix`` is a tuple of rows;
+    a cell that cannot be read is NaN.
     """
 
     id: str
@@ -167,3 +169,16 @@ class Parameters:
     analog: ParametersAnalog | None = None
     force: ParametersForce | None = None
     events: ParametersEvents | None = None
+
+
+def sections_of(parameters: Parameters) -> frozenset[str]:
+    """Return the names, as in SECTIONS, of the sections that ``parameters`` holds."""
+    sections = {
+        "general": parameters.general,
+        "3d": parameters.markers,
+        "6d": parameters.tools,
+        "analog": parameters.analog,
+        "force": parameters.force,
+        "events": parameters.events,
+    }
+    return frozenset(name for name, section in sections.items() if section is not None)

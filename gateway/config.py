@@ -1,0 +1,229 @@
+"""The gateway's configuration as frozen, validated settings.
+
+The docstring under each key says what it is; ``config/gateway.yaml`` says why one would change it.
+Mistakes raise pydantic's ValidationError, each with its location and a sentence: what was found and
+what is accepted. ``gateway.config_file`` adds file, line and column.
+"""
+
+import os
+import re
+from typing import Annotated, Final, Self
+
+from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
+
+from gateway.config_section import Section, accepts, mistake
+from gateway.config_values import (
+    ByteLimit,
+    ChannelPrefix,
+    Components,
+    Host,
+    KeyPrefix,
+    LcmUrl,
+    Port,
+    Seconds,
+    ServerByteOrder,
+    SourceName,
+    StreamRate,
+    Switch,
+    ZenohConfig,
+    not_empty,
+)
+from gateway.errors import ConfigError
+from gateway.rtc3d.commands import AllFrames, Frequency
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.rtc3d.packets import DEFAULT_MAX_C3D_BYTES, DEFAULT_MAX_PACKET_BYTES
+
+DEFAULT_LCM_URL: Final = "udpm://239.255.76.67:7667?ttl=0"
+"""LCM's own default, which stays on this host."""
+
+
+class Stream(Section):
+    """One TCP session with a source's server: these components at this rate."""
+
+    components: Components = WIRE_ORDER
+    """What to ask for: [all], or a list of 3d, 6d, analog, force, event. Kept in WIRE_ORDER."""
+
+    rate: StreamRate = AllFrames()
+    """How often: all, {frequency_hz: NUMBER} or {divisor: WHOLE NUMBER} (§5.3.5)."""
+
+
+class Reconnect(Section):
+    """The waits between tries to connect: each about twice the one before, up to a maximum."""
+
+    first_delay_s: Seconds = 0.2
+    """The first wait."""
+
+    max_delay_s: Seconds = 10.0
+    """The longest wait."""
+
+    @model_validator(mode="after")
+    def _max_is_not_below_first(self) -> Self:
+        if self.max_delay_s < self.first_delay_s:
+            raise mistake(
+                f"found {self.max_delay_s:g}; accepted is first_delay_s ({self.first_delay_s:g}) or more",
+                "max_delay_s",
+            )
+        return self
+
+
+class Source(Section):
+    """One RTC3D server, and how to read it."""
+
+    name: SourceName
+    """What keys and channels call this source; channels in upper case, with '_' for '-'."""
+
+    host: Host
+    """The server's name or address."""
+
+    port: Port = 3020
+    """The server's TCP port: 3020 for First Principles, 3030 for WaveFront (field note 12)."""
+
+    byte_order: ServerByteOrder = "big"
+    """The byte order to ask for. What is published is the same in both."""
+
+    streams: Annotated[
+        tuple[Stream, ...], AfterValidator(not_empty), accepts("a list of streams, one or more")
+    ] = (Stream(),)
+    """The TCP sessions with the server, each with its components and its rate."""
+
+    reconnect: Reconnect = Reconnect()
+    """The waits between tries to connect."""
+
+    connect_timeout_s: Seconds = 5.0
+    """How long a try to connect may take."""
+
+    reply_timeout_s: Seconds = 2.0
+    """How long the server may take to answer a command."""
+
+    stall_timeout_s: Seconds = 3.0
+    """How long a stream may be silent while a measurement runs."""
+
+    max_packet_bytes: ByteLimit = DEFAULT_MAX_PACKET_BYTES
+    """The largest packet that is believed; C3D files have a limit of their own."""
+
+    max_c3d_bytes: ByteLimit = DEFAULT_MAX_C3D_BYTES
+    """The largest C3D file that is taken."""
+
+    @field_validator("streams")
+    @classmethod
+    def _each_component_is_in_one_stream(cls, streams: tuple[Stream, ...]) -> tuple[Stream, ...]:
+        owners: dict[ComponentType, int] = {}
+        for index, stream in enumerate(streams):
+            for component in stream.components:
+                if component in owners:
+                    raise mistake(
+                        f"found {component.key!r}, which streams[{owners[component]}] has too; "
+                        "accepted is each component in one stream, for it has one key and one channel",
+                        *(index, "components"),
+                    )
+                owners[component] = index
+        return streams
+
+    @model_validator(mode="after")
+    def _frames_come_before_the_stall(self) -> Self:
+        for index, stream in enumerate(self.streams):
+            if isinstance(stream.rate, Frequency) and stream.rate.hz * self.stall_timeout_s <= 1:
+                raise mistake(
+                    f"found {stream.rate.hz:g}, one frame in {1 / stream.rate.hz:g} s, which stall_timeout_s "
+                    f"({self.stall_timeout_s:g}) takes for silence; accepted is more than "
+                    f"{1 / self.stall_timeout_s:g}, or a longer stall_timeout_s",
+                    *("streams", index, "rate", "frequency_hz"),
+                )
+        return self
+
+
+class ZenohSettings(Section):
+    """How data and answers go to Zenoh."""
+
+    enabled: Switch = True
+    """Whether anything is published, and answered, on Zenoh."""
+
+    prefix: KeyPrefix = "mocap"
+    """What all keys begin with."""
+
+    config: ZenohConfig = Field(default_factory=dict)
+    """Zenoh's own configuration: the path of a JSON5 file, or its keys inline. Not to be changed."""
+
+    express: Switch = False
+    """Whether each message is sent at once instead of in batches."""
+
+    tool_poses: Switch = False
+    """Whether each tool's pose is published on a key of its own, while someone listens."""
+
+
+class LcmSettings(Section):
+    """How data and answers go to LCM."""
+
+    enabled: Switch = True
+    """Whether anything is published, and answered, on LCM."""
+
+    prefix: ChannelPrefix = "MOCAP"
+    """What all channels begin with."""
+
+    url: LcmUrl | None = None
+    """Where to publish; see ``effective_url`` for none."""
+
+    tool_poses: Switch = False
+    """Whether each tool's pose is published on a channel of its own."""
+
+    @property
+    def effective_url(self) -> str:
+        """``url``, else the environment's LCM_DEFAULT_URL, else DEFAULT_LCM_URL.
+
+        The environment's is not checked here: LCM itself says what it cannot use.
+        """
+        return self.url or os.environ.get("LCM_DEFAULT_URL") or DEFAULT_LCM_URL
+
+
+class Settings(Section):
+    """The whole configuration."""
+
+    sources: Annotated[
+        tuple[Source, ...],
+        AfterValidator(not_empty),
+        accepts("a list of sources, one or more, each with name and host"),
+    ]
+    """The servers."""
+
+    zenoh: ZenohSettings = ZenohSettings()
+    """The Zenoh side."""
+
+    lcm: LcmSettings = LcmSettings()
+    """The LCM side."""
+
+    @field_validator("sources")
+    @classmethod
+    def _names_make_different_channels(cls, sources: tuple[Source, ...]) -> tuple[Source, ...]:
+        owners: dict[str, int] = {}
+        for index, source in enumerate(sources):
+            # As gateway.names makes channels: upper case, and everything else a single '_'.
+            channel = "_".join(re.findall("[A-Z0-9]+", source.name.upper()))
+            if channel in owners:
+                other = owners[channel]
+                raise mistake(
+                    f"found {source.name!r}, which shares its LCM channels with {sources[other].name!r}, "
+                    f"sources[{other}]; accepted is a name of other letters or digits, case aside",
+                    *(index, "name"),
+                )
+            owners[channel] = index
+        return sources
+
+    @model_validator(mode="after")
+    def _something_is_published(self) -> Self:
+        if not (self.zenoh.enabled or self.lcm.enabled):
+            raise mistake(
+                "found false here and in zenoh; accepted is true in one of them at least", "lcm", "enabled"
+            )
+        return self
+
+
+def single_server(host: str, port: int = 3020) -> Settings:
+    """Return settings for one server, everything else as by default: source "lab", one stream of all.
+
+    Raises ConfigError, one line per mistake, if ``host`` or ``port`` cannot be used.
+    """
+    try:
+        return Settings(sources=(Source(name="lab", host=host, port=port),))
+    except ValidationError as error:
+        lines = [f"{details['loc'][-1]}: {details['msg']}" for details in error.errors(include_url=False)]
+        raise ConfigError("\n".join(lines)) from None

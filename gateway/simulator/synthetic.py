@@ -1,0 +1,158 @@
+"""A scene made up from nothing: tools and markers in motion, sine waves, steps on plates, a button."""
+
+from collections.abc import Callable
+from typing import Final
+
+import numpy as np
+
+from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, Items
+from gateway.rtc3d.parameters import (
+    AnalogChannel,
+    EventDefinition,
+    EventParameter,
+    ExpectedValue,
+    Marker,
+    Parameters,
+    Parameters3D,
+    Parameters6D,
+    ParametersAnalog,
+    ParametersEvents,
+    Tool,
+)
+from gateway.simulator.bodies import RigidBodies
+from gateway.simulator.gait import ForcePlates
+from gateway.simulator.noise import Noise
+from gateway.simulator.scene import NO_EVENTS, Samples
+
+BUTTON_EVENT: Final = 0x123456
+"""The id of the only event, that of §6.6: param1 is the button's number, param2 1 pressed or 0 released."""
+
+_UNUSED: Final = -1  # 0xFFFFFFFF (§7.7)
+_BUTTONS: Final = 2  # pressed in turn
+_PERIOD_US: Final = 1_000_000
+_PRESSED_US: Final = 500_000  # into each period
+_RELEASED_US: Final = 800_000
+
+
+class SyntheticScene:
+    """A scene of any size, 0 of everything included, that goes on for ever and is the same each time.
+
+    Rates are in Hz: ``rate_hz`` of markers and tools, ``analog_rate_hz`` of analog channels and
+    force plates. ``seed`` chooses another scene of the same size.
+    """
+
+    num_frames: int | None = None
+
+    def __init__(
+        self,
+        *,
+        markers: int = 20,
+        tools: int = 2,
+        analog: int = 8,
+        plates: int = 2,
+        rate_hz: float = 100.0,
+        analog_rate_hz: float = 1000.0,
+        seed: int = 1,
+    ) -> None:
+        rng = np.random.default_rng(seed)
+        bodies = RigidBodies(markers, tools, rate_hz, rng)
+        channels = _AnalogSines(analog, analog_rate_hz, rng)
+        force_plates = ForcePlates(plates, analog_rate_hz, rng)
+        sources: list[tuple[ComponentType, int, float, Callable[[Samples], Items]]] = [
+            (ComponentType.MARKERS, markers, rate_hz, bodies.markers),
+            (ComponentType.TOOLS, tools, rate_hz, bodies.tools),
+            (ComponentType.ANALOG, analog, analog_rate_hz, channels.voltages),
+            (ComponentType.FORCE, plates, analog_rate_hz, force_plates.forces),
+        ]
+        self._items = {component: items for component, count, _, items in sources if count}
+        self.rates_hz = {component: rate for component, count, rate, _ in sources if count}
+        self.measurement_rate_hz = rate_hz
+        self.parameters = Parameters(
+            markers=Parameters3D(
+                frequency_hz=rate_hz,
+                markers=tuple(Marker(str(number), f"Marker {number}") for number in range(1, markers + 1)),
+            ),
+            tools=Parameters6D(
+                frequency_hz=rate_hz,
+                tools=tuple(
+                    Tool(
+                        str(number),
+                        f"Tool {number}",
+                        marker_ids=tuple(str(marker + 1) for marker in np.flatnonzero(on_tool)),
+                    )
+                    for number, on_tool in enumerate(bodies.tool_markers.T, start=1)
+                ),
+            ),
+            analog=channels.parameters,
+            force=force_plates.parameters,
+            events=_EVENTS,
+        )
+
+    def items(self, component: ComponentType, samples: Samples) -> Items:
+        """See Scene."""
+        return self._items[component](samples)
+
+    def events(self, start_us: int, stop_us: int) -> Items:
+        """See Scene. A button is pressed and let go again once a second."""
+        first, stop = _events_before(start_us), _events_before(stop_us)
+        if first >= stop:
+            return NO_EVENTS
+        period, released = np.divmod(np.arange(first, stop), 2)
+        events = np.empty(stop - first, LONG_EVENT)
+        events["id"] = BUTTON_EVENT
+        events["timestamp"] = period * _PERIOD_US + np.where(released, _RELEASED_US, _PRESSED_US)
+        events["param1"] = period % _BUTTONS + 1
+        events["param2"] = 1 - released
+        events["param3"] = _UNUSED
+        return events
+
+
+class _AnalogSines:
+    """Channels with a sine wave of its own frequency each, in mV, and noise."""
+
+    def __init__(self, num_channels: int, rate_hz: float, rng: np.random.Generator) -> None:
+        self._rate_hz = rate_hz
+        self._amplitude_mv = rng.uniform(200.0, 2000.0, num_channels)
+        self._angular_rate = 2 * np.pi * (0.5 + 0.75 * np.arange(num_channels))
+        self._noise = Noise(rng, num_channels)
+        self.parameters = ParametersAnalog(
+            tuple(
+                AnalogChannel(str(number), f"Analog {number}", unit="mV", frequency_hz=rate_hz)
+                for number in range(1, num_channels + 1)
+            )
+        )
+
+    def voltages(self, samples: Samples) -> Items:
+        """Return the Analog items, shape (len(samples), channels), in mV."""
+        angle = np.multiply.outer(samples / self._rate_hz, self._angular_rate)
+        voltage_mv: Items = self._amplitude_mv * np.sin(angle) + 2.0 * self._noise(samples)
+        return voltage_mv.astype(ITEM_DTYPES[ComponentType.ANALOG])
+
+
+def _events_before(time_us: int) -> int:
+    """Return how many button events have time stamps below ``time_us``."""
+    period, rest_us = divmod(max(time_us, 0), _PERIOD_US)
+    return 2 * period + (rest_us > _PRESSED_US) + (rest_us > _RELEASED_US)
+
+
+_EVENTS: Final = ParametersEvents(
+    (
+        EventDefinition(
+            id=f"0x{BUTTON_EVENT:x}",
+            label="Button",
+            description="Button action",
+            parameters=(
+                EventParameter("1", "int", "Button id number"),
+                EventParameter(
+                    "2",
+                    "int",
+                    "ON/OFF state",
+                    (
+                        ExpectedValue("1", "1", "ON", "Button was pressed"),
+                        ExpectedValue("2", "0", "OFF", "Button was released"),
+                    ),
+                ),
+            ),
+        ),
+    )
+)

@@ -1,0 +1,116 @@
+"""The examples, run as a reader would run them."""
+
+import os
+import re
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gateway.rtc3d.components import ComponentType
+from gateway.simulator.synthetic import SyntheticScene
+
+pytestmark = pytest.mark.netns
+
+ROOT = Path(__file__).parents[2]
+LCM_URL = "udpm://239.255.76.67:7712?ttl=0"
+PROGRAM = [sys.executable, "-m", "gateway"]
+
+
+@contextmanager
+def running(*command: str, ready: str) -> Iterator[subprocess.Popen[str]]:
+    """Run a program until the block ends; enters the block once ``ready`` stands in its output."""
+    environment = {**os.environ, "LCM_DEFAULT_URL": LCM_URL}
+    with subprocess.Popen(
+        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        assert process.stdout is not None
+        try:
+            for line in process.stdout:
+                if ready in line:
+                    break
+            else:
+                raise AssertionError(f"{command} ended without {ready!r}")
+            yield process
+        finally:
+            process.terminate()
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        return int(probe.getsockname()[1])
+
+
+@pytest.fixture(scope="module")
+def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
+    """A simulator and a gateway, as two programs; gives the gateway's Zenoh endpoint."""
+    port, endpoint = free_port(), f"tcp/127.0.0.1:{free_port()}"
+    config = tmp_path_factory.mktemp("gateway") / "gateway.yaml"
+    config.write_text(
+        f"""
+        sources: [{{name: lab, host: 127.0.0.1, port: {port}}}]
+        zenoh:
+          config: {{listen: {{endpoints: ["{endpoint}"]}}, scouting: {{multicast: {{enabled: false}}}}}}
+        """
+    )
+    simulate = [*PROGRAM, "simulate", "--port", str(port), "--markers", "3", "--rate", "100"]
+    gateway = [*PROGRAM, "run", "--config", str(config), "--log-level", "debug"]
+    with running(*simulate, ready="RTC3D server on"), running(*gateway, ready="zenoh: the session is open"):
+        yield endpoint
+
+
+def printed_positions(text: str) -> list[tuple[int, list[float]]]:
+    """Return frame number and first position of each frame printed."""
+    found = re.findall(
+        r"frame (\d+):[^\n]*?(?:\n[^#\n]*?)?(-?\d+\.\d+),\s?(-?\d+\.\d+),\s?(-?\d+\.\d+)", text
+    )
+    return [(int(number), [float(value) for value in position]) for number, *position in found]
+
+
+def assert_of_the_scene(text: str, at_least: int) -> None:
+    scene = SyntheticScene(markers=3, tools=4, analog=16, plates=2, rate_hz=100, analog_rate_hz=2000)
+    printed = printed_positions(text)
+    assert len(printed) >= at_least
+    for number, position in printed:
+        [items] = scene.items(ComponentType.MARKERS, np.array([number - 1]))
+        first = items[~np.isnan(items["x"])][0]
+        assert position == pytest.approx([first["x"], first["y"], first["z"]], abs=6e-4)
+
+
+def test_a_c_program_decodes_what_the_gateway_publishes(endpoint: str, tmp_path: Path) -> None:  # noqa: ARG001
+    if shutil.which("cc") is None or shutil.which("make") is None:
+        pytest.skip("no C compiler here (cc, make)")
+    build = subprocess.run(
+        ["make", "-C", str(ROOT / "examples"), f"PYTHON={sys.executable}", f"BUILD={tmp_path}"],
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert build.returncode == 0, build.stderr
+    with running(str(tmp_path / "subscriber"), "LAB", "20", ready="listening") as program:
+        text = program.communicate(timeout=30)[0]
+    assert_of_the_scene(text.replace(" missing", ""), 15)
+    assert program.returncode == 0
+
+
+def test_the_python_lcm_example(endpoint: str) -> None:  # noqa: ARG001
+    command = [sys.executable, str(ROOT / "examples/subscriber_lcm.py"), "LAB", "20"]
+    with running(*command, ready="listening") as program:
+        assert_of_the_scene(program.communicate(timeout=30)[0], 15)
+
+
+def test_the_python_zenoh_example(endpoint: str) -> None:
+    command = [
+        sys.executable,
+        str(ROOT / "examples/subscriber_zenoh.py"),
+        "--connect",
+        endpoint,
+        "--count",
+        "20",
+    ]
+    with running(*command, ready="listening") as program:
+        assert_of_the_scene(program.communicate(timeout=30)[0], 15)
