@@ -32,8 +32,12 @@ _SECTION_WORDS: Final = {
 # "Event" is an alias that some clients use.
 _COMPONENTS: Final = {word: kind for kind, word in COMPONENT_WORDS.items()} | {"Event": ComponentType.EVENT}
 _SECTIONS: Final = {word: name for name, word in _SECTION_WORDS.items()} | {"Event": "events"}
+_KNOWN_COMMANDS: Final = (
+    "known are Version, SetByteOrder, SendParameters, SendCurrentFrame, StreamFrames, Bye"
+)
 _Name = TypeVar("_Name")
-_NUMBER: Final = re.compile(r"\d{1,9}(\.\d{1,6})?", re.ASCII)
+_NUMBER: Final = re.compile(r"\d{1,9}(\.\d{1,20})?", re.ASCII)
+_MIN_HZ: Final = 1e-6  # the smallest that our own six decimals can write
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +161,7 @@ def parse_command(body: bytes) -> Command:
     """
     words = text_of(body).split()
     if not words:
-        raise CommandError("Empty command")
+        raise CommandError(f"Empty command; {_KNOWN_COMMANDS}")
     verb, parameters = words[0].lower(), [word.lower() for word in words[1:]]
     match verb:
         case "version":
@@ -175,10 +179,7 @@ def parse_command(body: bytes) -> Command:
         case "bye":
             raise CommandError("Bye takes no parameter")
         case _:
-            raise CommandError(
-                f"Unknown command {_shown(words[0])}; known are Version, SetByteOrder, "
-                "SendParameters, SendCurrentFrame, StreamFrames, Bye"
-            )
+            raise CommandError(f"Unknown command {_shown(words[0])}; {_KNOWN_COMMANDS}")
 
 
 def _parse_version(parameters: Sequence[str]) -> Version:
@@ -209,7 +210,8 @@ def _parse_stream_frames(parameters: Sequence[str]) -> StreamFrames | StopStream
             rate = parsed
         else:
             raise CommandError("StreamFrames takes one of FrequencyDivisor:n, Frequency:n, AllFrames")
-    return StreamFrames(rate, _parse_names(names, _COMPONENTS, "component"))
+    others = ("FrequencyDivisor:n", "Frequency:n", "AllFrames", "Stop (alone)")
+    return StreamFrames(rate, _parse_names(names, _COMPONENTS, "parameter", others))
 
 
 def _parse_rate(word: str) -> Rate | None:
@@ -220,7 +222,7 @@ def _parse_rate(word: str) -> Rate | None:
     if not colon:
         return None
     number = float(value) if _NUMBER.fullmatch(value) else 0.0
-    if name == "frequency" and number > 0:
+    if name == "frequency" and number >= _MIN_HZ:
         return Frequency(number)
     if name == "frequencydivisor" and number >= 1 and number.is_integer():
         return FrequencyDivisor(int(number))
@@ -230,15 +232,21 @@ def _parse_rate(word: str) -> Rate | None:
     )
 
 
-def _parse_names(words: Sequence[str], known: dict[str, _Name], what: str) -> tuple[_Name, ...]:
-    """Return the named things, each once, in the order given; empty for All or nothing."""
+def _parse_names(
+    words: Sequence[str], known: dict[str, _Name], what: str, others: Sequence[str] = ()
+) -> tuple[_Name, ...]:
+    """Return the named things, each once, in the order given; empty for All or nothing.
+
+    ``others`` are what else the command takes, for the error's text.
+    """
     by_word = {word.lower(): name for word, name in known.items()}
     names: dict[_Name, None] = {}
     for word in words:
         if word in by_word:
             names[by_word[word]] = None
         elif word != "all":
-            raise CommandError(f"Unknown {what} {_shown(word)}; known are All, {', '.join(known)}")
+            accepted = ", ".join(["All", *known, *others])
+            raise CommandError(f"Unknown {what} {_shown(word)}; known are {accepted}")
     return () if "all" in words else tuple(names)
 
 

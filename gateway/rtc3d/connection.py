@@ -17,6 +17,8 @@ from collections import deque
 from enum import Enum
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from gateway.errors import ClosedError, FrameError, LinkError, PacketError, ParametersError, ServerError
 from gateway.rtc3d.commands import (
     SECTIONS,
@@ -30,7 +32,16 @@ from gateway.rtc3d.commands import (
     Version,
     encode_command,
 )
-from gateway.rtc3d.components import ByteOrder, Frame, byte_order_of, split_frame
+from gateway.rtc3d.components import (
+    LONG_EVENT,
+    ByteOrder,
+    ComponentType,
+    Frame,
+    build_component,
+    build_frame,
+    byte_order_of,
+    split_frame,
+)
 from gateway.rtc3d.packets import (
     DEFAULT_MAX_C3D_BYTES,
     DEFAULT_MAX_PACKET_BYTES,
@@ -192,6 +203,18 @@ class Connection:
         self.under_way = command
         self._outgoing += encode_packet(PacketType.COMMAND, encode_command(command))
 
+    def send_recording(self, *, start: bool) -> None:
+        """Start or stop the server's recording as WaveFront's clients do (field note 16); no reply comes.
+
+        Raises ClosedError after the end.
+        """
+        if self.state in {State.CLOSING, State.CLOSED}:
+            raise ClosedError(f"recording control not sent: the connection is {self.state.value}")
+        unused = -1
+        event = np.array([(int(start), 0, unused, unused, unused)], LONG_EVENT)
+        component = build_component(ComponentType.EVENT, -1, 0, event, self._agreed_order)
+        self._outgoing += encode_packet(PacketType.DATA, build_frame([component], self._agreed_order))
+
     def give_up(self) -> None:
         """Wait no longer for the command under way; should its reply come later, it goes to nobody."""
         if self.under_way is not None:
@@ -232,6 +255,10 @@ class Connection:
                 frame = split_frame(packet.body, self.byte_order)
         except FrameError as error:
             events.append(FrameRejected(error))
+            return
+        if isinstance(self.under_way, SendCurrentFrame) and self.state is not State.STREAMING:
+            # Nothing streams, so it is the answer and nothing else.
+            self._answer(packet, events)
             return
         if self.under_way is not None:
             self._answer_with_frame(packet, frame, events)

@@ -47,7 +47,7 @@ def encode_packet(packet_type: int, body: bytes = b"") -> bytes:
 
 
 def text_of(body: bytes) -> str:
-    """Return a type 0 or 1 body as text: NULs and white space at its end are dropped (field notes 8, 13).
+    """Return a type 0 or 1 body as text: NULs and white space around it are dropped (field notes 8, 13).
 
     Bytes that are not ASCII are kept as Latin-1, so that any body can be shown.
     """

@@ -32,8 +32,8 @@ from gateway.rtc3d.parameters import (
     Tool,
 )
 
-MAX_XML_BYTES: Final = 4 * 1024 * 1024
-"""More than this is not parsed: 10 000 markers with descriptions take a quarter of it."""
+MAX_XML_BYTES: Final = 1024 * 1024
+"""More than this is not parsed: it would name some 8000 markers, and take seconds at worst."""
 MAX_RECOVERED: Final = 20
 """How many entries ``ParsedParameters.recovered`` has at most."""
 
@@ -41,7 +41,16 @@ _ROOT: Final = "RT_Parameters"
 # A stray end tag makes libxml2 close one element too many, at last the root, and drop what follows.
 # That many further roots around a malformed document keep it (libxml2 allows a depth of 256).
 _SPARE_ROOTS: Final = 64
-_BARE_AMPERSAND: Final = re.compile(rb"&(?!(?:amp|lt|gt|quot|apos|#\d+|#x[\da-fA-F]+);)")
+# After its first error libxml2 drops every entity, &amp; too, but no character by number.
+_AMPERSAND: Final = re.compile(rb"&(?:amp;|lt;|gt;|quot;|apos;|(?!#\d+;|#x[\da-fA-F]+;))")
+_BY_NUMBER: Final = {
+    b"&": b"&#38;",
+    b"&amp;": b"&#38;",
+    b"&lt;": b"&#60;",
+    b"&gt;": b"&#62;",
+    b"&quot;": b"&#34;",
+    b"&apos;": b"&#39;",
+}
 _NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
@@ -153,11 +162,11 @@ _TAGS: Final = {tag.lower(): tag for tag in (_ROOT, *_PARENTS)}
 def parse_parameters(xml: bytes) -> ParsedParameters:
     """Return what the body of an XML packet (type 2) holds of §6.
 
-    Read liberally: unknown elements and text between elements are ignored, sections may be absent,
-    NULs and white space around texts are dropped, the case of tags does not count (field note 9). Text or a
-    number that is absent or cannot be read gets its field's default, a cell of a calibration matrix
-    NaN. XML that is not well-formed, as the specification's own examples of §6.5 and §6.6, is read
-    as far as it makes sense. ``recovered`` has a line for each such fault, at most MAX_RECOVERED.
+    Read liberally (field note 9): unknown elements and text between elements are ignored, sections
+    may be absent, NULs at the end and white space around texts are dropped, the case of tags does not
+    count. What is absent or cannot be read gets its field's default, a cell of a calibration matrix
+    NaN. XML that is not well-formed, as the specification's own examples of §6.5 and §6.6, is read as
+    a human reads it. ``recovered`` has a line for each fault found, at most MAX_RECOVERED.
 
     Raises ParametersError, and nothing else, if no parameters can be found, if the XML declares
     entities, or if it is larger than MAX_XML_BYTES.
@@ -191,9 +200,8 @@ def _tree(body: bytes, notes: list[str]) -> etree._Element:
     if errors:
         for error in errors:
             _note(notes, error)
-        root, _ = _parse(
-            b"<%b>" % _ROOT.encode() * _SPARE_ROOTS + _BARE_AMPERSAND.sub(b"&amp;", body), encoding
-        )
+        content = _AMPERSAND.sub(lambda found: _BY_NUMBER[found[0]], body)
+        root, _ = _parse(b"<%b>" % _ROOT.encode() * _SPARE_ROOTS + content, encoding)
     elif not is_parameters:
         _note(notes, f"the root element is not {_ROOT}")
     tree = etree.Element(_ROOT)
@@ -262,8 +270,9 @@ def _hang(root: etree._Element, tree: etree._Element, *, rehang: bool) -> None:
                 continue
             _, parent = max(able, key=itemgetter(0))
         placed[element] = hung = etree.SubElement(parent, tag)
+        # Recovery may keep characters that lxml then refuses, depending on libxml2's version.
         hung.text = _xml_text(element.text or "")
-        hung.set("id", _xml_text(element.get("id") or element.get("ID", "")))
+        hung.set("id", _xml_text(element.get("id") or element.get("ID") or ""))
         latest[tag] = (position, hung)
 
 
@@ -300,8 +309,9 @@ def _number(element: etree._Element, text: str, kind: type, notes: list[str]) ->
             return number
     except (ValueError, OverflowError):
         pass
-    place = element.getroottree().getpath(element).removeprefix(f"/{_ROOT}/")
-    _note(notes, f"{place} {_shown(text)} is not a number")
+    if len(notes) < MAX_RECOVERED:  # getpath takes long among many siblings
+        place = element.getroottree().getpath(element).removeprefix(f"/{_ROOT}/")
+        _note(notes, f"{place} {_shown(text)} is not a number")
     return None
 
 
@@ -352,7 +362,7 @@ def _xml_text(text: str) -> str:
 
 def _shown(text: str) -> str:
     """Return a text from the server fit for a message: bounded, printable."""
-    return ascii(text if len(text) <= 60 else text[:60] + "…")
+    return ascii(text) if len(text) <= 60 else ascii(text[:60]) + "…"
 
 
 def _note(notes: list[str], note: str) -> None:

@@ -30,7 +30,7 @@ from gateway.rtc3d.connection import (
     State,
     Stray,
 )
-from tests.vectors import EMPTY_FRAME, FULL_FRAME
+from tests.vectors import EMPTY_FRAME, FULL_FRAME, START_RECORDING, STOP_RECORDING
 
 STREAM = StreamFrames(AllFrames(), (ComponentType.MARKERS,))
 
@@ -253,9 +253,17 @@ def test_no_data_answers_a_request_for_the_current_frame() -> None:
 
 def test_a_streamed_frame_without_the_component_is_not_the_current_frame() -> None:
     markers_only = packet(3, struct.pack(">IIIiqI", 1, 24, 1, 5, 0, 0))
-    connection = after(STREAM, SendCurrentFrame((ComponentType.ANALOG,)))
+    connection = after(STREAM)
+    connection.receive(FRAME)
+    connection.send(SendCurrentFrame((ComponentType.ANALOG,)))
     assert answers(connection.receive(markers_only)) == []
     assert answers(connection.receive(FRAME)) == [SendCurrentFrame((ComponentType.ANALOG,))]
+
+
+def test_the_current_frame_is_no_part_of_a_stream_that_does_not_run() -> None:
+    connection = after(SendCurrentFrame())
+    assert [type(event) for event in connection.receive(FRAME)] == [Answered]
+    assert connection.state is State.IDLE
 
 
 def test_states_of_a_measurement() -> None:
@@ -295,6 +303,19 @@ def test_a_refused_stream_leaves_the_connection_idle() -> None:
     connection = after(STREAM)
     connection.receive(error("err-unknown parameter 3D"))
     assert connection.state is State.IDLE
+
+
+def test_recording_control_is_the_packet_of_field_note_16() -> None:
+    connection = Connection()
+    connection.send_recording(start=False)
+    assert connection.bytes_to_send() == STOP_RECORDING
+
+
+def test_recording_control_goes_in_the_byte_order_of_the_session() -> None:
+    connection = after(SetByteOrder("little"))
+    connection.receive(ok("OK-SetByteOrder LittleEndian"))
+    connection.send_recording(start=True)
+    assert connection.bytes_to_send() == START_RECORDING
 
 
 def test_nothing_is_sent_after_bye_or_the_end() -> None:

@@ -1,0 +1,247 @@
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.strategies import SearchStrategy
+
+from gateway.errors import FrameError
+from gateway.rtc3d.components import (
+    ITEM_DTYPES,
+    LONG_EVENT,
+    SHORT_EVENT,
+    Component,
+    ComponentType,
+    Frame,
+    big_endian_content,
+    build_component,
+    build_frame,
+    byte_order_of,
+    split_frame,
+)
+from tests.strategies import damaged
+from tests.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME, ByteOrder
+
+# The bytes of each field of one item, by §7.3 to §7.7 and field note 6.
+FIELD_BYTES = {
+    "3d": (4, 4, 4, 4),
+    "analog": (4,),
+    "force": (4, 4, 4, 4, 4, 4),
+    "6d": (4, 4, 4, 4, 4, 4, 4, 4),
+    "short event": (4, 4, 4, 4),
+    "long event": (4, 8, 4, 4, 4),
+}
+KINDS = {
+    "3d": (1, ITEM_DTYPES[ComponentType.MARKERS]),
+    "analog": (2, ITEM_DTYPES[ComponentType.ANALOG]),
+    "force": (3, ITEM_DTYPES[ComponentType.FORCE]),
+    "6d": (4, ITEM_DTYPES[ComponentType.TOOLS]),
+    "short event": (5, SHORT_EVENT),
+    "long event": (5, LONG_EVENT),
+}
+
+
+class Built(NamedTuple):
+    """What a component is built from; ``data`` is its items in big-endian form, any bits at all."""
+
+    kind: str
+    frame_number: int
+    timestamp_us: int
+    data: bytes
+
+    def items(self) -> npt.NDArray[Any]:
+        return np.frombuffer(self.data, KINDS[self.kind][1])
+
+    def build(self, order: ByteOrder) -> bytes:
+        kind = ComponentType(KINDS[self.kind][0])
+        return build_component(kind, self.frame_number, self.timestamp_us, self.items(), order)
+
+    def content(self, order: ByteOrder) -> bytes:
+        """Return the component's bytes after size and type, without the codec under test."""
+        fields = FIELD_BYTES[self.kind]
+        count = len(self.data) // sum(fields)
+        parts = [
+            self.frame_number.to_bytes(4, order, signed=True),
+            self.timestamp_us.to_bytes(8, order, signed=True),
+            count.to_bytes(4, order),
+        ]
+        start = 0
+        for width in fields * count:
+            part = self.data[start : start + width]
+            parts.append(part if order == "big" else part[::-1])
+            start += width
+        return b"".join(parts)
+
+    def wire(self, order: ByteOrder) -> bytes:
+        content = self.content(order)
+        header = (8 + len(content)).to_bytes(4, order) + KINDS[self.kind][0].to_bytes(4, order)
+        return header + content
+
+
+ODD_FLOATS = [
+    bytes.fromhex(bits)
+    for bits in (
+        "FFFFFFFF",  # missing
+        "7FC00000",  # quiet NaN
+        "7F800001",  # signalling NaN
+        "FFA5A5A5",  # signalling NaN with a payload
+        "7F800000",  # infinity
+        "80000000",  # -0.0
+        "00000001",  # the smallest denormal
+    )
+]
+
+
+@st.composite
+def built_components(draw: st.DrawFn) -> Built:
+    kind = draw(st.sampled_from(sorted(KINDS)))
+    words = sum(FIELD_BYTES[kind]) // 4 * draw(st.integers(0, 4))
+    word = st.binary(min_size=4, max_size=4) | st.sampled_from(ODD_FLOATS)
+    return Built(
+        kind,
+        draw(st.integers(-(2**31), 2**31 - 1)),
+        draw(st.integers(-(2**63), 2**63 - 1)),
+        b"".join(draw(st.lists(word, min_size=words, max_size=words))),
+    )
+
+
+orders: SearchStrategy[ByteOrder] = st.sampled_from(["big", "little"])
+frames_of_built = st.lists(built_components(), max_size=5)
+
+
+def frame(components: list[bytes], order: ByteOrder) -> bytes:
+    return len(components).to_bytes(4, order) + b"".join(components)
+
+
+valid_bodies = (st.sampled_from([*FULL_FRAME.values(), *FRAME_WITH_UNKNOWN.values()])) | st.builds(
+    lambda parts, order: frame([part.wire(order) for part in parts], order), frames_of_built, orders
+)
+any_bodies = damaged(valid_bodies) | valid_bodies | st.binary(max_size=300)
+
+
+@given(built_components(), orders, orders)
+def test_any_items_are_built_bit_by_bit(built: Built, items_order: ByteOrder, order: ByteOrder) -> None:
+    items = built.items()
+    items = items.astype(items.dtype.newbyteorder(items_order))
+    kind = ComponentType(KINDS[built.kind][0])
+    wire = build_component(kind, built.frame_number, built.timestamp_us, items, order)
+    assert wire == built.wire(order)
+
+
+@given(frames_of_built, orders)
+def test_a_frame_is_its_count_and_its_components(parts: list[Built], order: ByteOrder) -> None:
+    wires = [part.wire(order) for part in parts]
+    assert build_frame(wires, order) == frame(wires, order)
+
+
+@given(frames_of_built, orders)
+def test_what_is_split_is_what_was_built(parts: list[Built], order: ByteOrder) -> None:
+    split = split_frame(build_frame([part.build(order) for part in parts], order), order)
+    assert split.unknown_types == ()
+    for part, component in zip(parts, split.components, strict=True):
+        item_bytes = sum(FIELD_BYTES[part.kind])
+        assert component.type == KINDS[part.kind][0]
+        assert component.frame_number == part.frame_number
+        assert component.timestamp_us == part.timestamp_us
+        assert component.num_items == len(part.data) // item_bytes
+        assert component.byte_order == order
+        assert bytes(component.content) == part.content(order)
+        assert component.items().tobytes() == part.content(order)[16:]
+        if component.num_items:
+            assert component.item_bytes == item_bytes
+            assert component.items().dtype.names == KINDS[part.kind][1].names
+
+
+@given(frames_of_built, orders)
+def test_big_endian_content_does_not_depend_on_the_order_received(
+    parts: list[Built], order: ByteOrder
+) -> None:
+    split = split_frame(frame([part.wire(order) for part in parts], order), order)
+    for part, component in zip(parts, split.components, strict=True):
+        assert bytes(big_endian_content(component)) == part.content("big")
+
+
+unknown_types = st.integers(0, 0xFFFFFFFF).filter(lambda kind: not 1 <= kind <= 5)
+unknown_components = st.tuples(unknown_types, st.binary(max_size=40))
+
+
+@given(st.lists(built_components() | unknown_components, max_size=6), orders)
+def test_unknown_components_are_skipped_wherever_they_stand(
+    parts: list[Built | tuple[int, bytes]], order: ByteOrder
+) -> None:
+    wires, known, unknown = [], [], []
+    for part in parts:
+        if isinstance(part, Built):
+            known.append(part.content(order))
+            wires.append(part.wire(order))
+        else:
+            kind, data = part
+            unknown.append(kind)
+            wires.append((8 + len(data)).to_bytes(4, order) + kind.to_bytes(4, order) + data)
+    split = split_frame(frame(wires, order), order)
+    assert [bytes(component.content) for component in split.components] == known
+    assert list(split.unknown_types) == unknown
+
+
+@given(frames_of_built, orders, orders)
+def test_the_byte_order_of_a_frame_is_found(
+    parts: list[Built], order: ByteOrder, expected: ByteOrder
+) -> None:
+    body = frame([part.wire(order) for part in parts], order)
+    assert byte_order_of(body, expected) == (order if parts else expected)
+
+
+# Bytes that nobody meant ---------------------------------------------------------------------
+
+
+def split_or_none(body: bytes, order: ByteOrder) -> Frame | None:
+    try:
+        return split_frame(body, order)
+    except FrameError:
+        return None
+
+
+def assert_sound(component: Component, order: ByteOrder) -> None:
+    """Assert that the component's sizes and counts agree, so that what uses it cannot fail."""
+    assert component.byte_order == order
+    assert len(component.content) == 16 + component.num_items * component.item_bytes
+    items = component.items()
+    assert items.shape == (component.num_items,)
+    assert items.tobytes() == bytes(component.content)[16:]
+    content = bytes(component.content)
+    assert component.frame_number == int.from_bytes(content[:4], order, signed=True)
+    assert component.timestamp_us == int.from_bytes(content[4:12], order, signed=True)
+    assert component.num_items == int.from_bytes(content[12:16], order)
+    assert len(big_endian_content(component)) == len(content)
+
+
+@settings(max_examples=300)
+@given(any_bodies, orders)
+def test_any_bytes_give_a_sound_frame_or_a_frame_error(body: bytes, order: ByteOrder) -> None:
+    split = split_or_none(body, order)
+    if split is None:
+        return
+    assert len(split.components) + len(split.unknown_types) == int.from_bytes(body[:4], order)
+    for component in split.components:
+        assert_sound(component, order)
+    known_bytes = 4 + sum(8 + len(component.content) for component in split.components)
+    if split.unknown_types:
+        assert known_bytes + 8 * len(split.unknown_types) <= len(body)
+    else:
+        assert known_bytes == len(body)
+
+
+@settings(max_examples=300)
+@given(any_bodies, orders)
+def test_any_bytes_have_a_byte_order_in_which_they_make_sense_or_give_a_frame_error(
+    body: bytes, expected: ByteOrder
+) -> None:
+    makes_sense = {order: split_or_none(body, order) is not None for order in ("big", "little")}
+    try:
+        found = byte_order_of(body, expected)
+    except FrameError:
+        assert not any(makes_sense.values())
+    else:
+        assert makes_sense[found]
+        assert found == expected or not makes_sense[expected]

@@ -1,0 +1,35 @@
+import contextlib
+import json
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.decode import decode, one_line, to_json
+from gateway.errors import ProtocolError
+from gateway.message import Stamp, splice, tool_poses
+from gateway.rtc3d.components import ComponentType, split_frame
+from gateway.status import OutputHealth, OutputStatus, StreamStatus, status_message
+from tests.strategies import damaged
+from tests.vectors import FULL_FRAME
+
+STAMP = Stamp(1, 2, 3)
+COMPONENTS = split_frame(FULL_FRAME["big"], "big").components
+TOOLS = next(component for component in COMPONENTS if component.type is ComponentType.TOOLS)
+STATUS = status_message(
+    source="lab",
+    server="192.0.2.20:3020",
+    sequence=1,
+    streams=[(StreamStatus("3d", limitations=["no parameters"]), 60.0)],
+    outputs=[(OutputStatus("zenoh"), OutputHealth(True))],
+)
+valid = st.sampled_from(
+    [*(splice(each, STAMP, 1) for each in COMPONENTS), *tool_poses(TOOLS, STAMP, [1, 2]), STATUS.encode()]
+)
+
+
+@given(damaged(valid) | st.binary(max_size=100))
+def test_whatever_decodes_can_be_shown_and_nothing_else_than_protocol_errors_escapes(message: bytes) -> None:
+    with contextlib.suppress(ProtocolError):
+        decoded = decode(message)
+        assert one_line(decoded)
+        assert json.dumps(to_json(decoded), allow_nan=False)

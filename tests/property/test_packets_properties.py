@@ -1,0 +1,140 @@
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.strategies import SearchStrategy
+
+from gateway.errors import PacketError
+from gateway.rtc3d.packets import Packet, PacketReader, encode_packet, text_of
+from tests.strategies import damaged, pieces_of
+
+LIMIT = 64
+C3D_LIMIT = 96
+
+packet_types = st.sampled_from([0, 1, 2, 3, 4, 5]) | st.integers(0, 0xFFFFFFFF)
+packets = st.builds(Packet, packet_types, st.binary(max_size=LIMIT - 8))
+packet_lists = st.lists(packets, max_size=8)
+
+
+def wire(packet: Packet) -> bytes:
+    """Return the packet's bytes by §4.1, without the encoder under test."""
+    return (8 + len(packet.body)).to_bytes(4, "big") + packet.type.to_bytes(4, "big") + packet.body
+
+
+def stream_of(packet_list: list[Packet]) -> bytes:
+    return b"".join(wire(packet) for packet in packet_list)
+
+
+def limit_of(packet_type: int) -> int:
+    return C3D_LIMIT if packet_type == 5 else LIMIT
+
+
+def new_reader() -> PacketReader:
+    return PacketReader(max_packet_bytes=LIMIT, max_c3d_bytes=C3D_LIMIT)
+
+
+def facts_of(error: PacketError | None) -> tuple[str, int, int, int] | None:
+    if error is None:
+        return None
+    return str(error), error.size, error.packet_type, error.offset
+
+
+def pieces(streams: SearchStrategy[bytes]) -> SearchStrategy[list[bytes]]:
+    return streams.flatmap(pieces_of)
+
+
+valid_streams = packet_lists.map(stream_of)
+# Headers of any size and type make the bounds likely to be met, which bytes at random seldom do.
+headers = st.builds(
+    lambda size, packet_type: size.to_bytes(4, "big") + packet_type.to_bytes(4, "big"),
+    st.sampled_from([7, 8, LIMIT, LIMIT + 1, C3D_LIMIT, C3D_LIMIT + 1]) | st.integers(0, 0xFFFFFFFF),
+    packet_types,
+)
+any_streams = (
+    st.binary(max_size=300)
+    | st.builds(lambda *parts: b"".join(parts), valid_streams, headers, st.binary(max_size=C3D_LIMIT))
+    | damaged(valid_streams)
+    | valid_streams
+)
+
+
+@given(packets)
+def test_a_packet_is_encoded_as_size_type_and_body(packet: Packet) -> None:
+    assert encode_packet(packet.type, packet.body) == wire(packet)
+
+
+@given(packet_lists, st.data())
+def test_any_split_of_a_stream_gives_the_same_packets(packet_list: list[Packet], data: st.DataObject) -> None:
+    reader = new_reader()
+    read = []
+    for piece in data.draw(pieces_of(stream_of(packet_list))):
+        read += reader.feed(piece)
+    assert read == packet_list
+    assert reader.error is None
+    assert reader.buffered_bytes == 0
+
+
+@given(packet_lists)
+def test_a_stream_fed_byte_by_byte_gives_the_same_packets(packet_list: list[Packet]) -> None:
+    reader = new_reader()
+    read = []
+    for byte in stream_of(packet_list):
+        read += reader.feed(bytes([byte]))
+    assert read == packet_list
+    assert reader.buffered_bytes == 0
+
+
+@settings(max_examples=300)
+@given(pieces(any_streams))
+def test_every_byte_is_returned_or_held_until_an_error(stream: list[bytes]) -> None:
+    reader = new_reader()
+    fed = returned = 0
+    for piece in stream:
+        after_error = reader.error is not None
+        read = reader.feed(piece)
+        fed += len(piece)
+        returned += sum(8 + len(packet.body) for packet in read)
+        if reader.error is None:
+            assert reader.buffered_bytes == fed - returned
+            assert reader.buffered_bytes < max(LIMIT, C3D_LIMIT)
+        else:
+            assert reader.buffered_bytes == 0
+        assert not (after_error and read)
+
+
+@settings(max_examples=300)
+@given(pieces(any_streams))
+def test_what_is_read_from_any_bytes_is_what_they_hold(stream: list[bytes]) -> None:
+    reader = new_reader()
+    read = []
+    for piece in stream:
+        read += reader.feed(piece)
+    whole = b"".join(stream)
+    assert whole.startswith(stream_of(read))
+    assert all(8 + len(packet.body) <= limit_of(packet.type) for packet in read)
+    rest = whole[len(stream_of(read)) :]
+    size, packet_type = int.from_bytes(rest[:4], "big"), int.from_bytes(rest[4:8], "big")
+    if reader.error is None:
+        assert len(rest) < 8 or 8 <= size <= limit_of(packet_type)
+        assert len(rest) < 8 or len(rest) < size
+    else:
+        assert not 8 <= size <= limit_of(packet_type)
+        assert (reader.error.size, reader.error.packet_type) == (size, packet_type)
+        assert reader.error.offset == len(stream_of(read))
+
+
+@settings(max_examples=300)
+@given(pieces(any_streams))
+def test_a_split_changes_neither_packets_nor_error(stream: list[bytes]) -> None:
+    whole, split = new_reader(), new_reader()
+    read = []
+    for piece in stream:
+        read += split.feed(piece)
+    assert read == whole.feed(b"".join(stream))
+    assert facts_of(split.error) == facts_of(whole.error)
+    assert split.buffered_bytes == whole.buffered_bytes
+
+
+@given(st.binary())
+def test_any_body_has_a_text(body: bytes) -> None:
+    text = text_of(body)
+    assert text.encode("latin-1") in body
+    assert not text.endswith(("\0", " ", "\t", "\r", "\n"))

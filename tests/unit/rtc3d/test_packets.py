@@ -1,0 +1,289 @@
+import tracemalloc
+
+import pytest
+
+from gateway.errors import PacketError
+from gateway.rtc3d.packets import (
+    DEFAULT_MAX_C3D_BYTES,
+    DEFAULT_MAX_PACKET_BYTES,
+    Packet,
+    PacketReader,
+    PacketType,
+    encode_packet,
+    text_of,
+)
+from tests.vectors import PACKETS, PacketVector
+
+LIMIT = 100
+C3D_LIMIT = 200
+
+each_packet = pytest.mark.parametrize("vector", PACKETS, ids=[vector.name for vector in PACKETS])
+
+
+def header(size: int, packet_type: int) -> bytes:
+    return size.to_bytes(4, "big") + packet_type.to_bytes(4, "big")
+
+
+def limited_reader() -> PacketReader:
+    return PacketReader(max_packet_bytes=LIMIT, max_c3d_bytes=C3D_LIMIT)
+
+
+def error_of(reader: PacketReader) -> PacketError:
+    assert reader.error is not None
+    return reader.error
+
+
+def test_types_are_numbered_as_in_the_specification() -> None:
+    assert [(kind.value, kind.name) for kind in PacketType] == [
+        (0, "ERROR"),
+        (1, "COMMAND"),
+        (2, "XML"),
+        (3, "DATA"),
+        (4, "NO_DATA"),
+        (5, "C3D"),
+    ]
+
+
+@each_packet
+def test_encodes_each_packet_as_documented(vector: PacketVector) -> None:
+    assert encode_packet(vector.type, vector.body) == vector.packet
+
+
+@each_packet
+def test_reads_each_packet_as_documented(vector: PacketVector) -> None:
+    reader = PacketReader()
+    assert reader.feed(vector.packet) == [Packet(vector.type, vector.body)]
+    assert reader.buffered_bytes == 0
+    assert reader.error is None
+
+
+@each_packet
+def test_reads_each_packet_byte_by_byte(vector: PacketVector) -> None:
+    reader = PacketReader()
+    for count, byte in enumerate(vector.packet[:-1], start=1):
+        assert reader.feed(bytes([byte])) == []
+        assert reader.buffered_bytes == count
+    assert reader.feed(vector.packet[-1:]) == [Packet(vector.type, vector.body)]
+    assert reader.buffered_bytes == 0
+
+
+def test_reads_many_packets_from_one_piece_in_order_and_keeps_the_rest() -> None:
+    reader = PacketReader()
+    stream = b"".join(vector.packet for vector in PACKETS)
+    assert reader.feed(stream + header(20, 1) + b"Vers") == [
+        Packet(vector.type, vector.body) for vector in PACKETS
+    ]
+    assert reader.buffered_bytes == 12
+    assert reader.feed(b"ion 1.0\0" + PACKETS[0].packet) == [
+        Packet(1, b"Version 1.0\0"),
+        Packet(PACKETS[0].type, PACKETS[0].body),
+    ]
+    assert reader.buffered_bytes == 0
+
+
+def test_an_empty_piece_changes_nothing() -> None:
+    reader = PacketReader()
+    assert reader.feed(b"") == []
+    reader.feed(header(12, 3) + b"\0")
+    assert reader.feed(b"") == []
+    assert reader.buffered_bytes == 9
+    assert reader.feed(b"\0\0\0") == [Packet(3, b"\0\0\0\0")]
+
+
+@pytest.mark.parametrize("packet_type", [6, 0x01000000, 0xFFFFFFFF])
+def test_a_type_that_the_specification_does_not_know_passes_through(packet_type: int) -> None:
+    packet = header(11, packet_type) + b"new"
+    assert limited_reader().feed(packet) == [Packet(packet_type, b"new")]
+    assert encode_packet(packet_type, b"new") == packet
+
+
+def test_a_body_stays_as_it_was_when_more_is_fed() -> None:
+    reader = PacketReader()
+    reader.feed(header(12, 3))
+    (packet,) = reader.feed(b"abcd" + header(12, 3))
+    reader.feed(b"efgh" * 100)
+    assert packet.body == b"abcd"
+
+
+# Bounds of the size field --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("packet_type", [0, 1, 2, 3, 4, 6, 0xFFFFFFFF])
+@pytest.mark.parametrize("size", [8, 9, LIMIT])
+def test_accepts_sizes_from_8_to_the_limit(size: int, packet_type: int) -> None:
+    reader = limited_reader()
+    assert reader.feed(header(size, packet_type) + bytes(size - 8)) == [Packet(packet_type, bytes(size - 8))]
+    assert reader.error is None
+
+
+@pytest.mark.parametrize("packet_type", [0, 1, 2, 3, 4, 6, 0xFFFFFFFF])
+@pytest.mark.parametrize("size", [0, 7, LIMIT + 1, 0xFFFFFFFF])
+def test_refuses_other_sizes_at_the_header(size: int, packet_type: int) -> None:
+    reader = limited_reader()
+    assert reader.feed(header(size, packet_type)) == []
+    error = error_of(reader)
+    assert (error.size, error.packet_type, error.offset) == (size, packet_type, 0)
+
+
+@pytest.mark.parametrize("size", [8, LIMIT + 1, C3D_LIMIT])
+def test_a_c3d_file_has_its_own_limit(size: int) -> None:
+    reader = limited_reader()
+    assert reader.feed(header(size, 5) + bytes(size - 8)) == [Packet(5, bytes(size - 8))]
+    assert reader.error is None
+
+
+@pytest.mark.parametrize("size", [7, C3D_LIMIT + 1])
+def test_refuses_a_c3d_file_beyond_its_limit(size: int) -> None:
+    reader = limited_reader()
+    assert reader.feed(header(size, 5)) == []
+    assert (error_of(reader).size, error_of(reader).packet_type) == (size, 5)
+
+
+def test_a_c3d_limit_below_the_packet_limit_holds_too() -> None:
+    reader = PacketReader(max_packet_bytes=200, max_c3d_bytes=100)
+    reader.feed(header(101, 5))
+    assert error_of(reader).size == 101
+
+
+def test_limits_are_16_mib_and_256_mib_unless_configured() -> None:
+    assert DEFAULT_MAX_PACKET_BYTES == 16 * 1024 * 1024
+    assert DEFAULT_MAX_C3D_BYTES == 256 * 1024 * 1024
+    for packet_type, limit in [(3, DEFAULT_MAX_PACKET_BYTES), (5, DEFAULT_MAX_C3D_BYTES)]:
+        within, beyond = PacketReader(), PacketReader()
+        within.feed(header(limit, packet_type))
+        beyond.feed(header(limit + 1, packet_type))
+        assert within.error is None
+        assert error_of(beyond).size == limit + 1
+
+
+def test_the_error_of_a_small_size_says_size_bound_type_and_offset() -> None:
+    reader = limited_reader()
+    reader.feed(PACKETS[1].packet + header(7, 3))
+    text = str(error_of(reader))
+    assert "size 7" in text
+    assert "less than the header's 8" in text
+    assert "type 3" in text
+    assert "byte 20" in text
+
+
+@pytest.mark.parametrize(("packet_type", "limit"), [(2, LIMIT), (5, C3D_LIMIT)])
+def test_the_error_of_a_large_size_says_size_limit_type_and_offset(packet_type: int, limit: int) -> None:
+    reader = limited_reader()
+    # "SSH-2.0-" as a header: what another protocol's greeting looks like.
+    reader.feed(header(0x5353482D, packet_type))
+    text = str(error_of(reader))
+    assert f"size {0x5353482D}" in text
+    assert f"limit {limit}" in text
+    assert f"type {packet_type}" in text
+    assert "byte 0 " in text
+    assert "check host and port" in text
+
+
+# Of 20, 8 and 15 bytes: the next packet starts at byte 43 of the stream.
+EARLIER = (PACKETS[1], PACKETS[4], PACKETS[5])
+EARLIER_STREAM = b"".join(vector.packet for vector in EARLIER)
+EARLIER_PACKETS = [Packet(vector.type, vector.body) for vector in EARLIER]
+
+
+def test_packets_before_the_bad_one_are_returned_and_counted_in_the_offset() -> None:
+    reader = limited_reader()
+    assert reader.feed(EARLIER_STREAM + header(0, 1) + b"rest") == EARLIER_PACKETS
+    assert error_of(reader).offset == 43
+
+
+@pytest.mark.parametrize("piece", [1, 3, 8, 19, 21])
+def test_the_offset_does_not_depend_on_how_the_stream_was_cut(piece: int) -> None:
+    reader = limited_reader()
+    stream = EARLIER_STREAM + header(LIMIT + 1, 1)
+    packets = []
+    for start in range(0, len(stream), piece):
+        packets += reader.feed(stream[start : start + piece])
+    assert packets == EARLIER_PACKETS
+    assert error_of(reader).offset == 43
+
+
+def test_a_bad_size_is_no_error_before_its_header_is_whole() -> None:
+    reader = limited_reader()
+    reader.feed(header(7, 1)[:7])
+    assert reader.error is None
+    reader.feed(header(7, 1)[7:])
+    assert error_of(reader).size == 7
+
+
+@pytest.mark.parametrize("first", [b"", b"\0\0"], ids=["at once", "after a part of the header"])
+def test_after_the_error_nothing_more_is_returned_or_kept(first: bytes) -> None:
+    reader = limited_reader()
+    reader.feed(first)
+    reader.feed(header(7, 1)[len(first) :] + PACKETS[1].packet)
+    error = error_of(reader)
+    assert reader.buffered_bytes == 0
+    assert reader.feed(PACKETS[1].packet) == []
+    assert reader.buffered_bytes == 0
+    assert reader.error is error
+
+
+def test_a_packet_of_4_gib_cannot_be_encoded() -> None:
+    class Body(bytes):  # says a length that a test should not allocate
+        def __new__(cls, length: int) -> "Body":
+            body = super().__new__(cls)
+            body.length = length
+            return body
+
+        length: int
+
+        def __len__(self) -> int:
+            return self.length
+
+    assert encode_packet(2, Body(0xFFFFFFFF - 8)) == b"\xff\xff\xff\xff\0\0\0\x02"
+    with pytest.raises(PacketError, match="4294967296") as caught:
+        encode_packet(2, Body(0xFFFFFFFF - 7))
+    assert (caught.value.size, caught.value.packet_type) == (4294967296, 2)
+
+
+# Memory --------------------------------------------------------------------------------------
+
+
+def test_a_header_that_claims_16_mib_takes_only_the_memory_of_what_came() -> None:
+    reader = PacketReader()
+    tracemalloc.start()
+    try:
+        reader.feed(header(16 * 1024 * 1024, 3) + bytes(1000))
+        reader.feed(bytes(1000))
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert reader.buffered_bytes == 2008
+    assert peak < 100_000
+
+
+def test_the_memory_of_a_large_packet_is_given_back() -> None:
+    reader = PacketReader()
+    large = header(1_000_000, 3) + bytes(999_992)
+    tracemalloc.start()
+    try:
+        for start in range(0, len(large), 100_000):
+            reader.feed(large[start : start + 100_000])
+        held, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert reader.buffered_bytes == 0
+    assert held < 100_000
+
+
+# Text of bodies ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("body", "text"),
+    [
+        (b"", ""),
+        (b"OK-Version 1.0", "OK-Version 1.0"),
+        (b"Version 1.0\0", "Version 1.0"),
+        (b"StreamFrames\n", "StreamFrames"),
+        (b"StreamFrames 3D \r\n\0\0", "StreamFrames 3D"),
+        (b"\0\0\0", ""),
+        (b"d\xe9j\xe0 vu\xff\0", "d\xe9j\xe0 vu\xff"),
+    ],
+)
+def test_text_ends_before_nul_and_white_space(body: bytes, text: str) -> None:
+    assert text_of(body) == text

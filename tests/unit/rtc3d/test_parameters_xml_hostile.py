@@ -1,0 +1,87 @@
+"""XML that is meant to bring the reader of parameters down, or is none at all."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from gateway.errors import ParametersError
+from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
+from gateway.rtc3d.parameters_xml import MAX_RECOVERED, MAX_XML_BYTES, parse_parameters
+from tests.spec_parameters import in_root, markers_of
+
+
+class TestHostileXml:
+    @pytest.mark.parametrize(
+        "body",
+        [
+            b"",
+            b"\0",
+            b"hello",
+            b"<",
+            b"<html><body>404</body></html>",
+            b"HTTP/1.1 400 Bad Request\r\n",
+            b"<a/>",
+        ],
+    )
+    def test_what_holds_no_section_is_refused_with_its_first_bytes(self, body: bytes) -> None:
+        with pytest.raises(ParametersError, match=re.escape(ascii(body.decode().strip("\0\r\n")))):
+            parse_parameters(body)
+
+    def test_the_bytes_shown_are_bounded_and_printable(self) -> None:
+        with pytest.raises(ParametersError) as caught:
+            parse_parameters(b"\x1b[2J\xff\0" * 1000)
+        assert str(caught.value).isprintable()
+        assert len(str(caught.value)) < 500
+
+    def test_entities_are_refused(self) -> None:
+        entities = "".join(f"<!ENTITY e{n} '{f'&e{n - 1};' * 10}'>" for n in range(1, 12))
+        xml = (
+            f"<!DOCTYPE x [<!ENTITY e0 'ha'>{entities}]>"
+            + in_root("<The_3D><Unit>&e11;</Unit></The_3D>").decode()
+        )
+        with pytest.raises(ParametersError, match="entities"):
+            parse_parameters(xml.encode())
+
+    def test_entities_that_an_encoding_hides_are_not_expanded(self) -> None:
+        xml = "<!DOCTYPE x [<!ENTITY e 'metre'>]>" + in_root("<The_3D><Unit>&e;</Unit></The_3D>").decode()
+        parameters = parse_parameters(b"\xfe\xff" + xml.encode("utf-16-be")).parameters
+        assert parameters == Parameters(markers=Parameters3D())
+
+    def test_an_external_document_type_is_not_fetched(self, tmp_path: Path) -> None:
+        dtd = tmp_path / "x.dtd"
+        dtd.write_text("<!ATTLIST Marker id CDATA 'from the file'>")
+        xml = f"<!DOCTYPE RT_Parameters SYSTEM '{dtd.as_uri()}'>".encode() + in_root(
+            "<The_3D><Markers><Marker/></Markers></The_3D>"
+        )
+        assert markers_of(xml).markers == (Marker(id=""),)
+
+    @pytest.mark.parametrize("tag", [b"a", b"Marker", b"Event", b"RT_Parameters"])
+    def test_deep_nesting_ends_at_a_bound(self, tag: bytes) -> None:
+        xml = b"<RT_Parameters><The_3D><Unit>m</Unit><Markers>" + b"<%b>" % tag * 50_000
+        parameters, recovered = parse_parameters(xml)
+        assert parameters.markers is not None
+        assert parameters.markers.unit == "m"
+        assert len(parameters.markers.markers) < 300
+        assert recovered
+
+    def test_too_much_is_refused_before_it_is_parsed(self) -> None:
+        xml = b"<RT_Parameters>" + b" " * MAX_XML_BYTES + b"</RT_Parameters>"
+        with pytest.raises(ParametersError, match=rf"{len(xml)} bytes.* limit of {MAX_XML_BYTES}"):
+            parse_parameters(xml)
+
+    def test_a_great_many_faults_are_read_through(self) -> None:
+        cells = "<Col/>" * 50_000 + "<Col>a</Col>" * 50_000
+        matrix = f"<Calibration_Matrix><Row>{cells}</Row></Calibration_Matrix>"
+        xml = in_root(f"<Force><Plates><Plate>{matrix}</Plate></Plates></Force>")
+        parameters, recovered = parse_parameters(xml)
+        assert parameters.force is not None
+        assert len(parameters.force.plates[0].calibration_matrix[0]) == 100_000
+        assert len(recovered) == MAX_RECOVERED
+
+    def test_control_characters_in_malformed_xml_are_dropped(self) -> None:
+        xml = in_root("<The_3D><Unit>m\x01m</Unit><Markers><Marker id='\x02&#3;1'/></Markers></The_3D>")
+        parameters, recovered = parse_parameters(xml)
+        assert parameters.markers is not None
+        assert parameters.markers.unit == "mm"
+        assert recovered
