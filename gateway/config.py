@@ -7,6 +7,7 @@ what is accepted. ``gateway.config_file`` adds file, line and column.
 
 import os
 import re
+from pathlib import Path
 from typing import Annotated, Final, Self
 
 from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
@@ -16,6 +17,7 @@ from gateway.config_values import (
     ByteLimit,
     ChannelPrefix,
     Components,
+    FileLimit,
     Host,
     KeyPrefix,
     LcmUrl,
@@ -23,6 +25,7 @@ from gateway.config_values import (
     Seconds,
     ServerByteOrder,
     SourceName,
+    SpoolDirectory,
     StreamRate,
     Switch,
     ZenohConfig,
@@ -104,6 +107,15 @@ class Source(Section):
     max_c3d_bytes: ByteLimit = DEFAULT_MAX_C3D_BYTES
     """The largest C3D file that is taken."""
 
+    query_timeout_s: Seconds = 4.0
+    """How long a peer's question may wait for the server, the questions before it included."""
+
+    fresh_interval_s: Seconds = 1.0
+    """How long an answer of the server counts as fresh: no peer makes it answer more often."""
+
+    remote_control: Switch = False
+    """Whether peers may start and stop the server's recording (field note 16)."""
+
     @field_validator("streams")
     @classmethod
     def _each_component_is_in_one_stream(cls, streams: tuple[Stream, ...]) -> tuple[Stream, ...]:
@@ -175,6 +187,30 @@ class LcmSettings(Section):
         return self.url or os.environ.get("LCM_DEFAULT_URL") or DEFAULT_LCM_URL
 
 
+class SpoolSettings(Section):
+    """Where complete C3D files that servers send are kept (packet type 5)."""
+
+    directory: SpoolDirectory | None = None
+    """A folder; None means $STATE_DIRECTORY/c3d under systemd, else the user's state folder."""
+
+    max_files: FileLimit = 100
+    """How many files are kept; the oldest goes first."""
+
+    max_bytes: ByteLimit = 1024 * 1024 * 1024
+    """How many bytes they may take together; the oldest goes first."""
+
+    @property
+    def effective_directory(self) -> Path:
+        """The folder in use."""
+        if self.directory is not None:
+            return Path(self.directory)
+        state = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+        if state:
+            return Path(state) / "c3d"
+        home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+        return Path(home) / "rtc3d-gateway" / "c3d"
+
+
 class Settings(Section):
     """The whole configuration."""
 
@@ -184,6 +220,9 @@ class Settings(Section):
         accepts("a list of sources, one or more, each with name and host"),
     ]
     """The servers."""
+
+    spool: SpoolSettings = SpoolSettings()
+    """Where the servers' C3D files are kept."""
 
     zenoh: ZenohSettings = ZenohSettings()
     """The Zenoh side."""

@@ -49,6 +49,12 @@ def _lcm_url(text: str) -> str:
     return text
 
 
+def _absolute_path(text: str) -> str:
+    if not text.startswith("/") or not text.isprintable():
+        raise ValueError
+    return text
+
+
 Switch = Annotated[bool, Field(strict=True), accepts("true or false")]
 Seconds = Annotated[
     float,
@@ -66,6 +72,10 @@ ByteLimit = Annotated[
     Field(strict=True, ge=1024, le=0xFFFFFFFF),  # a packet's size field has 32 bits (§4.1)
     accepts("a whole number of bytes from 1024 to 4294967295"),
 ]
+FileLimit = Annotated[
+    int, Field(strict=True, ge=1, le=100_000), accepts("a whole number of files from 1 to 100000")
+]
+SpoolDirectory = Annotated[str, AfterValidator(_absolute_path), accepts("a folder's absolute path, or null")]
 Host = Annotated[
     str, AfterValidator(_host), accepts("a host name or an IP address; the port has a key of its own")
 ]

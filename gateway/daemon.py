@@ -3,19 +3,16 @@
 import asyncio
 import logging
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
-from gateway.config import Settings, Source, Stream
-from gateway.fanout import FanOut
-from gateway.message import Stamp
+from gateway.config import Settings
 from gateway.outputs.contract import Output
 from gateway.outputs.lcm_output import LcmOutput
 from gateway.outputs.zenoh_output import ZenohOutput
-from gateway.rtc3d.components import Frame
-from gateway.rtc3d.parameters import Parameters
-from gateway.session import Handlers
-from gateway.status import FrameRate, StreamStatus, status_message
-from gateway.supervisor import Supervisor
+from gateway.queries.lcm_queries import LcmQueries
+from gateway.queries.zenoh_queries import ZenohQueries
+from gateway.source_gateway import SourceGateway
+from gateway.spool import Spool
 
 _STATUS_PERIOD_S: Final = 1.0
 
@@ -32,51 +29,8 @@ def build_outputs(settings: Settings) -> list[Output]:
     return outputs
 
 
-class _SourceGateway:
-    """One source: its streams' supervisors, and the fan-out that they share."""
-
-    def __init__(self, source: Source, outputs: Sequence[Output], tool_outputs: set[str]) -> None:
-        self.source = source
-        self.fan_out = FanOut(source.name, outputs, tool_outputs)
-        self.statuses = [StreamStatus(_components_text(stream)) for stream in source.streams]
-        self._rates = [FrameRate() for _ in source.streams]
-        self.supervisors = [
-            Supervisor(source, stream, status, self._handlers(stream, status))
-            for stream, status in zip(source.streams, self.statuses, strict=True)
-        ]
-
-    def _handlers(self, stream: Stream, status: StreamStatus) -> Handlers:
-        wanted = frozenset(stream.components)
-        publish = self.fan_out.publish
-
-        def on_frame(frame: Frame, utime: int) -> None:
-            publish(frame, Stamp(utime, utime, status.session), wanted)
-
-        def on_parameters(_xml: bytes, parameters: Parameters) -> None:
-            self.fan_out.set_parameters(parameters)
-
-        def on_file(content: bytes) -> None:
-            logger.info("%s: a C3D file of %d bytes came; not kept", self.source.name, len(content))
-
-        return Handlers(on_frame, on_parameters, on_file)
-
-    def publish_status(self) -> None:
-        """Publish what ``status_t`` holds of this source."""
-        rates_hz = [
-            rate.update(status.frames_in) for rate, status in zip(self._rates, self.statuses, strict=True)
-        ]
-        message = status_message(
-            source=self.source.name,
-            server=f"{self.source.host}:{self.source.port}",
-            sequence=self.fan_out.next_status_sequence(),
-            streams=list(zip(self.statuses, rates_hz, strict=True)),
-            outputs=[(status, output.health()) for output, status in self.fan_out.outputs],
-        )
-        self.fan_out.publish_status(message.encode())
-
-
 class Gateway:
-    """All sources and all outputs of one configuration.
+    """All sources and all outputs of one configuration; make it in a running event loop.
 
     ``outputs`` are built from the settings unless given, as the demo and the tests do.
     """
@@ -88,7 +42,23 @@ class Gateway:
             for name, wanted in (("zenoh", settings.zenoh.tool_poses), ("lcm", settings.lcm.tool_poses))
             if wanted
         }
-        self.sources = [_SourceGateway(source, self._outputs, tool_outputs) for source in settings.sources]
+        spool = Spool(settings.spool.effective_directory, settings.spool.max_files, settings.spool.max_bytes)
+        self.sources = [
+            SourceGateway(source, self._outputs, tool_outputs, spool, self._tell_parameters, self._tell_file)
+            for source in settings.sources
+        ]
+        desks = {source.source.name: source.desk for source in self.sources}
+        self._zenoh_queries: list[ZenohQueries] = []
+        self._lcm_queries: list[LcmQueries] = []
+        for output in self._outputs:
+            if isinstance(output, ZenohOutput):
+                zenoh_queries = ZenohQueries(output.settings.prefix, desks)
+                output.when_open(zenoh_queries.declare)
+                self._zenoh_queries.append(zenoh_queries)
+            elif isinstance(output, LcmOutput):
+                lcm_queries = LcmQueries(output.settings, desks, shared=output.is_shared)
+                output.when_open(lcm_queries.declare)
+                self._lcm_queries.append(lcm_queries)
 
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set; then say Bye to every server and close the outputs."""
@@ -107,6 +77,10 @@ class Gateway:
                 for task in running:
                     task.cancel()
         finally:
+            for source in self.sources:
+                source.close()
+            for queries in self._queries:
+                await queries.close()
             for output in self._outputs:
                 output.close()
 
@@ -117,7 +91,17 @@ class Gateway:
                 output.maintain()
             for source in self.sources:
                 source.publish_status()
+            for lcm_queries in self._lcm_queries:
+                lcm_queries.maintain()
 
+    @property
+    def _queries(self) -> list[ZenohQueries | LcmQueries]:
+        return [*self._zenoh_queries, *self._lcm_queries]
 
-def _components_text(stream: Stream) -> str:
-    return " ".join(component.key for component in stream.components)
+    def _tell_parameters(self, source: str, xml: bytes) -> None:
+        for queries in self._queries:
+            queries.tell_parameters(source, xml)
+
+    def _tell_file(self, source: str, description: dict[str, Any]) -> None:
+        for queries in self._zenoh_queries:
+            queries.tell_file(source, description)

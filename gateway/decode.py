@@ -8,8 +8,8 @@ import rtc3d
 
 from gateway.errors import ProtocolError
 
-_TYPES: Final[dict[bytes, type[Any]]] = {
-    message_type._get_packed_fingerprint(): message_type  # noqa: SLF001 - lcm-gen offers no other way
+MESSAGE_TYPES_BY_NAME: Final[dict[str, type[Any]]] = {
+    message_type.__name__: message_type
     for message_type in (
         rtc3d.markers_t,
         rtc3d.tools_t,
@@ -19,6 +19,12 @@ _TYPES: Final[dict[bytes, type[Any]]] = {
         rtc3d.tool_pose_t,
         rtc3d.status_t,
     )
+}
+"""The types of all messages that the gateway publishes."""
+
+_TYPES: Final = {
+    message_type._get_packed_fingerprint(): message_type  # noqa: SLF001 - lcm-gen offers no other way
+    for message_type in MESSAGE_TYPES_BY_NAME.values()
 }
 
 

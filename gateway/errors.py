@@ -16,7 +16,9 @@
     │   ├── ReplyTimeoutError     a command was not answered in time
     │   ├── SilenceError          nothing came although a measurement runs
     │   └── ClosedError           it ended: by the server, by us, or by the network
-    └── OutputError               a message could not be handed to Zenoh or LCM
+    ├── OutputError               a message could not be handed to Zenoh or LCM
+    ├── SpoolError                a C3D file from a server could not be kept
+    └── QueryError                a peer's question cannot be answered; the text goes to the peer
 
 A message says what happened, to which server or file, and what to do about it.
 """
@@ -90,3 +92,19 @@ class OutputError(GatewayError):
     def __init__(self, message: str, *, cause: str) -> None:
         super().__init__(message)
         self.cause = cause
+
+
+class SpoolError(GatewayError):
+    """A C3D file from a server could not be kept."""
+
+
+class QueryError(GatewayError):
+    """A peer's question cannot be answered. The text goes to the peer, ``code`` to its program.
+
+    ``code`` is bad-request (ask otherwise), no-connection (the server is away), refused (the server
+    said no), timeout (it said nothing) or nothing-yet (there is none so far).
+    """
+
+    def __init__(self, message: str, *, code: str = "bad-request") -> None:
+        super().__init__(message)
+        self.code = code

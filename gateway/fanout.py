@@ -10,7 +10,7 @@ import rtc3d
 from gateway.errors import OutputError
 from gateway.log import FailureLog
 from gateway.message import MESSAGE_TYPES, Stamp, metres_per_unit, splice, tool_poses, type_name
-from gateway.names import Topic, unique_name
+from gateway.names import MAX_LABEL_LENGTH, Topic, unique_name
 from gateway.outputs.contract import Output, Publisher
 from gateway.rtc3d.components import Component, ComponentType, Frame
 from gateway.rtc3d.parameters import Parameters
@@ -65,6 +65,8 @@ class FanOut:
             for component, message_type in MESSAGE_TYPES.items()
         }
         self._status_publishers = _declare(self._ways, Topic(source, ("status",), "rtc3d.status_t"))
+        self.newest: dict[ComponentType, bytes] = {}
+        """The newest message of each component."""
         self._sequences: Counter[ComponentType | str] = Counter()
         self._tools = _ToolPoses(source, [way for way in self._ways if way.output.name in tool_outputs])
         for output in outputs:
@@ -84,6 +86,7 @@ class FanOut:
             sequence = self._sequences[kind]
             self._sequences[kind] = sequence + 1
             message = splice(component, stamp, sequence)
+            self.newest[kind] = message
             for way, publisher in self._publishers[kind]:
                 way.send(publisher, kind.key, message)
             if kind is ComponentType.TOOLS:
@@ -112,8 +115,9 @@ class _ToolPoses:
         self._ways = ways
         self._labels: tuple[str, ...] = ()
         self._metres = 1e-3
-        self._sending: list[_Sending] = []  # per tool
-        self._sequences: list[int] = []
+        self._tools: list[tuple[str, _Sending]] = []  # name and publishers of each
+        self._sequences: dict[str, int] = {}  # by name
+        self._failures = FailureLog(logger, source)
 
     def set_parameters(self, parameters: Parameters) -> None:
         labels = () if parameters.tools is None else tuple(tool.label for tool in parameters.tools.tools)
@@ -127,32 +131,45 @@ class _ToolPoses:
         self._metres = metres or 1e-3
 
     def publish(self, component: Component, stamp: Stamp) -> None:
-        if not self._ways or component.num_items > _MAX_TOOLS:
+        if not self._ways:
             return
-        if len(self._sending) != component.num_items:
-            self._open(component.num_items)
-        if not any(publisher.wanted for sending in self._sending for _, publisher in sending):
+        count = component.num_items
+        if count > _MAX_TOOLS:
+            self._refuse(count)
             return
-        messages = tool_poses(component, stamp, self._sequences, self._metres)
-        for tool, message in enumerate(messages):
-            for way, publisher in self._sending[tool]:
+        if count > len(self._tools):
+            self._open(count)
+        # Fewer than before keep their keys: a count that goes up and down declares nothing anew.
+        tools = self._tools[:count]
+        if not any(publisher.wanted for _, sending in tools for _, publisher in sending):
+            return
+        sequences = [self._sequences[name] for name, _ in tools]
+        messages = tool_poses(component, stamp, sequences, self._metres)
+        for (name, sending), message in zip(tools, messages, strict=True):
+            for way, publisher in sending:
                 if publisher.wanted:
                     way.send(publisher, "6d/tool", message)
-            self._sequences[tool] += 1
+            self._sequences[name] += 1
+
+    def _refuse(self, count: int) -> None:
+        self._failures.failed(f"a frame of {count} tools; none has a key of its own above {_MAX_TOOLS}")
+        for way in self._ways:
+            way.status.drops["too many tools"] += 1
 
     def _open(self, count: int) -> None:
         """Declare ``count`` tools; those beyond the parameters are numbered, doubled labels too."""
         self._close()
-        taken: set[str] = set()
+        # A name that was there before goes on with its numbers.
+        before, self._sequences = self._sequences, {}
         for index in range(count):
             label = self._labels[index].strip() if index < len(self._labels) else ""
-            taken.add(label := unique_name(label or f"tool {index + 1}", taken))
-            topic = Topic(self._source, (ComponentType.TOOLS.key, label), type_name(rtc3d.tool_pose_t))
-            self._sending.append(_declare(self._ways, topic))
-        self._sequences = [0] * count
+            name = unique_name(label or f"tool {index + 1}", self._sequences, MAX_LABEL_LENGTH)
+            self._sequences[name] = before.get(name, 0)
+            topic = Topic(self._source, (ComponentType.TOOLS.key, name), type_name(rtc3d.tool_pose_t))
+            self._tools.append((name, _declare(self._ways, topic)))
 
     def _close(self) -> None:
-        for sending in self._sending:
+        for _, sending in self._tools:
             for _, publisher in sending:
                 publisher.close()
-        self._sending.clear()
+        self._tools.clear()

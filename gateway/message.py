@@ -106,7 +106,7 @@ def tool_poses(
 def _pose(component: Component, tool: tuple[float, ...], metres: float) -> bytes:
     q0, qx, qy, qz, x, y, z, error = tool
     # Any NaN means missing (field note 7); a robot is never given half a pose.
-    visible = not any(map(math.isnan, (q0, qx, qy, qz, x, y, z)))
+    visible = not any(map(math.isnan, tool))
     if not visible:
         pose = (math.nan,) * 8
     else:

@@ -8,6 +8,9 @@ from urllib.parse import quote
 MAX_CHANNEL_LENGTH = 63
 """What LCM allows; a longer name is refused by ``publish``."""
 
+MAX_LABEL_LENGTH = 200
+"""What is kept of a tool's label, which is the server's word: Zenoh panics over keys of 64 kB."""
+
 
 class Topic(NamedTuple):
     """One stream of messages: of ``source``, under ``parts`` (its name on both sides), of one LCM type.
@@ -37,7 +40,7 @@ def escape_key_chunk(label: str) -> str:
 
 
 def lcm_channel(prefix: str, source: str, *parts: str) -> str:
-    """Return the channel PREFIX_SOURCE_PART…, upper case, ASCII letters, digits and ``_`` only.
+    """Return the channel PREFIX_SOURCE_PART…; behind ``prefix`` only upper-case ASCII, digits and ``_``.
 
     It is cut to MAX_CHANNEL_LENGTH. Two labels can give one channel: see ``unique_name``.
     """
@@ -46,8 +49,11 @@ def lcm_channel(prefix: str, source: str, *parts: str) -> str:
 
 
 def unique_name(name: str, taken: Container[str], max_length: int = MAX_CHANNEL_LENGTH) -> str:
-    """Return ``name``, or with ``_2``, ``_3``, … behind it the first that is not ``taken``."""
-    candidate, number = name, 1
+    """Return ``name``, or with ``_2``, ``_3``, … behind it the first that is not ``taken``.
+
+    It is cut to ``max_length``, the number included.
+    """
+    candidate, number = name[:max_length], 1
     while candidate in taken:
         number += 1
         suffix = f"_{number}"

@@ -35,7 +35,7 @@ from gateway.rtc3d.connection import (
 )
 from gateway.rtc3d.packets import Packet, text_of
 from gateway.rtc3d.parameters import Parameters
-from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from gateway.status import StreamStatus, now_utime
 
 _BYE_S: Final = 0.5
@@ -49,8 +49,10 @@ class Handlers(NamedTuple):
 
     frame: Callable[[Frame, int], None]
     """The frame, and the host's time at which it came, in µs since the Unix epoch."""
-    parameters: Callable[[bytes, Parameters], None]
+    parameters: Callable[[bytes, ParsedParameters], None]
     """The server's XML as it came, and what it says."""
+    connected: Callable[[], None]
+    """The handshake is done."""
     file: Callable[[bytes], None]
     """A complete C3D file."""
 
@@ -80,6 +82,8 @@ class Session(asyncio.Protocol):
         self._rejected = FailureLog(logger, source.name)
         self._unknown_types: set[int] = set()
         self.server = f"{source.host}:{source.port}"
+        self.ready = False
+        """Whether questions may be asked: after the handshake, before the end."""
 
     @property
     def delivered(self) -> bool:
@@ -131,6 +135,8 @@ class Session(asyncio.Protocol):
             except ReplyTimeoutError:
                 self._limit(f"the server did not acknowledge {request}")
             self._status.rate = "" if request.rate is None else str(request.rate)
+            self.ready = True
+            self._handlers.connected()
             return
         raise LinkError(
             f"{self.server} refuses to stream in every form that the protocol has; "
@@ -148,7 +154,7 @@ class Session(asyncio.Protocol):
             return None
         for text in parsed.recovered:
             logger.info("%s: parameters repaired: %s", self._source.name, text)
-        self._handlers.parameters(packet.body, parsed.parameters)
+        self._handlers.parameters(packet.body, parsed)
         return parsed.parameters
 
     async def _try(self, command: Command) -> Packet | None:
@@ -186,6 +192,12 @@ class Session(asyncio.Protocol):
             finally:
                 self._connection.give_up()
                 self._reply = None
+
+    def record(self, *, start: bool) -> None:
+        """Start or stop the server's recording (field note 16); raises LinkError after the end."""
+        self._check_open()
+        self._connection.send_recording(start=start)
+        self._flush()
 
     def _check_open(self) -> None:
         if self._error is not None:
@@ -229,6 +241,7 @@ class Session(asyncio.Protocol):
 
     async def close(self) -> None:
         """Say Bye, and end the connection at the latest half a second later."""
+        self.ready = False
         if self._transport is None:
             return
         if self._error is None:
@@ -319,6 +332,7 @@ class Session(asyncio.Protocol):
         if self._error is not None:
             return
         self._error = error
+        self.ready = False
         if self._reply is not None and not self._reply.done():
             self._reply.set_exception(error)
         self._ended.set_exception(error)

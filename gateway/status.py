@@ -4,10 +4,14 @@ import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from typing import Final
 
 import rtc3d
 
 from gateway import __version__
+
+MAX_ERROR_LENGTH: Final = 500
+"""What is kept of an error's text: it may quote a server, and goes out with every status message."""
 
 
 def now_utime() -> int:
@@ -37,8 +41,8 @@ class StreamStatus:
     last_error_utime: int = 0
 
     def note_error(self, text: str) -> None:
-        """Keep ``text`` as the last error, with the time."""
-        self.last_error = text
+        """Keep ``text``, at most MAX_ERROR_LENGTH of it, as the last error, with the time."""
+        self.last_error = text[:MAX_ERROR_LENGTH]
         self.last_error_utime = now_utime()
 
 

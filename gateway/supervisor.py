@@ -41,7 +41,13 @@ class Supervisor:
         self._status = status
         self._handlers = handlers
         self._delays_s = delays_s
+        self._session: Session | None = None
         self._failures = FailureLog(logger, f"{source.name} ({status.components})")
+
+    @property
+    def session(self) -> Session | None:
+        """The session that questions can be asked of; None while there is none."""
+        return self._session if self._session is not None and self._session.ready else None
 
     async def run(self) -> None:
         """Keep the stream going until cancelled; then say Bye.
@@ -52,7 +58,7 @@ class Supervisor:
         """
         delays_s = self._delays_s(self._source.reconnect)
         while True:
-            session = Session(self._source, self._stream, self._status, self._handlers)
+            self._session = session = Session(self._source, self._stream, self._status, self._handlers)
             try:
                 await session.connect()
                 await session.start_stream()

@@ -1,8 +1,10 @@
 """Messages out on LCM: one channel per topic."""
 
+import ipaddress
 import logging
 import socket
 import time
+from collections.abc import Callable
 from typing import Final
 from urllib.parse import urlsplit
 
@@ -20,18 +22,21 @@ logger = logging.getLogger(__name__)
 
 
 def multicast_problem(url: str) -> str:
-    """Return why datagrams to a ``udpm:`` URL would not leave this machine; "" if they would.
+    """Return why datagrams to a ``udpm:`` or ``mpudpm:`` URL would not leave this machine; "" if they would.
 
     LCM says so on C's stderr only and raises a bare RuntimeError, so it is found out before.
     """
     parts = urlsplit(url)
-    if parts.scheme != "udpm":
+    if parts.scheme not in {"udpm", "mpudpm"}:
         return ""
     try:
-        host, port = parts.hostname or "239.255.76.67", parts.port or 7667
+        group, port = str(ipaddress.IPv4Address(parts.hostname or "239.255.76.67")), parts.port or 7667
+    except ValueError:
+        return ""  # not an address: LCM itself refuses it
+    try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.connect((host, port))
-    except (OSError, ValueError) as error:
+            probe.connect((group, port))
+    except OSError as error:
         return (
             f"no multicast to {url}: {error}; bring a network interface up, or give it a multicast route: "
             "ip route add 224.0.0.0/4 dev INTERFACE"
@@ -58,14 +63,19 @@ class LcmPublisher:
     def __init__(self, output: "LcmOutput", channel: str) -> None:
         self.channel = channel
         self._output = output
+        self._closed = False
 
     def publish(self, message: bytes) -> None:
         """Send one message; raises OutputError if the network did not take it."""
+        if self._closed:
+            raise OutputError(f"LCM channel {self.channel} is closed; ask for a new one", cause="closed")
         self._output.send(self.channel, message)
 
     def close(self) -> None:
         """Free the channel's name."""
-        self._output.forget(self)
+        if not self._closed:
+            self._closed = True
+            self._output.forget(self)
 
 
 class LcmOutput:
@@ -78,7 +88,8 @@ class LcmOutput:
         self._shared = shared
         self._lcm: lcm.LCM | None = None
         self._channels: set[str] = set()
-        self._problem = "LCM is not open yet"
+        self._declarations: list[Callable[[lcm.LCM], None]] = []
+        self._problem = "LCM is not open; start the output first"
         self._retry_at_s = 0.0
         self._failures = FailureLog(logger, self.name)
 
@@ -91,6 +102,19 @@ class LcmOutput:
             self._retry_at_s = time.monotonic() + _RETRY_S
         else:
             self._sent()
+            for declare in self._declarations:
+                declare(self._lcm)
+
+    @property
+    def is_shared(self) -> bool:
+        """Whether somebody else handles this LCM object's subscriptions."""
+        return self._shared is not None
+
+    def when_open(self, declare: Callable[[lcm.LCM], None]) -> None:
+        """Call ``declare`` with the LCM object once it is open."""
+        self._declarations.append(declare)
+        if self._lcm is not None:
+            declare(self._lcm)
 
     def publisher(self, topic: Topic) -> LcmPublisher:
         """Return a new publisher of ``topic`` on a channel that no other publisher of ours has."""
@@ -107,12 +131,11 @@ class LcmOutput:
         """Publish on ``channel``; raises OutputError if it failed. The next message is tried again."""
         if self._lcm is None:
             raise OutputError(self._problem, cause="not open")
-        if channel not in self._channels:
-            raise OutputError(f"LCM channel {channel} is closed", cause="closed")
         try:
             self._lcm.publish(channel, message)
         except OSError as error:
-            problem = multicast_problem(self.settings.effective_url) or str(error)
+            url = self.settings.effective_url
+            problem = multicast_problem(url) or f"LCM did not send to {url}: {error}; check lcm.url"
             self._failed(problem)
             raise OutputError(problem, cause="send failed") from error
         if self._problem:
@@ -141,5 +164,5 @@ class LcmOutput:
     def close(self) -> None:
         """Let LCM go: it has no close, deleting the object frees its sockets and thread."""
         self._lcm = None
-        self._problem = "LCM is closed"
+        self._problem = "LCM is closed; start the gateway again"
         self._retry_at_s = float("inf")

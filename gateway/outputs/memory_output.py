@@ -18,9 +18,11 @@ class MemoryPublisher:
         self._closed = False
 
     def publish(self, message: bytes) -> None:
-        """Keep ``message``; raises OutputError while the output is not open."""
-        if self._closed or not self._output.is_open:
-            raise OutputError("memory output is closed; start it first", cause="closed")
+        """Keep ``message``; raises OutputError while the output is not open, or once closed."""
+        if self._closed:
+            raise OutputError(f"{self._topic} is closed; ask for a new publisher", cause="closed")
+        if not self._output.is_open:
+            raise OutputError(self._output.health().problem, cause="not open")
         self._output.messages.append((self._topic, message))
 
     def close(self) -> None:
@@ -55,7 +57,7 @@ class MemoryOutput:
 
     def health(self) -> OutputHealth:
         """Return whether the output is open."""
-        return OutputHealth(True) if self.is_open else OutputHealth(False, "memory output is closed")
+        return OutputHealth(self.is_open, "" if self.is_open else "memory output is not open; start it")
 
     def close(self) -> None:
         """Close the output; what it kept stays readable."""

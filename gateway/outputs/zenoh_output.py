@@ -5,10 +5,11 @@ Opened in a thread of its own, because ``zenoh.open`` blocks; see docs/design.md
 
 import json
 import logging
+import re
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import zenoh
 
@@ -25,10 +26,17 @@ _DEFAULTS: Final = {
     # 16 MB of /dev/shm, and files left behind after a kill, for messages of a few kB.
     "transport": {"shared_memory": {"enabled": False}},
     # A lost router is found again within half a second instead of up to 4 s.
+    # Caches for late subscribers need samples with time stamps.
+    "timestamping": {"enabled": True},
     "connect": {"retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}},
 }
 """What the gateway wants other than Zenoh's own defaults, where an inline configuration is silent."""
 
+_REMEDY: Final = "is the router running, are zenoh.config's endpoints right and free?"
+_NO_ROUTER: Final = OutputHealth(
+    False, "no Zenoh router is connected: start zenohd, or correct zenoh.config's connect/endpoints"
+)
+_HEALTHY: Final = OutputHealth(True)
 _RETRY_S: Final = 1.0
 _JOIN_S: Final = 1.0
 
@@ -46,7 +54,12 @@ def zenoh_config(config: Path | Mapping[str, Any]) -> zenoh.Config:
         return zenoh.Config.from_json5(json.dumps(_merged(_DEFAULTS, config)))
     except (zenoh.ZError, TypeError, ValueError) as error:
         where = f"file {config}" if isinstance(config, Path) else "inline zenoh.config"
-        raise ConfigError(f"Zenoh does not accept the {where}: {error}") from error
+        raise ConfigError(f"Zenoh does not accept the {where}: {_reason(error)}") from error
+
+
+def _reason(error: Exception) -> str:
+    """Return the error's text on one line, without the place in Zenoh's source that it may end in."""
+    return " ".join(re.sub(r" at \S+\.rs:\d+\.?$", "", str(error)).split())
 
 
 def _merged(defaults: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
@@ -65,27 +78,26 @@ class ZenohPublisher:
 
     def __init__(self, output: "ZenohOutput", topic: Topic) -> None:
         self._output = output
-        self._topic = topic
+        self._key = zenoh_key(output.settings.prefix, topic.source, *topic.parts)
+        self._type_name = topic.type_name
         self._publisher: zenoh.Publisher | None = None
         self._matched = False
+        self._closed = False
 
     @property
     def wanted(self) -> bool:
         """Whether a subscriber matches the key now."""
-        return self._matched
+        return self._matched and not self._closed
 
     def bind(self, session: zenoh.Session) -> None:
         """Declare the publisher on an open session."""
-        settings = self._output.settings
         publisher = session.declare_publisher(
-            zenoh_key(settings.prefix, self._topic.source, *self._topic.parts),
-            encoding=zenoh.Encoding(LCM_ENCODING).with_schema(self._topic.type_name),
+            self._key,
+            encoding=zenoh.Encoding(LCM_ENCODING).with_schema(self._type_name),
             congestion_control=zenoh.CongestionControl.DROP,
-            express=settings.express,
+            express=self._output.settings.express,
         )
-        publisher.declare_matching_listener(self._on_matching)
-        # Zenoh's type stub says bool here; it is the same MatchingStatus that listeners get.
-        self._matched = cast(zenoh.MatchingStatus, publisher.matching_status).matching
+        publisher.declare_matching_listener(self._on_matching)  # tells of subscribers there already, too
         self._publisher = publisher
 
     def _on_matching(self, status: zenoh.MatchingStatus) -> None:
@@ -93,25 +105,28 @@ class ZenohPublisher:
 
     def publish(self, message: bytes) -> None:
         """Hand ``message`` to Zenoh; raises OutputError while not open, or a client without a router."""
-        if self._publisher is None:
-            raise OutputError(self._output.health().problem, cause="not open")
-        if self._output.lacks_router:
-            raise OutputError(self._output.health().problem, cause="no router")
+        if self._closed:
+            raise OutputError(f"Zenoh key {self._key} is closed; ask for a new publisher", cause="closed")
+        health = self._output.health()
+        if self._publisher is None or not health.connected:
+            cause = "not open" if self._output.session is None else "no router"
+            raise OutputError(health.problem, cause=cause)
         try:
             self._publisher.put(message)
         except zenoh.ZError as error:
-            raise OutputError(f"Zenoh did not take a message: {error}", cause="put failed") from error
+            text = f"Zenoh did not take a message for {self._key}: {_reason(error)}"
+            raise OutputError(text, cause="put failed") from error
 
     def close(self) -> None:
         """Undeclare the publisher."""
-        publisher, self._publisher = self._publisher, None
-        self._matched = False
+        self._closed = True
         self._output.forget(self)
+        publisher, self._publisher = self._publisher, None
         if publisher is not None:
             try:
                 publisher.undeclare()
             except zenoh.ZError as error:
-                logger.debug("undeclaring %s: %s", self._topic, error)
+                logger.debug("undeclaring %s: %s", self._key, error)
 
 
 class ZenohOutput:
@@ -127,9 +142,10 @@ class ZenohOutput:
         self._session: zenoh.Session | None = None
         self._publishers: list[ZenohPublisher] = []
         self._sources: list[str] = []
+        self._declarations: list[Callable[[zenoh.Session], None]] = []
         self._tokens: list[zenoh.LivelinessToken] = []
         self._transports = 0
-        self._problem = "the Zenoh session is not open yet"
+        self._problem = f"the Zenoh session is not open yet; {_REMEDY}"
         self._closing = threading.Event()
         self._opener = threading.Thread(target=self._open, name="zenoh-open", daemon=True)
         self._failures = FailureLog(logger, self.name)
@@ -154,10 +170,7 @@ class ZenohOutput:
             try:
                 session = zenoh.open(self._config)
             except zenoh.ZError as error:
-                self._problem = (
-                    f"the Zenoh session does not open: {error}; "
-                    "is the router running, are zenoh.config's endpoints right and free?"
-                )
+                self._problem = f"the Zenoh session does not open: {_reason(error)}; {_REMEDY}"
                 self._failures.failed(self._problem)
                 self._closing.wait(_RETRY_S)
                 continue
@@ -166,10 +179,12 @@ class ZenohOutput:
                 if self._closing.is_set():
                     session.close()
                     return
-                self._session = session
                 for publisher in self._publishers:
                     publisher.bind(session)
                 self._tokens = [self._token(session, source) for source in self._sources]
+                self._session = session
+                for declare in self._declarations:
+                    declare(session)
             self._problem = ""
             self._failures.recovered("the session is open")
             return
@@ -202,6 +217,13 @@ class ZenohOutput:
             if self._session is not None:
                 self._tokens.append(self._token(self._session, source))
 
+    def when_open(self, declare: Callable[[zenoh.Session], None]) -> None:
+        """Call ``declare`` with the session once it is open, in the thread that opens it."""
+        with self._lock:
+            self._declarations.append(declare)
+            if self._session is not None:
+                declare(self._session)
+
     def maintain(self) -> None:
         """Tell of a router lost or found; Zenoh itself reconnects."""
         if self._session is None:
@@ -216,11 +238,8 @@ class ZenohOutput:
         if self._session is None:
             return OutputHealth(False, self._problem)
         if self.lacks_router:
-            return OutputHealth(
-                False,
-                "no Zenoh router is connected: start zenohd, or correct zenoh.config's connect/endpoints",
-            )
-        return OutputHealth(True)
+            return _NO_ROUTER
+        return _HEALTHY
 
     def close(self) -> None:
         """Close the session: without it a process with callbacks never ends."""
@@ -230,6 +249,6 @@ class ZenohOutput:
         with self._lock:
             session, self._session = self._session, None
             self._tokens.clear()
-            self._problem = "the Zenoh session is closed"
+            self._problem = "the Zenoh session is closed; start the gateway again"
         if session is not None:
             session.close()

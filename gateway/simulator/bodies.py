@@ -33,8 +33,9 @@ class RigidBodies:
         bodies = max(1, num_markers // _MARKERS_PER_BODY)
         self._body_of_marker = np.minimum(np.arange(num_markers) // _MARKERS_PER_BODY, bodies - 1)
         self._body_of_tool = np.arange(num_tools) % bodies
-        self.tool_markers: Floats = (self._body_of_marker[:, None] == self._body_of_tool).astype(np.float32)
-        """1 where a marker is a tool's, else 0; shape (markers, tools)."""
+        self._first_markers = np.arange(bodies) * _MARKERS_PER_BODY
+        self.tool_markers: _Booleans = self._body_of_marker[:, None] == self._body_of_tool
+        """Which markers are which tool's, shape (markers, tools)."""
 
         self._travel = _Waves(rng, (bodies, 3), amplitude=(50.0, 300.0), period_s=(2.0, 9.0))
         self._swing = _Waves(rng, (bodies,), amplitude=(0.3, 1.5), period_s=(1.5, 6.0))
@@ -80,8 +81,8 @@ class RigidBodies:
         time_s = samples / self._rate_hz
         half = self._swing(time_s).take(self._body_of_tool, axis=1)[..., None] / 2
         visible = ~self._hidden(time_s)
-        num_visible = visible.astype(np.float32) @ self.tool_markers
-        square_mm = (_square_sum(self._noise_mm(samples)) * visible) @ self.tool_markers
+        num_visible = self._sum_on_tools(visible.astype(np.float32))
+        square_mm = self._sum_on_tools(_square_sum(self._noise_mm(samples)) * visible)
         values = np.empty((*num_visible.shape, 8), np.float32)
         values[..., :4] = self._quaternion_cos * np.cos(half) + self._quaternion_sin * np.sin(half)
         values[..., 4:7] = self._positions_mm(time_s, self._origins, self._body_of_tool)
@@ -116,8 +117,16 @@ class RigidBodies:
         body: _Booleans = self._hiding_bodies(time_s) > np.cos(np.pi * _BODY_HIDDEN)
         return marker | body.take(self._body_of_marker, axis=1)
 
+    def _sum_on_tools(self, per_marker: Floats) -> Floats:
+        """Return the sums over each tool's markers, shape (samples, tools), of values of each marker."""
+        if per_marker.shape[1] == 0:
+            return np.zeros((len(per_marker), len(self._body_of_tool)))
+        # not a matrix product: its rounding depends on how many samples are asked for at once
+        sums: Floats = np.add.reduceat(per_marker, self._first_markers, axis=1)
+        return sums.take(self._body_of_tool, axis=1)
+
     def _noise_mm(self, samples: Samples) -> Floats:
-        return _NOISE_MM * self._noise(samples).reshape(len(samples), -1, 3)
+        return _NOISE_MM * self._noise(samples).reshape(len(samples), len(self._body_of_marker), 3)
 
 
 class _Waves:

@@ -26,7 +26,7 @@ from gateway.rtc3d.components import ByteOrder, ComponentType, byte_order_of, sp
 from gateway.rtc3d.packets import Packet, PacketType, encode_packet, text_of
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import build_parameters
-from gateway.simulator.frames import DataPacket, FrameBuilder, exact_rate
+from gateway.simulator.frames import DataPacket, FrameBuilder
 
 VERSION: Final = "1.0"
 NO_DATA: Final = encode_packet(PacketType.NO_DATA)
@@ -129,6 +129,7 @@ class Client:
         self._last_us = -1
         self._events_from_us = None
         if self._subscription is not None:
+            self._events_from_us = 0
             self._begin_stream(self._subscription, 0)
 
     def measurement_stopped(self) -> list[bytes]:
@@ -193,17 +194,8 @@ class Client:
                 self.byte_order = byte_order
             case SendParameters(sections):
                 return [encode_packet(PacketType.XML, build_parameters(self._parameters(sections)))]
-            case SendCurrentFrame(components):
-                elapsed_us = self._want_frames()
-                if elapsed_us is None:
-                    return [acknowledgement, NO_DATA]
-                self._requests.append(_Request(self._server.frames(components), self._last_us))
-            case StreamFrames():
-                elapsed_us = self._want_frames()
-                self._subscription = command
-                if elapsed_us is None:
-                    return [acknowledgement, NO_DATA]
-                self._begin_stream(command, elapsed_us)
+            case SendCurrentFrame() | StreamFrames():
+                return [acknowledgement, *self._want_frames(command)]
             case StopStreaming():
                 self._subscription = self._stream = None
                 if not self._requests:
@@ -220,20 +212,26 @@ class Client:
         unwanted = {field: None for section, field in _PARAMETER_FIELDS.items() if section not in sections}
         return replace(known, **unwanted)
 
-    def _want_frames(self) -> int | None:
-        """Return the measurement's time, None if none runs; from its first wish on a client gets events."""
+    def _want_frames(self, command: SendCurrentFrame | StreamFrames) -> list[bytes]:
+        """Note which frames the client wants; return a No Data packet if no measurement runs."""
         elapsed_us = self._server.measurement_us()
+        if isinstance(command, StreamFrames):
+            self._subscription = command
+        if elapsed_us is None:
+            return [NO_DATA]
+        if isinstance(command, StreamFrames):
+            self._begin_stream(command, elapsed_us)
+        else:
+            self._requests.append(_Request(self._server.frames(command.components), self._last_us))
         if self._events_from_us is None:
             self._events_from_us = elapsed_us
-        return elapsed_us
+        return []
 
     def _begin_stream(self, command: StreamFrames, elapsed_us: int) -> None:
         frames = self._server.frames(command.components)
         # the frame of this moment is new to the client unless it is the last that it got
         first_tick = frames.tick_after(max(elapsed_us - 1, self._last_us))
         self._stream = _Stream(frames, command.rate, first_tick)
-        if self._events_from_us is None:
-            self._events_from_us = elapsed_us
 
     def _build(self, frames: FrameBuilder, tick: int) -> DataPacket:
         time_us = frames.time_us(tick)

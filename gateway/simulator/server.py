@@ -1,4 +1,4 @@
-"""The simulator's server: listens, keeps the measurement's time, sends each client the frames that are due."""
+"""The simulator's server: listens, keeps the measurement's time, sends each client what is due."""
 
 import asyncio
 import logging
@@ -6,7 +6,7 @@ from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import replace
 from types import TracebackType
-from typing import Final, Self
+from typing import Final, Self, cast
 
 import gateway
 from gateway.errors import GatewayError
@@ -228,7 +228,8 @@ class Connection(asyncio.Protocol):
         self._inbox: deque[Packet] = deque()
         self._is_full = False  # MAX_UNREAD_BYTES wait for the client to read
         self._was_full = False
-        self._first_sent_s = self._last_sent_s = 0.0
+        self._first_sent_s: float | None = None  # loop times of this session's first and newest frame
+        self._last_sent_s = 0.0
         self.closed: asyncio.Future[None] = self._loop.create_future()
         self.counts = SentCounts()
         """What was sent to this client so far."""
@@ -237,13 +238,12 @@ class Connection(asyncio.Protocol):
     @property
     def due_us(self) -> int | None:
         """When the next frame is due, in µs since the measurement's start; None if none is to be sent."""
-        return None if self._is_full else self.client.due_us
+        return self.client.due_us if self._can_send() else None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """See asyncio.Protocol."""
-        assert isinstance(transport, asyncio.Transport)
-        self.transport = transport
-        transport.set_write_buffer_limits(high=MAX_UNREAD_BYTES)
+        self.transport = cast(asyncio.Transport, transport)
+        self.transport.set_write_buffer_limits(high=MAX_UNREAD_BYTES)
         peer = transport.get_extra_info("peername")
         self.client.name = f"{peer[0]}:{peer[1]}"
         self._simulator.connections.add(self)
@@ -280,6 +280,7 @@ class Connection(asyncio.Protocol):
         )
         if not self.transport.is_closing():
             self.transport.resume_reading()
+        self._simulator.schedule()
         self._work()
 
     def data_received(self, data: bytes) -> None:
@@ -290,8 +291,8 @@ class Connection(asyncio.Protocol):
             self._work()
 
     def send_due(self, elapsed_us: int) -> None:
-        """Send the frames that are due by now, or drop them if the client does not read."""
-        if self._is_full:
+        """Send the frames that are due by now, or drop them if the client does not read or is leaving."""
+        if not self._can_send():
             self.client.drop_due(elapsed_us)
             return
         for packet, components in self.client.due(elapsed_us):
@@ -299,34 +300,39 @@ class Connection(asyncio.Protocol):
             self.counts.add(components)
             self._simulator.counts.add(components)
             self._last_sent_s = self._loop.time()
-            self._first_sent_s = self._first_sent_s or self._last_sent_s
-            if self._is_full or self.transport.is_closing():
+            if self._first_sent_s is None:
+                self._first_sent_s = self._last_sent_s
+            if not self._can_send():
                 break
 
     def send(self, packet: bytes) -> None:
         """Send one packet; everything that leaves for this client goes through here."""
-        self.transport.write(packet)
+        if not self.transport.is_closing():
+            self.transport.write(packet)
 
     def close(self) -> None:
         """Close the connection once everything has been sent; ``closed`` is done then."""
         self._inbox.clear()
-        self._simulator.connections.discard(self)
         self.transport.close()
 
+    def _can_send(self) -> bool:
+        return not (self._is_full or self.transport.is_closing())
+
     def _work(self) -> None:
-        """Answer one packet and leave the rest for the loop's next round, so that no client holds up others."""
-        if self._is_full or self.transport.is_closing():
+        """Answer one packet, the others in the loop's next rounds, so that no client holds up another."""
+        if not self._can_send():
             return
         if self._inbox:
             for packet in self.client.answer(self._inbox.popleft()):
                 self.send(packet)
+            if self.client.said_bye:
+                self.close()
+                return
             elapsed_us = self._simulator.elapsed_us()
             if elapsed_us is not None:
                 self.send_due(elapsed_us)
             self._simulator.schedule()
-        if self.client.said_bye:
-            self.close()
-        elif self._inbox:
+        if self._inbox:
             self._loop.call_soon(self._work)
         elif self._reader.error is not None:
             size = self._reader.error.size
@@ -338,13 +344,13 @@ class Connection(asyncio.Protocol):
     def _parameters(self) -> Parameters:
         address, port = self.transport.get_extra_info("sockname")[:2]
         frames = self.counts.frames
-        streaming_s = self._last_sent_s - self._first_sent_s
+        streaming_s = 0.0 if self._first_sent_s is None else self._last_sent_s - self._first_sent_s
         general = General(
             name=NAME,
             version=gateway.__version__,
             address=address,
             port=port,
             frames_sent=frames,
-            frames_per_s=(frames - 1) / streaming_s if streaming_s > 0 else 0.0,
+            frames_per_s=round((frames - 1) / streaming_s, 2) if streaming_s > 0 else 0.0,
         )
         return replace(self._simulator.scene.parameters, general=general)

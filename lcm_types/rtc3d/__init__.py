@@ -13,6 +13,9 @@ from .forces_t import forces_t as forces_t
 from .marker_t import marker_t as marker_t
 from .markers_t import markers_t as markers_t
 from .output_status_t import output_status_t as output_status_t
+from .parameters_reply_t import parameters_reply_t as parameters_reply_t
+from .parameters_request_t import parameters_request_t as parameters_request_t
+from .parameters_t import parameters_t as parameters_t
 from .status_t import status_t as status_t
 from .stream_status_t import stream_status_t as stream_status_t
 from .tool_pose_t import tool_pose_t as tool_pose_t

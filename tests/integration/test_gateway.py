@@ -144,7 +144,8 @@ async def test_bye_is_said_on_the_way_out() -> None:
         async with gateway_to(server.port) as running:
             await running.heard("3d")
         await running.until(lambda: commands[-1:] == ["Bye"])
-    assert commands == ["Version 1.0", "SendParameters", "StreamFrames AllFrames", "Bye"]
+    assert commands[:3] == ["Version 1.0", "SendParameters", "StreamFrames AllFrames"]
+    assert commands[-1] == "Bye"
 
 
 async def test_a_server_that_knows_stream_frames_alone_streams() -> None:

@@ -110,14 +110,14 @@ MISTAKES: list[tuple[str, str]] = [
         "    prot: 3030",
         "lab.yaml:4:5: sources[0].prot: unknown key (did you mean 'port'?); known: name, host, port, "
         "byte_order, streams, reconnect, connect_timeout_s, reply_timeout_s, stall_timeout_s, "
-        "max_packet_bytes, max_c3d_bytes",
+        "max_packet_bytes, max_c3d_bytes, query_timeout_s, fresh_interval_s, remote_control",
     ),
     (
         "sorces: 1",
-        "lab.yaml:4:1: sorces: unknown key (did you mean 'sources'?); known: sources, zenoh, lcm",
+        "lab.yaml:4:1: sorces: unknown key (did you mean 'sources'?); known: sources, spool, zenoh, lcm",
     ),
-    ("on: 1", "lab.yaml:4:1: on: unknown key; known: sources, zenoh, lcm"),
-    ("a b: 1", "lab.yaml:4:1: 'a b': unknown key; known: sources, zenoh, lcm"),
+    ("on: 1", "lab.yaml:4:1: on: unknown key; known: sources, spool, zenoh, lcm"),
+    ("a b: 1", "lab.yaml:4:1: 'a b': unknown key; known: sources, spool, zenoh, lcm"),
     (
         "    byte_order: bigendian",
         "lab.yaml:4:17: sources[0].byte_order: found 'bigendian'; accepted is big or little",
@@ -272,7 +272,7 @@ def test_an_empty_file_is_refused(file: Path, content: str) -> None:
 @pytest.mark.parametrize(("content", "found"), [("[1]", "a list"), ("text", "'text'"), ("~", "nothing")])
 def test_a_file_that_is_no_mapping_is_refused(file: Path, content: str, found: str) -> None:
     assert refused(file, content) == [
-        f"lab.yaml:1:1: found {found}; accepted is a mapping with any of the keys sources, zenoh, lcm"
+        f"lab.yaml:1:1: found {found}; accepted is a mapping with any of the keys sources, spool, zenoh, lcm"
     ]
 
 

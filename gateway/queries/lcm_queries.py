@@ -1,0 +1,191 @@
+"""Questions that come on LCM, as parameters_request_t; and parameters told unasked, as parameters_t.
+
+LCM is open to everybody on the network and knows no flow control: requests wait in a bounded queue,
+malformed ones are counted and ignored.
+"""
+
+import asyncio
+import contextlib
+import logging
+import threading
+import time
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any, Final
+
+import lcm
+import rtc3d
+
+from gateway.config import LcmSettings
+from gateway.errors import QueryError
+from gateway.names import lcm_channel
+from gateway.queries.desk import Desk
+from gateway.rtc3d.commands import SECTIONS
+from gateway.status import now_utime
+
+MAX_PENDING: Final = 64
+"""How many requests are worked on at once; more are dropped and counted."""
+
+MAX_REQUEST_BYTES: Final = 4096
+MAX_REQUESTER_BYTES: Final = 128
+REPEAT_S: Final = 5.0
+"""How often the parameters are published again, for those who came late."""
+
+_POLL_MS: Final = 100
+_JOIN_S: Final = 1.0
+
+logger = logging.getLogger(__name__)
+
+
+class _Told:
+    """A source's newest parameters, and when they are to be published again."""
+
+    def __init__(self) -> None:
+        self.message = rtc3d.parameters_t()
+        self.again_at_s = 0.0
+
+
+class LcmQueries:
+    """Answers for all ``desks``, by the source's name, on the channels of ``settings.prefix``.
+
+    ``declare`` is called once LCM is open. Where ``shared`` is true somebody else handles that LCM
+    object, as with memq://; else a thread of this object does.
+    """
+
+    def __init__(self, settings: LcmSettings, desks: Mapping[str, Desk], *, shared: bool) -> None:
+        self._prefix = settings.prefix
+        self._desks = desks
+        self._shared = shared
+        self._loop = asyncio.get_running_loop()
+        self._lcm: lcm.LCM | None = None
+        self._subscriptions: list[lcm.LCMSubscription] = []
+        self._thread: threading.Thread | None = None
+        self._closing = threading.Event()
+        self._pending = 0  # changed in the loop, read in the handler's thread
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._told: dict[str, _Told] = {}
+        self.results: Counter[str] = Counter()
+        """Requests by result: ok, the code of the error, malformed or dropped."""
+
+    def declare(self, connection: lcm.LCM) -> None:
+        """Listen for requests on an open LCM object."""
+        self._lcm = connection
+        for source, desk in self._desks.items():
+            channel = lcm_channel(self._prefix, source, "PARAMETERS_REQUEST")
+
+            def on_request(_channel: str, data: bytes, desk: Desk = desk) -> None:
+                self._take(desk, data)
+
+            subscription = connection.subscribe(f"^{channel}$", on_request)
+            subscription.set_queue_capacity(MAX_PENDING)
+            self._subscriptions.append(subscription)
+        if not self._shared:
+            self._thread = threading.Thread(target=self._handle, name="lcm-requests", daemon=True)
+            self._thread.start()
+
+    def _handle(self) -> None:
+        while not self._closing.is_set() and self._lcm is not None:
+            try:
+                self._lcm.handle_timeout(_POLL_MS)
+            except OSError as error:
+                logger.debug("handling LCM requests: %s", error)
+                self._closing.wait(_POLL_MS / 1000)
+
+    def _take(self, desk: Desk, data: bytes) -> None:
+        """Check a request in the handler's thread and hand it to the loop."""
+        if self._pending >= MAX_PENDING:
+            self.results["dropped"] += 1
+            return
+        request = _decoded(data)
+        if request is None:
+            self.results["malformed"] += 1
+            logger.debug("%s: malformed LCM request of %d bytes", desk.source.name, len(data))
+            return
+        with contextlib.suppress(RuntimeError):  # the loop has just ended
+            self._loop.call_soon_threadsafe(self._start, desk, request)
+
+    def _start(self, desk: Desk, request: Any) -> None:
+        if self._pending >= MAX_PENDING:
+            self.results["dropped"] += 1
+            return
+        self._pending += 1
+        task = asyncio.create_task(self._answer(desk, request))
+        self._tasks.add(task)
+        task.add_done_callback(self._done)
+
+    def _done(self, task: asyncio.Task[None]) -> None:
+        self._pending -= 1
+        self._tasks.discard(task)
+
+    async def _answer(self, desk: Desk, request: Any) -> None:
+        reply = rtc3d.parameters_reply_t()
+        reply.request_id, reply.requester = request.request_id, request.requester
+        try:
+            known = await desk.parameters(_sections(request), fresh=request.fresh, stale_ok=False)
+        except QueryError as error:
+            reply.error, reply.error_code = str(error), error.code
+            self.results[error.code] += 1
+        else:
+            reply.xml = known.xml.decode("utf-8", "replace")
+            reply.age_s = time.monotonic() - known.came_s
+            self.results["ok"] += 1
+        self._publish(desk.source.name, "PARAMETERS_REPLY", reply)
+
+    def tell_parameters(self, source: str, xml: bytes) -> None:
+        """Publish a source's parameters, now and again every REPEAT_S seconds."""
+        told = self._told.setdefault(source, _Told())
+        told.message.xml = xml.decode("utf-8", "replace")
+        told.message.capture_utime = now_utime()
+        told.message.session = self._desks[source].session
+        self._repeat(source, told)
+
+    def maintain(self) -> None:
+        """Repeat what is due; called once a second."""
+        for source, told in self._told.items():
+            if time.monotonic() >= told.again_at_s:
+                self._repeat(source, told)
+
+    def _repeat(self, source: str, told: _Told) -> None:
+        told.message.utime = now_utime()
+        self._publish(source, "PARAMETERS", told.message)
+        told.message.sequence += 1
+        told.again_at_s = time.monotonic() + REPEAT_S
+
+    def _publish(self, source: str, name: str, message: Any) -> None:
+        if self._lcm is not None:
+            try:
+                self._lcm.publish(lcm_channel(self._prefix, source, name), message.encode())
+            except OSError as error:
+                logger.debug("%s: %s not sent on LCM: %s", source, name, error)
+
+    async def close(self) -> None:
+        """Stop listening; requests under way get no reply."""
+        self._closing.set()
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        if self._thread is not None:
+            await asyncio.to_thread(self._thread.join, _JOIN_S)
+        if self._lcm is not None:
+            for subscription in self._subscriptions:
+                self._lcm.unsubscribe(subscription)
+            self._lcm = None
+
+
+def _decoded(data: bytes) -> Any | None:
+    """Return a ``parameters_request_t``; None for bytes that are none, or too many."""
+    if len(data) > MAX_REQUEST_BYTES:
+        return None
+    try:
+        request = rtc3d.parameters_request_t.decode(data)
+    except Exception:  # noqa: BLE001 - lcm-gen's decoders raise whatever comes
+        return None
+    return request if len(request.requester.encode()) <= MAX_REQUESTER_BYTES else None
+
+
+def _sections(request: Any) -> tuple[str, ...]:
+    """Return the sections asked for, in SECTIONS' order; raises QueryError for an unknown one."""
+    unknown = set(request.sections) - set(SECTIONS)
+    if unknown:
+        raise QueryError(f"unknown section {min(unknown)!r}; accepted: {', '.join(SECTIONS)}")
+    return tuple(section for section in SECTIONS if section in request.sections)
