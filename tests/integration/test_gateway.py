@@ -51,7 +51,7 @@ class Running:
 
 @asynccontextmanager
 async def gateway_to(port: int, **settings: Any) -> AsyncIterator[Running]:
-    source = {
+    source: dict[str, Any] = {
         "name": "lab",
         "host": "127.0.0.1",
         "port": port,

@@ -13,7 +13,6 @@ import lcm
 import numpy as np
 import numpy.typing as npt
 import pytest
-from tests.waiting import wait_until_async
 
 from gateway.config import LcmSettings, Settings, Source, Stream, ZenohSettings
 from gateway.daemon import Gateway
@@ -26,6 +25,7 @@ from gateway.simulator.scene import Scene
 from gateway.simulator.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.simulator.take import Take
+from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 
@@ -136,7 +136,7 @@ async def test_every_value_that_arrives_is_the_files(name: str, frames: int, com
         await running.until(lambda: min(len(side["3d"]) for side in (running.zenoh, running.lcm)) > frames)
         running.simulator.stop_measurement()
     for side in (running.zenoh, running.lcm):
-        assert set(side) - {"status"} == set(components)
+        assert set(side) - {"status", "parameters"} == set(components)
         for component in components:
             assert_equal_to_file(side[component], component, expected[component])
     if name == "optotrak.c3d":
