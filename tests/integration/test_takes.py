@@ -18,6 +18,7 @@ from gateway.config import LcmSettings, Settings, Source, Stream, ZenohSettings
 from gateway.daemon import Gateway
 from gateway.listening import LcmListener, ZenohListener, channel_pattern, key_pattern, open_zenoh
 from gateway.message import message_items
+from gateway.outputs.contract import Output
 from gateway.outputs.lcm_output import LcmOutput
 from gateway.outputs.zenoh_output import ZenohOutput
 from gateway.rtc3d.components import BY_KEY, ComponentType
@@ -66,7 +67,8 @@ async def lab(scene: Scene, *streams: Stream) -> AsyncIterator[Lab]:
             lcm=LcmSettings(url=LCM_URL),
         )
         stop = asyncio.Event()
-        outputs = [zenoh_output := ZenohOutput(settings.zenoh), LcmOutput(settings.lcm)]
+        zenoh_output = ZenohOutput(settings.zenoh)
+        outputs: list[Output] = [zenoh_output, LcmOutput(settings.lcm)]
         gateway = asyncio.create_task(Gateway(settings, outputs).run(stop))
         running = Lab(simulator)
         await running.until(lambda: zenoh_output.session is not None)
