@@ -50,6 +50,7 @@ class Simulator:
         self.connections: set[Connection] = set()
         self.counts = SentCounts()
         """What was sent to all clients so far."""
+        self._dropped_before = 0  # by clients no longer connected
         self._event_bytes = event_bytes
         self._once = once
         self._builders: dict[frozenset[ComponentType], FrameBuilder] = {}
@@ -68,6 +69,11 @@ class Simulator:
     def frames_sent(self) -> int:
         """How many frames were sent to all clients so far."""
         return self.counts.frames
+
+    @property
+    def frames_dropped(self) -> int:
+        """How many frames clients missed so far because they did not read or the server was late."""
+        return self._dropped_before + sum(c.client.frames_dropped for c in self.connections)
 
     async def start(self) -> None:
         """Listen, and begin the measurement unless it waits for the first request.
@@ -161,6 +167,12 @@ class Simulator:
             self._builders[choice] = FrameBuilder(self.scene, components, self._event_bytes)
         return self._builders[choice]
 
+    def forget(self, connection: "Connection") -> None:
+        """Take a connection that has ended off the list."""
+        self.connections.discard(connection)
+        self._dropped_before += connection.client.frames_dropped
+        self.schedule()
+
     def schedule(self) -> None:
         """Set the timer to when the next frame is due to any client, or the pass ends."""
         if self._timer is not None:
@@ -253,8 +265,7 @@ class Connection(asyncio.Protocol):
         """See asyncio.Protocol."""
         _log.info("%s: disconnected%s", self.client.name, f" ({exc})" if exc else "")
         self._inbox.clear()
-        self._simulator.connections.discard(self)
-        self._simulator.schedule()
+        self._simulator.forget(self)
         self.closed.set_result(None)
 
     def pause_writing(self) -> None:

@@ -1,0 +1,280 @@
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, Items
+from gateway.simulator.synthetic import BUTTON_EVENT, SyntheticScene
+
+Floats = npt.NDArray[np.floating[Any]]
+
+RATE_HZ = 50.0
+MINUTE = np.arange(int(60 * RATE_HZ))
+NOISE_MM = 0.1
+
+
+@pytest.fixture(scope="module")
+def scene() -> SyntheticScene:
+    return SyntheticScene(
+        markers=23, tools=7, analog=5, plates=2, rate_hz=RATE_HZ, analog_rate_hz=500.0
+    )  # 5 bodies, two of them two tools, one of 7 markers
+
+
+def table(items: Items) -> Floats:
+    """The items' fields as a further axis, in the native byte order."""
+    values: Floats = items.view(">f4").reshape(*items.shape, -1).astype(np.float64)
+    return values
+
+
+def rotation(quaternion: Floats) -> Floats:
+    """Rotation matrices, shape (n, 3, 3), of quaternions (q0, qx, qy, qz), shape (n, 4)."""
+    w, x, y, z = quaternion.T
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.moveaxis(np.array(rows), 2, 0)
+
+
+def fitted(local_mm: Floats, measured_mm: Floats) -> tuple[Floats, Floats]:
+    """Least-squares rotation and translation that bring local onto measured (Kabsch), shape (markers, 3)."""
+    local_centre, centre = local_mm.mean(axis=0), measured_mm.mean(axis=0)
+    u, _, vt = np.linalg.svd((measured_mm - centre).T @ (local_mm - local_centre))
+    turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+    return turn, centre - turn @ local_centre
+
+
+def tool_and_markers(scene: SyntheticScene, tool: int) -> tuple[Floats, Floats]:
+    """A minute of the tool's item, (frames, 8), and of its markers' items, (frames, markers, 4)."""
+    tools, markers = scene.parameters.tools, scene.parameters.markers
+    assert tools is not None
+    assert markers is not None
+    ids = [marker.id for marker in markers.markers]
+    columns = [ids.index(marker_id) for marker_id in tools.tools[tool].marker_ids]
+    poses = table(scene.items(ComponentType.TOOLS, MINUTE))[:, tool]
+    return poses, table(scene.items(ComponentType.MARKERS, MINUTE))[:, columns]
+
+
+def local_mm_of(poses: Floats, markers: Floats) -> Floats:
+    """The markers in the tool's own coordinates, (frames, markers, 3)."""
+    from_origin = markers[..., :3] - poses[:, None, 4:7]
+    local_mm: Floats = np.einsum("tji,tmj->tmi", rotation(poses[:, :4]), from_origin)
+    return local_mm
+
+
+@pytest.mark.parametrize("tool", range(7))
+def test_a_tools_markers_are_rigid_in_its_own_coordinates(scene: SyntheticScene, tool: int) -> None:
+    poses, markers = tool_and_markers(scene, tool)
+    local_mm = local_mm_of(poses, markers)
+
+    assert np.nanstd(local_mm, axis=0) == pytest.approx(NOISE_MM, rel=0.15)
+    in_view = poses[~np.isnan(poses[:, 0])]
+    assert np.linalg.norm(in_view[:, :4], axis=1) == pytest.approx(1.0, abs=1e-6)
+    assert np.ptp(in_view[:, 4:7], axis=0).min() > 10  # mm: it moves
+    assert np.nanmax(np.abs(np.diff(poses[:, :4], axis=0))) < 0.1  # smoothly, at 50 Hz
+
+
+@pytest.mark.parametrize("tool", range(7))
+def test_a_fit_of_the_visible_markers_gives_the_tools_pose_and_error(
+    scene: SyntheticScene, tool: int
+) -> None:
+    poses, markers = tool_and_markers(scene, tool)
+    local_mm = np.nanmean(local_mm_of(poses, markers), axis=0)
+    for pose, measured in list(zip(poses, markers, strict=True))[::100]:
+        if np.isnan(pose[0]):
+            continue
+        visible = ~np.isnan(measured[:, 0])
+        turn, origin_mm = fitted(local_mm[visible], measured[visible, :3])
+        expected = rotation(pose[None, :4])[0]
+
+        assert origin_mm == pytest.approx(pose[4:7], abs=5 * NOISE_MM)
+        assert turn == pytest.approx(expected, abs=0.01)
+        off_mm = measured[visible, :3] - (local_mm[visible] @ expected.T + pose[4:7])
+        assert pose[7] == pytest.approx(np.sqrt(np.mean(np.sum(off_mm**2, axis=1))), abs=0.02)
+
+
+def test_a_tool_is_out_of_view_exactly_when_fewer_than_three_of_its_markers_are_visible(
+    scene: SyntheticScene,
+) -> None:
+    for tool in range(7):
+        poses, markers = tool_and_markers(scene, tool)
+        num_visible = np.sum(~np.isnan(markers[..., 0]), axis=1)
+        assert np.array_equal(np.isnan(poses[:, 0]), num_visible < 3)
+
+
+def test_markers_are_out_of_view_now_and_then_and_tools_too(scene: SyntheticScene) -> None:
+    for component in (ComponentType.MARKERS, ComponentType.TOOLS):
+        missing = np.isnan(table(scene.items(component, MINUTE))[..., 0])
+        assert 0.005 < missing.mean() < 0.15
+        assert np.any(missing, axis=0).all()
+        assert not np.all(missing, axis=0).any()
+
+
+def test_what_is_missing_has_the_bytes_of_the_specification(scene: SyntheticScene) -> None:
+    markers = scene.items(ComponentType.MARKERS, MINUTE)
+    tools = scene.items(ComponentType.TOOLS, MINUTE)
+
+    missing_markers = {item.tobytes() for item in markers[np.isnan(markers["x"])]}
+    assert missing_markers == {b"\xff" * 12 + bytes.fromhex("4479C000")}  # 999.0
+    assert {item.tobytes() for item in tools[np.isnan(tools["x"])]} == {b"\xff" * 32}
+
+
+def test_visible_markers_have_a_small_residual(scene: SyntheticScene) -> None:
+    markers = scene.items(ComponentType.MARKERS, MINUTE)
+    residuals = markers["reliability"][~np.isnan(markers["x"])]
+
+    assert np.all(residuals >= 0)
+    assert residuals.max() < 1.0
+
+
+@settings(deadline=None)
+@given(first=st.integers(0, 10**9), cut=st.integers(0, 40))
+def test_a_sample_is_the_same_whatever_it_is_asked_for_with(first: int, cut: int) -> None:
+    scene = SyntheticScene(markers=100, tools=10, analog=3, plates=2)
+    samples = np.arange(first, first + 40)
+    for component in scene.rates_hz:
+        whole = scene.items(component, samples)
+        parts = scene.items(component, samples[:cut]), scene.items(component, samples[cut:])
+        assert b"".join(part.tobytes() for part in parts) == whole.tobytes()
+
+
+def test_channels_are_sines_of_different_frequencies(scene: SyntheticScene) -> None:
+    voltages = table(scene.items(ComponentType.ANALOG, np.arange(10_000)))[..., 0]  # 20 s at 500 Hz
+
+    spectrum = np.abs(np.fft.rfft(voltages, axis=0))
+    assert (np.argmax(spectrum, axis=0) / 20).tolist() == [0.5, 1.25, 2.0, 2.75, 3.5]
+    assert np.all(np.max(np.abs(voltages), axis=0) > 100)  # mV
+
+
+def steps_on(scene: SyntheticScene, plate: int) -> list[Floats]:
+    """The force items, (samples, 6), of each whole step on the plate in 6 s."""
+    forces = table(scene.items(ComponentType.FORCE, np.arange(3000)))[:, plate]
+    edges = np.flatnonzero(np.diff((forces[:, 2] > 30).astype(int)))
+    return [forces[a + 1 : b] for a, b in pairwise(edges) if forces[a + 1, 2] > 30]
+
+
+@pytest.mark.parametrize("plate", [0, 1])
+def test_a_step_has_two_humps_of_about_the_bodys_weight(scene: SyntheticScene, plate: int) -> None:
+    steps = steps_on(scene, plate)
+
+    assert len(steps) >= 3
+    for step in steps:
+        third = len(step) // 3
+        early, middle, late = (
+            np.max(step[:third, 2]),
+            np.min(step[third:-third, 2]),
+            np.max(step[-third:, 2]),
+        )
+        assert 800 < early < 950
+        assert 800 < late < 950
+        assert 500 < middle < 700
+
+
+@pytest.mark.parametrize("plate", [0, 1])
+def test_moments_put_the_centre_of_pressure_on_the_plate_from_heel_to_toe(
+    scene: SyntheticScene, plate: int
+) -> None:
+    force = scene.parameters.force
+    assert force is not None
+    described = force.plates[plate]
+    assert {channel.unit for channel in described.channels[3:]} == {"Nm"}
+    half_x_mm = (described.corners[1].x - described.corners[0].x) / 2
+    half_y_mm = (described.corners[2].y - described.corners[1].y) / 2
+    for step in steps_on(scene, plate):
+        fx, fy, fz, mx, my, mz = step.T
+        x_mm, y_mm = -1000 * my / fz, 1000 * mx / fz
+        assert np.all(np.abs(x_mm) < half_x_mm)
+        assert np.all(np.abs(y_mm) < half_y_mm)
+        assert np.all(np.diff(y_mm) > 0)
+        assert y_mm[-1] - y_mm[0] > 150
+        free_moment_nm = mz - (x_mm * fy - y_mm * fx) / 1000
+        assert np.max(np.abs(free_moment_nm)) == pytest.approx(3.0, abs=0.05)
+
+
+def test_nobody_stands_on_a_plate_between_steps(scene: SyntheticScene) -> None:
+    fz = table(scene.items(ComponentType.FORCE, np.arange(3000)))[..., 2]
+
+    assert np.mean(np.abs(fz) < 5) == pytest.approx(0.4, abs=0.05)
+
+
+def test_a_button_is_pressed_and_released_every_second(scene: SyntheticScene) -> None:
+    events = scene.events(0, 3_000_000)
+
+    assert [tuple(event) for event in events.tolist()] == [
+        (BUTTON_EVENT, 500_000, 1, 1, -1),
+        (BUTTON_EVENT, 800_000, 1, 0, -1),
+        (BUTTON_EVENT, 1_500_000, 2, 1, -1),
+        (BUTTON_EVENT, 1_800_000, 2, 0, -1),
+        (BUTTON_EVENT, 2_500_000, 1, 1, -1),
+        (BUTTON_EVENT, 2_800_000, 1, 0, -1),
+    ]
+    assert scene.parameters.events is not None
+    assert [int(event.id, 0) for event in scene.parameters.events.events] == [BUTTON_EVENT]
+
+
+@given(
+    times_us=st.lists(st.integers(0, 50).map(lambda tenths: 100_000 * tenths), min_size=2, max_size=6).map(
+        sorted
+    )
+)
+def test_events_are_the_same_whatever_the_times_they_are_asked_between(times_us: list[int]) -> None:
+    scene = SyntheticScene(markers=0, tools=0, analog=0, plates=0)
+
+    parts = [scene.events(a, b).tolist() for a, b in pairwise(times_us)]
+
+    whole = scene.events(times_us[0], times_us[-1]).tolist()
+    assert [event for part in parts for event in part] == whole
+    assert all(times_us[0] <= event[1] < times_us[-1] for event in whole)
+
+
+@settings(deadline=None, max_examples=50)
+@given(
+    markers=st.integers(0, 30),
+    tools=st.integers(0, 12),
+    analog=st.integers(0, 5),
+    plates=st.integers(0, 3),
+    seed=st.integers(0, 99),
+)
+def test_any_size_gives_what_its_parameters_describe(
+    markers: int, tools: int, analog: int, plates: int, seed: int
+) -> None:
+    scene = SyntheticScene(markers=markers, tools=tools, analog=analog, plates=plates, seed=seed)
+    described = scene.parameters
+    assert described.markers is not None
+    assert described.tools is not None
+    assert described.analog is not None
+    assert described.force is not None
+    counts = {
+        ComponentType.MARKERS: len(described.markers.markers),
+        ComponentType.TOOLS: len(described.tools.tools),
+        ComponentType.ANALOG: len(described.analog.channels),
+        ComponentType.FORCE: len(described.force.plates),
+    }
+
+    assert list(counts.values()) == [markers, tools, analog, plates]
+    assert set(scene.rates_hz) == {component for component, count in counts.items() if count}
+    for component in scene.rates_hz:
+        items = scene.items(component, np.arange(5, 12))
+        assert items.shape == (7, counts[component])
+        assert items.dtype == ITEM_DTYPES[component]
+    known = {marker.id for marker in described.markers.markers}
+    assert all(known.issuperset(tool.marker_ids) for tool in described.tools.tools)
+
+
+def test_labels_are_what_people_read() -> None:
+    parameters = SyntheticScene(markers=2, tools=1, analog=1, plates=1).parameters
+
+    assert parameters.markers is not None
+    assert parameters.tools is not None
+    assert parameters.analog is not None
+    assert parameters.force is not None
+    assert [marker.label for marker in parameters.markers.markers] == ["Marker 1", "Marker 2"]
+    assert parameters.tools.tools[0].label == "Tool 1"
+    assert parameters.tools.tools[0].marker_ids == ("1", "2")
+    assert parameters.analog.channels[0].label == "Analog 1"
+    assert parameters.force.plates[0].label == "Force plate 1"

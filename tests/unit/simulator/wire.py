@@ -1,0 +1,57 @@
+"""RTC3D as a client sees it, packed and read with struct from the specification's tables alone."""
+
+import struct
+from typing import Literal, NamedTuple
+
+ByteOrder = Literal["big", "little"]
+ERROR, COMMAND, XML, DATA, NO_DATA = range(5)
+MARKERS, ANALOG, FORCE, TOOLS, EVENT = range(1, 6)
+
+_ITEMS = {MARKERS: "4f", ANALOG: "f", FORCE: "6f", TOOLS: "8f", EVENT: "iqiii"}
+_SHORT_EVENT = "iiii"
+
+
+class Part(NamedTuple):
+    """One component of a frame."""
+
+    type: int
+    frame_number: int
+    timestamp_us: int
+    items: list[tuple[float, ...]]
+
+
+def packet(packet_type: int, body: bytes = b"") -> bytes:
+    """§4.1: size of the whole packet, type, body."""
+    return struct.pack(">II", 8 + len(body), packet_type) + body
+
+
+def command(text: str) -> bytes:
+    """§5.1: a command as a packet of type 1."""
+    return packet(COMMAND, text.encode("ascii"))
+
+
+def cut(stream: bytes) -> list[tuple[int, bytes]]:
+    """Return the packets (type, body) of a byte stream that must hold whole packets only."""
+    packets = []
+    while stream:
+        size, packet_type = struct.unpack_from(">II", stream)
+        assert 8 <= size <= len(stream), "half a packet"
+        packets.append((packet_type, stream[8:size]))
+        stream = stream[size:]
+    return packets
+
+
+def frame_of(body: bytes, byte_order: ByteOrder = "big", *, event_bytes: int = 24) -> list[Part]:
+    """§7.1: return the components of a data frame's body, all of whose sizes and counts must agree."""
+    sign = ">" if byte_order == "big" else "<"
+    (component_count,) = struct.unpack_from(sign + "I", body)
+    start, parts = 4, []
+    for _ in range(component_count):
+        size, kind, number, timestamp_us, count = struct.unpack_from(sign + "IIiqI", body, start)
+        item = sign + (_SHORT_EVENT if kind == EVENT and event_bytes == 16 else _ITEMS[kind])
+        data = body[start + 24 : start + size]
+        assert len(data) == count * struct.calcsize(item), "size and count disagree"
+        parts.append(Part(kind, number, timestamp_us, list(struct.iter_unpack(item, data))))
+        start += size
+    assert start == len(body), "bytes after the last component"
+    return parts
