@@ -14,6 +14,7 @@ from pydantic import AfterValidator, Field, ValidationError, field_validator, mo
 
 from gateway.config_section import Section, accepts, mistake
 from gateway.config_values import (
+    Backlog,
     ByteLimit,
     ChannelPrefix,
     Components,
@@ -21,6 +22,8 @@ from gateway.config_values import (
     Host,
     KeyPrefix,
     LcmUrl,
+    MaxRates,
+    Milliseconds,
     Port,
     Seconds,
     ServerByteOrder,
@@ -48,6 +51,15 @@ class Stream(Section):
 
     rate: StreamRate = AllFrames()
     """How often: all, {frequency_hz: NUMBER} or {divisor: WHOLE NUMBER} (§5.3.5)."""
+
+    backlog: Backlog = "latest"
+    """While frames come late: publish the newest only, or all of them. Events are never skipped."""
+
+    on_demand: Switch = False
+    """Whether the stream runs only while somebody listens; with LCM on, somebody always may."""
+
+    idle_after_s: Seconds = 5.0
+    """How long nobody must have listened before an on-demand stream is stopped."""
 
 
 class Reconnect(Section):
@@ -100,6 +112,9 @@ class Source(Section):
 
     stall_timeout_s: Seconds = 3.0
     """How long a stream may be silent while a measurement runs."""
+
+    max_lag_ms: Milliseconds = 50.0
+    """How late frames may come before less is asked of the server."""
 
     max_packet_bytes: ByteLimit = DEFAULT_MAX_PACKET_BYTES
     """The largest packet that is believed; C3D files have a limit of their own."""
@@ -159,6 +174,9 @@ class ZenohSettings(Section):
     express: Switch = False
     """Whether each message is sent at once instead of in batches."""
 
+    max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
+    """The highest rate of each component named; frames beyond it are left out, evenly."""
+
     tool_poses: Switch = False
     """Whether each tool's pose is published on a key of its own, while someone listens."""
 
@@ -174,6 +192,9 @@ class LcmSettings(Section):
 
     url: LcmUrl | None = None
     """Where to publish; see ``effective_url`` for none."""
+
+    max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
+    """The highest rate of each component named; frames beyond it are left out, evenly."""
 
     tool_poses: Switch = False
     """Whether each tool's pose is published on a channel of its own."""

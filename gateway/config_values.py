@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal, TypeVar
 
 import zenoh
-from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, ValidationInfo
+from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, TypeAdapter, ValidationInfo
 
 from gateway.config_section import Section, accepts, did_you_mean, mistake, one_of, shown
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
@@ -60,6 +60,11 @@ Seconds = Annotated[
     float,
     Field(strict=True, ge=0.001, le=86400, allow_inf_nan=False),
     accepts("a number of seconds from 0.001 to 86400"),
+]
+Milliseconds = Annotated[
+    float,
+    Field(strict=True, ge=1, le=60_000, allow_inf_nan=False),
+    accepts("a number of milliseconds from 1 to 60000"),
 ]
 Hertz = Annotated[
     float,
@@ -218,9 +223,34 @@ StreamRate = Annotated[
 ]
 """YAML: all, {frequency_hz: NUMBER} or {divisor: WHOLE NUMBER}."""
 
+Backlog = Annotated[Literal["latest", "all"], accepts("latest or all")]
+
 ServerByteOrder = Annotated[ByteOrder, accepts("big or little")]
 
 ZenohConfig = Annotated[
     Path | dict[str, Any], PlainValidator(_zenoh_config, json_schema_input_type=str | dict[str, Any])
 ]
 """YAML: a path, or a mapping."""
+
+_RATES: Final = TypeAdapter(dict[str, Hertz])
+
+
+def _max_rates(value: object) -> dict[ComponentType, float]:
+    if not isinstance(value, dict):
+        raise mistake(f"found {shown(value)}; accepted is a mapping such as {{3d: 60}}, or {{}}")
+    rates = {}
+    for key, rate in value.items():
+        if key not in BY_KEY and not isinstance(key, ComponentType):
+            meant = did_you_mean(key, _COMPONENT_KEYS)
+            raise mistake(f"found {shown(key)}{meant}; accepted is {one_of(_COMPONENT_KEYS)}")
+        component = key if isinstance(key, ComponentType) else BY_KEY[key]
+        rates[component] = _RATES.validate_python({component.key: rate})[component.key]
+    return rates
+
+
+MaxRates = Annotated[
+    dict[ComponentType, float],
+    PlainValidator(_max_rates, json_schema_input_type=dict[Literal["3d", "6d", "analog", "force"], float]),
+    PlainSerializer(lambda rates: {component.key: rate for component, rate in rates.items()}),
+]
+"""YAML: {3d: NUMBER, …}."""

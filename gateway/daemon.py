@@ -15,6 +15,8 @@ from gateway.source_gateway import SourceGateway
 from gateway.spool import Spool
 
 _STATUS_PERIOD_S: Final = 1.0
+_OPENING_S: Final = 2.0
+_OPENING_POLL_S: Final = 0.02
 
 logger = logging.getLogger(__name__)
 
@@ -65,6 +67,7 @@ class Gateway:
         for output in self._outputs:
             output.start()
         try:
+            await self._outputs_open()
             async with asyncio.TaskGroup() as tasks:
                 running = [
                     tasks.create_task(supervisor.run())
@@ -83,6 +86,14 @@ class Gateway:
                 await queries.close()
             for output in self._outputs:
                 output.close()
+
+    async def _outputs_open(self) -> None:
+        """Wait until frames can go out, but not for long: one side may be away while the other works."""
+        deadline_s = asyncio.get_running_loop().time() + _OPENING_S
+        while asyncio.get_running_loop().time() < deadline_s:
+            if all(output.health().connected for output in self._outputs):
+                return
+            await asyncio.sleep(_OPENING_POLL_S)
 
     async def _keep_status(self) -> None:
         while True:

@@ -18,6 +18,7 @@ MESSAGE_TYPES_BY_NAME: Final[dict[str, type[Any]]] = {
         rtc3d.events_t,
         rtc3d.tool_pose_t,
         rtc3d.status_t,
+        rtc3d.clock_t,
     )
 }
 """The types of all messages that the gateway publishes."""
@@ -60,6 +61,8 @@ def one_line(message: Any) -> str:
     """Return what a person wants to see first of a decoded message."""
     if isinstance(message, rtc3d.status_t):
         return _status_line(message)
+    if isinstance(message, rtc3d.clock_t):
+        return f"#{message.sequence} {_clock_text(message.clock)} ({message.components})"
     text = _contents(message)
     return f"#{message.sequence} frame {message.frame_number} at {message.timestamp / 1e6:.4f} s: {text}"
 
@@ -93,6 +96,12 @@ def _positions(items: Sequence[Any]) -> str:
     seen = [(item.x, item.y, item.z) for item in items if not math.isnan(item.x)]
     first = f", the first seen at {_numbers(seen[0])}" if seen else ""
     return f"{len(items) - len(seen)} missing{first}"
+
+
+def _clock_text(clock: Any) -> str:
+    if not clock.has_clock:
+        return "the server's time stamps make no clock"
+    return f"offset {clock.offset_us} µs, drift {clock.drift_ppm:.1f} ppm, ± {clock.uncertainty_us:.0f} µs"
 
 
 def _numbers(values: Sequence[float]) -> str:

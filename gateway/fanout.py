@@ -1,8 +1,7 @@
 """From one source's frames to every output: splice each component once, hand it to all."""
 
 import logging
-from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Final
 
 import rtc3d
@@ -12,6 +11,7 @@ from gateway.log import FailureLog
 from gateway.message import MESSAGE_TYPES, Stamp, metres_per_unit, splice, tool_poses, type_name
 from gateway.names import MAX_LABEL_LENGTH, Topic, unique_name
 from gateway.outputs.contract import Output, Publisher
+from gateway.pacing import Pacer
 from gateway.rtc3d.components import Component, ComponentType, Frame
 from gateway.rtc3d.parameters import Parameters
 from gateway.status import OutputStatus
@@ -48,6 +48,18 @@ class _Way:
         self._failures.failed(text)
 
 
+class _Lane:
+    """One component on its way to one output: paced, and numbered by itself."""
+
+    def __init__(self, way: _Way, component: ComponentType, topic: Topic) -> None:
+        self.way = way
+        self.publisher = way.output.publisher(topic)
+        max_rate_hz = way.output.max_rate_hz.get(component)
+        # Events are never skipped.
+        self.pacer = None if max_rate_hz is None or component is ComponentType.EVENT else Pacer(max_rate_hz)
+        self.sequence = 0
+
+
 _Sending = list[tuple[_Way, Publisher]]
 
 
@@ -56,19 +68,34 @@ def _declare(ways: Iterable[_Way], topic: Topic) -> _Sending:
 
 
 class FanOut:
-    """Publishes what one source sends. ``tool_outputs`` are the names of outputs with a key per tool."""
+    """Publishes what one source sends. ``tool_outputs`` are the names of outputs with a key per tool.
 
-    def __init__(self, source: str, outputs: Sequence[Output], tool_outputs: Collection[str] = ()) -> None:
+    ``on_layout`` is called when the number of markers, tools, channels or plates changes.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        outputs: Sequence[Output],
+        tool_outputs: Collection[str] = (),
+        on_layout: Callable[[], None] = lambda: None,
+    ) -> None:
         self._ways = [_Way(source, output) for output in outputs]
-        self._publishers = {
-            component: _declare(self._ways, Topic(source, (component.key,), type_name(message_type)))
+        self._lanes = {
+            component: [
+                _Lane(way, component, Topic(source, (component.key,), type_name(message_type)))
+                for way in self._ways
+            ]
             for component, message_type in MESSAGE_TYPES.items()
         }
         self._status_publishers = _declare(self._ways, Topic(source, ("status",), "rtc3d.status_t"))
+        self._clock_publishers = _declare(self._ways, Topic(source, ("clock",), "rtc3d.clock_t"))
         self.newest: dict[ComponentType, bytes] = {}
         """The newest message of each component."""
-        self._sequences: Counter[ComponentType | str] = Counter()
+        self._num_items: dict[ComponentType, int] = {}
+        self._on_layout = on_layout
         self._tools = _ToolPoses(source, [way for way in self._ways if way.output.name in tool_outputs])
+        self._source = source
         for output in outputs:
             output.announce(source)
 
@@ -78,29 +105,56 @@ class FanOut:
         return [(way.output, way.status) for way in self._ways]
 
     def publish(self, frame: Frame, stamp: Stamp, wanted: Collection[ComponentType]) -> None:
-        """Publish the frame's components that are ``wanted``; never raises for an output's sake."""
+        """Publish the frame's components that are ``wanted``; never raises for an output's sake.
+
+        An output that paces a component leaves frames out; its messages are numbered by themselves.
+        """
         for component in frame.components:
             kind = component.type
             if kind not in wanted:
                 continue
-            sequence = self._sequences[kind]
-            self._sequences[kind] = sequence + 1
-            message = splice(component, stamp, sequence)
-            self.newest[kind] = message
-            for way, publisher in self._publishers[kind]:
-                way.send(publisher, kind.key, message)
+            message = None
+            sequence = -1
+            for lane in self._lanes[kind]:
+                if lane.pacer is not None and not lane.pacer.due(component.timestamp_us, stamp.utime):
+                    continue
+                if message is None or sequence != lane.sequence:
+                    sequence = lane.sequence
+                    message = splice(component, stamp, sequence)
+                lane.sequence += 1
+                lane.way.send(lane.publisher, kind.key, message)
+            if message is not None:
+                self.newest[kind] = message
             if kind is ComponentType.TOOLS:
                 self._tools.publish(component, stamp)
+            if kind is not ComponentType.EVENT and component.num_items != self._num_items.get(kind):
+                self._note_layout(kind, component.num_items)
+
+    def _note_layout(self, kind: ComponentType, num_items: int) -> None:
+        before = self._num_items.get(kind)
+        self._num_items[kind] = num_items
+        if before is not None:
+            logger.info("%s: %s has %d items now, %d before", self._source, kind.key, num_items, before)
+            self._on_layout()
+
+    def listened(self, components: Collection[ComponentType]) -> bool:
+        """Return whether anybody may be listening to one of the components on one of the outputs."""
+        return any(lane.publisher.wanted for kind in components for lane in self._lanes[kind])
+
+    def show_flowing(self, flowing: bool) -> None:
+        """Show on every output that can whether frames of the source flow."""
+        for way in self._ways:
+            way.output.show_flowing(self._source, flowing)
 
     def publish_status(self, message: bytes) -> None:
         """Publish an encoded ``status_t``."""
         for way, publisher in self._status_publishers:
             way.send(publisher, "status", message)
 
-    def next_status_sequence(self) -> int:
-        """Return the sequence number of the next status message."""
-        self._sequences["status"] += 1
-        return self._sequences["status"] - 1
+    def publish_clock(self, message: bytes) -> None:
+        """Publish an encoded ``clock_t``."""
+        for way, publisher in self._clock_publishers:
+            way.send(publisher, "clock", message)
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Take the tools' labels (§6.3) and the unit of length (§6.2) for the messages per tool."""

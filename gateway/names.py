@@ -62,4 +62,4 @@ def unique_name(name: str, taken: Container[str], max_length: int = MAX_CHANNEL_
 
 
 def _channel_part(text: str) -> str:
-    return re.sub(r"[^A-Z0-9]+", "_", text.upper(), flags=re.ASCII).strip("_") or "_"
+    return re.sub(r"[^A-Z0-9]+", "_", text.upper()).strip("_") or "_"

@@ -1,9 +1,19 @@
-"""Which rate is asked of a server, and what is asked when it refuses."""
+"""Which rate is asked of a server: what is asked when it refuses, and less while frames come late."""
 
 from collections.abc import Sequence
+from typing import Final
 
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate, StreamFrames
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+
+BEHIND_S: Final = 1.0
+"""How long frames must be late without a break before less is asked for."""
+
+FIRST_WAIT_S: Final = 10.0
+MAX_WAIT_S: Final = 300.0
+"""How long frames must be in time before more is asked for: at first, and at most."""
+
+MAX_HALVINGS: Final = 8
 
 
 def stream_requests(
@@ -23,3 +33,69 @@ def stream_requests(
         rates.append(FrequencyDivisor(max(1, round(server_rate_hz / rate.hz))))
     wanted = [StreamFrames(rate, names), *(StreamFrames(each) for each in rates), StreamFrames()]
     return list(dict.fromkeys(wanted))
+
+
+def halved(rate: Rate | None, times: int) -> Rate | None:
+    """Return ``rate`` halved so many times; None, a server's default, counts as all frames."""
+    if times == 0:
+        return rate
+    match rate:
+        case Frequency(hz):
+            return Frequency(hz / 2**times)
+        case FrequencyDivisor(divisor):
+            return FrequencyDivisor(divisor * 2**times)
+        case _:
+            return FrequencyDivisor(2**times)
+
+
+class LagControl:
+    """Decides how often the configured rate is halved, from how late the frames are.
+
+    Late for BEHIND_S: halve once more. In time for ``wait_s``: one halving less, never above what was
+    configured. A step up that is taken back within its own wait has failed: the next wait is twice as
+    long, up to MAX_WAIT_S; one that holds makes it FIRST_WAIT_S again. So a link that carries half the
+    rate is not tried to death.
+    """
+
+    def __init__(self, max_lag_s: float) -> None:
+        self._max_lag_s = max_lag_s
+        self.halvings = 0
+        self.behind = False
+        """Whether the newest frame was late."""
+        self.wait_s = FIRST_WAIT_S
+        self._since_s: float | None = None  # of being behind, or in time, without a break
+        self._stepped_up_s: float | None = None
+
+    def observe(self, now_s: float, lag_s: float) -> bool:
+        """Take one frame's lateness; return whether ``halvings`` changed."""
+        behind = lag_s > self._max_lag_s
+        if behind is not self.behind or self._since_s is None:
+            self.behind = behind
+            self._since_s = now_s
+            return False
+        held_s = now_s - self._since_s
+        if behind:
+            return held_s >= BEHIND_S and self._step_down(now_s)
+        return held_s >= self.wait_s and self.halvings > 0 and self._step_up(now_s)
+
+    def restart(self) -> None:
+        """Forget how late frames were: what comes next is no continuation of what came before."""
+        self.behind = False
+        self._since_s = None
+
+    def _step_down(self, now_s: float) -> bool:
+        if self.halvings >= MAX_HALVINGS:
+            return False
+        if self._stepped_up_s is not None:
+            failed = now_s - self._stepped_up_s < self.wait_s
+            self.wait_s = min(2 * self.wait_s, MAX_WAIT_S) if failed else FIRST_WAIT_S
+            self._stepped_up_s = None
+        self.halvings += 1
+        self._since_s = now_s
+        return True
+
+    def _step_up(self, now_s: float) -> bool:
+        self.halvings -= 1
+        self._stepped_up_s = now_s
+        self._since_s = now_s
+        return True

@@ -12,14 +12,12 @@ from gateway.errors import (
     ClosedError,
     ConnectError,
     LinkError,
-    ParametersError,
     ReplyTimeoutError,
     ServerError,
     SilenceError,
 )
 from gateway.log import FailureLog
-from gateway.rate import stream_requests
-from gateway.rtc3d.commands import Bye, Command, SendParameters, SetByteOrder, Version
+from gateway.rtc3d.commands import Bye, Command, Version
 from gateway.rtc3d.components import ComponentType, Frame
 from gateway.rtc3d.connection import (
     Answered,
@@ -34,12 +32,19 @@ from gateway.rtc3d.connection import (
     Stray,
 )
 from gateway.rtc3d.packets import Packet, text_of
-from gateway.rtc3d.parameters import Parameters
-from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
+from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.status import StreamStatus, now_utime
+from gateway.stream_state import StreamInput
 
 _BYE_S: Final = 0.5
 """How long a server may take to close after Bye; some never do (field note 10)."""
+
+_INPUTS: Final = {
+    State.STREAMING: StreamInput.FRAME,
+    State.NO_MEASUREMENT: StreamInput.NO_DATA,
+    State.IDLE: StreamInput.STOPPED,
+}
+"""What a change of the connection's state means to the stream."""
 
 logger = logging.getLogger(__name__)
 
@@ -47,18 +52,16 @@ logger = logging.getLogger(__name__)
 class Handlers(NamedTuple):
     """Who takes what a session receives. Called from the event loop; they must not wait."""
 
-    frame: Callable[[Frame, int], None]
-    """The frame, and the host's time at which it came, in µs since the Unix epoch."""
+    frames: Callable[[list[Frame], int], None]
+    """Frames that came together, oldest first, and the host's time of it in µs since the Unix epoch."""
     parameters: Callable[[bytes, ParsedParameters], None]
     """The server's XML as it came, and what it says."""
-    connected: Callable[[], None]
-    """The handshake is done."""
     file: Callable[[bytes], None]
     """A complete C3D file."""
 
 
 class Session(asyncio.Protocol):
-    """One connection of one stream: ``connect``, ``start_stream``, ``ended``, ``close``, in this order.
+    """One connection of one stream: ``connect``, ``ask``, ``ended``, ``close``, in this order.
 
     It keeps ``status`` up to date. Every method that waits raises LinkError once the connection is of
     no more use, always with the first reason.
@@ -68,9 +71,9 @@ class Session(asyncio.Protocol):
         self._source = source
         self._stream = stream
         self._status = status
-        self._handlers = handlers
+        self.handlers = handlers
         self._connection = Connection(source.max_packet_bytes, source.max_c3d_bytes)
-        self._state = State.IDLE
+        self._seen = State.IDLE  # of the connection
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
         self._ended: asyncio.Future[None] = self._loop.create_future()
@@ -80,19 +83,16 @@ class Session(asyncio.Protocol):
         self._asking = asyncio.Lock()
         self._last_frame_s = 0.0
         self._rejected = FailureLog(logger, source.name)
-        self._unknown_types: set[int] = set()
         self.server = f"{source.host}:{source.port}"
-        self.ready = False
-        """Whether questions may be asked: after the handshake, before the end."""
 
     @property
-    def delivered(self) -> bool:
-        """Whether the server came as far as frames, or as saying that no measurement runs."""
-        return self._state in {State.STREAMING, State.NO_MEASUREMENT}
+    def is_open(self) -> bool:
+        """Whether the connection is there and of use."""
+        return self._transport is not None and self._error is None
 
     async def connect(self) -> None:
         """Connect; raises ConnectError with the reason and what to look at."""
-        self._status.state = "connecting"
+        self._status.move(StreamInput.DIAL, self.server)
         try:
             async with asyncio.timeout(self._source.connect_timeout_s):
                 await self._loop.create_connection(lambda: self, self._source.host, self._source.port)
@@ -107,69 +107,8 @@ class Session(asyncio.Protocol):
             ) from error
         except OSError as error:
             raise ConnectError(_connect_text(self.server, error)) from error
-
-    async def start_stream(self) -> None:
-        """Shake hands (§5.3.1 to §5.3.5) and ask for frames.
-
-        What the server refuses or does not answer is noted in the status as a limitation and done
-        without (field note 2). Raises LinkError if it refuses to stream in every form.
-        """
-        self._status.state = "handshaking"
-        self._status.limitations.clear()
-        self._status.byte_order = self._status.rate = ""
-        self._status.session += 1
-        await self._try(Version())
-        if self._source.byte_order == "little":
-            await self._try(SetByteOrder("little"))
-        parameters = await self._fetch_parameters()
-        frequency_hz = None
-        if parameters is not None and parameters.markers is not None:
-            frequency_hz = parameters.markers.frequency_hz
-        for request in stream_requests(self._stream.rate, self._stream.components, frequency_hz):
-            self._last_frame_s = self._loop.time()
-            try:
-                await self.ask(request)
-            except ServerError as error:
-                self._limit(f"the server refused {request}: {error}")
-                continue
-            except ReplyTimeoutError:
-                self._limit(f"the server did not acknowledge {request}")
-            self._status.rate = "" if request.rate is None else str(request.rate)
-            self.ready = True
-            self._handlers.connected()
-            return
-        raise LinkError(
-            f"{self.server} refuses to stream in every form that the protocol has; "
-            "check its real-time output settings"
-        )
-
-    async def _fetch_parameters(self) -> Parameters | None:
-        packet = await self._try(SendParameters())
-        if packet is None:
-            return None
-        try:
-            parsed = parse_parameters(packet.body)
-        except ParametersError as error:
-            self._limit(f"no parameters: {error}")
-            return None
-        for text in parsed.recovered:
-            logger.info("%s: parameters repaired: %s", self._source.name, text)
-        self._handlers.parameters(packet.body, parsed)
-        return parsed.parameters
-
-    async def _try(self, command: Command) -> Packet | None:
-        """Return the answer; None if the server refused the command or did not answer it."""
-        try:
-            return await self.ask(command)
-        except ServerError as error:
-            self._limit(f"the server refused {command}: {error}")
-        except ReplyTimeoutError:
-            self._limit(f"the server did not answer {command}")
-        return None
-
-    def _limit(self, text: str) -> None:
-        self._status.limitations.append(text)
-        logger.warning("%s: %s", self._source.name, text)
+        self._last_frame_s = self._loop.time()
+        self._status.move(StreamInput.CONNECTED, self.server)
 
     async def ask(self, command: Command) -> Packet:
         """Send ``command`` and return the packet that answers it; one command at a time.
@@ -226,11 +165,10 @@ class Session(asyncio.Protocol):
         Otherwise a harmless question shows whether the server is there: any answer will do.
         """
         only_events = set(self._stream.components) == {ComponentType.EVENT}
-        if self._state is State.STREAMING and not only_events:
-            raise SilenceError(
-                f"no frame from {self.server} for {self._source.stall_timeout_s:g} s "
-                "although a measurement runs; connecting again"
-            )
+        if self._seen is State.STREAMING and not only_events:
+            text = f"no frame from {self.server} for {self._source.stall_timeout_s:g} s"
+            self._status.move(StreamInput.SILENCE, text)
+            raise SilenceError(f"{text} although a measurement runs; connecting again")
         try:
             await self.ask(Version())
         except ServerError:
@@ -241,11 +179,11 @@ class Session(asyncio.Protocol):
 
     async def close(self) -> None:
         """Say Bye, and end the connection at the latest half a second later."""
-        self.ready = False
         if self._transport is None:
             return
         if self._error is None:
             self._connection.send(Bye())
+            self._error = ClosedError(f"the connection to {self.server} was closed by the gateway")
             self._flush()
             # The rest of the stream is read on: closing with data unread would reset the connection,
             # and the server might never see the Bye.
@@ -267,19 +205,18 @@ class Session(asyncio.Protocol):
     def data_received(self, data: bytes) -> None:
         """Take bytes; the straight path from here to the outputs is calls, not tasks."""
         utime = now_utime()
-        status = self._status
-        status.bytes_in += len(data)
+        self._status.bytes_in += len(data)
+        frames: list[Frame] = []
         for event in self._connection.receive(data):
             if type(event) is Frame:
-                status.frames_in += 1
-                self._last_frame_s = self._loop.time()
-                if event.unknown_types:
-                    self._note_unknown(event.unknown_types)
-                self._handlers.frame(event, utime)
+                frames.append(event)
             else:
                 self._on_event(event)
-        if self._connection.state is not self._state:
+        if self._connection.state is not self._seen:
             self._on_state()
+        if frames:
+            self._last_frame_s = self._loop.time()
+            self.handlers.frames(frames, utime)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Note the end, whoever caused it."""
@@ -289,11 +226,11 @@ class Session(asyncio.Protocol):
         self._lost.set()
 
     def _on_state(self) -> None:
-        self._state = self._connection.state
-        if self._state in {State.STREAMING, State.NO_MEASUREMENT, State.IDLE}:
-            self._status.state = self._state.value
-            self._status.byte_order = self._connection.byte_order or ""
-            self._last_frame_s = self._loop.time()
+        self._seen = self._connection.state
+        self._last_frame_s = self._loop.time()
+        self._status.byte_order = self._connection.byte_order or ""
+        if self._seen in _INPUTS:
+            self._status.move(_INPUTS[self._seen], self.server)
 
     def _on_event(self, event: Event) -> None:
         match event:
@@ -308,9 +245,11 @@ class Session(asyncio.Protocol):
                 self._status.note_error(f"frame rejected: {frame_error}")
                 self._rejected.failed(f"frame rejected: {frame_error}")
             case FileReceived(content):
-                self._handlers.file(content)
+                self.handlers.file(content)
             case OtherByteOrder(byte_order):
-                self._limit(f"the server sends {byte_order}-endian frames, not the byte order agreed")
+                text = f"the server sends {byte_order}-endian frames, not the byte order agreed"
+                self._status.limit(text)
+                logger.warning("%s: %s", self._source.name, text)
             case Broken(packet_error):
                 self._fail(ClosedError(f"{self.server}: {packet_error}"))
             case Stray(packet):
@@ -319,20 +258,11 @@ class Session(asyncio.Protocol):
                     self._source.name, packet.type, text_of(packet.body[:200]),
                 )  # fmt: skip
 
-    def _note_unknown(self, types: tuple[int, ...]) -> None:
-        self._status.drops["unknown component"] += len(types)
-        new = set(types) - self._unknown_types
-        # Bounded, because the numbers are the server's.
-        if new and len(self._unknown_types) < 16:
-            self._unknown_types |= new
-            logger.warning("%s: components of unknown type %s are skipped", self._source.name, sorted(new))
-
     def _fail(self, error: LinkError) -> None:
         """End with the first reason: every waiter gets it."""
         if self._error is not None:
             return
         self._error = error
-        self.ready = False
         if self._reply is not None and not self._reply.done():
             self._reply.set_exception(error)
         self._ended.set_exception(error)

@@ -2,22 +2,21 @@
 
 import asyncio
 import logging
+import math
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
 
 from gateway.config import Source, Stream
 from gateway.errors import LinkError, QueryError, SpoolError
 from gateway.fanout import FanOut
-from gateway.message import Stamp
 from gateway.outputs.contract import Output
 from gateway.queries.answers import C3D, Answer
 from gateway.queries.desk import Ask, Desk, StreamAccess
-from gateway.rtc3d.components import Frame
 from gateway.rtc3d.parameters_xml import ParsedParameters
-from gateway.session import Handlers
 from gateway.spool import Spool
-from gateway.status import FrameRate, StreamStatus, status_message
-from gateway.supervisor import Supervisor
+from gateway.status import FrameRate, StreamStatus, clock_message, status_message
+from gateway.stream_state import StreamState
+from gateway.supervisor import Callbacks, Supervisor
 
 logger = logging.getLogger(__name__)
 
@@ -39,10 +38,10 @@ class SourceGateway:
         tell_file: Callable[[str, dict[str, Any]], None],
     ) -> None:
         self.source = source
-        self.fan_out = FanOut(source.name, outputs, tool_outputs)
-        self.statuses = [StreamStatus(_components_text(stream)) for stream in source.streams]
+        self.fan_out = FanOut(source.name, outputs, tool_outputs, self._ask_parameters_again)
+        self.statuses = [self._new_status(stream) for stream in source.streams]
         self.supervisors = [
-            Supervisor(source, stream, status, self._handlers(stream, status))
+            Supervisor(source, stream, status, self._callbacks(stream))
             for stream, status in zip(source.streams, self.statuses, strict=True)
         ]
         self.desk = Desk(
@@ -63,12 +62,19 @@ class SourceGateway:
         self._tell_file = tell_file
         self._rates = [FrameRate() for _ in source.streams]
         self._tasks: set[asyncio.Task[None]] = set()
+        self._asks_again = False
+        self._sequence = 0  # of status and clock messages
         self._newest_status = self._status()
 
     def publish_status(self) -> None:
         """Publish what ``status_t`` holds of this source; called once a second."""
+        self._sequence += 1
         self._newest_status = self._status()
         self.fan_out.publish_status(self._newest_status)
+        # One server has one clock: the stream that knows it best tells it.
+        best = min(self.statuses, key=_uncertainty_us)
+        clock = clock_message(self.desk.session, self._sequence, best)
+        self.fan_out.publish_clock(clock.encode())
 
     def close(self) -> None:
         """Give up what is under way besides the supervisors."""
@@ -82,19 +88,23 @@ class SourceGateway:
         message = status_message(
             source=self.source.name,
             server=f"{self.source.host}:{self.source.port}",
-            sequence=self.fan_out.next_status_sequence(),
+            sequence=self._sequence,
             streams=list(zip(self.statuses, rates_hz, strict=True)),
             outputs=[(status, output.health()) for output, status in self.fan_out.outputs],
         )
         encoded: bytes = message.encode()
         return encoded
 
-    def _handlers(self, stream: Stream, status: StreamStatus) -> Handlers:
-        wanted = frozenset(stream.components)
-        publish = self.fan_out.publish
+    def _new_status(self, stream: Stream) -> StreamStatus:
+        components = " ".join(component.key for component in stream.components)
+        return StreamStatus(components, name=f"{self.source.name} ({components})", on_state=self._on_state)
 
-        def on_frame(frame: Frame, utime: int) -> None:
-            publish(frame, Stamp(utime, utime, status.session), wanted)
+    def _on_state(self, _state: StreamState) -> None:
+        flowing = any(status.state is StreamState.STREAMING for status in self.statuses)
+        self.fan_out.show_flowing(flowing)
+
+    def _callbacks(self, stream: Stream) -> Callbacks:
+        wanted = frozenset(stream.components)
 
         def on_parameters(xml: bytes, parsed: ParsedParameters) -> None:
             self.fan_out.set_parameters(parsed.parameters)
@@ -106,10 +116,29 @@ class SourceGateway:
                 self.fan_out.newest.pop(component, None)  # what an earlier connection sent is not current
             self._start(self.desk.fill())
 
-        def on_file(content: bytes) -> None:
-            self._start(self._keep(content))
+        return Callbacks(
+            publish=self.fan_out.publish,
+            parameters=on_parameters,
+            connected=on_connected,
+            restarted=self._ask_parameters_again,
+            file=lambda content: self._start(self._keep(content)),
+            listened=lambda: self.fan_out.listened(wanted),
+        )
 
-        return Handlers(on_frame, on_parameters, on_connected, on_file)
+    def _ask_parameters_again(self) -> None:
+        """The scene may have changed: ask once the server may be asked again; who listens is told."""
+        if not self._asks_again:
+            self._asks_again = True
+            self._start(self._refresh())
+
+    async def _refresh(self) -> None:
+        try:
+            await asyncio.sleep(self.source.fresh_interval_s)
+            await self.desk.parameters((), fresh=True, stale_ok=False)
+        except QueryError as error:
+            logger.debug("%s: parameters not asked again: %s", self.source.name, error)
+        finally:
+            self._asks_again = False
 
     def _start(self, work: Any) -> None:
         task = asyncio.create_task(work)
@@ -155,5 +184,5 @@ def _asker(supervisor: Supervisor) -> Callable[[], Ask | None]:
     return ask
 
 
-def _components_text(stream: Stream) -> str:
-    return " ".join(component.key for component in stream.components)
+def _uncertainty_us(status: StreamStatus) -> float:
+    return status.clock.uncertainty_us if status.clock.has_clock else math.inf

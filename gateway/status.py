@@ -1,17 +1,27 @@
 """Counters of streams and outputs, and the status message made of them."""
 
+import logging
 import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
 import rtc3d
 
 from gateway import __version__
+from gateway.clock import ServerClock
+from gateway.stream_state import StreamInput, StreamState, next_state
 
 MAX_ERROR_LENGTH: Final = 500
 """What is kept of an error's text: it may quote a server, and goes out with every status message."""
+
+
+MAX_LIMITATIONS: Final = 20
+
+_TRYING: Final = (StreamState.CONNECTING, StreamState.HANDSHAKING, StreamState.WAITING)
+
+logger = logging.getLogger(__name__)
 
 
 def now_utime() -> int:
@@ -21,24 +31,53 @@ def now_utime() -> int:
 
 @dataclass(slots=True)
 class StreamStatus:
-    """How one stream is; the supervisor and the fan-out keep it up to date, the status reads it.
+    """How one stream is; the session and the intake keep it up to date, the status reads it.
 
+    ``name`` begins its log lines; ``on_state`` is called with each new state.
     ``components`` is as configured, space-separated. ``drops`` counts what came and was not
     published, by cause. ``limitations`` says what the present connection does without.
     """
 
     components: str
-    state: str = "connecting"
+    name: str = ""
+    on_state: Callable[[StreamState], None] = lambda _state: None
+    state: StreamState = StreamState.WAITING
     byte_order: str = ""
     rate: str = ""
     session: int = 0
     frames_in: int = 0
     bytes_in: int = 0
     reconnects: int = 0
+    restarts: int = 0
+    lag_s: float = 0.0
+    clock: ServerClock = field(default_factory=ServerClock)
     drops: Counter[str] = field(default_factory=Counter)
     limitations: list[str] = field(default_factory=list)
     last_error: str = ""
     last_error_utime: int = 0
+
+    def move(self, happened: StreamInput, cause: str) -> None:
+        """Change the state as the table has it, log the change with its cause, and tell of it."""
+        before, self.state = self.state, next_state(self.state, happened)
+        if self.state is before:
+            return
+        # While a server is away, the tries come and go: the supervisor tells of them as one failure.
+        level = logging.DEBUG if self.state in _TRYING else logging.INFO
+        logger.log(
+            level, "%s: %s → %s: %s (%s)", self.name, before.value, self.state.value, happened.value, cause
+        )
+        self.on_state(self.state)
+
+    def begin_session(self) -> None:
+        """Count a new connection and forget what was agreed in the last one."""
+        self.session += 1
+        self.limitations.clear()
+        self.byte_order = self.rate = ""
+
+    def limit(self, text: str) -> None:
+        """Note what this connection does without; at most MAX_LIMITATIONS of them are kept."""
+        if text not in self.limitations and len(self.limitations) < MAX_LIMITATIONS:
+            self.limitations.append(text)
 
     def note_error(self, text: str) -> None:
         """Keep ``text``, at most MAX_ERROR_LENGTH of it, as the last error, with the time."""
@@ -102,22 +141,48 @@ def status_message(
     return message
 
 
+def clock_message(source_session: int, sequence: int, stream: StreamStatus) -> rtc3d.clock_t:
+    """Return the clock of one stream as its LCM message."""
+    message = rtc3d.clock_t()
+    message.utime = message.capture_utime = now_utime()
+    message.sequence = sequence
+    message.session = source_session
+    message.components = stream.components
+    message.clock = clock_model(stream.clock)
+    return message
+
+
+def clock_model(clock: ServerClock) -> rtc3d.clock_model_t:
+    """Return what is known of a server's clock as its LCM type."""
+    model = rtc3d.clock_model_t()
+    model.has_clock = clock.has_clock
+    if clock.has_clock:
+        model.offset_us = round(clock.offset_us)
+        model.drift_ppm = clock.drift_ppm
+        model.uncertainty_us = clock.uncertainty_us
+    model.samples = clock.samples
+    return model
+
+
 def _stream_message(stream: StreamStatus, rate_hz: float) -> rtc3d.stream_status_t:
     message = rtc3d.stream_status_t()
     for name in (
         "components",
-        "state",
         "byte_order",
         "rate",
         "session",
         "frames_in",
         "bytes_in",
         "reconnects",
+        "restarts",
         "last_error",
         "last_error_utime",
     ):
         setattr(message, name, getattr(stream, name))
+    message.state = stream.state.value
     message.frame_rate_hz = rate_hz
+    message.lag_ms = 1000 * stream.lag_s
+    message.clock = clock_model(stream.clock)
     message.drops = _counts(stream.drops)
     message.num_drops = len(message.drops)
     message.limitations = list(stream.limitations)

@@ -1,8 +1,10 @@
 """What every output is to the fan-out; tests/contract/ holds each one to it."""
 
+from collections.abc import Mapping
 from typing import Protocol
 
 from gateway.names import Topic
+from gateway.rtc3d.components import ComponentType
 from gateway.status import OutputHealth
 
 
@@ -34,6 +36,10 @@ class Output(Protocol):
     def name(self) -> str:
         """The short name that counters go by: zenoh, lcm."""
 
+    @property
+    def max_rate_hz(self) -> Mapping[ComponentType, float]:
+        """The highest rate of each component that is to be limited."""
+
     def start(self) -> None:
         """Begin to open what the output sends through; returns at once."""
 
@@ -42,6 +48,9 @@ class Output(Protocol):
 
     def announce(self, source: str) -> None:
         """Show to all that the gateway serves ``source``, for as long as the output is open."""
+
+    def show_flowing(self, source: str, flowing: bool) -> None:
+        """Show to all whether frames of ``source`` flow."""
 
     def maintain(self) -> None:
         """Look after the output: called once a second from the loop; does not block."""

@@ -85,6 +85,7 @@ class LcmOutput:
 
     def __init__(self, settings: LcmSettings, shared: lcm.LCM | None = None) -> None:
         self.settings = settings
+        self.max_rate_hz = settings.max_rate_hz
         self._shared = shared
         self._lcm: lcm.LCM | None = None
         self._channels: set[str] = set()
@@ -151,6 +152,9 @@ class LcmOutput:
 
     def announce(self, source: str) -> None:
         """LCM has nothing of the kind; the status messages show who serves ``source``."""
+
+    def show_flowing(self, source: str, flowing: bool) -> None:
+        """LCM has nothing of the kind; the status messages show the state of every stream."""
 
     def maintain(self) -> None:
         """Open LCM if it is not open and the last try is a while ago."""

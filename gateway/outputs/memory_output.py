@@ -4,6 +4,7 @@ from collections import deque
 
 from gateway.errors import OutputError
 from gateway.names import Topic
+from gateway.rtc3d.components import ComponentType
 from gateway.status import OutputHealth
 
 
@@ -36,6 +37,8 @@ class MemoryOutput:
     name = "memory"
 
     def __init__(self, capacity: int = 100_000) -> None:
+        self.max_rate_hz: dict[ComponentType, float] = {}
+        self.flowing: set[str] = set()
         self.messages: deque[tuple[Topic, bytes]] = deque(maxlen=capacity)
         self.announced: set[str] = set()
         self.is_open = False
@@ -51,6 +54,13 @@ class MemoryOutput:
     def announce(self, source: str) -> None:
         """Note that ``source`` is served."""
         self.announced.add(source)
+
+    def show_flowing(self, source: str, flowing: bool) -> None:
+        """Note whether frames of ``source`` flow."""
+        if flowing:
+            self.flowing.add(source)
+        else:
+            self.flowing.discard(source)
 
     def maintain(self) -> None:
         """Nothing needs looking after."""

@@ -9,7 +9,7 @@ import re
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import zenoh
 
@@ -25,9 +25,9 @@ LCM_ENCODING: Final = "application/x-lcm"
 _DEFAULTS: Final = {
     # 16 MB of /dev/shm, and files left behind after a kill, for messages of a few kB.
     "transport": {"shared_memory": {"enabled": False}},
-    # A lost router is found again within half a second instead of up to 4 s.
     # Caches for late subscribers need samples with time stamps.
     "timestamping": {"enabled": True},
+    # A lost router is found again within half a second instead of up to 4 s.
     "connect": {"retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}},
 }
 """What the gateway wants other than Zenoh's own defaults, where an inline configuration is silent."""
@@ -58,8 +58,8 @@ def zenoh_config(config: Path | Mapping[str, Any]) -> zenoh.Config:
 
 
 def _reason(error: Exception) -> str:
-    """Return the error's text on one line, without the place in Zenoh's source that it may end in."""
-    return " ".join(re.sub(r" at \S+\.rs:\d+\.?$", "", str(error)).split())
+    """Return the error's text on one line, without the places in Zenoh's source."""
+    return " ".join(re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error)).split())
 
 
 def _merged(defaults: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
@@ -100,6 +100,12 @@ class ZenohPublisher:
         publisher.declare_matching_listener(self._on_matching)  # tells of subscribers there already, too
         self._publisher = publisher
 
+    def look(self) -> None:
+        """See again whether anybody listens: a notification may have been missed."""
+        if self._publisher is not None:
+            # Zenoh's type stub says bool here; it is the same MatchingStatus that listeners get.
+            self._matched = cast(zenoh.MatchingStatus, self._publisher.matching_status).matching
+
     def _on_matching(self, status: zenoh.MatchingStatus) -> None:
         self._matched = status.matching  # from Zenoh's thread; setting a flag is all it does
 
@@ -136,6 +142,7 @@ class ZenohOutput:
 
     def __init__(self, settings: ZenohSettings) -> None:
         self.settings = settings
+        self.max_rate_hz = settings.max_rate_hz
         self._config = zenoh_config(settings.config)
         self._is_client = json.loads(self._config.get_json("mode") or "null") == "client"
         self._lock = threading.Lock()  # of _session, _publishers and _sources, shared with _opener
@@ -144,6 +151,7 @@ class ZenohOutput:
         self._sources: list[str] = []
         self._declarations: list[Callable[[zenoh.Session], None]] = []
         self._tokens: list[zenoh.LivelinessToken] = []
+        self._flowing: dict[str, zenoh.LivelinessToken | None] = {}
         self._transports = 0
         self._problem = f"the Zenoh session is not open yet; {_REMEDY}"
         self._closing = threading.Event()
@@ -181,7 +189,9 @@ class ZenohOutput:
                     return
                 for publisher in self._publishers:
                     publisher.bind(session)
-                self._tokens = [self._token(session, source) for source in self._sources]
+                self._tokens = [self._token(session, source, "alive") for source in self._sources]
+                for source in self._flowing:
+                    self._flowing[source] = self._token(session, source, "server")
                 self._session = session
                 for declare in self._declarations:
                     declare(session)
@@ -192,8 +202,8 @@ class ZenohOutput:
     def _on_transport(self, event: zenoh.TransportEvent) -> None:
         self._transports += 1 if event.kind == zenoh.SampleKind.PUT else -1
 
-    def _token(self, session: zenoh.Session, source: str) -> zenoh.LivelinessToken:
-        return session.liveliness().declare_token(zenoh_key(self.settings.prefix, source, "alive"))
+    def _token(self, session: zenoh.Session, source: str, name: str) -> zenoh.LivelinessToken:
+        return session.liveliness().declare_token(zenoh_key(self.settings.prefix, source, name))
 
     def publisher(self, topic: Topic) -> ZenohPublisher:
         """Return a new publisher of ``topic``; it sends as soon as the session is open."""
@@ -215,7 +225,19 @@ class ZenohOutput:
         with self._lock:
             self._sources.append(source)
             if self._session is not None:
-                self._tokens.append(self._token(self._session, source))
+                self._tokens.append(self._token(self._session, source, "alive"))
+
+    def show_flowing(self, source: str, flowing: bool) -> None:
+        """Hold the liveliness token PREFIX/SOURCE/server while frames flow, and only then."""
+        with self._lock:
+            if not flowing:
+                token = self._flowing.pop(source, None)
+                if token is not None:
+                    token.undeclare()
+            elif source not in self._flowing:
+                self._flowing[source] = (
+                    None if self._session is None else self._token(self._session, source, "server")
+                )
 
     def when_open(self, declare: Callable[[zenoh.Session], None]) -> None:
         """Call ``declare`` with the session once it is open, in the thread that opens it."""
@@ -228,6 +250,9 @@ class ZenohOutput:
         """Tell of a router lost or found; Zenoh itself reconnects."""
         if self._session is None:
             return
+        with self._lock:
+            for publisher in self._publishers:
+                publisher.look()
         if self.lacks_router:
             self._links.failed(self.health().problem)
         elif self._links.failing:
@@ -249,6 +274,7 @@ class ZenohOutput:
         with self._lock:
             session, self._session = self._session, None
             self._tokens.clear()
+            self._flowing.clear()
             self._problem = "the Zenoh session is closed; start the gateway again"
         if session is not None:
             session.close()

@@ -36,6 +36,7 @@ from gateway.rtc3d.components import BY_KEY, Component, ComponentType, byte_orde
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from gateway.status import StreamStatus, now_utime
+from gateway.stream_state import StreamState
 
 NOT_PUBLISHED: Final = -1
 """The sequence number of a frame that was asked for and is no part of the stream."""
@@ -193,7 +194,7 @@ class Desk:
         session = stream.status.session
         if stream.ask() is None:
             raise QueryError(self.connection_problem(), code="no-connection")
-        if stream.status.state == "streaming":
+        if stream.status.state is StreamState.STREAMING:
             message = self._newest.get(kind)
             if message is None:
                 raise QueryError(

@@ -5,6 +5,8 @@ lcm-gen 1.5.3
 """
 
 from .analog_t import analog_t as analog_t
+from .clock_model_t import clock_model_t as clock_model_t
+from .clock_t import clock_t as clock_t
 from .count_t import count_t as count_t
 from .event_t import event_t as event_t
 from .events_t import events_t as events_t

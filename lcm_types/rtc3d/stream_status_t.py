@@ -12,11 +12,11 @@ import rtc3d
 class stream_status_t(object):
     """ One stream of a source: a TCP session with the components and the rate asked for. """
 
-    __slots__ = ["components", "state", "byte_order", "rate", "frame_rate_hz", "session", "frames_in", "bytes_in", "reconnects", "num_drops", "drops", "num_limitations", "limitations", "last_error", "last_error_utime"]
+    __slots__ = ["components", "state", "byte_order", "rate", "frame_rate_hz", "session", "frames_in", "bytes_in", "reconnects", "restarts", "lag_ms", "clock", "num_drops", "drops", "num_limitations", "limitations", "last_error", "last_error_utime"]
 
-    __typenames__ = ["string", "string", "string", "string", "float", "int32_t", "int64_t", "int64_t", "int64_t", "int32_t", "rtc3d.count_t", "int32_t", "string", "string", "int64_t"]
+    __typenames__ = ["string", "string", "string", "string", "float", "int32_t", "int64_t", "int64_t", "int64_t", "int64_t", "float", "rtc3d.clock_model_t", "int32_t", "rtc3d.count_t", "int32_t", "string", "string", "int64_t"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, ["num_drops"], None, ["num_limitations"], None, None]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_drops"], None, ["num_limitations"], None, None]
 
     def __init__(self):
         self.components = ""
@@ -61,6 +61,20 @@ class stream_status_t(object):
         """ LCM Type: int64_t """
         self.reconnects = 0
         """ LCM Type: int64_t """
+        self.restarts = 0
+        """
+        How often frame numbers or time stamps began anew within a connection.
+        LCM Type: int64_t
+        """
+
+        self.lag_ms = 0.0
+        """
+        How late the newest frame came, against the clock.
+        LCM Type: float
+        """
+
+        self.clock = rtc3d.clock_model_t()
+        """ LCM Type: rtc3d.clock_model_t """
         self.num_drops = 0
         """
         Frames and components that were not published, by cause.
@@ -113,7 +127,10 @@ class stream_status_t(object):
         buf.write(struct.pack('>I', len(__rate_encoded)+1))
         buf.write(__rate_encoded)
         buf.write(b"\0")
-        buf.write(struct.pack(">fiqqqi", self.frame_rate_hz, self.session, self.frames_in, self.bytes_in, self.reconnects, self.num_drops))
+        buf.write(struct.pack(">fiqqqqf", self.frame_rate_hz, self.session, self.frames_in, self.bytes_in, self.reconnects, self.restarts, self.lag_ms))
+        assert self.clock._get_packed_fingerprint() == rtc3d.clock_model_t._get_packed_fingerprint()
+        self.clock._encode_one(buf)
+        buf.write(struct.pack(">i", self.num_drops))
         for i0 in range(self.num_drops):
             assert self.drops[i0]._get_packed_fingerprint() == rtc3d.count_t._get_packed_fingerprint()
             self.drops[i0]._encode_one(buf)
@@ -150,7 +167,9 @@ class stream_status_t(object):
         self.byte_order = buf.read(__byte_order_len)[:-1].decode('utf-8', 'replace')
         __rate_len = struct.unpack('>I', buf.read(4))[0]
         self.rate = buf.read(__rate_len)[:-1].decode('utf-8', 'replace')
-        self.frame_rate_hz, self.session, self.frames_in, self.bytes_in, self.reconnects, self.num_drops = struct.unpack(">fiqqqi", buf.read(36))
+        self.frame_rate_hz, self.session, self.frames_in, self.bytes_in, self.reconnects, self.restarts, self.lag_ms = struct.unpack(">fiqqqqf", buf.read(44))
+        self.clock = rtc3d.clock_model_t._decode_one(buf)
+        self.num_drops = struct.unpack(">i", buf.read(4))[0]
         self.drops = []
         for i0 in range(self.num_drops):
             self.drops.append(rtc3d.count_t._decode_one(buf))
@@ -168,7 +187,7 @@ class stream_status_t(object):
     def _get_hash_recursive(parents):
         if stream_status_t in parents: return 0
         newparents = parents + [stream_status_t]
-        tmphash = (0xbd94250b01c62be3+ rtc3d.count_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0xd074a25ffd94ea6f+ rtc3d.clock_model_t._get_hash_recursive(newparents)+ rtc3d.count_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -21,6 +21,7 @@ from gateway.rtc3d.commands import FrequencyDivisor
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.simulator.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
+from gateway.stream_state import StreamState
 from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
 
 FRAME = markers_frame(7, (1.0, 2.0, 3.0))
@@ -95,7 +96,7 @@ async def test_every_component_of_the_simulator_is_published() -> None:
         markers = await running.heard("3d", 20)
         assert [message.sequence for message in markers] == list(range(len(markers)))
         assert {message.session for message in markers} == {1}
-        assert running.status.state == "streaming"
+        assert running.status.state is StreamState.STREAMING
         assert running.status.byte_order == "big"
         assert running.status.rate == "AllFrames"
 
@@ -319,7 +320,7 @@ async def test_silence_without_a_measurement_is_no_fault_if_the_server_answers()
 
     async with ScriptedServer(script) as server, gateway_to(server.port, stall_timeout_s=0.3) as running:
         await probes.wait()
-        assert running.status.state == "no measurement"
+        assert running.status.state is StreamState.NO_MEASUREMENT
         assert server.connections == 1
 
 
@@ -346,7 +347,7 @@ async def test_a_measurement_that_starts_later_is_streamed() -> None:
     async with Simulator(scene) as simulator:
         simulator.stop_measurement()
         async with gateway_to(simulator.port) as running:
-            await running.until(lambda: running.status.state == "no measurement")
+            await running.until(lambda: running.status.state is StreamState.NO_MEASUREMENT)
             simulator.start_measurement()
             await running.heard("3d", 5)
             assert running.status.session == 1

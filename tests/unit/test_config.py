@@ -410,10 +410,12 @@ def test_every_mistake_is_told_at_once() -> None:
     sources = [source(prt=1), {"name": "b"}]
     assert dict(mistakes(Settings, {"sources": sources, "lcm": None, "zenho": {}})) == {
         "sources.0.prt": "unknown key (did you mean 'port'?); known: name, host, port, byte_order, streams, "
-        "reconnect, connect_timeout_s, reply_timeout_s, stall_timeout_s, max_packet_bytes, max_c3d_bytes, "
+        "reconnect, connect_timeout_s, reply_timeout_s, stall_timeout_s, max_lag_ms, "
+        "max_packet_bytes, max_c3d_bytes, "
         "query_timeout_s, fresh_interval_s, remote_control",
         "sources.1.host": "missing; this key has no default",
-        "lcm": "found nothing; accepted is a mapping with any of the keys enabled, prefix, url, tool_poses",
+        "lcm": "found nothing; accepted is a mapping with any of the keys enabled, prefix, url, "
+        "max_rate_hz, tool_poses",
         "zenho": "unknown key (did you mean 'zenoh'?); known: sources, spool, zenoh, lcm",
     }
 

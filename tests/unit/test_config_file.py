@@ -110,6 +110,7 @@ MISTAKES: list[tuple[str, str]] = [
         "    prot: 3030",
         "lab.yaml:4:5: sources[0].prot: unknown key (did you mean 'port'?); known: name, host, port, "
         "byte_order, streams, reconnect, connect_timeout_s, reply_timeout_s, stall_timeout_s, "
+        "max_lag_ms, "
         "max_packet_bytes, max_c3d_bytes, query_timeout_s, fresh_interval_s, remote_control",
     ),
     (
@@ -139,7 +140,7 @@ MISTAKES: list[tuple[str, str]] = [
     (
         "zenoh:",
         "lab.yaml:4:7: zenoh: found nothing; accepted is a mapping with any of the keys enabled, prefix, "
-        "config, express, tool_poses",
+        "config, express, max_rate_hz, tool_poses",
     ),
     ("lcm: {enabled: 1}", "lab.yaml:4:16: lcm.enabled: found 1; accepted is true or false"),
     ("  - host: lab-2", "lab.yaml:4:5: sources[1].name: missing; this key has no default"),
@@ -210,7 +211,7 @@ sources:
 """
     assert refused(file, text) == [
         "lab.yaml:1:7: lcm.enable: unknown key (did you mean 'enabled'?); "
-        "known: enabled, prefix, url, tool_poses",
+        "known: enabled, prefix, url, max_rate_hz, tool_poses",
         "lab.yaml:2:17: zenoh.prefix: found '/mocap'; accepted is a Zenoh key of at most 128 characters, "
         "such as mocap or site/mocap, without space, * $ # ? and without / at an end or doubled",
         "lab.yaml:4:5: sources[0].name: missing; this key has no default",

@@ -1,0 +1,94 @@
+"""From received frames to the fan-out: when each was captured, how late it is, what is skipped."""
+
+import asyncio
+import logging
+from collections.abc import Callable
+from typing import Final
+
+from gateway.clock import ServerClock
+from gateway.config import Source, Stream
+from gateway.message import Stamp
+from gateway.rate import LagControl
+from gateway.rtc3d.components import ComponentType, Frame
+from gateway.status import StreamStatus
+
+_MAX_UNKNOWN_TYPES: Final = 16
+
+logger = logging.getLogger(__name__)
+
+Publish = Callable[[Frame, Stamp, frozenset[ComponentType]], None]
+"""Takes a frame, its times, and which of its components are to be published."""
+
+_EVENTS: Final = frozenset({ComponentType.EVENT})
+
+
+class Intake:
+    """Takes the frames of one session, in the batches in which they come from the network.
+
+    ``on_lag`` is called with the number of halvings when the rate should change; ``on_restart`` when
+    the server's frame numbers or time stamps begin anew within the session.
+    """
+
+    def __init__(
+        self,
+        source: Source,
+        stream: Stream,
+        status: StreamStatus,
+        publish: Publish,
+        on_lag: Callable[[int], None],
+        on_restart: Callable[[], None],
+    ) -> None:
+        self._source = source
+        self._wanted = frozenset(stream.components)
+        self._events = _EVENTS & self._wanted
+        self._skips = stream.backlog == "latest"
+        self._status = status
+        self._publish = publish
+        self._on_lag = on_lag
+        self._on_restart = on_restart
+        self._loop = asyncio.get_running_loop()
+        self._clock = status.clock = ServerClock()
+        self._lag = LagControl(source.max_lag_ms / 1000)
+        self._unknown_types: set[int] = set()
+
+    def take(self, frames: list[Frame], utime: int) -> None:
+        """Take frames that came together at ``utime``, oldest first.
+
+        While they come late, only the newest of them is published whole; of the others the events are,
+        which are never skipped, and the rest is counted.
+        """
+        status = self._status
+        status.frames_in += len(frames)
+        last = frames[-1]
+        for frame in frames:
+            if frame.unknown_types:
+                self._note_unknown(frame.unknown_types)
+            if not frame.components:
+                continue
+            stamp = self._stamp(frame, utime)
+            if self._lag.behind and self._skips and frame is not last:
+                status.drops["skipped while behind"] += 1
+                self._publish(frame, stamp, self._events)
+            else:
+                self._publish(frame, stamp, self._wanted)
+
+    def _stamp(self, frame: Frame, utime: int) -> Stamp:
+        first = frame.components[0]
+        reading = self._clock.observe(first.timestamp_us, first.frame_number, utime)
+        if reading.restarted:
+            self._status.restarts += 1
+            self._lag.restart()
+            self._on_restart()
+        elif self._clock.has_clock:
+            self._status.lag_s = reading.lag_s
+            if self._lag.observe(self._loop.time(), reading.lag_s):
+                self._on_lag(self._lag.halvings)
+        return Stamp(utime, reading.capture_utime, self._status.session)
+
+    def _note_unknown(self, types: tuple[int, ...]) -> None:
+        self._status.drops["unknown component"] += len(types)
+        new = set(types) - self._unknown_types
+        # Bounded, because the numbers are the server's.
+        if new and len(self._unknown_types) < _MAX_UNKNOWN_TYPES:
+            self._unknown_types |= new
+            logger.warning("%s: components of unknown type %s are skipped", self._source.name, sorted(new))

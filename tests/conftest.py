@@ -1,0 +1,27 @@
+"""What tests need of the machine: without it they skip on a user's machine, and fail in CI."""
+
+import os
+from typing import Final
+
+import pytest
+
+_NEEDS: Final = {
+    "netns": (
+        os.environ.get("RTC3D_NETNS") == "1",
+        "needs a network namespace: run tests/with-netns pytest, as root or with user namespaces allowed",
+    ),
+    "takes": (
+        bool(os.environ.get("RTC3D_TAKES")),
+        "needs recordings: set RTC3D_TAKES to a folder with optotrak.c3d and qualisys.c3d",
+    ),
+}
+"""By marker: whether the machine has it, and what to do if not."""
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    for marker, (present, reason) in _NEEDS.items():
+        if present or item.get_closest_marker(marker) is None:
+            continue
+        if os.environ.get("CI") == "true":
+            pytest.fail(f"CI must not skip this: {reason}", pytrace=False)
+        pytest.skip(reason)
