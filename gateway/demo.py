@@ -9,7 +9,7 @@ import asyncio
 import contextlib
 import socket
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -58,35 +58,44 @@ async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool
     heard = {side: _Heard() for side in _SIDES}
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
     lcm_settings = LcmSettings(url=None if udpm else "memq://")
-    shared = open_lcm(lcm_settings.effective_url)
-    async with Simulator(scene) as simulator:
+    subscriber_lcm = open_lcm(lcm_settings.effective_url)
+    async with contextlib.AsyncExitStack() as stack:
+        simulator = await stack.enter_async_context(Simulator(scene))
         simulator.stop_measurement()
         settings = _settings(simulator.port, endpoint, lcm_settings)
         zenoh_output = ZenohOutput(settings.zenoh)
-        gateway = Gateway(settings, [zenoh_output, LcmOutput(lcm_settings, None if udpm else shared)])
-        stop = asyncio.Event()
-        running = asyncio.create_task(gateway.run(stop))
-        listener = LcmListener(shared, channel_pattern("MOCAP", SOURCE, None), heard["lcm"].take)
+        # memq:// reaches nobody but the same object, so gateway and subscriber share it.
+        lcm_output = LcmOutput(lcm_settings, None if udpm else subscriber_lcm)
+        await stack.enter_async_context(_running(Gateway(settings, [zenoh_output, lcm_output])))
+        listener = LcmListener(subscriber_lcm, channel_pattern("MOCAP", SOURCE, None), heard["lcm"].take)
+        stack.callback(listener.close)
         await _until(lambda: zenoh_output.session is not None, _READY_S, "Zenoh did not open")
         session = open_zenoh(endpoint)
-        try:
-            ZenohListener(session, key_pattern("mocap", SOURCE, None), heard["zenoh"].take)
-            await _until(
-                lambda: all(each.received["status"] for each in heard.values()), _READY_S,
-                "the gateway's status did not come on both sides",
-            )  # fmt: skip
-            simulator.start_measurement()
-            await _show(heard, seconds, console)
-            simulator.stop_measurement()
-            lost = await _settle(simulator, heard)
-        finally:
-            stop.set()
-            await running
-            session.close()
-            listener.close()
+        stack.callback(session.close)
+        ZenohListener(session, key_pattern("mocap", SOURCE, None), heard["zenoh"].take)
+        await _until(
+            lambda: all(each.received["status"] for each in heard.values()),
+            _READY_S,
+            "the gateway's status did not come on both sides",
+        )
+        simulator.start_measurement()
+        await _show(heard, seconds, console)
+        simulator.stop_measurement()
+        lost = await _settle(simulator, heard)
     console.print(_report(simulator.sent, heard))
     console.print("[green]Nothing was lost.[/]" if not lost else f"[red]{lost} messages were lost.[/]")
     return not lost
+
+
+@contextlib.asynccontextmanager
+async def _running(gateway: Gateway) -> AsyncIterator[None]:
+    stop = asyncio.Event()
+    task = asyncio.create_task(gateway.run(stop))
+    try:
+        yield
+    finally:
+        stop.set()
+        await task
 
 
 def _settings(port: int, endpoint: str, lcm_settings: LcmSettings) -> Settings:

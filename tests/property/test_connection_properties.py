@@ -1,7 +1,5 @@
 """Whatever a server sends, the connection gives events, and the replies stay with their commands."""
 
-import struct
-
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -17,13 +15,9 @@ from gateway.rtc3d.commands import (
     Version,
 )
 from gateway.rtc3d.connection import Answered, Connection, Refused
+from tests.servers import packet
 from tests.strategies import damaged, pieces_of
 from tests.vectors import FULL_FRAME
-
-
-def packet(packet_type: int, body: bytes) -> bytes:
-    return struct.pack(">II", 8 + len(body), packet_type) + body
-
 
 FRAME = packet(3, FULL_FRAME["big"])
 COMMANDS: list[Command] = [

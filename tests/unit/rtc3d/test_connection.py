@@ -30,22 +30,10 @@ from gateway.rtc3d.connection import (
     State,
     Stray,
 )
+from tests.servers import error, ok, packet
 from tests.vectors import EMPTY_FRAME, FULL_FRAME, START_RECORDING, STOP_RECORDING
 
 STREAM = StreamFrames(AllFrames(), (ComponentType.MARKERS,))
-
-
-def packet(packet_type: int, body: bytes | str = b"") -> bytes:
-    data = body.encode() if isinstance(body, str) else body
-    return struct.pack(">II", 8 + len(data), packet_type) + data
-
-
-def ok(text: str) -> bytes:
-    return packet(1, text)
-
-
-def error(text: str) -> bytes:
-    return packet(0, text)
 
 
 def xml(*sections: str) -> bytes:
