@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check lint types contracts generated lcm-types clean
+.PHONY: demo test check lint types contracts generated lcm-types fuzz soak clean
 
 demo: .venv/installed
 	$(BIN)/rtc3d-gateway demo
@@ -38,6 +38,24 @@ lcm-types: .venv/installed
 	$(BIN)/pip install --quiet --upgrade 'pip>=25.1'
 	$(BIN)/pip install --quiet --editable . --group dev
 	touch $@
+
+# Coverage-guided fuzzing, FUZZ_SECONDS for each target; not part of the check.
+FUZZ_SECONDS ?= 60
+FUZZ_TARGETS ?= packets frames connection commands parameters configuration messages
+
+fuzz: .venv/installed
+	$(BIN)/pip install --quiet atheris
+	set -e; for target in $(FUZZ_TARGETS); do \
+		echo "fuzzing $$target for $(FUZZ_SECONDS) s"; mkdir -p build/fuzz; \
+		(cd build/fuzz && PYTHONPATH=../.. ../../$(BIN)/python ../../tests/fuzz/fuzz.py $$target corpus-$$target \
+			-max_total_time=$(FUZZ_SECONDS) -print_final_stats=1 -verbosity=0); \
+	done
+
+# Random faults for SOAK_MINUTES, then a report; not part of the check.
+SOAK_MINUTES ?= 30
+
+soak: .venv/installed
+	tests/with-netns $(BIN)/python -m tests.soak --minutes $(SOAK_MINUTES) --report docs/reliability.md
 
 clean:
 	rm -rf .venv build dist

@@ -168,7 +168,7 @@ class _ToolPoses:
         self._source = source
         self._ways = ways
         self._labels: tuple[str, ...] = ()
-        self._metres = 1e-3
+        self._metres: float | None = 1e-3  # None: the server's unit is unknown
         self._tools: list[tuple[str, _Sending]] = []  # name and publishers of each
         self._sequences: dict[str, int] = {}  # by name
         self._failures = FailureLog(logger, source)
@@ -179,13 +179,20 @@ class _ToolPoses:
             self._labels = labels
             self._close()
         unit = "mm" if parameters.markers is None else parameters.markers.unit
-        metres = metres_per_unit(unit)
-        if metres is None and self._ways:
-            logger.warning("%s: unit of length %r is unknown; taken for mm per tool", self._source, unit)
-        self._metres = metres or 1e-3
+        self._metres = metres_per_unit(unit)
+        if self._metres is None and self._ways:
+            # A robot that moves by a guessed unit is worse than one that waits.
+            logger.warning(
+                "%s: unit of length %.40r is unknown, so no poses per tool; set it to mm or m in the server",
+                self._source,
+                unit,
+            )
 
     def publish(self, component: Component, stamp: Stamp) -> None:
         if not self._ways:
+            return
+        if self._metres is None:
+            self._drop("unknown unit")
             return
         count = component.num_items
         if count > _MAX_TOOLS:
@@ -207,8 +214,11 @@ class _ToolPoses:
 
     def _refuse(self, count: int) -> None:
         self._failures.failed(f"a frame of {count} tools; none has a key of its own above {_MAX_TOOLS}")
+        self._drop("too many tools")
+
+    def _drop(self, cause: str) -> None:
         for way in self._ways:
-            way.status.drops["too many tools"] += 1
+            way.status.drops[cause] += 1
 
     def _open(self, count: int) -> None:
         """Declare ``count`` tools; those beyond the parameters are numbered, doubled labels too."""

@@ -41,7 +41,7 @@ class Intake:
         self._source = source
         self._wanted = frozenset(stream.components)
         self._events = _EVENTS & self._wanted
-        self._skips = stream.backlog == "latest"
+        self.skips = stream.backlog == "latest"
         self._status = status
         self._publish = publish
         self._on_lag = on_lag
@@ -59,6 +59,7 @@ class Intake:
         """
         status = self._status
         status.frames_in += len(frames)
+        status.last_frame_utime = utime
         last = frames[-1]
         for frame in frames:
             if frame.unknown_types:
@@ -66,7 +67,7 @@ class Intake:
             if not frame.components:
                 continue
             stamp = self._stamp(frame, utime)
-            if self._lag.behind and self._skips and frame is not last:
+            if self._lag.behind and self.skips and frame is not last:
                 status.drops["skipped while behind"] += 1
                 self._publish(frame, stamp, self._events)
             else:

@@ -11,12 +11,15 @@ from gateway.status import OutputHealth
 class MemoryPublisher:
     """Appends the messages of one topic to the output's queue."""
 
-    wanted = True
-
     def __init__(self, output: "MemoryOutput", topic: Topic) -> None:
         self._output = output
         self._topic = topic
         self._closed = False
+
+    @property
+    def wanted(self) -> bool:
+        """Whether the output pretends that somebody listens."""
+        return self._output.listened
 
     def publish(self, message: bytes) -> None:
         """Keep ``message``; raises OutputError while the output is not open, or once closed."""
@@ -39,6 +42,8 @@ class MemoryOutput:
     def __init__(self, capacity: int = 100_000) -> None:
         self.max_rate_hz: dict[ComponentType, float] = {}
         self.flowing: set[str] = set()
+        self.listened = True
+        """Whether somebody listens, as far as publishers tell."""
         self.messages: deque[tuple[Topic, bytes]] = deque(maxlen=capacity)
         self.announced: set[str] = set()
         self.is_open = False

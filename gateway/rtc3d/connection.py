@@ -110,6 +110,7 @@ _ACKNOWLEDGED: Final = re.compile(
 )
 """The command that an acknowledgement's text begins with, as all known servers write it (field note 1)."""
 
+_MAX_ERROR_BYTES: Final = 300  # of an error text: it goes into logs and every status message
 _REMEMBERED: Final = 8
 """How many commands owed a reply, and how many just answered, are kept to know stray replies by."""
 
@@ -317,7 +318,7 @@ class Connection:
             self._answered.append(command)
             if isinstance(command, StreamFrames):
                 self._move(Input.REFUSED)
-            events.append(Refused(command, ServerError(text_of(packet.body) or "no reason given")))
+            events.append(Refused(command, ServerError(text_of(packet.body[:_MAX_ERROR_BYTES]) or "no reason given")))
         elif PacketType.COMMAND in _ANSWERS[type(command)]:
             self._owed.clear()
             if isinstance(command, SetByteOrder):

@@ -298,16 +298,15 @@ def test_after_closing_messages_are_refused_and_health_says_why(rig: Rig) -> Non
     publisher = rig.output.publisher(MARKERS)
     rig.output.close()
     health = rig.output.health()
-    assert not health.connected
     error = refused(publisher)
-    assert (error.cause, str(error)) == ("not open", health.problem)
+    assert (health.connected, error.cause, str(error)) == (False, "not open", health.problem)
     assert refused(rig.output.publisher(ANALOG)).cause == "not open"
 
 
 def test_closing_is_safe_from_any_state(rig: Rig) -> None:
     rig.output.close()
-    assert not rig.output.health().connected
     rig.output.close()
+    assert not rig.output.health().connected
 
 
 def test_closing_again_is_safe_for_output_and_publisher(rig: Rig) -> None:
@@ -328,11 +327,18 @@ def test_a_closed_output_stays_closed(rig: Rig) -> None:
     assert not rig.output.health().connected
 
 
-def test_sources_are_announced_before_and_after_opening(rig: Rig) -> None:
-    rig.output.announce("lab")
+def test_sources_can_be_shown_in_any_state(rig: Rig) -> None:
+    def show() -> None:
+        rig.output.announce("lab")
+        for flowing in (True, True, False, False, True):
+            rig.output.show_flowing("lab", flowing)
+
+    show()
     open_output(rig)
-    rig.output.announce("hall-2")
+    show()
     assert connected(rig.output)
+    rig.output.close()
+    show()
 
 
 # Healing -------------------------------------------------------------------------------------

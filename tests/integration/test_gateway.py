@@ -3,73 +3,23 @@
 import asyncio
 import logging
 import struct
-from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
 import rtc3d
 
-from gateway.config import Reconnect, Source, Stream
-from gateway.config import Settings as GatewaySettings
-from gateway.daemon import Gateway
-from gateway.decode import decode
-from gateway.outputs.memory_output import MemoryOutput
+from gateway.config import Stream
 from gateway.rtc3d.commands import FrequencyDivisor
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.simulator.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream_state import StreamState
+from tests.labs import gateway_to
 from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
 
 FRAME = markers_frame(7, (1.0, 2.0, 3.0))
 XML = packet(2, "<RT_Parameters Ver='1.00'><The_3D><Frequency>100</Frequency></The_3D></RT_Parameters>")
-
-
-class Running:
-    """A gateway of one source that publishes into memory."""
-
-    def __init__(self, gateway: Gateway, output: MemoryOutput) -> None:
-        self.gateway = gateway
-        self.output = output
-        [self.source] = gateway.sources
-        self.status = self.source.statuses[0]
-
-    def messages(self, component: str) -> list[Any]:
-        return [decode(data) for topic, data in self.output.messages if topic.parts == (component,)]
-
-    async def until(self, condition: Callable[[], bool]) -> None:
-        async with asyncio.timeout(10):
-            while not condition():  # noqa: ASYNC110 - any state of the gateway can be waited for
-                await asyncio.sleep(0.005)
-
-    async def heard(self, component: str, count: int = 1) -> list[Any]:
-        await self.until(lambda: len(self.messages(component)) >= count)
-        return self.messages(component)
-
-
-@asynccontextmanager
-async def gateway_to(port: int, **settings: Any) -> AsyncIterator[Running]:
-    source: dict[str, Any] = {
-        "name": "lab",
-        "host": "127.0.0.1",
-        "port": port,
-        "reconnect": Reconnect(first_delay_s=0.01, max_delay_s=0.05),
-        "reply_timeout_s": 0.3,
-        "stall_timeout_s": 1.0,
-    }
-    output = MemoryOutput()
-    gateway = Gateway(GatewaySettings(sources=(Source(**(source | settings)),)), [output])
-    stop = asyncio.Event()
-    task = asyncio.create_task(gateway.run(stop))
-    try:
-        yield Running(gateway, output)
-    finally:
-        stop.set()
-        async with asyncio.timeout(5):
-            await task
 
 
 def obliging(command: str) -> bytes:

@@ -8,7 +8,7 @@ from gateway.decode import decode, one_line, to_json
 from gateway.errors import ProtocolError
 from gateway.message import Stamp, splice, tool_poses
 from gateway.rtc3d.components import ComponentType, split_frame
-from gateway.status import OutputHealth, OutputStatus, StreamStatus, status_message
+from gateway.status import OutputHealth, OutputStatus, StreamStatus, clock_message, status_message
 from tests.strategies import damaged
 from tests.vectors import FULL_FRAME
 
@@ -22,8 +22,14 @@ STATUS = status_message(
     streams=[(StreamStatus("3d", limitations=["no parameters"]), 60.0)],
     outputs=[(OutputStatus("zenoh"), OutputHealth(True))],
 )
+CLOCK = clock_message(1, 2, StreamStatus("3d"))
 valid = st.sampled_from(
-    [*(splice(each, STAMP, 1) for each in COMPONENTS), *tool_poses(TOOLS, STAMP, [1, 2]), STATUS.encode()]
+    [
+        *(splice(each, STAMP, 1) for each in COMPONENTS),
+        *tool_poses(TOOLS, STAMP, [1, 2]),
+        STATUS.encode(),
+        CLOCK.encode(),
+    ]
 )
 
 

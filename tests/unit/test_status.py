@@ -6,12 +6,15 @@ import pytest
 import rtc3d
 
 from gateway import __version__
+from gateway.clock import ServerClock
 from gateway.status import (
     MAX_ERROR_LENGTH,
     FrameRate,
     OutputHealth,
     OutputStatus,
     StreamStatus,
+    clock_message,
+    clock_model,
     now_utime,
     status_message,
 )
@@ -75,6 +78,8 @@ def test_the_status_message_has_every_field() -> None:
         frames_in=2**40,
         bytes_in=2**41,
         reconnects=2,
+        restarts=4,
+        lag_s=0.0125,
         drops=Counter({"unknown component": 5, "frame rejected": 1}),
         limitations=["the server refused Version 1.0: err-version", "no parameters"],
         last_error="Verbindung weg – Kabel prüfen",
@@ -114,8 +119,8 @@ def test_the_status_message_has_every_field() -> None:
                 "frames_in": 2**40,
                 "bytes_in": 2**41,
                 "reconnects": 2,
-                "restarts": 0,
-                "lag_ms": 0.0,
+                "restarts": 4,
+                "lag_ms": 12.5,
                 "clock": NO_CLOCK,
                 "num_drops": 2,
                 "drops": [
@@ -170,6 +175,37 @@ def test_the_status_message_has_every_field() -> None:
             },
         ],
     }
+
+
+def test_the_clock_message_has_every_field() -> None:
+    stream = StreamStatus("3d 6d", session=1)
+    before = now_utime()
+    message = fields_of(rtc3d.clock_t.decode(clock_message(3, 17, stream).encode()))
+    assert before <= message["utime"] <= now_utime()
+    assert message == {
+        "utime": message["utime"],
+        "capture_utime": message["utime"],
+        "sequence": 17,
+        "session": 3,
+        "components": "3d 6d",
+        "clock": NO_CLOCK,
+    }
+
+
+def test_a_clock_that_is_known_is_told() -> None:
+    clock = ServerClock()
+    for number in range(8_000):  # 20 s at 400 Hz, with a gateway's clock that is 50 ppm faster
+        timestamp_us = 2_500 * number
+        clock.observe(timestamp_us, number, 1_700_000_000_000_000 + timestamp_us + timestamp_us // 20_000)
+    assert clock.has_clock
+    assert fields_of(clock_model(clock)) == {
+        "has_clock": True,
+        "offset_us": round(clock.offset_us),
+        "drift_ppm": clock.drift_ppm,
+        "uncertainty_us": clock.uncertainty_us,
+        "samples": clock.samples,
+    }
+    assert clock.drift_ppm == pytest.approx(50, abs=1)
 
 
 @pytest.mark.parametrize("counter", ["messages", "drops"])

@@ -53,8 +53,8 @@ class Lab:
         assert sample.payload.to_bytes() == b"message"
         return sample
 
-    def alive(self) -> list[str]:
-        replies = self.somebody.liveliness().get("**/alive")
+    def tokens(self, keys: str) -> list[str]:
+        replies = self.somebody.liveliness().get(keys)
         return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
 
     def close(self) -> None:
@@ -144,16 +144,20 @@ def test_sources_are_alive_from_announcement_to_close(lab: Lab) -> None:
     lab.output.announce("lab")
     lab.open()
     seen: list[tuple[str, str]] = []
+
+    def alive() -> list[str]:
+        return lab.tokens("mocap/*/alive")
+
     watching = lab.somebody.liveliness().declare_subscriber(
         "mocap/*/alive",
         lambda sample: seen.append((str(sample.key_expr), str(sample.kind))),
         history=True,
     )
-    wait_until(lambda: lab.alive() == ["mocap/lab/alive"])
+    wait_until(lambda: alive() == ["mocap/lab/alive"])
     lab.output.announce("hall-2")
-    wait_until(lambda: lab.alive() == ["mocap/hall-2/alive", "mocap/lab/alive"])
+    wait_until(lambda: alive() == ["mocap/hall-2/alive", "mocap/lab/alive"])
     lab.output.close()
-    wait_until(lambda: lab.alive() == [])
+    wait_until(lambda: alive() == [])
     born = [("mocap/lab/alive", "SampleKind.PUT"), ("mocap/hall-2/alive", "SampleKind.PUT")]
     gone = {(key, "SampleKind.DELETE") for key, _ in born}
     wait_until(lambda: gone <= set(seen))
@@ -161,6 +165,25 @@ def test_sources_are_alive_from_announcement_to_close(lab: Lab) -> None:
     # Zenoh may tell of a token twice: from history, and as it comes.
     told = list(dict.fromkeys(seen))
     assert (told[:2], set(told[2:])) == (born, gone)
+
+
+def test_a_server_is_shown_while_its_frames_flow(lab: Lab) -> None:
+    def shown() -> list[str]:
+        return lab.tokens("mocap/*/server")
+
+    lab.output.show_flowing("lab", True)
+    lab.open()
+    wait_until(lambda: shown() == ["mocap/lab/server"])
+    lab.output.show_flowing("hall-2", True)
+    lab.output.show_flowing("hall-2", True)
+    wait_until(lambda: shown() == ["mocap/hall-2/server", "mocap/lab/server"])
+    lab.output.show_flowing("lab", False)
+    lab.output.show_flowing("lab", False)
+    wait_until(lambda: shown() == ["mocap/hall-2/server"])
+    lab.output.show_flowing("lab", True)
+    wait_until(lambda: shown() == ["mocap/hall-2/server", "mocap/lab/server"])
+    lab.output.close()
+    wait_until(lambda: shown() == [])
 
 
 # Opening -------------------------------------------------------------------------------------

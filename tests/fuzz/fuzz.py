@@ -1,0 +1,149 @@
+"""Coverage-guided fuzzing of everything that takes bytes from outside: only documented errors escape.
+
+    make fuzz FUZZ_SECONDS=600                                          all targets, so long each
+    python tests/fuzz/fuzz.py TARGET CORPUS_FOLDER [libFuzzer options]  one of them
+
+The corpus begins with the tests' hand-written vectors. What is found is written as crash-… into the
+current folder; give that file in place of the folder to run it again.
+"""
+
+import contextlib
+import logging
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import atheris
+
+with atheris.instrument_imports(include=["gateway"]):
+    from gateway.config_file import load
+    from gateway.decode import decode, one_line, to_json
+    from gateway.errors import CommandError, ConfigError, FrameError, ParametersError, ProtocolError
+    from gateway.message import Stamp, splice
+    from gateway.rtc3d.commands import SendParameters, StreamFrames, Version, parse_command
+    from gateway.rtc3d.components import byte_order_of, split_frame
+    from gateway.rtc3d.connection import Connection, State
+    from gateway.rtc3d.packets import PacketReader
+    from gateway.rtc3d.parameters_xml import build_parameters, parse_parameters
+
+from tests.vectors import COMPONENTS, FRAME_WITH_UNKNOWN, FULL_FRAME, PACKETS
+
+ROOT = Path(__file__).parents[2]
+STAMP = Stamp(1, 2, 3)
+
+
+def packets(data: bytes) -> None:
+    """Any bytes in any split: packets or an error set, and no more held than was fed."""
+    provider = atheris.FuzzedDataProvider(data)
+    reader = PacketReader(max_packet_bytes=4096, max_c3d_bytes=8192)
+    fed = 0
+    while provider.remaining_bytes():
+        piece = provider.ConsumeBytes(provider.ConsumeIntInRange(0, 200))
+        reader.feed(piece)
+        fed += len(piece)
+        assert reader.buffered_bytes <= min(fed, 8192)
+
+
+def frames(data: bytes) -> None:
+    """A data frame is split and its messages decode, or it is rejected."""
+    try:
+        frame = split_frame(data, byte_order_of(data, "big"))
+    except FrameError:
+        return
+    for component in frame.components:
+        message = splice(component, STAMP, 7)
+        decoded = decode(message)
+        one_line(decoded)
+        to_json(decoded)
+        assert len(component.items()) == component.num_items
+
+
+def connection(data: bytes) -> None:
+    """A client survives whatever a server sends, between commands of its own."""
+    provider = atheris.FuzzedDataProvider(data)
+    client = Connection(max_packet_bytes=4096)
+    commands = (Version(), SendParameters(), StreamFrames())
+    while provider.remaining_bytes():
+        if client.under_way is None and client.state is not State.CLOSED:
+            client.send(commands[provider.ConsumeIntInRange(0, 2)])
+        elif provider.ConsumeBool():
+            client.give_up()
+        client.receive(provider.ConsumeBytes(provider.ConsumeIntInRange(0, 300)))
+
+
+def commands(data: bytes) -> None:
+    """A client's command is parsed, and says the same when written again, or is refused."""
+    try:
+        command = parse_command(data)
+    except CommandError as error:
+        str(error).encode("ascii")
+        return
+    assert parse_command(str(command).encode()) == command
+
+
+def parameters(data: bytes) -> None:
+    """XML is read, and what was read can be written and read again, or is refused."""
+    try:
+        parsed = parse_parameters(data)
+    except ParametersError:
+        return
+    parse_parameters(build_parameters(parsed.parameters))
+
+
+def configuration(data: bytes) -> None:
+    """A file is a configuration, or every mistake in it has a line."""
+    with tempfile.NamedTemporaryFile(suffix=".yaml") as file:
+        file.write(data)
+        file.flush()
+        try:
+            load(Path(file.name))
+        except ConfigError as error:
+            lines = str(error).splitlines()
+        else:
+            return
+    assert all(line.startswith(file.name) for line in lines)
+
+
+def messages(data: bytes) -> None:
+    """Bytes from LCM or Zenoh are one of our messages, or refused."""
+    with contextlib.suppress(ProtocolError):
+        one_line(decode(data))
+
+
+TARGETS: dict[str, Callable[[bytes], None]] = {
+    target.__name__: target
+    for target in (packets, frames, connection, commands, parameters, configuration, messages)
+}
+
+
+def seeds() -> Iterator[bytes]:
+    """Give what a corpus begins with: the same for all targets, libFuzzer keeps what is of use."""
+    for vector in PACKETS:
+        yield vector.packet
+    for component in COMPONENTS:
+        yield from component.wire.values()
+    yield from FULL_FRAME.values()
+    yield from FRAME_WITH_UNKNOWN.values()
+    yield from (str(command).encode() for command in (Version(), SendParameters(("3d",)), StreamFrames()))
+    for folder, pattern in (("tests/data/spec_xml", "*.xml"), ("config", "*.yaml")):
+        for path in (ROOT / folder).glob(pattern):
+            yield path.read_bytes()
+
+
+def main() -> None:
+    if len(sys.argv) < 3 or sys.argv[1] not in TARGETS:
+        sys.exit(f"{__doc__}\nTARGET is one of {', '.join(TARGETS)}")
+    logging.disable()
+    target = TARGETS[sys.argv.pop(1)]
+    corpus = Path(sys.argv[1])
+    if not corpus.is_file():
+        corpus.mkdir(parents=True, exist_ok=True)
+        for number, seed in enumerate(seeds()):
+            (corpus / f"seed-{number:03}").write_bytes(seed)
+    atheris.Setup(sys.argv, target)
+    atheris.Fuzz()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,142 @@
+"""What happens to a stream while its connection stays: demand, layout, lateness, states."""
+
+import asyncio
+
+import pytest
+
+from gateway.config import Stream
+from gateway.simulator.server import Simulator
+from gateway.simulator.synthetic import SyntheticScene
+from gateway.stream_state import StreamState
+from tests.labs import gateway_to
+from tests.servers import Client, ScriptedServer, markers_frame, ok, packet
+
+XML = packet(2, "<RT_Parameters Ver='1.00'><The_3D/></RT_Parameters>")
+
+
+class Recorder:
+    """A server that streams a counted frame whenever it is told to, and remembers its commands."""
+
+    def __init__(self) -> None:
+        self.commands: list[str] = []
+        self.client: Client | None = None
+        self.number = 0
+
+    async def script(self, client: Client) -> None:
+        self.client = client
+
+        def answer(command: str) -> bytes:
+            self.commands.append(command)
+            return XML if command.startswith("SendParameters") else ok(f"OK-{command}")
+
+        await client.commands(answer)
+
+    def stream(self, *positions: tuple[float, float, float]) -> None:
+        assert self.client is not None
+        self.number += 1
+        self.client.send(markers_frame(self.number, *positions))
+
+    def count(self, command: str) -> int:
+        return self.commands.count(command)
+
+
+ORIGIN = (0.0, 0.0, 0.0)
+START, STOP = "StreamFrames AllFrames", "StreamFrames Stop"
+
+
+async def test_a_stream_on_demand_runs_while_somebody_listens() -> None:
+    server = Recorder()
+    stream = Stream(on_demand=True, idle_after_s=0.1)
+    async with (
+        ScriptedServer(server.script) as listening,
+        gateway_to(listening.port, streams=(stream,)) as lab,
+    ):
+        for rounds in (1, 2, 3):
+            await lab.until(lambda count=rounds: server.count(START) == count)
+            server.stream(ORIGIN)
+            await lab.heard("3d", rounds)
+            lab.output.listened = False
+            await lab.until(lambda count=rounds: server.count(STOP) == count)
+            await lab.until(lambda: lab.status.state is StreamState.IDLE)
+            lab.output.listened = True
+        assert lab.status.session == 1
+
+
+async def test_a_stream_that_is_always_on_runs_without_listeners() -> None:
+    server = Recorder()
+    async with ScriptedServer(server.script) as listening, gateway_to(listening.port) as lab:
+        lab.output.listened = False
+        await lab.until(lambda: server.count(START) == 1)
+        for number in range(1, 20):
+            server.stream(ORIGIN)
+            await lab.heard("3d", number)
+        assert server.count(STOP) == 0
+
+
+async def test_a_changed_number_of_markers_makes_the_gateway_ask_for_parameters() -> None:
+    server = Recorder()
+    async with (
+        ScriptedServer(server.script) as listening,
+        gateway_to(listening.port, fresh_interval_s=0.05) as lab,
+    ):
+        await lab.until(lambda: server.count("SendParameters Events") == 1)  # the cache is filled
+        asked = server.count("SendParameters")
+        server.stream(ORIGIN)
+        server.stream(ORIGIN)
+        await lab.heard("3d", 2)
+        assert server.count("SendParameters") == asked
+        server.stream(ORIGIN, ORIGIN)
+        await lab.until(lambda: server.count("SendParameters") == asked + 1)
+        assert [message.num_markers for message in await lab.heard("3d", 3)] == [1, 1, 2]
+
+
+async def test_time_stamps_going_back_are_a_restart_and_no_reconnect() -> None:
+    server = Recorder()
+    async with ScriptedServer(server.script) as listening, gateway_to(listening.port) as lab:
+        await lab.until(lambda: server.count(START) == 1)
+        for _ in range(5):
+            server.stream(ORIGIN)
+        server.number = 0
+        server.stream(ORIGIN)
+        await lab.heard("3d", 6)
+        assert lab.status.restarts == 1
+        assert lab.status.session == 1
+
+
+async def test_states_follow_the_server_and_show_on_the_outputs(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("INFO")
+    async with Simulator(SyntheticScene(rate_hz=200)) as simulator:
+        simulator.stop_measurement()
+        async with gateway_to(simulator.port) as lab:
+            await lab.until(lambda: lab.status.state is StreamState.NO_MEASUREMENT)
+            assert not lab.output.flowing
+            simulator.start_measurement()
+            await lab.until(lambda: lab.status.state is StreamState.STREAMING)
+            await lab.until(lambda: lab.output.flowing == {"lab"})
+            simulator.stop_measurement()
+            await lab.until(lambda: lab.status.state is StreamState.NO_MEASUREMENT)
+            await lab.until(lambda: not lab.output.flowing)
+    changes = [record.message for record in caplog.records if "→" in record.message]
+    assert sum("no measurement → streaming" in change for change in changes) == 1
+    assert sum("streaming → no measurement" in change for change in changes) == 1
+
+
+async def test_late_frames_make_the_gateway_ask_for_less() -> None:
+    """The server's frames come in time for 3 s, and then 0.3 s late: its time stamps stay behind."""
+    server = Recorder()
+    async with ScriptedServer(server.script) as listening, gateway_to(listening.port) as lab:
+        await lab.until(lambda: server.count(START) == 1)
+        loop = asyncio.get_running_loop()
+        start_s = loop.time()
+        while not any("FrequencyDivisor:2" in command for command in server.commands):
+            elapsed_s = loop.time() - start_s
+            late_s = 0.3 if elapsed_s > 3 else 0.0
+            assert elapsed_s < 20
+            due = int((elapsed_s - late_s) * 200)
+            while server.number < due:
+                server.number += 1
+                assert server.client is not None
+                server.client.send(markers_frame(5 * server.number, ORIGIN))
+            await asyncio.sleep(0.005)
+        assert lab.status.lag_s > 0.05
+        await lab.until(lambda: lab.status.rate == "FrequencyDivisor:2")
