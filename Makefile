@@ -2,7 +2,16 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test check lint types contracts generated lcm-types fuzz soak clean
+# Where `make install` puts things. Units in /etc/systemd/system would be the administrator's, and could not be masked.
+PREFIX := /opt/rtc3d-gateway
+CONFIG := /etc/rtc3d-gateway
+LIB := /usr/local/lib
+UNITS := rtc3d-gateway.service rtc3d-gateway@.service
+
+# What tests of installing use; sudo finds this one, and the service can reach it.
+SYSTEM_PYTHON ?= /usr/bin/python3
+
+.PHONY: demo test check lint types contracts generated lcm-types fuzz soak wheel install uninstall clean
 
 demo: .venv/installed
 	$(BIN)/rtc3d-gateway demo
@@ -32,6 +41,44 @@ generated: .venv/installed
 lcm-types: .venv/installed
 	rm -f lcm_types/rtc3d/*.py
 	$(BIN)/lcm-gen --python --ppath lcm_types lcm_types/rtc3d/*.lcm
+
+# For `pipx install dist/*.whl`.
+wheel:
+	$(PYTHON) -m pip wheel --quiet --no-deps --wheel-dir dist .
+
+# As root. The service runs as a user that cannot enter homes, so its Python must not be in one.
+install:
+	@$(PYTHON) -c 'import sys; home = sys.base_prefix.startswith(("/home/", "/root/")); \
+	    sys.exit(f"{sys.base_prefix} is in a home, where the service cannot read; give make PYTHON=/usr/bin/python3" if home else 0)'
+	$(PYTHON) -m venv $(PREFIX)/venv
+	$(PREFIX)/venv/bin/pip install --quiet --upgrade '.[systemd]'
+	install -d $(LIB)/systemd/system $(LIB)/sysusers.d $(LIB)/tmpfiles.d /usr/local/bin
+	for unit in $(UNITS); do sed 's|/opt/rtc3d-gateway|$(PREFIX)|' systemd/$$unit >$(LIB)/systemd/system/$$unit; done
+	install -m 644 systemd/sysusers.conf $(LIB)/sysusers.d/rtc3d-gateway.conf
+	install -m 644 systemd/tmpfiles.conf $(LIB)/tmpfiles.d/rtc3d-gateway.conf
+	systemd-sysusers rtc3d-gateway.conf
+	systemd-tmpfiles --create rtc3d-gateway.conf
+	[ -e $(CONFIG)/gateway.yaml ] || install -m 644 config/gateway.yaml $(CONFIG)/gateway.yaml
+	ln -sfn $(PREFIX)/venv/bin/rtc3d-gateway /usr/local/bin/rtc3d-gateway
+	[ ! -d /run/systemd/system ] || systemctl daemon-reload
+	@echo 'Name your server in $(CONFIG)/gateway.yaml; then: systemctl enable --now rtc3d-gateway'
+
+# As root. What stays: $(CONFIG), the C3D files in /var/lib/rtc3d-gateway, and the user that they belong to.
+uninstall:
+	[ ! -d /run/systemd/system ] || systemctl stop 'rtc3d-gateway@*.service'
+	[ ! -d /run/systemd/system ] || systemctl disable --now $(UNITS)
+	rm -f $(UNITS:%=$(LIB)/systemd/system/%) $(LIB)/sysusers.d/rtc3d-gateway.conf \
+	    $(LIB)/tmpfiles.d/rtc3d-gateway.conf /usr/local/bin/rtc3d-gateway
+	rm -rf $(PREFIX)/venv
+	-rmdir $(PREFIX)
+	[ ! -d /run/systemd/system ] || systemctl daemon-reload
+
+# All that installing downloads, for its tests: they have no network.
+build/wheelhouse/complete: pyproject.toml
+	rm -rf build/wheelhouse build/wheelhouse-venv
+	$(SYSTEM_PYTHON) -m venv build/wheelhouse-venv
+	build/wheelhouse-venv/bin/pip wheel --quiet --wheel-dir build/wheelhouse pip hatchling '.[systemd]'
+	touch $@
 
 .venv/installed: pyproject.toml
 	$(PYTHON) -m venv .venv

@@ -1,8 +1,10 @@
-"""The command line. Exit status: 0 done, 1 it did not work, 2 the command or configuration is wrong."""
+"""The command line. Exit status: 0 done, 1 it did not work, 2 the command or configuration is wrong.
+
+``params`` also tells apart 3 no gateway, 4 a gateway whose server is away, 5 no answer in time.
+"""
 
 import asyncio
 import contextlib
-import logging
 import os
 import signal
 import sys
@@ -12,13 +14,20 @@ from typing import Annotated, NoReturn
 import typer
 from rich.console import Console
 
-from gateway import __version__
-from gateway.config import DEFAULT_LCM_URL, Settings, single_server
+from gateway import __version__, cli_configuration
+from gateway.cli_configuration import ConfigOption, ServerOption, configuration
+from gateway.config import DEFAULT_LCM_URL, Settings
 from gateway.config_file import load
 from gateway.daemon import Gateway
 from gateway.demo import run_demo
 from gateway.echo import echo, lcm_messages, zenoh_messages
 from gateway.errors import ConfigError, GatewayError
+from gateway.log_format import LogFormat, LogLevel, set_up_log
+from gateway.params import EXIT_STATUSES, ask_lcm, ask_zenoh
+from gateway.params_forms import show
+from gateway.rtc3d.commands import SECTIONS
+from gateway.simulator.faults.kinds import list_of_kinds, parse_fault
+from gateway.simulator.scenario import Scenario, load_scenario
 from gateway.simulator.scene import Scene
 from gateway.simulator.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
@@ -34,7 +43,14 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-LogLevel = Annotated[str, typer.Option(help="debug, info, warning or error.")]
+app.add_typer(cli_configuration.app, name="config")
+
+LogLevelOption = Annotated[
+    LogLevel, typer.Option(case_sensitive=False, help="How much to log: this and above.")
+]
+LogFormatOption = Annotated[
+    LogFormat, typer.Option(case_sensitive=False, help="auto is the journal under systemd, else text.")
+]
 
 
 def main() -> NoReturn:
@@ -73,42 +89,14 @@ def _options(
 
 @app.command()
 def run(
-    config: Annotated[
-        Path | None, typer.Option(help="The configuration, YAML; see config/gateway.yaml.")
-    ] = None,
-    server: Annotated[
-        str | None, typer.Option(help="For a first try: HOST[:PORT] of an RT server, all else as by default.")
-    ] = None,
-    log_level: LogLevel = "info",
+    config: ConfigOption = None,
+    server: ServerOption = None,
+    log_level: LogLevelOption = LogLevel.INFO,
+    log_format: LogFormatOption = LogFormat.AUTO,
 ) -> None:
     """Run the gateway until Ctrl-C or SIGTERM."""
-    _set_up_log(log_level)
-    asyncio.run(_run_gateway(_settings(config, server)))
-
-
-def _settings(config: Path | None, server: str | None) -> Settings:
-    if config is not None and server is None:
-        return load(config)
-    if server is not None and config is None:
-        host, port = _host_and_port(server)
-        return single_server(host, port)
-    raise typer.BadParameter("give either --config FILE or --server HOST[:PORT]")
-
-
-def _host_and_port(server: str) -> tuple[str, int]:
-    """Return the parts of HOST, HOST:PORT or [IPV6]:PORT."""
-    if server.startswith("["):
-        host, _, rest = server[1:].partition("]")
-        port = rest.removeprefix(":")
-    elif server.count(":") == 1:
-        host, _, port = server.partition(":")
-    else:
-        host, port = server, ""
-    if not port:
-        return host, _DEFAULT_PORT
-    if not (port.isdecimal() and 0 < int(port) < 65536):
-        raise typer.BadParameter(f"{server!r}: the port is a number from 1 to 65535")
-    return host, int(port)
+    set_up_log(log_level, log_format)
+    asyncio.run(_run_gateway(configuration(config, server).settings))
 
 
 async def _run_gateway(settings: Settings) -> None:
@@ -152,8 +140,15 @@ def _scene(  # one place for the options that simulate and demo share
     )
 
 
+def _list_faults(wanted: bool) -> None:
+    if wanted:
+        print(list_of_kinds())
+        raise typer.Exit
+
+
 @app.command()
 def simulate(
+    context: typer.Context,
     host: Annotated[str, typer.Option(help="The address to listen on.")] = "127.0.0.1",
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="The port; 0 takes a free one.")
@@ -169,21 +164,55 @@ def simulate(
     analog_rate: AnalogRate = 2000.0,
     c3d: C3d = None,
     once: Annotated[bool, typer.Option("--once", help="Play the C3D file once, then say No Data.")] = False,
-    log_level: LogLevel = "info",
+    scenario: Annotated[
+        Path | None, typer.Option(help="Scene and faults, YAML; see config/scenarios/bad-day.yaml.")
+    ] = None,
+    fault: Annotated[
+        list[str] | None, typer.Option(help="A fault such as 'delay,delay_ms=80,at_s=5'; can be repeated.")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Another course of what is random in faults.")
+    ] = None,
+    list_faults: Annotated[  # noqa: ARG001 - its callback does it
+        bool,
+        typer.Option(
+            "--list-faults", callback=_list_faults, is_eager=True, help="Print all faults there are."
+        ),
+    ] = False,
+    log_level: LogLevelOption = LogLevel.INFO,
+    log_format: LogFormatOption = LogFormat.AUTO,
 ) -> None:
-    """Be an RTC3D server: a synthetic scene, or a C3D recording."""
+    """Be an RTC3D server: a synthetic scene or a C3D recording, with faults if wanted."""
     if once and c3d is None:
         raise typer.BadParameter("--once goes with --c3d: a synthetic scene has no end")
-    _set_up_log(log_level)
-    scene = _scene(c3d, markers, tools, analog, plates, rate, analog_rate)
-    asyncio.run(_run_simulator(Simulator(scene, host=host, port=port, once=once), seconds))
+    set_up_log(log_level, log_format)
+    sizes: dict[str, float] = {
+        "markers": markers,
+        "tools": tools,
+        "analog": analog,
+        "plates": plates,
+        "rate_hz": rate,
+        "analog_rate_hz": analog_rate,
+    }
+    given = {name: value for name, value in sizes.items() if _is_given(context, name.removesuffix("_hz"))}
+    planned = Scenario(faults=()) if scenario is None else load_scenario(scenario)
+    planned = planned.extended(given, map(parse_fault, fault or ()), seed)
+    scene = planned.scene.build() if c3d is None else Take(c3d)
+    asyncio.run(_run_simulator(Simulator(scene, host=host, port=port, once=once), planned, seconds))
 
 
-async def _run_simulator(simulator: Simulator, seconds: float | None) -> None:
+def _is_given(context: typer.Context, option: str) -> bool:
+    """Return whether the option stands on the command line."""
+    source = context.get_parameter_source(option)
+    return source is not None and source.name == "COMMANDLINE"
+
+
+async def _run_simulator(simulator: Simulator, scenario: Scenario, seconds: float | None) -> None:
     stop = asyncio.Event()
     _stop_on_signals(stop)
     async with simulator:
         print(f"RTC3D server on {simulator.host}:{simulator.port}; Ctrl-C ends it", flush=True)
+        simulator.faults.play(scenario.faults, seed=scenario.seed, scene=scenario.scene)
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(stop.wait(), seconds)
 
@@ -201,10 +230,17 @@ def demo(
     c3d: C3d = None,
 ) -> None:
     """Show it all at work: simulator, gateway and a subscriber on each side, and count what is lost."""
-    _set_up_log("warning")
+    set_up_log(LogLevel.WARNING)
     scene = _scene(c3d, markers, tools, analog, plates, rate, analog_rate)
     if not asyncio.run(run_demo(scene, seconds, Console(), udpm=udpm)):
         raise typer.Exit(1)
+
+
+Connect = Annotated[
+    str | None, typer.Option(help="Zenoh endpoint of the gateway or router, as tcp/192.0.2.5:7447.")
+]
+Url = Annotated[str | None, typer.Option(help="LCM URL; by default $LCM_DEFAULT_URL, else LCM's own.")]
+Prefix = Annotated[str | None, typer.Option(help="The gateway's prefix: mocap on Zenoh, MOCAP on LCM.")]
 
 
 @app.command("echo")
@@ -213,27 +249,21 @@ def echo_command(
     lcm: Annotated[bool, typer.Option("--lcm", help="Listen on LCM.")] = False,
     source: Annotated[str | None, typer.Option(help="One source only.")] = None,
     component: Annotated[
-        str | None, typer.Option(help="3d, 6d, analog, force, event or status only.")
+        str | None,
+        typer.Option(help="3d, 6d, analog, force, event, status, clock, parameters or c3d only."),
     ] = None,
     count: Annotated[int | None, typer.Option(min=1, help="Stop after so many messages.")] = None,
     seconds: Annotated[float | None, typer.Option(min=0, help="Stop after so long.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object a line.")] = False,
-    connect: Annotated[
-        str | None, typer.Option(help="Zenoh endpoint of the gateway or router, as tcp/192.0.2.5:7447.")
-    ] = None,
-    url: Annotated[
-        str | None, typer.Option(help="LCM URL; by default $LCM_DEFAULT_URL, else LCM's own.")
-    ] = None,
-    prefix: Annotated[
-        str | None, typer.Option(help="The gateway's prefix: mocap on Zenoh, MOCAP on LCM.")
-    ] = None,
+    connect: Connect = None,
+    url: Url = None,
+    prefix: Prefix = None,
 ) -> None:
     """Subscribe to what a gateway publishes, and print it. Exit status 1 if less came than asked for."""
     if zenoh and lcm:
         raise typer.BadParameter("give --zenoh or --lcm; one at a time")
     if lcm:
-        url = url or os.environ.get("LCM_DEFAULT_URL") or DEFAULT_LCM_URL
-        opened = lcm_messages(prefix or "MOCAP", source, component, url)
+        opened = lcm_messages(prefix or "MOCAP", source, component, _lcm_url(url))
     else:
         opened = zenoh_messages(prefix or "mocap", source, component, connect)
     with opened as messages:
@@ -246,9 +276,49 @@ def echo_command(
         raise typer.Exit(1)
 
 
-def _set_up_log(level: str) -> None:
-    if level.lower() not in {"debug", "info", "warning", "error"}:
-        raise typer.BadParameter(f"log level {level!r}; known are debug, info, warning, error")
-    logging.basicConfig(
-        level=level.upper(), format="%(asctime)s %(levelname)s %(message)s", stream=sys.stderr
-    )
+def _lcm_url(url: str | None) -> str:
+    return url or os.environ.get("LCM_DEFAULT_URL") or DEFAULT_LCM_URL
+
+
+@app.command("params")
+def params_command(
+    sections: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="SECTION", help=f"Of {', '.join(SECTIONS)}; none means all."),
+    ] = None,
+    zenoh: Annotated[bool, typer.Option("--zenoh", help="Ask on Zenoh (the default).")] = False,
+    lcm: Annotated[bool, typer.Option("--lcm", help="Ask on LCM.")] = False,
+    source: Annotated[str | None, typer.Option(help="One source only.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="JSON, by source.")] = False,
+    as_xml: Annotated[bool, typer.Option("--xml", help="The server's XML, as it came.")] = False,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Have the gateway ask the server now; else what it knows will do.")
+    ] = False,
+    connect: Connect = None,
+    url: Url = None,
+    prefix: Prefix = None,
+    timeout: Annotated[float, typer.Option(min=0.1, help="How many seconds to wait for answers.")] = 5.0,
+) -> None:
+    """Ask gateways for the parameters of their servers: markers, tools, channels, plates, events.
+
+    Exit status 3: no gateway is there; 4: its server is away; 5: no answer in time; 1: anything else.
+    """
+    if zenoh and lcm:
+        raise typer.BadParameter("give --zenoh or --lcm; one at a time")
+    if as_json and as_xml:
+        raise typer.BadParameter("give --json or --xml; one at a time")
+    asked = tuple(dict.fromkeys(sections or ()))
+    if unknown := set(asked) - set(SECTIONS):
+        raise typer.BadParameter(f"unknown section {min(unknown)!r}; known are {', '.join(SECTIONS)}")
+    if lcm:
+        outcome = ask_lcm(prefix or "MOCAP", source, asked, fresh=fresh, url=_lcm_url(url), timeout_s=timeout)
+    else:
+        outcome = ask_zenoh(prefix or "mocap", source, asked, fresh=fresh, connect=connect, timeout_s=timeout)
+    problems = [
+        *outcome.problems,
+        *show(outcome.told, "json" if as_json else "xml" if as_xml else "table", sys.stdout),
+    ]
+    for problem in problems:
+        print(problem, file=sys.stderr)
+    if problems:
+        raise typer.Exit(EXIT_STATUSES.get(problems[0].code, 1))

@@ -10,7 +10,7 @@ import re
 from pathlib import Path
 from typing import Annotated, Final, Self
 
-from pydantic import AfterValidator, Field, ValidationError, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from gateway.config_section import Section, accepts, mistake
 from gateway.config_values import (
@@ -34,7 +34,6 @@ from gateway.config_values import (
     ZenohConfig,
     not_empty,
 )
-from gateway.errors import ConfigError
 from gateway.rtc3d.commands import AllFrames, Frequency
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.packets import DEFAULT_MAX_C3D_BYTES, DEFAULT_MAX_PACKET_BYTES
@@ -50,7 +49,7 @@ class Stream(Section):
     """What to ask for: [all], or a list of 3d, 6d, analog, force, event. Kept in WIRE_ORDER."""
 
     rate: StreamRate = AllFrames()
-    """How often: all, {frequency_hz: NUMBER} or {divisor: WHOLE NUMBER} (§5.3.5)."""
+    """How often: all, {frequency_hz: NUMBER} or {divisor: WHOLE NUMBER}."""
 
     backlog: Backlog = "latest"
     """While frames come late: publish the newest only, or all of them. Events are never skipped."""
@@ -91,13 +90,16 @@ class Source(Section):
     """The server's name or address."""
 
     port: Port = 3020
-    """The server's TCP port: 3020 for First Principles, 3030 for WaveFront (field note 12)."""
+    """The server's TCP port: 3020 for First Principles, 3030 for WaveFront."""
 
     byte_order: ServerByteOrder = "big"
     """The byte order to ask for. What is published is the same in both."""
 
     streams: Annotated[
-        tuple[Stream, ...], AfterValidator(not_empty), accepts("a list of streams, one or more")
+        tuple[Stream, ...],
+        AfterValidator(not_empty),
+        accepts("a list of streams, one or more"),
+        Field(json_schema_extra={"minItems": 1}),
     ] = (Stream(),)
     """The TCP sessions with the server, each with its components and its rate."""
 
@@ -129,7 +131,7 @@ class Source(Section):
     """How long an answer of the server counts as fresh: no peer makes it answer more often."""
 
     remote_control: Switch = False
-    """Whether peers may start and stop the server's recording (field note 16)."""
+    """Whether peers may start and stop the server's recording."""
 
     @field_validator("streams")
     @classmethod
@@ -168,7 +170,7 @@ class ZenohSettings(Section):
     prefix: KeyPrefix = "mocap"
     """What all keys begin with."""
 
-    config: ZenohConfig = Field(default_factory=dict)
+    config: ZenohConfig = Field(default_factory=dict, repr=False)  # it may hold a password
     """Zenoh's own configuration: the path of a JSON5 file, or its keys inline. Not to be changed."""
 
     express: Switch = False
@@ -191,7 +193,7 @@ class LcmSettings(Section):
     """What all channels begin with."""
 
     url: LcmUrl | None = None
-    """Where to publish; see ``effective_url`` for none."""
+    """Where to publish; null is the environment's LCM_DEFAULT_URL, else LCM's own, on this host only."""
 
     max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
     """The highest rate of each component named; frames beyond it are left out, evenly."""
@@ -209,10 +211,10 @@ class LcmSettings(Section):
 
 
 class SpoolSettings(Section):
-    """Where complete C3D files that servers send are kept (packet type 5)."""
+    """Where complete C3D files that servers send are kept."""
 
     directory: SpoolDirectory | None = None
-    """A folder; None means $STATE_DIRECTORY/c3d under systemd, else the user's state folder."""
+    """A folder; null is c3d in the service's state directory under systemd, else in the user's."""
 
     max_files: FileLimit = 100
     """How many files are kept; the oldest goes first."""
@@ -232,6 +234,19 @@ class SpoolSettings(Section):
         return Path(home) / "rtc3d-gateway" / "c3d"
 
 
+class MetricsSettings(Section):
+    """How the gateway is watched over HTTP: Prometheus' metrics on /metrics, and /healthz."""
+
+    enabled: Switch = True
+    """Whether HTTP is served at all."""
+
+    address: Host = "127.0.0.1"
+    """Where to listen: an address of this host, 0.0.0.0 or "::" for all."""
+
+    port: Port = 9464
+    """The TCP port."""
+
+
 class Settings(Section):
     """The whole configuration."""
 
@@ -239,6 +254,7 @@ class Settings(Section):
         tuple[Source, ...],
         AfterValidator(not_empty),
         accepts("a list of sources, one or more, each with name and host"),
+        Field(json_schema_extra={"minItems": 1}),
     ]
     """The servers."""
 
@@ -250,6 +266,9 @@ class Settings(Section):
 
     lcm: LcmSettings = LcmSettings()
     """The LCM side."""
+
+    metrics: MetricsSettings = MetricsSettings()
+    """How the gateway is watched."""
 
     @field_validator("sources")
     @classmethod
@@ -275,15 +294,3 @@ class Settings(Section):
                 "found false here and in zenoh; accepted is true in one of them at least", "lcm", "enabled"
             )
         return self
-
-
-def single_server(host: str, port: int = 3020) -> Settings:
-    """Return settings for one server, everything else as by default: source "lab", one stream of all.
-
-    Raises ConfigError, one line per mistake, if ``host`` or ``port`` cannot be used.
-    """
-    try:
-        return Settings(sources=(Source(name="lab", host=host, port=port),))
-    except ValidationError as error:
-        lines = [f"{details['loc'][-1]}: {details['msg']}" for details in error.errors(include_url=False)]
-        raise ConfigError("\n".join(lines)) from None

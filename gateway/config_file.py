@@ -1,211 +1,172 @@
-"""Reads a configuration file: YAML to settings, and each mistake with its file, line and column."""
+"""Reads settings: YAML files and environment variables to sections, and each mistake with its place."""
 
-import re
+import json
+import os
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple, TypeVar
 
-import yaml
 from pydantic import ValidationError
 
 from gateway.config import Settings
-from gateway.config_section import UNKNOWN_KEY, shown
+from gateway.config_environment import PREFIX, override, variable_name
+from gateway.config_secrets import MASK, is_secret_key, key_of_file, secrets_in, without_secrets
+from gateway.config_section import UNKNOWN_KEY, Section
+from gateway.config_yaml import Document, Location, Place, line_and_column_after, read_yaml
 from gateway.errors import ConfigError
 
 MAX_FILE_BYTES: Final = 1024 * 1024
 
-MAX_VALUES: Final = 10_000
-"""How many values a file may hold; what an alias repeats counts again."""
+AnySection = TypeVar("AnySection", bound=Section)
 
-MAX_DEPTH: Final = 32
-"""How many levels of values may be nested."""
-
-MAX_NUMBER_LENGTH: Final = 40
-"""How many characters a number may have."""
-
-Location = tuple[str | int, ...]
-"""The keys and indices that lead to a value: ("sources", 0, "port")."""
-
-_YAML: Final = "tag:yaml.org,2002:"
+_ZENOH_CONFIG: Final = ("zenoh", "config")
 
 
-def load(path: Path) -> Settings:
-    """Return the settings in the YAML file at ``path``; relative paths in it count from its folder.
+class Configuration(NamedTuple):
+    """The gateway's settings, and the place of each value that is not a default."""
 
-    Raises ConfigError with one line per mistake, ``FILE:LINE:COLUMN: KEY: what was found; what is
-    accepted``. Of mistakes in the YAML itself only the first is told: the rest cannot be read.
+    settings: Settings
+    places: Mapping[Location, Place]
+
+
+def load(path: Path | None, environ: Mapping[str, str] = os.environ) -> Settings:
+    """Return the gateway's settings; see ``read``."""
+    return read(path, environ).settings
+
+
+def read(path: Path | None, environ: Mapping[str, str] = os.environ) -> Configuration:
+    """Return what ``environ`` says (``config_environment``), over the YAML file at ``path`` if there is one.
+
+    Relative paths count from the file's folder, else from the current one. Raises ConfigError with one
+    line per mistake, ``PLACE: KEY: what was found; what is accepted``; the place is FILE:LINE:COLUMN or
+    the variable. Of mistakes in the YAML itself only the first is told: the rest cannot be read.
     """
-    document = _Document(path)
-    values = document.read(_text_of(path))
+    if path is None:
+        document = read_yaml("{}", "environment", has_lines=False)
+        return _configuration(document, Path.cwd(), environ)
+    document = _read_file(path, Settings, "config/gateway.yaml")
+    return _configuration(document, path.parent.absolute(), environ)
+
+
+def read_server(host: str, port: int, environ: Mapping[str, str] = os.environ) -> Configuration:
+    """Return the configuration of one server as source "lab", all else as by default or in ``environ``.
+
+    Raises ConfigError as ``read`` does, with the place ``--server``.
+    """
+    sources = json.dumps({"sources": [{"name": "lab", "host": host, "port": port}]})
+    return _configuration(read_yaml(sources, "--server", has_lines=False), Path.cwd(), environ)
+
+
+def load_as(section: type[AnySection], path: Path, *, example: str) -> AnySection:
+    """Return what the YAML file at ``path`` holds; relative paths in it count from its folder.
+
+    Raises ConfigError as ``read`` does. ``example`` is a file that could have been meant.
+    """
+    document = _read_file(path, section, example)
     try:
-        return Settings.model_validate(values, context={"folder": path.parent.absolute()})
+        return section.model_validate(document.values, context={"folder": path.parent.absolute()})
     except ValidationError as error:
-        raise document.explained(error) from None
+        raise _in_order(_explained(document, error)) from None
 
 
-def _text_of(path: Path) -> str:
+def _configuration(document: Document, folder: Path, environ: Mapping[str, str]) -> Configuration:
+    override(document, environ)
+    mistakes = _take_out_secrets(document)
+    try:
+        settings = Settings.model_validate(document.values, context={"folder": folder})
+    except ValidationError as error:
+        raise _in_order([*mistakes, *_explained(document, error)]) from None
+    if mistakes:
+        raise _in_order(mistakes)
+    return Configuration(settings, document.places)
+
+
+def _read_file(path: Path, section: type[Section], example: str) -> Document:
+    document = read_yaml(_text_of(path, example), str(path))
+    if not document.places:
+        needed = next(name for name, field in section.model_fields.items() if field.is_required())
+        raise ConfigError(f"{path}: empty; accepted is a mapping, with the key {needed} at least")
+    return document
+
+
+def _text_of(path: Path, example: str) -> str:
     try:
         with path.open("rb") as file:
             data = file.read(MAX_FILE_BYTES + 1)
     except OSError as error:
         raise ConfigError(
-            f"{path}: cannot be read: {error.strerror}; name a YAML file such as config/gateway.yaml"
+            f"{path}: cannot be read: {error.strerror}; name a YAML file such as {example}"
         ) from error
     if len(data) > MAX_FILE_BYTES:
         raise ConfigError(f"{path}: too large; accepted is a file of at most {MAX_FILE_BYTES} bytes")
     try:
         return data.decode("utf-8-sig")  # some editors begin a file with a byte order mark
     except UnicodeDecodeError as error:
-        place = _place_after(error.object[: error.start].decode())
+        place = Place(str(path), *line_and_column_after(error.object[: error.start].decode()))
         found = f"0x{error.object[error.start]:02X}"
-        raise ConfigError(f"{path}:{place}: found the byte {found}; accepted is text in UTF-8") from None
+        raise place.error((), f"found the byte {found}; accepted is text in UTF-8") from None
 
 
-class _Loader(yaml.SafeLoader):
-    """Makes nodes as SafeLoader does, nested to MAX_DEPTH only: it recurses, and Python's stack ends."""
-
-    _depth = 0
-
-    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
-        self._depth += 1
-        if self._depth > MAX_DEPTH:
-            mark = parent.start_mark if parent else None
-            raise yaml.composer.ComposerError(None, None, f"found more than {MAX_DEPTH} levels", mark)
-        node = super().compose_node(parent, index)
-        self._depth -= 1
-        return node
+_Mistake = tuple[Place, ConfigError]
 
 
-class _Document:
-    """The values of a file's one YAML document, and the place of each."""
+def _in_order(mistakes: list[_Mistake]) -> ConfigError:
+    """Return all mistakes as one error: those in the file in its order, then those in variables."""
+    ordered = sorted(mistakes, key=lambda mistake: (mistake[0].line == 0, *mistake[0], str(mistake[1])))
+    return ConfigError("\n".join(str(error) for _, error in ordered))
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._places: dict[Location, yaml.Mark] = {}
-        self._key_places: dict[Location, yaml.Mark] = {}
-        self._values_left = MAX_VALUES
 
-    def read(self, text: str) -> object:
-        """Return mappings (their keys as text), lists, texts, numbers, truth values and None."""
-        try:
-            loader = _Loader(text)
-        except yaml.reader.ReaderError as error:
-            place = _place_after(text[: error.position])
-            found = f"the character U+{ord(text[error.position]):04X}"
-            raise ConfigError(f"{self._path}:{place}: found {found}, which YAML does not allow") from None
-        try:
-            root = loader.get_single_node()
-        except yaml.MarkedYAMLError as error:
-            raise self._not_yaml(error, loader.get_mark()) from None
-        except (ValueError, OverflowError):  # from chr() and int() within PyYAML
-            raise self._error(loader.get_mark(), (), "not YAML: a number here is out of range") from None
-        if root is None:
-            raise ConfigError(f"{self._path}: empty; accepted is a mapping, with the key sources at least")
-        return self._value(root, ())
+def _explained(document: Document, error: ValidationError) -> list[_Mistake]:
+    """Return the mistakes that the models found, each with its place."""
+    mistakes = []
+    for details in error.errors(include_url=False):
+        location, text = details["loc"], details["msg"]
+        place = document.key_places.get(location) if details["type"] == UNKNOWN_KEY else None
+        place = place or document.nearest_place(location)
+        if place.line:
+            text += _variables_in(document, location)
+        mistakes.append((place, place.error(location, text)))
+    return mistakes
 
-    def explained(self, error: ValidationError) -> ConfigError:
-        """Return the mistakes that the models found, each with its place, in the file's order."""
-        lines = []
-        for details in error.errors(include_url=False):
-            location = details["loc"]
-            mark = self._key_places.get(location) if details["type"] == UNKNOWN_KEY else None
-            mark = mark or self._nearest_place(location)
-            lines.append((mark.index, str(self._error(mark, location, details["msg"]))))
-        return ConfigError("\n".join(line for _, line in sorted(lines)))
 
-    def _nearest_place(self, location: Location) -> yaml.Mark:
-        """Return where the value is; where it would belong if it is missing or a default."""
-        while location not in self._places:
-            location = location[:-1]
-        return self._places[location]
+def _variables_in(document: Document, location: Location) -> str:
+    """Return which variables set a part of the value: the mistake may be theirs."""
+    names = {
+        place.origin
+        for other, place in document.places.items()
+        if other[: len(location)] == location and place.origin.startswith(PREFIX)
+    }
+    return f" (a part of it is from {', '.join(sorted(names))})" if names else ""
 
-    def _value(self, node: yaml.Node, location: Location) -> object:
-        self._values_left -= 1
-        if self._values_left < 0 or len(location) >= MAX_DEPTH:  # only aliases reach this depth
-            limits = f"at most {MAX_VALUES} values in {MAX_DEPTH} levels, those of aliases included"
-            raise self._error(node.start_mark, (), f"found too much; accepted are {limits}")
-        self._places[location] = node.start_mark
-        match node, node.tag.removeprefix(_YAML):
-            case yaml.MappingNode(), "map":
-                return self._mapping(node, location)
-            case yaml.SequenceNode(), "seq":
-                return [self._value(item, (*location, index)) for index, item in enumerate(node.value)]
-            case (
-                yaml.ScalarNode(),
-                "str" | "timestamp" | "value" | "merge",
-            ):  # a source may be named 2026-06-01
-                return self._text(node, location)
-            case yaml.ScalarNode(), "bool" | "int" | "float":
-                return self._number(node, location)
-            case yaml.ScalarNode(), "null":
-                return None
-        text = f"found the tag {shown(node.tag)}; accepted are values without a tag"
-        raise self._error(node.start_mark, location, text)
 
-    def _mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, object]:
-        values: dict[str, object] = {}
-        for key_node, value_node in node.value:
-            if not isinstance(key_node, yaml.ScalarNode):
-                raise self._error(key_node.start_mark, location, "found a list or mapping as a key")
-            key = self._text(key_node, location)
-            here = (*location, key)
-            if key in values:
-                first = self._key_places[here].line + 1
-                raise self._error(key_node.start_mark, here, f"the same key as in line {first}")
-            if key_node.tag == f"{_YAML}merge":
-                text = "mappings are not merged; accepted is an alias as a key's value"
-                raise self._error(key_node.start_mark, here, text)
-            self._key_places[here] = key_node.start_mark
-            values[key] = self._value(value_node, here)
-        return values
+def _take_out_secrets(document: Document) -> list[_Mistake]:
+    """Take secrets that stand in the file itself out of the values, and return a mistake for each.
 
-    def _number(self, node: yaml.ScalarNode, location: Location) -> object:
-        if len(node.value) <= MAX_NUMBER_LENGTH:
-            try:
-                return yaml.constructor.SafeConstructor().construct_object(node)
-            except (ValueError, LookupError):  # such as 0x_, or a text that is tagged !!int or !!bool
-                pass
-        text = f"found {shown(node.value)}; accepted is a number of at most {MAX_NUMBER_LENGTH} characters"
-        raise self._error(node.start_mark, location, text)
-
-    def _text(self, node: yaml.ScalarNode, location: Location) -> str:
-        """Return a key or a text; half a surrogate pair, which an escape can write, is none."""
-        try:
-            node.value.encode()
-        except UnicodeEncodeError:
-            found = shown(node.value)
-            raise self._error(
-                node.start_mark, location, f"found {found}; accepted is text of whole characters"
-            ) from None
-        text: str = node.value
-        return text
-
-    def _not_yaml(self, error: yaml.MarkedYAMLError, end: yaml.Mark) -> ConfigError:
-        text = f"not YAML: {error.problem}"
-        if error.context and error.context_mark:
-            text = f"not YAML: {error.context} from line {error.context_mark.line + 1}: {error.problem}"
-        if isinstance(error, yaml.scanner.ScannerError | yaml.parser.ParserError):
-            text += "; check indentation, colons, quotes and brackets here"
-        return self._error(error.problem_mark or end, (), text)
-
-    def _error(self, mark: yaml.Mark, location: Location, text: str) -> ConfigError:
-        key = _key_path(location)
-        return ConfigError(
-            f"{self._path}:{mark.line + 1}:{mark.column + 1}: {key}{': ' if key else ''}{text}"
+    Files like this one are shown around and kept under version control. Taken out, no error quotes them.
+    """
+    config = document.values
+    for key in _ZENOH_CONFIG:
+        config = config.get(key) if isinstance(config, dict) else None
+    mistakes = []
+    for steps, secret in list(secrets_in(config)):
+        location = (*_ZENOH_CONFIG, *steps)
+        place = document.nearest_place(location)
+        if not place.line:
+            continue
+        _replace(config, steps, MASK if is_secret_key(steps[-1]) else without_secrets(secret))
+        path_key = key_of_file(steps[-1])
+        others = f"{path_key} with the path of the key's file, " if path_key else ""
+        text = (
+            f"found a secret, which does not belong in this file; accepted is {others}"
+            f"the environment variable {variable_name(location)}, or zenoh.config as the path "
+            "of a JSON5 file that only the gateway may read"
         )
+        mistakes.append((place, place.error(location, text)))
+    return mistakes
 
 
-def _key_path(location: Location) -> str:
-    """Return sources[0].port for ("sources", 0, "port")."""
-    path = ""
-    for step in location:
-        if isinstance(step, int):
-            path += f"[{step}]"
-        else:
-            path += ("." if path else "") + (step if re.fullmatch(r"[\w/-]{1,60}", step) else shown(step))
-    return path
-
-
-def _place_after(text: str) -> str:
-    """Return LINE:COLUMN, both from 1, of what follows ``text``."""
-    lines = text.split("\n")
-    return f"{len(lines)}:{len(lines[-1]) + 1}"
+def _replace(config: Any, steps: Location, value: object) -> None:
+    *way, last = steps
+    for step in way:
+        config = config[step]
+    config[last] = value

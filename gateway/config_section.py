@@ -15,6 +15,8 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
+from gateway.config_secrets import without_secrets
+
 UNKNOWN_KEY: Final = "unknown_key"
 """The type of the error that is in a key itself; all others are in a value, or in its absence."""
 
@@ -70,7 +72,7 @@ def accepts(what: str) -> WrapValidator:
 
 
 def shown(value: object) -> str:
-    """Return what was found, fit for a sentence: printable, on one line, bounded."""
+    """Return what was found, fit for a sentence: printable, on one line, bounded, without passwords."""
     match value:
         case None:
             return "nothing"
@@ -81,7 +83,8 @@ def shown(value: object) -> str:
         case list() | tuple():
             return "a list" if value else "an empty list"
         case str():
-            return repr(value if len(value) <= 60 else value[:60] + "…")
+            text = without_secrets(value)
+            return repr(text if len(text) <= 60 else text[:60] + "…")
     return str(value)
 
 

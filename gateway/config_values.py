@@ -10,12 +10,18 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 import zenoh
 from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, TypeAdapter, ValidationInfo
 
+from gateway.config_secrets import without_secrets
 from gateway.config_section import Section, accepts, did_you_mean, mistake, one_of, shown
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import BY_KEY, WIRE_ORDER, ByteOrder, ComponentType
 
 LCM_PROVIDERS: Final = ("udpm", "mpudpm", "memq", "tcpq", "file")
 """The URL schemes that the lcm package knows."""
+
+_ZENOH_MESSAGE: Final = re.compile(
+    r'Message \{ msg: "((?:[^"\\]|\\.)*)", location: Some\(Location \{ line: (\d+), column: (\d+)'
+)
+"""How Zenoh tells of a value in a file that it cannot use: a Rust debug text."""
 
 _Item = TypeVar("_Item")
 _COMPONENT_KEYS: Final = [component.key for component in WIRE_ORDER]
@@ -43,8 +49,10 @@ def _key_prefix(text: str) -> str:
 
 
 def _lcm_url(text: str) -> str:
-    provider, separator, _ = text.partition("://")
+    provider, separator, rest = text.partition("://")
     if provider not in LCM_PROVIDERS or not separator or not text.isprintable() or " " in text:
+        raise ValueError
+    if "@" in rest.partition("/")[0]:  # LCM knows no password, and says the whole URL in the log
         raise ValueError
     return text
 
@@ -107,7 +115,9 @@ KeyPrefix = Annotated[
 LcmUrl = Annotated[
     str,
     AfterValidator(_lcm_url),
-    accepts(f"a URL that begins with {one_of(f'{provider}://' for provider in LCM_PROVIDERS)}"),
+    accepts(
+        f"a URL that begins with {one_of(f'{provider}://' for provider in LCM_PROVIDERS)}, and has no user"
+    ),
 ]
 
 
@@ -202,9 +212,21 @@ def _ask_zenoh(read: Callable[[], object], what: str) -> None:
     try:
         read()
     except (zenoh.ZError, TypeError, ValueError) as error:
-        # Zenoh's reasons end in a place in its source text, and some are drawings of several lines.
-        reason = " ".join(re.sub(r" at \S+\.rs:\d+\.?$", "", str(error)).split())
-        raise mistake(f"Zenoh refuses {what}: {reason}") from None
+        raise mistake(f"Zenoh refuses {what}: {zenoh_reason(error)}") from None
+
+
+def zenoh_reason(error: Exception) -> str:
+    """Return the text of Zenoh's error on one line, without places in its source and without secrets."""
+    text = str(error)
+    if message := _ZENOH_MESSAGE.search(text):
+        text = f"line {message[2]}, column {message[3]}: " + re.sub(r"\\(.)", r"\1", message[1])
+    text = re.sub(r"\s+at \S+\.rs:\d+\.?", "", text)
+    # A drawing shows the line of the file that cannot be read, which may hold a password: its place
+    # and what was expected remain. So does the type of a wrong value, without the value.
+    text = re.sub(r"^ *--> (\d+):(\d+)", r"line \1, column \2:", text)
+    text = re.sub(r"^ *(\d+ )?\|.*\n|^ *= ", "", text, flags=re.MULTILINE)
+    text = re.sub(r"(invalid (?:type|value): [a-z ]+) (?:`[^`]*`|\"(?:[^\"\\]|\\.)*\")", r"\1", text)
+    return " ".join(without_secrets(text).split())
 
 
 Components = Annotated[
@@ -250,7 +272,7 @@ def _max_rates(value: object) -> dict[ComponentType, float]:
 
 MaxRates = Annotated[
     dict[ComponentType, float],
-    PlainValidator(_max_rates, json_schema_input_type=dict[Literal["3d", "6d", "analog", "force"], float]),
+    PlainValidator(_max_rates, json_schema_input_type=dict[Literal["3d", "6d", "analog", "force"], Hertz]),
     PlainSerializer(lambda rates: {component.key: rate for component, rate in rates.items()}),
 ]
 """YAML: {3d: NUMBER, …}."""

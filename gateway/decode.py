@@ -6,7 +6,8 @@ from typing import Any, Final
 
 import rtc3d
 
-from gateway.errors import ProtocolError
+from gateway.errors import ParametersError, ProtocolError
+from gateway.rtc3d.parameters_xml import parse_parameters
 
 MESSAGE_TYPES_BY_NAME: Final[dict[str, type[Any]]] = {
     message_type.__name__: message_type
@@ -19,9 +20,12 @@ MESSAGE_TYPES_BY_NAME: Final[dict[str, type[Any]]] = {
         rtc3d.tool_pose_t,
         rtc3d.status_t,
         rtc3d.clock_t,
+        rtc3d.parameters_t,
+        rtc3d.parameters_request_t,
+        rtc3d.parameters_reply_t,
     )
 }
-"""The types of all messages that the gateway publishes."""
+"""The types of all messages that go out, and of those that come back on LCM."""
 
 _TYPES: Final = {
     message_type._get_packed_fingerprint(): message_type  # noqa: SLF001 - lcm-gen offers no other way
@@ -29,21 +33,33 @@ _TYPES: Final = {
 }
 
 
-def decode(message: bytes) -> Any:
-    """Return the message as the object of its LCM type, told by its fingerprint.
+def message_type(message: bytes) -> type[Any]:
+    """Return the message's LCM type, told by its fingerprint.
 
     Raises ProtocolError for bytes that are none of our messages.
     """
-    message_type = _TYPES.get(message[:8])
-    if message_type is None:
+    found = _TYPES.get(message[:8])
+    if found is None:
         raise ProtocolError(
             f"{len(message)} bytes with the fingerprint {message[:8].hex()} are no message of this gateway; "
             "is another program, or another version of the gateway, publishing here?"
         )
+    return found
+
+
+def decode(message: bytes) -> Any:
+    """Return the message as the object of its LCM type; raises ProtocolError if it is none of ours."""
+    kind = message_type(message)
     try:
-        return message_type.decode(message)
+        decoded = kind.decode(message)
+        # lcm-gen's decoders take a text that is cut short for a shorter one. Where there are texts, no
+        # float is a signalling NaN, the one value that does not come back as it was.
+        whole = decoded.encode() == message or "string" not in kind.__typenames__
     except Exception as error:  # lcm-gen's decoders raise whatever comes
-        raise ProtocolError(f"a {message_type.__name__} of {len(message)} bytes is cut short") from error
+        raise ProtocolError(f"a {kind.__name__} of {len(message)} bytes is cut short") from error
+    if not whole:
+        raise ProtocolError(f"a {kind.__name__} of {len(message)} bytes is cut short or too long")
+    return decoded
 
 
 def to_json(value: Any) -> Any:
@@ -63,6 +79,8 @@ def one_line(message: Any) -> str:
         return _status_line(message)
     if isinstance(message, rtc3d.clock_t):
         return f"#{message.sequence} {_clock_text(message.clock)} ({message.components})"
+    if isinstance(message, rtc3d.parameters_t | rtc3d.parameters_request_t | rtc3d.parameters_reply_t):
+        return _parameters_line(message)
     text = _contents(message)
     return f"#{message.sequence} frame {message.frame_number} at {message.timestamp / 1e6:.4f} s: {text}"
 
@@ -102,6 +120,36 @@ def _clock_text(clock: Any) -> str:
     if not clock.has_clock:
         return "the server's time stamps make no clock"
     return f"offset {clock.offset_us} µs, drift {clock.drift_ppm:.1f} ppm, ± {clock.uncertainty_us:.0f} µs"
+
+
+def _parameters_line(message: Any) -> str:
+    match message:
+        case rtc3d.parameters_t():
+            return f"#{message.sequence} session {message.session}: {xml_text(message.xml.encode())}"
+        case rtc3d.parameters_request_t():
+            sections = " ".join(message.sections) or "all"
+            fresh = ", fresh" if message.fresh else ""
+            return f"request {message.request_id} of {message.requester!r}: {sections}{fresh}"
+    reply = message.error or f"{xml_text(message.xml.encode())}, {message.age_s:.1f} s old"
+    return f"reply {message.request_id} to {message.requester!r}: {reply}"
+
+
+def xml_text(xml: bytes) -> str:
+    """Return in a few words what a server's XML holds (§6)."""
+    size = f"{len(xml)} bytes of XML"
+    try:
+        parameters = parse_parameters(xml).parameters
+    except ParametersError:
+        return f"{size} that cannot be read as parameters"
+    items = (
+        ("markers", parameters.markers, "markers"),
+        ("tools", parameters.tools, "tools"),
+        ("analog channels", parameters.analog, "channels"),
+        ("force plates", parameters.force, "plates"),
+        ("events", parameters.events, "events"),
+    )
+    held = [f"{len(getattr(part, field))} {name}" for name, part, field in items if part is not None]
+    return f"{size}: {', '.join(held) or 'no markers, tools, channels, plates or events'}"
 
 
 def _numbers(values: Sequence[float]) -> str:

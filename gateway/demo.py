@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from gateway.config import LcmSettings, Settings, Source, Stream, ZenohSettings
+from gateway.config import LcmSettings, MetricsSettings, Settings, Source, Stream, ZenohSettings
 from gateway.daemon import Gateway
 from gateway.decode import decode, one_line
 from gateway.errors import OutputError
@@ -117,6 +117,7 @@ def _settings(port: int, endpoint: str, lcm_settings: LcmSettings) -> Settings:
             }
         ),
         lcm=lcm_settings,
+        metrics=MetricsSettings(enabled=False),
     )
 
 

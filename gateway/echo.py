@@ -5,9 +5,9 @@ import queue
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import TextIO
+from typing import Any, TextIO
 
-from gateway.decode import decode, one_line, to_json
+from gateway.decode import decode, one_line, to_json, xml_text
 from gateway.errors import ProtocolError
 from gateway.listening import (
     QUEUE_MESSAGES,
@@ -72,12 +72,49 @@ def echo(
             name, message = messages.get(timeout=wait_s)
         except queue.Empty:
             break
-        try:
-            decoded = decode(message)
-        except ProtocolError as error:
-            line = json.dumps({"key": name, "error": str(error)}) if as_json else f"{name}: {error}"
-        else:
-            line = json.dumps({"key": name} | to_json(decoded)) if as_json else f"{name} {one_line(decoded)}"
+        line = _json_line(name, message) if as_json else _text_line(name, message)
         print(line, file=out, flush=True)
         printed += 1
     return printed
+
+
+def _json_line(name: str, message: bytes) -> str:
+    try:
+        fields = to_json(decode(message))
+    except ProtocolError as error:
+        match _without_type(message):
+            case bytes() as xml:
+                fields = {"xml": xml.decode("utf-8", "replace")}
+            case dict() as announcement:
+                fields = announcement
+            case _:
+                fields = {"error": str(error)}
+    return json.dumps({"key": name} | fields)
+
+
+def _text_line(name: str, message: bytes) -> str:
+    try:
+        line = f"{name} {one_line(decode(message))}"
+    except ProtocolError as error:
+        match _without_type(message):
+            case bytes() as xml:
+                line = f"{name} {xml_text(xml)}"
+            case dict() as announcement:
+                line = f"{name} " + ", ".join(f"{key} {value}" for key, value in announcement.items())
+            case _:
+                line = f"{name}: {error}"
+    # Texts of servers and of strangers: none may steer the terminal.
+    return "".join(
+        character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in line
+    )
+
+
+def _without_type(message: bytes) -> bytes | dict[str, Any] | None:
+    """Return what Zenoh carries besides LCM messages: a server's XML, or the object of a JSON text."""
+    if message.lstrip().startswith(b"<"):
+        return message
+    try:
+        value = json.loads(message)
+    except (ValueError, RecursionError):
+        return None
+    return value if isinstance(value, dict) else None

@@ -7,7 +7,7 @@ from typing import Final
 import rtc3d
 
 from gateway.errors import OutputError
-from gateway.log import FailureLog
+from gateway.log import HOLD_S, FailureLog
 from gateway.message import MESSAGE_TYPES, Stamp, metres_per_unit, splice, tool_poses, type_name
 from gateway.names import MAX_LABEL_LENGTH, Topic, unique_name
 from gateway.outputs.contract import Output, Publisher
@@ -23,12 +23,33 @@ logger = logging.getLogger(__name__)
 
 
 class _Way:
-    """One output as one source sees it."""
+    """One output as one source sees it; with ``before`` it goes on with the numbers of the one replaced."""
 
-    def __init__(self, source: str, output: Output) -> None:
+    def __init__(self, source: str, output: Output, before: "_Way | None" = None) -> None:
         self.output = output
-        self.status = OutputStatus(output.name)
-        self._failures = FailureLog(logger, f"{source} to {output.name}")
+        self.status: OutputStatus = OutputStatus(output.name) if before is None else before.status
+        self.lanes: dict[ComponentType, _Lane] = {
+            kind: _Lane(
+                self,
+                kind,
+                Topic(source, (kind.key,), type_name(message_type)),
+                0 if before is None else before.lanes[kind].sequence,
+            )
+            for kind, message_type in MESSAGE_TYPES.items()
+        }
+        self.status_publisher = output.publisher(Topic(source, ("status",), "rtc3d.status_t"))
+        self.clock_publisher = output.publisher(Topic(source, ("clock",), "rtc3d.clock_t"))
+        self._failures = FailureLog(logger, f"{source} to {output.name}", HOLD_S)
+        self._source = source
+        output.announce(source)
+
+    def close(self) -> None:
+        """Give up everything that was declared on the output."""
+        for lane in self.lanes.values():
+            lane.publisher.close()
+        self.status_publisher.close()
+        self.clock_publisher.close()
+        self.output.withdraw(self._source)
 
     def send(self, publisher: Publisher, name: str, message: bytes) -> None:
         """Publish and count; what an output raises is its own affair, never the reader's."""
@@ -40,6 +61,7 @@ class _Way:
             self._dropped(type(error).__name__, f"{type(error).__name__}: {error}")
         else:
             self.status.messages[name] += 1
+            self.status.message_bytes[name] += len(message)
             if self._failures.failing:
                 self._failures.recovered("messages go out")
 
@@ -51,26 +73,31 @@ class _Way:
 class _Lane:
     """One component on its way to one output: paced, and numbered by itself."""
 
-    def __init__(self, way: _Way, component: ComponentType, topic: Topic) -> None:
+    def __init__(self, way: _Way, component: ComponentType, topic: Topic, sequence: int) -> None:
         self.way = way
         self.publisher = way.output.publisher(topic)
         max_rate_hz = way.output.max_rate_hz.get(component)
         # Events are never skipped.
         self.pacer = None if max_rate_hz is None or component is ComponentType.EVENT else Pacer(max_rate_hz)
-        self.sequence = 0
+        self.sequence = sequence
 
 
 _Sending = list[tuple[_Way, Publisher]]
 
 
-def _declare(ways: Iterable[_Way], topic: Topic) -> _Sending:
-    return [(way, way.output.publisher(topic)) for way in ways]
+def _declared(ways: Iterable[_Way], topic: Topic, before: _Sending) -> _Sending:
+    """Return a publisher of ``topic`` for each way, new ones and those there were; the others are closed."""
+    kept = dict(before)
+    sending = [(way, kept.pop(way) if way in kept else way.output.publisher(topic)) for way in ways]
+    for publisher in kept.values():
+        publisher.close()
+    return sending
 
 
 class FanOut:
     """Publishes what one source sends. ``tool_outputs`` are the names of outputs with a key per tool.
 
-    ``on_layout`` is called when the number of markers, tools, channels or plates changes.
+    ``on_layout`` is called when the number of markers, tools, channels or plates changes; it may be set anew.
     """
 
     def __init__(
@@ -80,24 +107,47 @@ class FanOut:
         tool_outputs: Collection[str] = (),
         on_layout: Callable[[], None] = lambda: None,
     ) -> None:
-        self._ways = [_Way(source, output) for output in outputs]
-        self._lanes = {
-            component: [
-                _Lane(way, component, Topic(source, (component.key,), type_name(message_type)))
-                for way in self._ways
-            ]
-            for component, message_type in MESSAGE_TYPES.items()
-        }
-        self._status_publishers = _declare(self._ways, Topic(source, ("status",), "rtc3d.status_t"))
-        self._clock_publishers = _declare(self._ways, Topic(source, ("clock",), "rtc3d.clock_t"))
+        self._ways: list[_Way] = []
+        self._last_ways: dict[str, _Way] = {}  # by the output's name, those given up too
+        self._lanes: dict[ComponentType, list[_Lane]] = {}
+        self.frames = dict.fromkeys(MESSAGE_TYPES, 0)
+        """How many frames came to be published with each component, left out by an output or not."""
         self.newest: dict[ComponentType, bytes] = {}
         """The newest message of each component."""
         self._num_items: dict[ComponentType, int] = {}
-        self._on_layout = on_layout
-        self._tools = _ToolPoses(source, [way for way in self._ways if way.output.name in tool_outputs])
+        self.on_layout = on_layout
+        self._flowing = False
+        self._tools = _ToolPoses(source)
         self._source = source
+        self.use(outputs, tool_outputs)
+
+    def use(self, outputs: Sequence[Output], tool_outputs: Collection[str] = ()) -> None:
+        """Publish on these outputs from now on. Those that were used before notice nothing.
+
+        One in place of another of its name goes on with its numbers and counters.
+        """
+        before = {way.output.name: way for way in self._ways}
+        self._ways = []
         for output in outputs:
-            output.announce(source)
+            way = before.pop(output.name, None)
+            if way is None or way.output is not output:
+                if way is not None:
+                    way.close()
+                way = _Way(self._source, output, self._last_ways.get(output.name))
+                if self._flowing:
+                    output.show_flowing(self._source, True)
+            self._last_ways[output.name] = way
+            self._ways.append(way)
+        self._lanes = {kind: [way.lanes[kind] for way in self._ways] for kind in MESSAGE_TYPES}
+        self._tools.use([way for way in self._ways if way.output.name in tool_outputs])
+        for way in before.values():
+            way.close()
+
+    def close(self) -> None:
+        """Give up all that was declared on the outputs."""
+        if self._flowing:
+            self.show_flowing(False)
+        self.use(())
 
     @property
     def outputs(self) -> list[tuple[Output, OutputStatus]]:
@@ -113,6 +163,7 @@ class FanOut:
             kind = component.type
             if kind not in wanted:
                 continue
+            self.frames[kind] += 1
             message = None
             sequence = -1
             for lane in self._lanes[kind]:
@@ -135,7 +186,7 @@ class FanOut:
         self._num_items[kind] = num_items
         if before is not None:
             logger.info("%s: %s has %d items now, %d before", self._source, kind.key, num_items, before)
-            self._on_layout()
+            self.on_layout()
 
     def listened(self, components: Collection[ComponentType]) -> bool:
         """Return whether anybody may be listening to one of the components on one of the outputs."""
@@ -143,18 +194,19 @@ class FanOut:
 
     def show_flowing(self, flowing: bool) -> None:
         """Show on every output that can whether frames of the source flow."""
+        self._flowing = flowing
         for way in self._ways:
             way.output.show_flowing(self._source, flowing)
 
     def publish_status(self, message: bytes) -> None:
         """Publish an encoded ``status_t``."""
-        for way, publisher in self._status_publishers:
-            way.send(publisher, "status", message)
+        for way in self._ways:
+            way.send(way.status_publisher, "status", message)
 
     def publish_clock(self, message: bytes) -> None:
         """Publish an encoded ``clock_t``."""
-        for way, publisher in self._clock_publishers:
-            way.send(publisher, "clock", message)
+        for way in self._ways:
+            way.send(way.clock_publisher, "clock", message)
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Take the tools' labels (§6.3) and the unit of length (§6.2) for the messages per tool."""
@@ -164,14 +216,22 @@ class FanOut:
 class _ToolPoses:
     """The messages per tool: SI poses, on keys that carry the tools' labels."""
 
-    def __init__(self, source: str, ways: list[_Way]) -> None:
+    def __init__(self, source: str) -> None:
         self._source = source
-        self._ways = ways
+        self._ways: list[_Way] = []
         self._labels: tuple[str, ...] = ()
         self._metres: float | None = 1e-3  # None: the server's unit is unknown
         self._tools: list[tuple[str, _Sending]] = []  # name and publishers of each
         self._sequences: dict[str, int] = {}  # by name
-        self._failures = FailureLog(logger, source)
+        self._too_many = FailureLog(logger, source, HOLD_S)
+        self._unit = FailureLog(logger, source)
+
+    def use(self, ways: list[_Way]) -> None:
+        self._ways = ways
+        self._tools = [(name, _declared(ways, self._topic(name), sending)) for name, sending in self._tools]
+
+    def _topic(self, name: str) -> Topic:
+        return Topic(self._source, (ComponentType.TOOLS.key, name), type_name(rtc3d.tool_pose_t))
 
     def set_parameters(self, parameters: Parameters) -> None:
         labels = () if parameters.tools is None else tuple(tool.label for tool in parameters.tools.tools)
@@ -182,11 +242,10 @@ class _ToolPoses:
         self._metres = metres_per_unit(unit)
         if self._metres is None and self._ways:
             # A robot that moves by a guessed unit is worse than one that waits.
-            logger.warning(
-                "%s: unit of length %.40r is unknown, so no poses per tool; set it to mm or m in the server",
-                self._source,
-                unit,
-            )
+            text = f"unit of length {unit[:40]!r} is unknown, so no poses per tool"
+            self._unit.failed(f"{text}; set it to mm or m in the server")
+        elif self._unit.failing:
+            self._unit.recovered(f"unit of length {unit!r} is known; poses per tool go out")
 
     def publish(self, component: Component, stamp: Stamp) -> None:
         if not self._ways:
@@ -198,6 +257,8 @@ class _ToolPoses:
         if count > _MAX_TOOLS:
             self._refuse(count)
             return
+        if self._too_many.failing:
+            self._too_many.recovered(f"frames of {count} tools; each has a key of its own")
         if count > len(self._tools):
             self._open(count)
         # Fewer than before keep their keys: a count that goes up and down declares nothing anew.
@@ -213,7 +274,7 @@ class _ToolPoses:
             self._sequences[name] += 1
 
     def _refuse(self, count: int) -> None:
-        self._failures.failed(f"a frame of {count} tools; none has a key of its own above {_MAX_TOOLS}")
+        self._too_many.failed(f"a frame of {count} tools; none has a key of its own above {_MAX_TOOLS}")
         self._drop("too many tools")
 
     def _drop(self, cause: str) -> None:
@@ -229,8 +290,7 @@ class _ToolPoses:
             label = self._labels[index].strip() if index < len(self._labels) else ""
             name = unique_name(label or f"tool {index + 1}", self._sequences, MAX_LABEL_LENGTH)
             self._sequences[name] = before.get(name, 0)
-            topic = Topic(self._source, (ComponentType.TOOLS.key, name), type_name(rtc3d.tool_pose_t))
-            self._tools.append((name, _declare(self._ways, topic)))
+            self._tools.append((name, _declared(self._ways, self._topic(name), [])))
 
     def _close(self) -> None:
         for _, sending in self._tools:

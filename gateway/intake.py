@@ -12,8 +12,6 @@ from gateway.rate import LagControl
 from gateway.rtc3d.components import ComponentType, Frame
 from gateway.status import StreamStatus
 
-_MAX_UNKNOWN_TYPES: Final = 16
-
 logger = logging.getLogger(__name__)
 
 Publish = Callable[[Frame, Stamp, frozenset[ComponentType]], None]
@@ -49,7 +47,6 @@ class Intake:
         self._loop = asyncio.get_running_loop()
         self._clock = status.clock = ServerClock()
         self._lag = LagControl(source.max_lag_ms / 1000)
-        self._unknown_types: set[int] = set()
 
     def take(self, frames: list[Frame], utime: int) -> None:
         """Take frames that came together at ``utime``, oldest first.
@@ -88,8 +85,6 @@ class Intake:
 
     def _note_unknown(self, types: tuple[int, ...]) -> None:
         self._status.drops["unknown component"] += len(types)
-        new = set(types) - self._unknown_types
-        # Bounded, because the numbers are the server's.
-        if new and len(self._unknown_types) < _MAX_UNKNOWN_TYPES:
-            self._unknown_types |= new
-            logger.warning("%s: components of unknown type %s are skipped", self._source.name, sorted(new))
+        text = f"components of unknown type {sorted(set(types))} are skipped"
+        if self._status.limit(text):
+            logger.warning("%s: %s", self._source.name, text)

@@ -8,6 +8,7 @@ from typing import Any, Final
 import lcm
 import zenoh
 
+from gateway.config_values import zenoh_reason
 from gateway.errors import OutputError
 from gateway.names import lcm_channel, zenoh_key
 from gateway.outputs.zenoh_output import zenoh_config
@@ -53,7 +54,8 @@ def open_zenoh(connect: str | None) -> zenoh.Session:
     except zenoh.ZError as error:
         where = f" to {connect}" if connect else ""
         raise OutputError(
-            f"no Zenoh session{where}: {error}; is the gateway or the router there?", cause="not open"
+            f"no Zenoh session{where}: {zenoh_reason(error)}; is the gateway or the router there?",
+            cause="not open",
         ) from error
 
 

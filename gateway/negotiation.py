@@ -109,5 +109,5 @@ class Negotiation:
         return None
 
     def _limit(self, text: str) -> None:
-        self._status.limit(text)
-        logger.warning("%s: %s", self._source.name, text)
+        level = logging.WARNING if self._status.limit(text) else logging.DEBUG
+        logger.log(level, "%s: %s", self._source.name, text)

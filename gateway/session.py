@@ -16,9 +16,9 @@ from gateway.errors import (
     ServerError,
     SilenceError,
 )
-from gateway.log import FailureLog
+from gateway.log import HOLD_S, FailureLog
 from gateway.rtc3d.commands import Bye, Command, Version
-from gateway.rtc3d.components import ComponentType, Frame
+from gateway.rtc3d.components import ByteOrder, ComponentType, Frame
 from gateway.rtc3d.connection import (
     Answered,
     Broken,
@@ -82,7 +82,7 @@ class Session(asyncio.Protocol):
         self._reply: asyncio.Future[Packet] | None = None
         self._asking = asyncio.Lock()
         self._last_frame_s = 0.0
-        self._rejected = FailureLog(logger, source.name)
+        self._rejected = FailureLog(logger, source.name, HOLD_S)
         self.server = f"{source.host}:{source.port}"
 
     @property
@@ -217,6 +217,8 @@ class Session(asyncio.Protocol):
         if frames:
             self._last_frame_s = self._loop.time()
             self.handlers.frames(frames, utime)
+            if self._rejected.failing:
+                self._rejected.recovered("frames are good again")
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Note the end, whoever caused it."""
@@ -247,9 +249,7 @@ class Session(asyncio.Protocol):
             case FileReceived(content):
                 self.handlers.file(content)
             case OtherByteOrder(byte_order):
-                text = f"the server sends {byte_order}-endian frames, not the byte order agreed"
-                self._status.limit(text)
-                logger.warning("%s: %s", self._source.name, text)
+                self._on_other_byte_order(byte_order)
             case Broken(packet_error):
                 self._fail(ClosedError(f"{self.server}: {packet_error}"))
             case Stray(packet):
@@ -257,6 +257,11 @@ class Session(asyncio.Protocol):
                     "%s: nobody waits for packet type %d: %.200s",
                     self._source.name, packet.type, text_of(packet.body[:200]),
                 )  # fmt: skip
+
+    def _on_other_byte_order(self, byte_order: ByteOrder) -> None:
+        text = f"the server sends {byte_order}-endian frames, not the byte order agreed"
+        if self._status.limit(text):
+            logger.warning("%s: %s", self._source.name, text)
 
     def _fail(self, error: LinkError) -> None:
         """End with the first reason: every waiter gets it."""

@@ -1,17 +1,32 @@
 """The folder of C3D files that servers sent: written whole, limited in number and size."""
 
+import contextlib
 import logging
 import os
+import re
 import tempfile
+import threading
+import time
+from collections.abc import Iterator
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 from gateway.errors import SpoolError
 
-_SUFFIX: Final = ".c3d"
+# Whatever else is in the folder is somebody else's, and not touched.
+_NAME: Final = re.compile(r"(?P<source>.+)-(?P<time>\d{8}T\d{6}\.\d{6}Z)\.c3d")
+_UNFINISHED: Final = ".c3d.part"
+_ABANDONED_S: Final = 3600.0
+"""An unfinished file that is older was left behind by a gateway that was killed."""
 
 logger = logging.getLogger(__name__)
+
+
+class _File(NamedTuple):
+    time: str  # sorts as the times do
+    source: str
+    path: Path
 
 
 class Spool:
@@ -24,6 +39,7 @@ class Spool:
         self.directory = directory
         self._max_files = max_files
         self._max_bytes = max_bytes
+        self._making_room = threading.Lock()
 
     def store(self, source: str, content: bytes) -> Path:
         """Write one file, under a temporary name until it is whole; return its path.
@@ -35,18 +51,16 @@ class Spool:
                 f"a C3D file of {len(content)} bytes from {source} is not kept: "
                 f"spool.max_bytes is {self._max_bytes}"
             )
-        name = f"{source}-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}{_SUFFIX}"
-        path = self.directory / name
+        path = self.directory / f"{source}-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}.c3d"
         temporary = None
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=self.directory, prefix=".", delete=False) as file:
+            with tempfile.NamedTemporaryFile(dir=self.directory, suffix=_UNFINISHED, delete=False) as file:
                 temporary = Path(file.name)
                 file.write(content)
                 file.flush()
                 os.fsync(file.fileno())
             temporary.replace(path)
-            self._make_room()
         except OSError as error:
             if temporary is not None:
                 temporary.unlink(missing_ok=True)
@@ -54,25 +68,32 @@ class Spool:
                 f"a C3D file of {len(content)} bytes from {source} cannot be kept in {self.directory}: "
                 f"{error.strerror}; check spool.directory and the space on it"
             ) from error
+        with self._making_room:
+            self._make_room()
         return path
 
     def newest(self, source: str) -> Path | None:
         """Return the newest file of ``source``, None if there is none."""
-        # The time in the name has a fixed width; a source's name may begin another's.
-        length = len(source) + 1 + len("YYYYMMDDThhmmss.ffffffZ") + len(_SUFFIX)
-        names = [path.name for path in self._files() if len(path.name) == length]
-        own = [name for name in names if name.startswith(f"{source}-")]
-        return self.directory / max(own) if own else None
+        own = [file for file in self._files() if file.source == source]
+        return max(own).path if own else None
 
-    def _files(self) -> list[Path]:
-        return list(self.directory.glob(f"[!.]*{_SUFFIX}"))
+    def _files(self) -> Iterator[_File]:
+        for path in self.directory.glob("*.c3d"):
+            if name := _NAME.fullmatch(path.name):
+                yield _File(name["time"], name["source"], path)
 
     def _make_room(self) -> None:
-        """Delete the oldest files beyond the limits."""
-        files = sorted(self._files(), key=lambda path: path.name.rsplit("-", 1)[-1], reverse=True)
+        """Delete the oldest files beyond the limits, and what was never finished."""
+        for path in self.directory.glob(f"*{_UNFINISHED}"):
+            with contextlib.suppress(FileNotFoundError):  # another thread has just finished it
+                if time.time() - path.stat().st_mtime > _ABANDONED_S:
+                    path.unlink()
         kept_bytes = 0
-        for number, path in enumerate(files, start=1):
-            kept_bytes += path.stat().st_size
-            if number > self._max_files or kept_bytes > self._max_bytes:
-                logger.info("%s is deleted: spool.max_files or spool.max_bytes is reached", path)
-                path.unlink()
+        for number, file in enumerate(sorted(self._files(), reverse=True), start=1):
+            try:
+                kept_bytes += file.path.stat().st_size
+                if number > self._max_files or kept_bytes > self._max_bytes:
+                    file.path.unlink()
+                    logger.info("%s is deleted: spool.max_files or spool.max_bytes is reached", file.path)
+            except OSError as error:
+                logger.warning("%s is old and cannot be deleted: %s", file.path, error.strerror)

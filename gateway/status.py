@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
@@ -18,6 +18,7 @@ MAX_ERROR_LENGTH: Final = 500
 
 
 MAX_LIMITATIONS: Final = 20
+"""How many are kept of one connection, and how many of those told last are known as told."""
 
 _TRYING: Final = (StreamState.CONNECTING, StreamState.HANDSHAKING, StreamState.WAITING)
 
@@ -36,6 +37,8 @@ class StreamStatus:
     ``name`` begins its log lines; ``on_state`` is called with each new state.
     ``components`` is as configured, space-separated. ``drops`` counts what came and was not
     published, by cause. ``limitations`` says what the present connection does without.
+    ``last_frame_utime`` is when the newest frame came, µs since the Unix epoch, 0 before the first.
+    ``tries`` counts the tries to connect since the last that ended in a handshake.
     """
 
     components: str
@@ -46,7 +49,9 @@ class StreamStatus:
     rate: str = ""
     session: int = 0
     frames_in: int = 0
+    last_frame_utime: int = 0
     bytes_in: int = 0
+    tries: int = 0
     reconnects: int = 0
     restarts: int = 0
     lag_s: float = 0.0
@@ -55,9 +60,14 @@ class StreamStatus:
     limitations: list[str] = field(default_factory=list)
     last_error: str = ""
     last_error_utime: int = 0
+    _told: deque[str] = field(default_factory=lambda: deque(maxlen=MAX_LIMITATIONS), init=False)
 
     def move(self, happened: StreamInput, cause: str) -> None:
         """Change the state as the table has it, log the change with its cause, and tell of it."""
+        if happened is StreamInput.DIAL:
+            self.tries += 1
+        elif happened is StreamInput.READY:
+            self.tries = 0
         before, self.state = self.state, next_state(self.state, happened)
         if self.state is before:
             return
@@ -74,10 +84,18 @@ class StreamStatus:
         self.limitations.clear()
         self.byte_order = self.rate = ""
 
-    def limit(self, text: str) -> None:
-        """Note what this connection does without; at most MAX_LIMITATIONS of them are kept."""
-        if text not in self.limitations and len(self.limitations) < MAX_LIMITATIONS:
-            self.limitations.append(text)
+    def limit(self, text: str) -> bool:
+        """Note what this connection does without; at most MAX_LIMITATIONS of them are kept.
+
+        Returns whether it is news: not noted before, of an earlier connection neither.
+        """
+        if text in self.limitations or len(self.limitations) >= MAX_LIMITATIONS:
+            return False
+        self.limitations.append(text)
+        if text in self._told:
+            return False
+        self._told.append(text)
+        return True
 
     def note_error(self, text: str) -> None:
         """Keep ``text``, at most MAX_ERROR_LENGTH of it, as the last error, with the time."""
@@ -87,11 +105,12 @@ class StreamStatus:
 
 @dataclass(slots=True)
 class OutputStatus:
-    """What one output did for one source: messages by component, and drops by cause."""
+    """What one output did for one source: messages and their bytes by component, and drops by cause."""
 
     name: str
     messages: Counter[str] = field(default_factory=Counter)
     drops: Counter[str] = field(default_factory=Counter)
+    message_bytes: Counter[str] = field(default_factory=Counter)
 
 
 @dataclass(frozen=True, slots=True)

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 from gateway.config import Reconnect, Source, Stream
 from gateway.errors import LinkError
 from gateway.intake import Intake, Publish
-from gateway.log import FailureLog
+from gateway.log import FailureLog, log_fields
 from gateway.negotiation import Negotiation
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.session import Handlers, Session
@@ -83,6 +83,11 @@ class Supervisor:
         because a motion-capture computer that is off today is on tomorrow. Anything else is a
         mistake in this program and is raised.
         """
+        server = f"{self._source.host}:{self._source.port}"
+        with log_fields(source=self._source.name, stream=self._status.components, peer=server):
+            await self._run_sessions()
+
+    async def _run_sessions(self) -> None:
         delays_s = self._delays_s(self._source.reconnect)
         while True:
             frames_before = self._status.frames_in
@@ -99,12 +104,13 @@ class Supervisor:
 
     async def _run_session(self) -> None:
         """Run one session to its end, which is always a LinkError."""
+        lateness = FailureLog(logger, self._status.name)
         intake = Intake(
             self._source,
             self._stream,
             self._status,
             self._callbacks.publish,
-            lambda halvings: self._change(self._follow_lag(negotiation, halvings)),
+            lambda halvings: self._change(self._follow_lag(negotiation, halvings, lateness)),
             self._callbacks.restarted,
         )
         session = Session(
@@ -142,14 +148,16 @@ class Supervisor:
         except LinkError as error:
             logger.debug("%s: %s", self._status.name, error)  # the session ends, and says why
 
-    async def _follow_lag(self, negotiation: Negotiation, halvings: int) -> None:
+    async def _follow_lag(self, negotiation: Negotiation, halvings: int, lateness: FailureLog) -> None:
+        lag_ms = 1000 * self._status.lag_s
         await negotiation.change_rate(halvings)
-        logger.warning(
-            "%s: frames come %.0f ms late; asked the server for %s",
-            self._status.name,
-            1000 * self._status.lag_s,
-            self._status.rate or "its default rate",
-        )
+        asked = f"asked the server for {self._status.rate or 'its default rate'}"
+        if lag_ms > self._source.max_lag_ms:
+            lateness.failed(f"frames come {lag_ms:.0f} ms late; {asked}")
+        elif halvings:
+            logger.debug("%s: frames come in time; %s", self._status.name, asked)
+        else:
+            lateness.recovered(f"frames come in time; {asked}")
 
     async def _follow_demand(self, negotiation: Negotiation) -> None:
         """Stop the stream while nobody listens, and start it again within DEMAND_POLL_S of the first."""

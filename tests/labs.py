@@ -5,7 +5,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
-from gateway.config import Reconnect, Settings, Source
+from gateway.config import MetricsSettings, Reconnect, Settings, Source
 from gateway.daemon import Gateway
 from gateway.decode import decode
 from gateway.outputs.memory_output import MemoryOutput
@@ -47,7 +47,8 @@ async def gateway_to(port: int, **settings: Any) -> AsyncIterator[Running]:
         "stall_timeout_s": 1.0,
     }
     output = MemoryOutput()
-    gateway = Gateway(Settings(sources=(Source(**(source | settings)),)), [output])
+    unwatched = MetricsSettings(enabled=False)
+    gateway = Gateway(Settings(sources=(Source(**(source | settings)),), metrics=unwatched), [output])
     stop = asyncio.Event()
     task = asyncio.create_task(gateway.run(stop))
     try:

@@ -31,6 +31,9 @@ class ToyOutput:
     def announce(self, source: str) -> None:
         self.announced.append(source)
 
+    def withdraw(self, source: str) -> None:
+        self.announced.remove(source)
+
     def show_flowing(self, _source: str, flowing: bool) -> None:
         self.flowing.append(flowing)
 

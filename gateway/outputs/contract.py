@@ -47,7 +47,10 @@ class Output(Protocol):
         """Return a new publisher of ``topic``, before or after the output is open."""
 
     def announce(self, source: str) -> None:
-        """Show to all that the gateway serves ``source``, for as long as the output is open."""
+        """Show to all that the gateway serves ``source``, until ``withdraw`` or the output's end."""
+
+    def withdraw(self, source: str) -> None:
+        """Show no longer that the gateway serves ``source``."""
 
     def show_flowing(self, source: str, flowing: bool) -> None:
         """Show to all whether frames of ``source`` flow."""

@@ -12,7 +12,7 @@ import lcm
 
 from gateway.config import LcmSettings
 from gateway.errors import OutputError
-from gateway.log import FailureLog
+from gateway.log import HOLD_S, FailureLog
 from gateway.names import Topic, lcm_channel, unique_name
 from gateway.status import OutputHealth
 
@@ -92,17 +92,20 @@ class LcmOutput:
         self._declarations: list[Callable[[lcm.LCM], None]] = []
         self._problem = "LCM is not open; start the output first"
         self._retry_at_s = 0.0
-        self._failures = FailureLog(logger, self.name)
+        self._opening = FailureLog(logger, self.name)
+        self._sending = FailureLog(logger, self.name, HOLD_S)
 
     def start(self) -> None:
         """Open LCM; what fails is tried again by ``maintain``."""
         try:
             self._lcm = self._shared or open_lcm(self.settings.effective_url)
         except OutputError as error:
-            self._failed(str(error))
+            self._problem = str(error)
+            self._opening.failed(self._problem)
             self._retry_at_s = time.monotonic() + _RETRY_S
         else:
-            self._sent()
+            self._problem = ""
+            self._opening.recovered(f"sending to {self.settings.effective_url}")
             for declare in self._declarations:
                 declare(self._lcm)
 
@@ -136,22 +139,18 @@ class LcmOutput:
             self._lcm.publish(channel, message)
         except OSError as error:
             url = self.settings.effective_url
-            problem = multicast_problem(url) or f"LCM did not send to {url}: {error}; check lcm.url"
-            self._failed(problem)
-            raise OutputError(problem, cause="send failed") from error
-        if self._problem:
-            self._sent()
-
-    def _failed(self, problem: str) -> None:
-        self._problem = problem
-        self._failures.failed(problem)
-
-    def _sent(self) -> None:
+            self._problem = multicast_problem(url) or f"LCM did not send to {url}: {error}; check lcm.url"
+            self._sending.failed(self._problem)
+            raise OutputError(self._problem, cause="send failed") from error
         self._problem = ""
-        self._failures.recovered(f"sending to {self.settings.effective_url}")
+        if self._sending.failing:
+            self._sending.recovered(f"sending to {self.settings.effective_url}")
 
     def announce(self, source: str) -> None:
         """LCM has nothing of the kind; the status messages show who serves ``source``."""
+
+    def withdraw(self, source: str) -> None:
+        """LCM has nothing of the kind."""
 
     def show_flowing(self, source: str, flowing: bool) -> None:
         """LCM has nothing of the kind; the status messages show the state of every stream."""

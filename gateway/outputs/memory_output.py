@@ -60,6 +60,10 @@ class MemoryOutput:
         """Note that ``source`` is served."""
         self.announced.add(source)
 
+    def withdraw(self, source: str) -> None:
+        """Note that ``source`` is no longer served."""
+        self.announced.discard(source)
+
     def show_flowing(self, source: str, flowing: bool) -> None:
         """Note whether frames of ``source`` flow."""
         if flowing:

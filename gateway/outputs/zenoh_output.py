@@ -5,7 +5,6 @@ Opened in a thread of its own, because ``zenoh.open`` blocks; see docs/design.md
 
 import json
 import logging
-import re
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -14,6 +13,7 @@ from typing import Any, Final, cast
 import zenoh
 
 from gateway.config import ZenohSettings
+from gateway.config_values import zenoh_reason
 from gateway.errors import ConfigError, OutputError
 from gateway.log import FailureLog
 from gateway.names import Topic, zenoh_key
@@ -38,7 +38,9 @@ _NO_ROUTER: Final = OutputHealth(
 )
 _HEALTHY: Final = OutputHealth(True)
 _RETRY_S: Final = 1.0
-_JOIN_S: Final = 1.0
+_JOIN_S: Final = 0.5
+_CLOSE_S: Final = 0.5
+"""How long closing may take. A peer that does not read holds it up for 10 s: that is left behind."""
 
 logger = logging.getLogger(__name__)
 
@@ -54,12 +56,7 @@ def zenoh_config(config: Path | Mapping[str, Any]) -> zenoh.Config:
         return zenoh.Config.from_json5(json.dumps(_merged(_DEFAULTS, config)))
     except (zenoh.ZError, TypeError, ValueError) as error:
         where = f"file {config}" if isinstance(config, Path) else "inline zenoh.config"
-        raise ConfigError(f"Zenoh does not accept the {where}: {_reason(error)}") from error
-
-
-def _reason(error: Exception) -> str:
-    """Return the error's text on one line, without the places in Zenoh's source."""
-    return " ".join(re.sub(r"\s+at \S+\.rs:\d+\.?", "", str(error)).split())
+        raise ConfigError(f"Zenoh does not accept the {where}: {zenoh_reason(error)}") from error
 
 
 def _merged(defaults: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
@@ -120,7 +117,7 @@ class ZenohPublisher:
         try:
             self._publisher.put(message)
         except zenoh.ZError as error:
-            text = f"Zenoh did not take a message for {self._key}: {_reason(error)}"
+            text = f"Zenoh did not take a message for {self._key}: {zenoh_reason(error)}"
             raise OutputError(text, cause="put failed") from error
 
     def close(self) -> None:
@@ -135,6 +132,13 @@ class ZenohPublisher:
                 logger.debug("undeclaring %s: %s", self._key, error)
 
 
+def _close(session: zenoh.Session) -> None:
+    try:
+        session.close()
+    except zenoh.ZError as error:
+        logger.debug("zenoh: closing the session: %s", zenoh_reason(error))
+
+
 class ZenohOutput:
     """One Zenoh session and its publishers. Raises ConfigError if Zenoh refuses the configuration."""
 
@@ -143,14 +147,14 @@ class ZenohOutput:
     def __init__(self, settings: ZenohSettings) -> None:
         self.settings = settings
         self.max_rate_hz = settings.max_rate_hz
-        self._config = zenoh_config(settings.config)
-        self._is_client = json.loads(self._config.get_json("mode") or "null") == "client"
-        self._lock = threading.Lock()  # of _session, _publishers and _sources, shared with _opener
+        self.config = zenoh_config(settings.config)
+        self._is_client = json.loads(self.config.get_json("mode") or "null") == "client"
+        self._lock = threading.Lock()  # of _session, _publishers and the tokens, shared with _opener
         self._session: zenoh.Session | None = None
         self._publishers: list[ZenohPublisher] = []
-        self._sources: list[str] = []
         self._declarations: list[Callable[[zenoh.Session], None]] = []
-        self._tokens: list[zenoh.LivelinessToken] = []
+        # By the source's name; None while the session is not open.
+        self._alive: dict[str, zenoh.LivelinessToken | None] = {}
         self._flowing: dict[str, zenoh.LivelinessToken | None] = {}
         self._transports = 0
         self._problem = f"the Zenoh session is not open yet; {_REMEDY}"
@@ -176,9 +180,9 @@ class ZenohOutput:
     def _open(self) -> None:
         while not self._closing.is_set():
             try:
-                session = zenoh.open(self._config)
+                session = zenoh.open(self.config)
             except zenoh.ZError as error:
-                self._problem = f"the Zenoh session does not open: {_reason(error)}; {_REMEDY}"
+                self._problem = f"the Zenoh session does not open: {zenoh_reason(error)}; {_REMEDY}"
                 self._failures.failed(self._problem)
                 self._closing.wait(_RETRY_S)
                 continue
@@ -189,7 +193,8 @@ class ZenohOutput:
                     return
                 for publisher in self._publishers:
                     publisher.bind(session)
-                self._tokens = [self._token(session, source, "alive") for source in self._sources]
+                for source in self._alive:
+                    self._alive[source] = self._token(session, source, "alive")
                 for source in self._flowing:
                     self._flowing[source] = self._token(session, source, "server")
                 self._session = session
@@ -222,22 +227,26 @@ class ZenohOutput:
 
     def announce(self, source: str) -> None:
         """Hold the liveliness token PREFIX/SOURCE/alive."""
-        with self._lock:
-            self._sources.append(source)
-            if self._session is not None:
-                self._tokens.append(self._token(self._session, source, "alive"))
+        self._show(self._alive, source, "alive", True)
+
+    def withdraw(self, source: str) -> None:
+        """Let the liveliness token PREFIX/SOURCE/alive go."""
+        self._show(self._alive, source, "alive", False)
 
     def show_flowing(self, source: str, flowing: bool) -> None:
         """Hold the liveliness token PREFIX/SOURCE/server while frames flow, and only then."""
+        self._show(self._flowing, source, "server", flowing)
+
+    def _show(
+        self, tokens: dict[str, zenoh.LivelinessToken | None], source: str, name: str, shown: bool
+    ) -> None:
         with self._lock:
-            if not flowing:
-                token = self._flowing.pop(source, None)
+            if not shown:
+                token = tokens.pop(source, None)
                 if token is not None:
                     token.undeclare()
-            elif source not in self._flowing:
-                self._flowing[source] = (
-                    None if self._session is None else self._token(self._session, source, "server")
-                )
+            elif source not in tokens:
+                tokens[source] = None if self._session is None else self._token(self._session, source, name)
 
     def when_open(self, declare: Callable[[zenoh.Session], None]) -> None:
         """Call ``declare`` with the session once it is open, in the thread that opens it."""
@@ -273,8 +282,10 @@ class ZenohOutput:
             self._opener.join(_JOIN_S)  # an open() that blocks is left behind; it closes what it opens
         with self._lock:
             session, self._session = self._session, None
-            self._tokens.clear()
+            self._alive.clear()
             self._flowing.clear()
             self._problem = "the Zenoh session is closed; start the gateway again"
         if session is not None:
-            session.close()
+            closer = threading.Thread(target=_close, args=(session,), name="zenoh-close", daemon=True)
+            closer.start()
+            closer.join(_CLOSE_S)

@@ -9,7 +9,7 @@ import contextlib
 import logging
 import threading
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -19,6 +19,7 @@ import rtc3d
 from gateway.config import LcmSettings
 from gateway.errors import QueryError
 from gateway.names import lcm_channel
+from gateway.queries.answers import unknown_section
 from gateway.queries.desk import Desk
 from gateway.rtc3d.commands import SECTIONS
 from gateway.status import now_utime
@@ -30,6 +31,10 @@ MAX_REQUEST_BYTES: Final = 4096
 MAX_REQUESTER_BYTES: Final = 128
 REPEAT_S: Final = 5.0
 """How often the parameters are published again, for those who came late."""
+
+_MALFORMED: Final = "malformed request"
+_BEYOND: Final = "request beyond the queue"
+"""What ignored requests are counted as."""
 
 _POLL_MS: Final = 100
 _JOIN_S: Final = 1.0
@@ -48,40 +53,61 @@ class _Told:
 class LcmQueries:
     """Answers for all ``desks``, by the source's name, on the channels of ``settings.prefix``.
 
-    ``declare`` is called once LCM is open. Where ``shared`` is true somebody else handles that LCM
-    object, as with memq://; else a thread of this object does.
+    The desks may change: ``serve`` and ``dismiss`` tell of one that came or went. ``drops`` are the
+    counters, by the source's name, of what was not answered. ``declare`` is called once LCM is open.
+    Where ``shared`` is true somebody else handles that LCM object, as with memq://; else a thread of
+    this object does.
     """
 
-    def __init__(self, settings: LcmSettings, desks: Mapping[str, Desk], *, shared: bool) -> None:
+    def __init__(
+        self,
+        settings: LcmSettings,
+        desks: Mapping[str, Desk],
+        drops: Mapping[str, Counter[str]],
+        *,
+        shared: bool,
+    ) -> None:
         self._prefix = settings.prefix
         self._desks = desks
+        self._drops = drops
         self._shared = shared
         self._loop = asyncio.get_running_loop()
         self._lcm: lcm.LCM | None = None
-        self._subscriptions: list[lcm.LCMSubscription] = []
+        self._subscriptions: dict[str, lcm.LCMSubscription] = {}  # by the source's name
         self._thread: threading.Thread | None = None
         self._closing = threading.Event()
-        self._pending = 0  # changed in the loop, read in the handler's thread
+        self._free = threading.BoundedSemaphore(MAX_PENDING)  # taken in the handler's thread
+        self._ignored: dict[str, Counter[str]] = defaultdict(Counter)  # by source; the handler's
         self._tasks: set[asyncio.Task[None]] = set()
         self._told: dict[str, _Told] = {}
         self.results: Counter[str] = Counter()
-        """Requests by result: ok, the code of the error, malformed or dropped."""
+        """Requests by result: ok, or the code of the error."""
 
     def declare(self, connection: lcm.LCM) -> None:
         """Listen for requests on an open LCM object."""
         self._lcm = connection
-        for source, desk in self._desks.items():
-            channel = lcm_channel(self._prefix, source, "PARAMETERS_REQUEST")
-
-            def on_request(_channel: str, data: bytes, desk: Desk = desk) -> None:
-                self._take(desk, data)
-
-            subscription = connection.subscribe(f"^{channel}$", on_request)
-            subscription.set_queue_capacity(MAX_PENDING)
-            self._subscriptions.append(subscription)
+        for source in self._desks:
+            self.serve(source)
         if not self._shared:
             self._thread = threading.Thread(target=self._handle, name="lcm-requests", daemon=True)
             self._thread.start()
+
+    def serve(self, source: str) -> None:
+        """Begin to answer for a source whose desk has come."""
+        if self._lcm is None or source in self._subscriptions:
+            return
+        channel = lcm_channel(self._prefix, source, "PARAMETERS_REQUEST")
+        subscription = self._lcm.subscribe(f"^{channel}$", lambda _channel, data: self._take(source, data))
+        subscription.set_queue_capacity(MAX_PENDING)
+        self._subscriptions[source] = subscription
+
+    def dismiss(self, source: str) -> None:
+        """Answer no longer for a source whose desk has gone.
+
+        Its requests find nobody. Its subscription stays: LCM's Python module frees one at once, though
+        the handler's thread may be at it.
+        """
+        self._told.pop(source, None)
 
     def _handle(self) -> None:
         while not self._closing.is_set() and self._lcm is not None:
@@ -91,30 +117,28 @@ class LcmQueries:
                 logger.debug("handling LCM requests: %s", error)
                 self._closing.wait(_POLL_MS / 1000)
 
-    def _take(self, desk: Desk, data: bytes) -> None:
+    def _take(self, source: str, data: bytes) -> None:
         """Check a request in the handler's thread and hand it to the loop."""
-        if self._pending >= MAX_PENDING:
-            self.results["dropped"] += 1
+        desk = self._desks.get(source)
+        if desk is None:
             return
+        ignored = self._ignored[source]
         request = _decoded(data)
         if request is None:
-            self.results["malformed"] += 1
-            logger.debug("%s: malformed LCM request of %d bytes", desk.source.name, len(data))
-            return
-        with contextlib.suppress(RuntimeError):  # the loop has just ended
-            self._loop.call_soon_threadsafe(self._start, desk, request)
+            ignored[_MALFORMED] += 1
+        elif not self._free.acquire(blocking=False):
+            ignored[_BEYOND] += 1
+        else:
+            with contextlib.suppress(RuntimeError):  # the loop has just ended
+                self._loop.call_soon_threadsafe(self._start, desk, request)
 
     def _start(self, desk: Desk, request: Any) -> None:
-        if self._pending >= MAX_PENDING:
-            self.results["dropped"] += 1
-            return
-        self._pending += 1
         task = asyncio.create_task(self._answer(desk, request))
         self._tasks.add(task)
         task.add_done_callback(self._done)
 
     def _done(self, task: asyncio.Task[None]) -> None:
-        self._pending -= 1
+        self._free.release()
         self._tasks.discard(task)
 
     async def _answer(self, desk: Desk, request: Any) -> None:
@@ -124,23 +148,28 @@ class LcmQueries:
             known = await desk.parameters(_sections(request), fresh=request.fresh, stale_ok=False)
         except QueryError as error:
             reply.error, reply.error_code = str(error), error.code
-            self.results[error.code] += 1
+        except Exception as error:
+            logger.exception("%s: LCM request %d of %r", desk.source.name, reply.request_id, reply.requester)
+            reply.error, reply.error_code = f"a defect in the gateway: {error!r}", "defect"
         else:
-            reply.xml = known.xml.decode("utf-8", "replace")
-            reply.age_s = time.monotonic() - known.came_s
-            self.results["ok"] += 1
+            reply.xml, reply.age_s = _text(known.xml), known.age_s
+        self.results[reply.error_code or "ok"] += 1
         self._publish(desk.source.name, "PARAMETERS_REPLY", reply)
 
     def tell_parameters(self, source: str, xml: bytes) -> None:
         """Publish a source's parameters, now and again every REPEAT_S seconds."""
         told = self._told.setdefault(source, _Told())
-        told.message.xml = xml.decode("utf-8", "replace")
+        told.message.xml = _text(xml)
         told.message.capture_utime = now_utime()
         told.message.session = self._desks[source].session
         self._repeat(source, told)
 
     def maintain(self) -> None:
-        """Repeat what is due; called once a second."""
+        """Repeat what is due, and count what was ignored; called once a second."""
+        for source, ignored in list(self._ignored.items()):
+            for cause in (_MALFORMED, _BEYOND):  # whole counts: the handler's thread goes on counting
+                if ignored[cause]:
+                    self._drops[source][cause] = ignored[cause]
         for source, told in self._told.items():
             if time.monotonic() >= told.again_at_s:
                 self._repeat(source, told)
@@ -167,7 +196,7 @@ class LcmQueries:
         if self._thread is not None:
             await asyncio.to_thread(self._thread.join, _JOIN_S)
         if self._lcm is not None:
-            for subscription in self._subscriptions:
+            for subscription in self._subscriptions.values():
                 self._lcm.unsubscribe(subscription)
             self._lcm = None
 
@@ -184,8 +213,18 @@ def _decoded(data: bytes) -> Any | None:
 
 
 def _sections(request: Any) -> tuple[str, ...]:
-    """Return the sections asked for, in SECTIONS' order; raises QueryError for an unknown one."""
+    """Return the sections asked for, () for all of them; raises QueryError for an unknown one."""
     unknown = set(request.sections) - set(SECTIONS)
     if unknown:
-        raise QueryError(f"unknown section {min(unknown)!r}; accepted: {', '.join(SECTIONS)}")
-    return tuple(section for section in SECTIONS if section in request.sections)
+        raise QueryError(unknown_section(min(unknown)))
+    asked = tuple(section for section in SECTIONS if section in request.sections)
+    return () if asked == SECTIONS else asked
+
+
+def _text(xml: bytes) -> str:
+    """Return XML as it came as a text: UTF-8, else Latin-1, without the NULs at its end (field note 9)."""
+    body = xml.rstrip(b"\0")
+    try:
+        return body.decode()
+    except UnicodeDecodeError:
+        return body.decode("latin-1")

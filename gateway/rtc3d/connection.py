@@ -314,13 +314,15 @@ class Connection:
             events.append(Stray(packet))
         elif packet.type == PacketType.ERROR:
             self.under_way = None
-            self._owed.clear()
+            self._settle(command)
             self._answered.append(command)
             if isinstance(command, StreamFrames):
                 self._move(Input.REFUSED)
-            events.append(Refused(command, ServerError(text_of(packet.body[:_MAX_ERROR_BYTES]) or "no reason given")))
+            events.append(
+                Refused(command, ServerError(text_of(packet.body[:_MAX_ERROR_BYTES]) or "no reason given"))
+            )
         elif PacketType.COMMAND in _ANSWERS[type(command)]:
-            self._owed.clear()
+            self._settle(command)
             if isinstance(command, SetByteOrder):
                 self._agreed_order = command.byte_order
             self._answer(packet, events)
@@ -346,7 +348,7 @@ class Connection:
     def _on_xml(self, packet: Packet, events: list[Event]) -> None:
         meant = self._parameters_meant(packet)
         if meant is not None and meant is self.under_way:
-            self._owed.clear()
+            self._settle(meant)
             self._answer(packet, events)
             return
         if meant is not None and meant in self._owed:
@@ -356,14 +358,20 @@ class Connection:
     def _parameters_meant(self, packet: Packet) -> Command | None:
         """Return the SendParameters that the XML answers: under way, owed, answered, or None."""
         asked = [self.under_way] if isinstance(self.under_way, SendParameters) else []
-        owed, answered = (
-            [command for command in commands if isinstance(command, SendParameters) and command not in asked]
-            for commands in (self._owed, self._answered)
-        )
-        if not owed and not answered:
+        owed = [late for late in self._owed if isinstance(late, SendParameters) and late not in asked]
+        if not owed:
+            # Whatever it holds: a server may know no sections and send all of them, or leave some out.
             return asked[0] if asked else None
         present = _sections_in(packet.body)
-        return max((*owed, *asked, *answered), key=lambda command: _fit(present, command))
+        return max((*owed, *asked), key=lambda command: _fit(present, command))
+
+    def _settle(self, command: Command) -> None:
+        """Expect no reply to earlier commands any more, because a server answers in order.
+
+        Unless one of them was the same: then this reply may be that one's, and another may follow.
+        """
+        if command not in self._owed:
+            self._owed.clear()
 
     def _answer(self, packet: Packet, events: list[Event]) -> None:
         """End the command under way with ``packet``."""

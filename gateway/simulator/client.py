@@ -139,6 +139,11 @@ class Client:
         self._stream = None
         return [NO_DATA] * waiting
 
+    def scene_changed(self) -> None:
+        """Go on with the stream, from its next frame on, in frames of the server's new scene."""
+        if self._stream is not None and self._subscription is not None:
+            self._begin_stream(self._subscription, self._stream.due_us)
+
     def answer(self, packet: Packet) -> list[bytes]:
         """Return the replies to a client's packet, each one packet."""
         match packet.type:

@@ -1,26 +1,18 @@
-"""The simulator's server: listens, keeps the measurement's time, sends each client what is due."""
+"""The simulator's server: listens, and keeps the measurement's time for all clients."""
 
 import asyncio
 import logging
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 from types import TracebackType
-from typing import Final, Self, cast
+from typing import Final, Self
 
-import gateway
 from gateway.errors import GatewayError
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.packets import Packet, PacketReader
-from gateway.rtc3d.parameters import General, Parameters
-from gateway.simulator.client import Client, Server, error_packet
+from gateway.simulator.connection import Connection, SentCounts
+from gateway.simulator.faults.control import Faults
 from gateway.simulator.frames import FrameBuilder, exact_rate, time_us
 from gateway.simulator.scene import Scene
-
-NAME: Final = "RTC3D simulator"
-MAX_COMMAND_BYTES: Final = 64 * 1024
-MAX_UNREAD_BYTES: Final = 4 * 1024 * 1024
-"""What is kept for a client that does not read; beyond it, frames for that client are dropped."""
 
 _CLOSING_S: Final = 1.0  # for clients to take what was sent before close() cuts them off
 _log = logging.getLogger(__name__)
@@ -50,6 +42,9 @@ class Simulator:
         self.connections: set[Connection] = set()
         self.counts = SentCounts()
         """What was sent to all clients so far."""
+        self.faults = Faults(self)
+        """What goes wrong on purpose; nothing unless it is told to."""
+        self._accepted = 0  # connections since the server's start
         self._dropped_before = 0  # by clients no longer connected
         self._event_bytes = event_bytes
         self._once = once
@@ -59,6 +54,11 @@ class Simulator:
         self._has_measured = False
         self._server: asyncio.Server | None = None
         self._timer: asyncio.TimerHandle | None = None
+
+    @property
+    def is_listening(self) -> bool:
+        """Whether clients can connect."""
+        return self._server is not None and self._server.is_serving()
 
     @property
     def sent(self) -> Counter[str]:
@@ -89,11 +89,14 @@ class Simulator:
                 "give it an address of this machine and a port that is free"
             ) from error
         self.port = self._server.sockets[0].getsockname()[1]
+        self._accepted = 0
+        self._has_measured = False
         if not self._once:
             self.start_measurement()
 
     async def close(self) -> None:
-        """End the measurement, close the connections, and stop listening."""
+        """End the faults and the measurement, close the connections, and stop listening."""
+        await self.faults.close()
         self.stop_measurement()
         if self._server is None:
             return
@@ -107,6 +110,15 @@ class Simulator:
             connection.transport.abort()
         await self._server.wait_closed()
         self._server = None
+
+    def vanish(self) -> None:
+        """End as if the process died: nobody is told. ``start`` brings the server back, on the same port."""
+        for connection in list(self.connections):
+            connection.transport.abort()
+        self.stop_measurement()
+        if self._server is not None:
+            self._server.close()
+            self._server = None
 
     async def __aenter__(self) -> Self:
         await self.start()
@@ -145,6 +157,14 @@ class Simulator:
                 connection.send(packet)
         self.schedule()
 
+    def change_scene(self, scene: Scene) -> None:
+        """Play another scene from now on; a measurement that runs goes on with it, its time stamps too."""
+        self.scene = scene
+        self._builders.clear()
+        for connection in self.connections:
+            connection.client.scene_changed()
+        self.schedule()
+
     def elapsed_us(self) -> int | None:
         """Return the time since the measurement's start in µs, None if none runs."""
         if self._started_s is None:
@@ -167,7 +187,14 @@ class Simulator:
             self._builders[choice] = FrameBuilder(self.scene, components, self._event_bytes)
         return self._builders[choice]
 
-    def forget(self, connection: "Connection") -> None:
+    def admit(self, connection: Connection) -> None:
+        """Put a new connection on the list, and give it its number."""
+        self._accepted += 1
+        connection.number = self._accepted
+        self.connections.add(connection)
+        self.faults.connected(connection)
+
+    def forget(self, connection: Connection) -> None:
         """Take a connection that has ended off the list."""
         self.connections.discard(connection)
         self._dropped_before += connection.client.frames_dropped
@@ -197,171 +224,3 @@ class Simulator:
             self.stop_measurement()
         else:
             self.schedule()
-
-
-class SentCounts:
-    """Counts data frames and the components in them."""
-
-    def __init__(self) -> None:
-        self._frames: Counter[tuple[ComponentType, ...]] = Counter()
-
-    def add(self, components: tuple[ComponentType, ...]) -> None:
-        """Count one frame of these components."""
-        self._frames[components] += 1
-
-    @property
-    def frames(self) -> int:
-        """How many frames were counted."""
-        return self._frames.total()
-
-    @property
-    def components(self) -> Counter[str]:
-        """How many of each component were in them, by the components' keys."""
-        counts: Counter[str] = Counter()
-        for components, frames in self._frames.items():
-            counts.update({component.key: frames for component in components})
-        return counts
-
-
-class Connection(asyncio.Protocol):
-    """One client's TCP connection: packets in to its Client, replies and due frames out.
-
-    Nagle's algorithm is off (§2.1): asyncio does that for every TCP connection. Each packet is
-    written at once and alone, since common clients read one with one recv (field note 15). A client
-    that does not read is not read from either, and its frames are dropped.
-    """
-
-    transport: asyncio.Transport
-
-    def __init__(self, simulator: Simulator) -> None:
-        self._simulator = simulator
-        self._loop = asyncio.get_running_loop()
-        self._reader = PacketReader(max_packet_bytes=MAX_COMMAND_BYTES, max_c3d_bytes=MAX_COMMAND_BYTES)
-        self._inbox: deque[Packet] = deque()
-        self._is_full = False  # MAX_UNREAD_BYTES wait for the client to read
-        self._was_full = False
-        self._first_sent_s: float | None = None  # loop times of this session's first and newest frame
-        self._last_sent_s = 0.0
-        self.closed: asyncio.Future[None] = self._loop.create_future()
-        self.counts = SentCounts()
-        """What was sent to this client so far."""
-        self.client = Client(Server(simulator.frames, self._parameters, simulator.measurement_us))
-
-    @property
-    def due_us(self) -> int | None:
-        """When the next frame is due, in µs since the measurement's start; None if none is to be sent."""
-        return self.client.due_us if self._can_send() else None
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """See asyncio.Protocol."""
-        self.transport = cast(asyncio.Transport, transport)
-        self.transport.set_write_buffer_limits(high=MAX_UNREAD_BYTES)
-        peer = transport.get_extra_info("peername")
-        self.client.name = f"{peer[0]}:{peer[1]}"
-        self._simulator.connections.add(self)
-        _log.info("%s: connected", self.client.name)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        """See asyncio.Protocol."""
-        _log.info("%s: disconnected%s", self.client.name, f" ({exc})" if exc else "")
-        self._inbox.clear()
-        self._simulator.forget(self)
-        self.closed.set_result(None)
-
-    def pause_writing(self) -> None:
-        """Stop sending and reading: the client does not read (asyncio.Protocol)."""
-        self._is_full = True
-        self.transport.pause_reading()
-        _log.log(
-            logging.DEBUG if self._was_full else logging.WARNING,
-            "%s does not read: %d MiB wait for it, and its frames are dropped until it does",
-            self.client.name,
-            MAX_UNREAD_BYTES >> 20,
-        )
-        self._was_full = True
-
-    def resume_writing(self) -> None:
-        """Go on: the client reads again (asyncio.Protocol)."""
-        self._is_full = False
-        elapsed_us = self._simulator.elapsed_us()
-        if elapsed_us is not None:
-            self.client.drop_due(elapsed_us)
-        _log.info(
-            "%s reads again; %d of its frames were dropped", self.client.name, self.client.frames_dropped
-        )
-        if not self.transport.is_closing():
-            self.transport.resume_reading()
-        self._simulator.schedule()
-        self._work()
-
-    def data_received(self, data: bytes) -> None:
-        """See asyncio.Protocol."""
-        is_idle = not self._inbox
-        self._inbox.extend(self._reader.feed(data))
-        if is_idle:
-            self._work()
-
-    def send_due(self, elapsed_us: int) -> None:
-        """Send the frames that are due by now, or drop them if the client does not read or is leaving."""
-        if not self._can_send():
-            self.client.drop_due(elapsed_us)
-            return
-        for packet, components in self.client.due(elapsed_us):
-            self.send(packet)
-            self.counts.add(components)
-            self._simulator.counts.add(components)
-            self._last_sent_s = self._loop.time()
-            if self._first_sent_s is None:
-                self._first_sent_s = self._last_sent_s
-            if not self._can_send():
-                break
-
-    def send(self, packet: bytes) -> None:
-        """Send one packet; everything that leaves for this client goes through here."""
-        if not self.transport.is_closing():
-            self.transport.write(packet)
-
-    def close(self) -> None:
-        """Close the connection once everything has been sent; ``closed`` is done then."""
-        self._inbox.clear()
-        self.transport.close()
-
-    def _can_send(self) -> bool:
-        return not (self._is_full or self.transport.is_closing())
-
-    def _work(self) -> None:
-        """Answer one packet, the others in the loop's next rounds, so that no client holds up another."""
-        if not self._can_send():
-            return
-        if self._inbox:
-            for packet in self.client.answer(self._inbox.popleft()):
-                self.send(packet)
-            if self.client.said_bye:
-                self.close()
-                return
-            elapsed_us = self._simulator.elapsed_us()
-            if elapsed_us is not None:
-                self.send_due(elapsed_us)
-            self._simulator.schedule()
-        if self._inbox:
-            self._loop.call_soon(self._work)
-        elif self._reader.error is not None:
-            size = self._reader.error.size
-            self.send(
-                error_packet(f"A packet of {size} bytes is out of bounds (8 to {MAX_COMMAND_BYTES}); closing")
-            )
-            self.close()
-
-    def _parameters(self) -> Parameters:
-        address, port = self.transport.get_extra_info("sockname")[:2]
-        frames = self.counts.frames
-        streaming_s = 0.0 if self._first_sent_s is None else self._last_sent_s - self._first_sent_s
-        general = General(
-            name=NAME,
-            version=gateway.__version__,
-            address=address,
-            port=port,
-            frames_sent=frames,
-            frames_per_s=round((frames - 1) / streaming_s, 2) if streaming_s > 0 else 0.0,
-        )
-        return replace(self._simulator.scene.parameters, general=general)

@@ -41,7 +41,7 @@ class parameters_reply_t(object):
 
         self.error_code = ""
         """
-        For programs: "", bad-request, no-connection, refused, timeout or busy.
+        For programs: "", bad-request, no-connection, refused, timeout or defect.
         LCM Type: string
         """
 

@@ -1,11 +1,13 @@
 """An RTC3D client made of nothing but a socket, and what it makes of frames."""
 
 import asyncio
+import socket
 import struct
+import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from typing import Protocol
 
-from gateway.simulator.server import Simulator
 from tests.unit.simulator.wire import (
     DATA,
     ByteOrder,
@@ -45,15 +47,36 @@ class RawClient:
             frames.append(frame_of(body, byte_order))
         return frames
 
+    async def reply(self) -> tuple[int, bytes]:
+        """The next packet that is no data frame; frames before it are thrown away."""
+        async with asyncio.timeout(TIMEOUT_S):
+            while (packet := await self.read())[0] == DATA:
+                pass
+        return packet
+
+    async def exactly(self, num_bytes: int) -> bytes:
+        async with asyncio.timeout(TIMEOUT_S):
+            return await self.reader.readexactly(num_bytes)
+
     async def rest(self) -> bytes:
         """What still comes until the server closes the connection."""
         async with asyncio.timeout(TIMEOUT_S):
             return await self.reader.read()
 
+    def segments_received(self) -> int:
+        """How many TCP segments with data came; at least one for each send, as Nagle is off."""
+        data_segs_in = 152  # in struct tcp_info of linux/tcp.h
+        info = self.writer.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256)
+        return int.from_bytes(info[data_segs_in : data_segs_in + 4], sys.byteorder)
+
+
+class Listening(Protocol):
+    port: int
+
 
 @asynccontextmanager
-async def connected(simulator: Simulator) -> AsyncIterator[RawClient]:
-    reader, writer = await asyncio.open_connection("127.0.0.1", simulator.port)
+async def connected(server: Listening) -> AsyncIterator[RawClient]:
+    reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
     try:
         yield RawClient(reader, writer)
     finally:

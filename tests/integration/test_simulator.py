@@ -2,18 +2,17 @@
 
 import asyncio
 import logging
-import socket
 import struct
-import sys
 from collections import Counter
 
 import pytest
 
 from gateway.errors import GatewayError
 from gateway.rtc3d.parameters_xml import parse_parameters
-from gateway.simulator.server import MAX_UNREAD_BYTES, Simulator
+from gateway.simulator.connection import MAX_UNREAD_BYTES
+from gateway.simulator.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, until
+from tests.integration.raw_client import TIMEOUT_S, connected, consecutive, until
 from tests.unit.simulator.counting_scene import CountingScene
 from tests.unit.simulator.wire import (
     ANALOG,
@@ -163,14 +162,7 @@ async def test_each_packet_is_sent_with_one_send() -> None:
         client.send(command("StreamFrames"), command("SendParameters"))
         for _ in range(60):
             await client.read()
-        assert segments_received(client) <= 60
-
-
-def segments_received(client: RawClient) -> int:
-    """How many TCP segments with data came; at least one for each send, as Nagle is off."""
-    data_segs_in = 152  # in struct tcp_info of linux/tcp.h
-    info = client.writer.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256)
-    return int.from_bytes(info[data_segs_in : data_segs_in + 4], sys.byteorder)
+        assert client.segments_received() <= 60
 
 
 # Many clients -------------------------------------------------------------------------------

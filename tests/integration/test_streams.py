@@ -1,6 +1,7 @@
 """What happens to a stream while its connection stays: demand, layout, lateness, states."""
 
 import asyncio
+from functools import partial
 
 import pytest
 
@@ -39,6 +40,9 @@ class Recorder:
     def count(self, command: str) -> int:
         return self.commands.count(command)
 
+    def has(self, command: str, count: int) -> bool:
+        return self.count(command) == count
+
 
 ORIGIN = (0.0, 0.0, 0.0)
 START, STOP = "StreamFrames AllFrames", "StreamFrames Stop"
@@ -52,11 +56,11 @@ async def test_a_stream_on_demand_runs_while_somebody_listens() -> None:
         gateway_to(listening.port, streams=(stream,)) as lab,
     ):
         for rounds in (1, 2, 3):
-            await lab.until(lambda count=rounds: server.count(START) == count)
+            await lab.until(partial(server.has, START, rounds))
             server.stream(ORIGIN)
             await lab.heard("3d", rounds)
             lab.output.listened = False
-            await lab.until(lambda count=rounds: server.count(STOP) == count)
+            await lab.until(partial(server.has, STOP, rounds))
             await lab.until(lambda: lab.status.state is StreamState.IDLE)
             lab.output.listened = True
         assert lab.status.session == 1

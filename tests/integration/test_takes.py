@@ -138,7 +138,7 @@ async def test_every_value_that_arrives_is_the_files(name: str, frames: int, com
         await running.until(lambda: min(len(side["3d"]) for side in (running.zenoh, running.lcm)) > frames)
         running.simulator.stop_measurement()
     for side in (running.zenoh, running.lcm):
-        assert set(side) - {"status", "parameters"} == set(components)
+        assert set(side) - {"status", "clock", "parameters"} == set(components)
         for component in components:
             assert_equal_to_file(side[component], component, expected[component])
     if name == "optotrak.c3d":

@@ -13,11 +13,9 @@ from gateway.config import (
     Source,
     Stream,
     ZenohSettings,
-    single_server,
 )
 from gateway.config_section import Section, shown
 from gateway.config_values import ChannelPrefix, SourceName
-from gateway.errors import ConfigError
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 
@@ -59,22 +57,9 @@ def test_one_server_is_enough() -> None:
 
 
 def test_settings_do_not_change() -> None:
-    settings = single_server("127.0.0.1")
+    settings = Settings.model_validate({"sources": [source()]})
     with pytest.raises(ValidationError):
         settings.sources[0].port = 1
-
-
-def test_single_server_has_the_defaults() -> None:
-    assert single_server("::1", 3030) == Settings(sources=(Source(name="lab", host="::1", port=3030),))
-
-
-def test_single_server_names_each_mistake() -> None:
-    with pytest.raises(ConfigError) as caught:
-        single_server("two words", 0)
-    assert str(caught.value).splitlines() == [
-        "host: found 'two words'; accepted is a host name or an IP address; the port has a key of its own",
-        "port: found 0; accepted is a whole number from 1 to 65535",
-    ]
 
 
 @pytest.mark.parametrize(
@@ -373,13 +358,25 @@ def test_lcm_urls_have_a_provider_of_lcm(url: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "url", ["", "udpm", "udpm:", "239.255.76.67:7667", "UDPM://", "zmq://x", "udpm://a b", "udpm://\n"]
+    "url",
+    [
+        "",
+        "udpm",
+        "udpm:",
+        "239.255.76.67:7667",
+        "UDPM://",
+        "zmq://x",
+        "udpm://a b",
+        "udpm://\n",
+        "tcpq://me@lab",
+    ],
 )
 def test_other_lcm_urls_are_refused(url: str) -> None:
     assert mistakes(LcmSettings, {"url": url}) == [
         (
             "url",
-            f"found {shown(url)}; accepted is a URL that begins with udpm://, mpudpm://, memq://, tcpq:// or file://",
+            f"found {shown(url)}; accepted is a URL that begins with udpm://, mpudpm://, memq://, tcpq:// "
+            "or file://, and has no user",
         )
     ]
 
@@ -416,12 +413,17 @@ def test_every_mistake_is_told_at_once() -> None:
         "sources.1.host": "missing; this key has no default",
         "lcm": "found nothing; accepted is a mapping with any of the keys enabled, prefix, url, "
         "max_rate_hz, tool_poses",
-        "zenho": "unknown key (did you mean 'zenoh'?); known: sources, spool, zenoh, lcm",
+        "zenho": "unknown key (did you mean 'zenoh'?); known: sources, spool, zenoh, lcm, metrics",
     }
 
 
 def test_what_is_shown_is_one_bounded_line() -> None:
     assert shown("a\nb\x1b" + "x" * 1000) == repr("a\nb\x1b" + "x" * 56 + "…")
+
+
+def test_what_is_shown_has_no_password() -> None:
+    assert shown("tcpq://me:geheim@lab:7700") == "'tcpq://me:***@lab:7700'"
+    assert shown("x" * 50 + "tls/lab#connect_private_key_base64=geheim").count("geheim") == 0
 
 
 def test_every_key_has_a_description_in_the_schema() -> None:

@@ -47,7 +47,15 @@ def clock() -> bytes:
     return encoded
 
 
-EVERY_KIND = [*map(message_of, COMPONENTS), *poses(), status(), clock()]
+def parameters() -> list[bytes]:
+    """A message, a request and a reply as they go over LCM."""
+    told, request, reply = rtc3d.parameters_t(), rtc3d.parameters_request_t(), rtc3d.parameters_reply_t()
+    told.xml = reply.xml = "<RT_Parameters/>"
+    request.requester = reply.requester = "viewer"
+    return [told.encode(), request.encode(), reply.encode()]
+
+
+EVERY_KIND = [*map(message_of, COMPONENTS), *poses(), status(), clock(), *parameters()]
 every_kind = pytest.mark.parametrize(
     "message", EVERY_KIND, ids=lambda message: type(decode(message)).__name__
 )
@@ -55,7 +63,7 @@ every_kind = pytest.mark.parametrize(
 
 def test_all_published_types_are_known() -> None:
     assert set(MESSAGE_TYPES_BY_NAME) == {type(decode(message)).__name__ for message in EVERY_KIND}
-    assert len(MESSAGE_TYPES_BY_NAME) == 8
+    assert len(MESSAGE_TYPES_BY_NAME) == 11
 
 
 @every_kind

@@ -3,6 +3,7 @@ import logging
 import numpy as np
 import pytest
 
+from gateway import fanout
 from gateway.decode import decode
 from gateway.errors import OutputError
 from gateway.fanout import FanOut
@@ -137,8 +138,9 @@ def test_a_message_refused_still_counts_so_that_the_gap_shows() -> None:
 
 
 def test_a_failing_output_is_told_once_loudly_then_quietly_and_when_it_is_over(
-    caplog: pytest.LogCaptureFixture,
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(fanout, "HOLD_S", 0.0)
     caplog.set_level(logging.DEBUG, "gateway.fanout")
     output = ToyOutput()
     fan_out = FanOut("lab", [output])
@@ -150,6 +152,15 @@ def test_a_failing_output_is_told_once_loudly_then_quietly_and_when_it_is_over(
     assert [record.levelno for record in repeats] == [logging.DEBUG, logging.DEBUG]
     assert recovery.levelno == logging.INFO
     assert "lab to toy: messages go out" in recovery.getMessage()
+
+
+def test_messages_that_fail_by_turns_are_one_failure(caplog: pytest.LogCaptureFixture) -> None:
+    output = ToyOutput()
+    fan_out = FanOut("lab", [output])
+    for output.error in [OutputError("too large", cause="send failed"), None] * 5:
+        fan_out.publish(FULL, STAMP, {ComponentType.MARKERS})
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
+    assert fan_out.outputs[0][1].messages == {"3d": 5}
 
 
 # Pacing, layouts and listeners ---------------------------------------------------------------

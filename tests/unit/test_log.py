@@ -1,9 +1,11 @@
+import asyncio
 import logging
 import re
+from collections.abc import Iterator
 
 import pytest
 
-from gateway.log import FailureLog
+from gateway.log import FIELDS, FailureLog, FieldsFilter, log_fields
 
 LOGGER = logging.getLogger("tests.failures")
 
@@ -68,3 +70,76 @@ def test_failing_is_what_was_told_last() -> None:
     failures.recovered("streaming")
     told.append(failures.failing)
     assert told == [False, True, False]
+
+
+def test_what_fails_by_turns_is_over_once_it_has_worked_for_long_enough(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 0.0
+    monkeypatch.setattr("gateway.log.time.monotonic", lambda: now_s)
+    failures = FailureLog(LOGGER, "lab", hold_s=5.0)
+    for second in range(4):
+        now_s = float(second)
+        failures.failed("too large")
+        failures.recovered("messages go out")
+    assert levels(caplog) == [logging.WARNING, *[logging.DEBUG] * 3]
+    assert failures.failing
+    now_s = 8.0
+    failures.recovered("messages go out")
+    assert caplog.messages[-1] == "lab: messages go out, after 8.0 s and 4 failures"
+    assert not failures.failing
+
+
+# Fields --------------------------------------------------------------------------------------
+
+
+class Collector(logging.Handler):
+    def __init__(self) -> None:
+        super().__init__()
+        self.records: list[logging.LogRecord] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.records.append(record)
+
+
+@pytest.fixture
+def records() -> Iterator[list[logging.LogRecord]]:
+    """Collect what a handler with the filter is given."""
+    handler = Collector()
+    handler.addFilter(FieldsFilter())
+    LOGGER.addHandler(handler)
+    yield handler.records
+    LOGGER.removeHandler(handler)
+
+
+def fields(record: logging.LogRecord) -> dict[str, str]:
+    return {name: getattr(record, name) for name in FIELDS if hasattr(record, name)}
+
+
+def test_records_have_the_fields_that_are_set_and_no_others(records: list[logging.LogRecord]) -> None:
+    LOGGER.warning("before")
+    with log_fields(source="lab"):
+        with log_fields(stream="3d", peer="192.0.2.20:3020"):
+            LOGGER.warning("inside")
+        LOGGER.warning("outside")
+    LOGGER.warning("after")
+    assert [fields(record) for record in records] == [
+        {},
+        {"source": "lab", "stream": "3d", "peer": "192.0.2.20:3020"},
+        {"source": "lab"},
+        {},
+    ]
+
+
+async def test_tasks_and_callbacks_have_the_fields_of_where_they_were_started(
+    records: list[logging.LogRecord],
+) -> None:
+    async def run(source: str) -> None:
+        with log_fields(source=source):
+            asyncio.get_running_loop().call_soon(LOGGER.warning, "callback")
+            await asyncio.create_task(asyncio.sleep(0))
+            LOGGER.warning("task")
+
+    await asyncio.gather(run("hall"), run("lab"))
+    told = [(fields(record)["source"], record.getMessage()) for record in records]
+    assert sorted(told) == [("hall", "callback"), ("hall", "task"), ("lab", "callback"), ("lab", "task")]

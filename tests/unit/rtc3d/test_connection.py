@@ -175,6 +175,13 @@ def test_late_xml_is_not_handed_to_another_question() -> None:
     assert answers(connection.receive(xml("The_6D"))) == [SendParameters(("6d",))]
 
 
+def test_a_server_that_sends_all_sections_whatever_is_asked_is_understood() -> None:
+    connection = after(SendParameters())
+    connection.receive(xml("The_3D", "The_6D"))
+    connection.send(SendParameters(("general",)))
+    assert answers(connection.receive(xml("The_3D", "The_6D"))) == [SendParameters(("general",))]
+
+
 def test_missing_xml_does_not_shift_the_next() -> None:
     connection = after(SendParameters(("3d",)))
     connection.give_up()

@@ -1,0 +1,78 @@
+"""What is secret in a configuration, and how it is kept out of sight.
+
+Zenoh's own keys hold the secrets there are: passwords, and private keys as text. Their paths are none.
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any, Final
+
+MASK: Final = "***"
+"""What stands where a secret is."""
+
+_SECRET_KEY: Final = re.compile(r"(?:.*_)?(?:password|passphrase|secret|private_key_(?:pem|base64|raw))")
+# Zenoh keeps what is below this key, in a plugin's configuration, out of its admin space.
+_PRIVATE: Final = "private"
+
+# An endpoint may carry configuration: tls/lab:7447#connect_private_key_base64=…;….
+_IN_ENDPOINT: Final = re.compile(r"((?:password|private_key_(?:raw|base64|pem))=)[^;\s\"'\])]+")
+_IN_URL: Final = re.compile(r"(://[^/\s:@]*:)[^/\s@]+(?=@)")
+_PEM: Final = re.compile(
+    r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(?:-----END [A-Z ]*PRIVATE KEY-----|$)", re.DOTALL
+)
+
+_Steps = tuple[str | int, ...]
+
+
+def is_secret_key(key: object) -> bool:
+    """Return whether the value of ``key`` is a secret, whatever it looks like."""
+    return isinstance(key, str) and (key == _PRIVATE or _SECRET_KEY.fullmatch(key.lower()) is not None)
+
+
+def secrets_in(value: Any, location: _Steps = ()) -> Iterator[tuple[_Steps, Any]]:
+    """Yield each secret in nested mappings and lists, with the keys and indices that lead to it."""
+    match value:
+        case Mapping():
+            for key, item in value.items():
+                if is_secret_key(key):
+                    if item is not None:
+                        yield (*location, key), item
+                else:
+                    yield from secrets_in(item, (*location, key))
+        case list() | tuple():
+            for index, item in enumerate(value):
+                yield from secrets_in(item, (*location, index))
+        case str() if without_secrets(value) != value:
+            yield location, value
+
+
+def key_of_file(key: object) -> str:
+    """Return the key that takes the path of what ``key`` takes as text: connect_private_key, …; or ""."""
+    match str(key).rpartition("_"):
+        case (stem, "_", "base64"):
+            return stem
+        case (stem, "_", "pem"):
+            return f"{stem}_file"
+    return ""
+
+
+def masked(value: Any) -> Any:
+    """Return a copy of nested mappings and lists with MASK for every secret."""
+    match value:
+        case Mapping():
+            return {
+                key: MASK if is_secret_key(key) and item is not None else masked(item)
+                for key, item in value.items()
+            }
+        case list() | tuple():
+            return [masked(item) for item in value]
+        case str():
+            return without_secrets(value)
+    return value
+
+
+def without_secrets(text: str) -> str:
+    """Return ``text`` with MASK for passwords in URLs, for keys in endpoints, and for keys as PEM."""
+    text = _PEM.sub(MASK, text)
+    text = _IN_ENDPOINT.sub(rf"\g<1>{MASK}", text)
+    return _IN_URL.sub(rf"\g<1>{MASK}", text)

@@ -1,0 +1,1 @@
+"""What goes wrong with the simulator on purpose: the kinds of faults, and what begins and ends them."""

@@ -1,0 +1,111 @@
+"""Every kind of fault by its name, and how a fault is read from a mapping or from the command line's form."""
+
+import re
+from collections.abc import Iterator
+from typing import Any, Final
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from gateway.config_section import did_you_mean, mistake, shown
+from gateway.errors import ConfigError
+from gateway.simulator.faults.base import Fault, as_given
+from gateway.simulator.faults.frames import FRAME_FAULTS
+from gateway.simulator.faults.replies import REPLY_FAULTS
+from gateway.simulator.faults.server import SERVER_FAULTS
+from gateway.simulator.faults.stream import STREAM_FAULTS
+
+KINDS: Final[dict[str, type[Fault]]] = {
+    fault.kind: fault for fault in (*SERVER_FAULTS, *REPLY_FAULTS, *FRAME_FAULTS, *STREAM_FAULTS)
+}
+"""In the order in which they act on what passes through a connection."""
+
+COMMON: Final = {
+    "at_s": "begin so many seconds after the start; without it and every_s, at the start",
+    "every_s": "begin again and again, so many seconds apart, at random up to half more or less",
+    "for_s": "last so many seconds; without it, until the end",
+    "times": "over for good once it happened so often: packets or replies changed, else beginnings",
+    "connection": "only the n-th connection since the server's start; without it, all",
+}
+"""The parameters that many kinds have: what they do."""
+
+_NAMES: Final = ", ".join(KINDS)
+_COMMAS: Final = re.compile(r",(?![^\[]*\])")  # those that are not in a list
+
+
+def parse_fault(text: str) -> Fault:
+    """Return the fault in the form ``KIND,NAME=VALUE,…``, such as ``restart,away_s=2,scene.markers=12``.
+
+    Lists are written ``[a,b]``. Raises ConfigError, one line per mistake.
+    """
+    kind, *assignments = _COMMAS.split(text)
+    values: dict[str, Any] = {"fault": kind}
+    for assignment in assignments:
+        path, equals, value = assignment.partition("=")
+        *mappings, name = path.split(".")
+        target = values
+        for mapping in mappings:
+            target = target.setdefault(mapping, {})
+            if not isinstance(target, dict):
+                raise ConfigError(f"fault {text!r}: {mapping} has a value and parts; accepted is one of them")
+        if not equals or name in target:
+            raise ConfigError(f"fault {text!r}: found {assignment!r}; accepted is NAME=VALUE, each name once")
+        target[name] = _value(value)
+    try:
+        return fault_of(values)
+    except ValidationError as error:
+        lines = []
+        for details in error.errors(include_url=False):
+            where = ".".join(map(str, details["loc"]))
+            lines.append(f"fault {text!r}: {where}: {details['msg']}")
+        raise ConfigError("\n".join(lines)) from None
+
+
+def fault_of(value: object) -> Fault:
+    """Return the fault in a mapping: its kind under ``fault``, its parameters beside that.
+
+    Raises ValidationError.
+    """
+    match value:
+        case Fault():
+            return value
+        case {"fault": str(kind), **parameters} if kind in KINDS:
+            return KINDS[kind].model_validate(parameters)
+        case {"fault": kind}:
+            raise mistake(f"found {shown(kind)}{did_you_mean(kind, KINDS)}; accepted is {_NAMES}", "fault")
+    raise mistake(f"found {shown(value)}; accepted is a mapping with the key fault, one of {_NAMES}")
+
+
+def meaning_of(kind: type[Fault]) -> str:
+    """Return a sentence: what happens."""
+    return (kind.__doc__ or "").partition("\n")[0]
+
+
+def parameters_of(kind: type[Fault]) -> Iterator[tuple[str, str, str]]:
+    """Give name, default and meaning of each parameter that is the kind's own; "" for no default."""
+    for name, field in kind.model_fields.items():
+        if name not in COMMON:
+            default = field.get_default()
+            shown_default = "" if field.is_required() or isinstance(default, BaseModel) else as_given(default)
+            yield name, shown_default, field.description or ""
+
+
+def list_of_kinds() -> str:
+    """Return a text for a terminal: every kind, what it does, and its parameters."""
+    lines = []
+    for name, kind in KINDS.items():
+        common = [key for key in ("for_s", "connection") if key in kind.model_fields]
+        lines.append(f"{name}{''.join(f' [{key}]' for key in common)}")
+        lines.append(f"    {meaning_of(kind)}")
+        for key, default, text in parameters_of(kind):
+            lines.append(f"    {key}{'=' if default else ''}{default}  {text}")
+    lines += ["", "Every kind has at_s, every_s and times, and the others where they stand beside its name:"]
+    lines += [f"    {key}  {text}" for key, text in COMMON.items()]
+    return "\n".join(lines)
+
+
+def _value(text: str) -> object:
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError:
+        return text

@@ -1,0 +1,62 @@
+"""A synthetic scene's sizes and rates as settings: a mapping of a scenario."""
+
+from dataclasses import replace
+from typing import Annotated, Self
+
+from pydantic import Field
+
+from gateway.config_section import Section, accepts
+from gateway.simulator.scene import Scene
+from gateway.simulator.synthetic import SyntheticScene
+
+Size = Annotated[int, Field(strict=True, ge=0, le=10_000), accepts("a whole number from 0 to 10000")]
+Rate = Annotated[
+    float,
+    Field(strict=True, ge=0.1, le=100_000, allow_inf_nan=False),
+    accepts("a number of samples per second from 0.1 to 100000"),
+]
+Label = Annotated[str, Field(min_length=1, max_length=60), accepts("a text of 1 to 60 characters")]
+Seed = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1), accepts("a whole number from 0")]
+
+
+class SceneSettings(Section):
+    """A synthetic scene (``gateway.simulator.synthetic``)."""
+
+    markers: Size = 24
+    """How many markers."""
+
+    tools: Size = 4
+    """How many 6D tools."""
+
+    analog: Size = 16
+    """How many analog channels."""
+
+    plates: Size = 2
+    """How many force plates."""
+
+    rate_hz: Rate = 200.0
+    """Samples per second of markers and tools."""
+
+    analog_rate_hz: Rate = 2000.0
+    """Samples per second of analog channels and force plates."""
+
+    marker_label: Label = "Marker"
+    """What the markers' labels begin with, before their number."""
+
+    seed: Seed = 1
+    """Chooses another scene of the same size."""
+
+    def changed_by(self, changes: Self) -> Self:
+        """Return these settings with those that are given in ``changes``."""
+        return self.model_copy(update={name: getattr(changes, name) for name in changes.model_fields_set})
+
+    def build(self) -> Scene:
+        """Return the scene."""
+        scene = SyntheticScene(**self.model_dump(exclude={"marker_label"}))
+        described = scene.parameters.markers
+        if described is not None:
+            markers = tuple(
+                replace(marker, label=f"{self.marker_label} {marker.id}") for marker in described.markers
+            )
+            scene.parameters = replace(scene.parameters, markers=replace(described, markers=markers))
+        return scene

@@ -1,0 +1,125 @@
+"""Frames of a server whose clock is known exactly, as they come over a network. Nothing sleeps."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Final, Self
+
+import numpy as np
+import numpy.typing as npt
+
+from gateway.clock import ServerClock
+
+EPOCH_UTIME: Final = 1_700_000_000_000_000
+LEAST_DELAY_US: Final = 300
+
+Times = npt.NDArray[np.int64]
+Numbers = npt.NDArray[np.float64]
+
+
+def whole_us(times_us: npt.NDArray[np.floating[Any]]) -> Times:
+    """Return the times rounded to µs."""
+    return np.round(times_us).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Frames:
+    """Frames in the order in which they come; the arrays are of shape (frames,) and in µs.
+
+    ``captured_utime`` has the network's least delay in it: who only receives cannot know better.
+    """
+
+    timestamps_us: Times
+    arrivals_utime: Times
+    captured_utime: Times
+
+    def __len__(self) -> int:
+        return len(self.timestamps_us)
+
+    def __add__(self, other: Self) -> "Frames":
+        return Frames(
+            np.concatenate([self.timestamps_us, other.timestamps_us]),
+            np.concatenate([self.arrivals_utime, other.arrivals_utime]),
+            np.concatenate([self.captured_utime, other.captured_utime]),
+        )
+
+    def part(self, first: int, end: int | None = None) -> "Frames":
+        """Return some of the frames."""
+        part = slice(first, end)
+        return Frames(self.timestamps_us[part], self.arrivals_utime[part], self.captured_utime[part])
+
+    def with_timestamps(self, timestamps_us: Times) -> "Frames":
+        """Return the same frames as another server would stamp them."""
+        return replace(self, timestamps_us=timestamps_us)
+
+    def with_delays(self, delays_us: npt.NDArray[np.floating[Any]]) -> "Frames":
+        """Return the same frames, each so much later on the network, and those behind not before it."""
+        arrivals = self.arrivals_utime + whole_us(delays_us)
+        return replace(self, arrivals_utime=np.maximum.accumulate(arrivals))
+
+    def with_host_set(self, by_us: int) -> "Frames":
+        """Return the same frames as told by a host clock that was set forward by so much."""
+        return Frames(self.timestamps_us, self.arrivals_utime + by_us, self.captured_utime + by_us)
+
+
+def simulate(
+    *,
+    seconds: float,
+    rate_hz: float,
+    seed: int = 0,
+    drift_ppm: float | Callable[[Numbers], Numbers] = 0.0,
+    jitter_us: float = 5_000,
+    outliers: float = 0.0,
+    start_us: int = 5_000_000,
+) -> Frames:
+    """Return the frames of a server that captures at ``rate_hz`` for ``seconds`` of host time.
+
+    The host's clock is faster than the server's by ``drift_ppm``, or by that as a function of the seconds.
+    Delays are exponential with the mean ``jitter_us``; a share of ``outliers`` has 200 ms more. TCP keeps the
+    order: behind a late frame, all are late. The server's clock starts at ``start_us``.
+    """
+    random = np.random.default_rng(seed)
+    host_s = np.arange(round(seconds * rate_hz)) / rate_hz
+    drift = np.asarray(drift_ppm(host_s) if callable(drift_ppm) else drift_ppm) * 1e-6
+    server_s = np.cumsum(np.diff(host_s, prepend=0.0) / (1 + drift))
+    delays_us = random.exponential(1.0, len(host_s)) * jitter_us
+    delays_us += 200_000 * (random.random(len(host_s)) < outliers)
+    captured = EPOCH_UTIME + LEAST_DELAY_US + whole_us(host_s * 1e6)
+    stamps = start_us + whole_us(server_s * 1e6)
+    return Frames(stamps, captured, captured).with_delays(delays_us)
+
+
+@dataclass(frozen=True)
+class Observed:
+    """What a clock said at each frame; arrays of shape (frames,)."""
+
+    captures_utime: Times
+    lags_s: Numbers
+    restarted: npt.NDArray[np.bool_]
+    has_clock: npt.NDArray[np.bool_]
+    uncertainties_us: Numbers
+    errors_us: Times
+
+
+def observe(clock: ServerClock, frames: Frames, first_frame_number: int = 0) -> Observed:
+    """Show the frames to ``clock``; their numbers count from ``first_frame_number``."""
+    said = []
+    pairs = zip(frames.timestamps_us.tolist(), frames.arrivals_utime.tolist(), strict=True)
+    for number, (timestamp_us, arrival_utime) in enumerate(pairs, first_frame_number):
+        said.append(
+            (*clock.observe(timestamp_us, number, arrival_utime), clock.has_clock, clock.uncertainty_us)
+        )
+    captures, lags, restarted, has_clock, uncertainties = zip(*said, strict=True)
+    captures_utime = np.array(captures, np.int64)
+    return Observed(
+        captures_utime,
+        np.array(lags),
+        np.array(restarted),
+        np.array(has_clock),
+        np.array(uncertainties),
+        captures_utime - frames.captured_utime,
+    )
+
+
+def percentile_95_us(errors_us: Times) -> float:
+    """Return what 95 of 100 errors are within, whatever their sign."""
+    return float(np.percentile(np.abs(errors_us), 95))

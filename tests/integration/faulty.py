@@ -1,0 +1,47 @@
+"""A simulator with faults and a client of it, and what both are like when all is well again."""
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+from gateway.simulator.connection import Connection
+from gateway.simulator.server import Simulator
+from tests.integration.raw_client import RawClient, connected, consecutive, until
+from tests.unit.simulator.counting_scene import CountingScene
+from tests.unit.simulator.wire import (
+    COMMAND,
+    command,
+)
+
+FAST_HZ = 1000.0
+NEVER_MS = 600_000
+VERSION = (COMMAND, b"OK-Version 1.0")
+
+
+@asynccontextmanager
+async def playing(rate_hz: float = FAST_HZ) -> AsyncIterator[tuple[Simulator, RawClient]]:
+    async with Simulator(CountingScene(rate_hz)) as simulator, connected(simulator) as client:
+        await until(lambda: len(simulator.connections) == 1)
+        yield simulator, client
+
+
+def only(simulator: Simulator) -> Connection:
+    [connection] = simulator.connections
+    return connection
+
+
+def waiting_bytes(simulator: Simulator) -> int:
+    return sum(c.line.waiting_bytes for c in simulator.connections if c.line is not None)
+
+
+async def well(simulator: Simulator, client: RawClient) -> None:
+    """Clear all faults; then the connection is as if there had never been any."""
+    await simulator.faults.clear()
+    assert only(simulator).line is None
+    client.send(command("StreamFrames Stop"), command("Version 1.0"))
+    while (await client.reply()) != VERSION:
+        pass
+    assert await client.ask("StreamFrames 3D") == (COMMAND, b"OK-StreamFrames 3D")
+    frames = await client.frames(20)
+    assert consecutive(frames)
+    assert all(part.timestamp_us == (part.frame_number - 1) * 1000 for [part] in frames)
+    assert all(part.items[1][1:] == (1.5, -2.0, 0.25) for [part] in frames)

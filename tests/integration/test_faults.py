@@ -1,0 +1,197 @@
+"""Faults of the server and of the network, one by one and several at once: after each, data flows again."""
+
+import asyncio
+import threading
+from collections.abc import Coroutine
+from contextlib import AsyncExitStack
+from functools import partial
+from typing import Any, TypeVar
+
+import pytest
+from hypothesis import HealthCheck, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_as_test
+
+from gateway.simulator.faults.kinds import KINDS
+from gateway.simulator.server import Simulator
+from gateway.simulator.synthetic import SyntheticScene
+from tests.labs import Running, gateway_to
+from tests.networks import free_port
+from tests.proxy import FuzzingProxy
+from tests.waiting import wait_until_async
+
+_Result = TypeVar("_Result")
+
+LINGERING = 20  # frames of the bad time that may still be under way when it ends
+
+
+def scene() -> SyntheticScene:
+    return SyntheticScene(markers=3, tools=1, analog=2, plates=1, rate_hz=200, analog_rate_hz=200)
+
+
+def assert_well_formed(lab: Running) -> None:
+    """Every message decodes, and none came twice: sequences grow by one without a gap."""
+    for component in ("3d", "6d", "analog", "force", "event"):
+        messages = lab.messages(component)  # decodes each
+        if messages:
+            first = messages[0].sequence
+            assert [message.sequence for message in messages] == list(range(first, first + len(messages)))
+        marks = [(message.session, message.frame_number, message.timestamp) for message in messages]
+        if not lab.status.restarts:
+            assert len(set(marks)) == len(marks)
+
+
+def _more_reconnects(lab: Running, than: int) -> bool:
+    return lab.status.reconnects > than
+
+
+async def flows_again(lab: Running) -> None:
+    """Wait for more frames than may have been under way; the limit is generous, CI is slow."""
+    before = lab.status.frames_in
+    await wait_until_async(lambda: lab.status.frames_in > before + LINGERING, 20)
+
+
+@pytest.mark.parametrize("kind", sorted(KINDS))
+async def test_after_each_fault_data_flows_again(kind: str) -> None:
+    async with Simulator(scene(), port=free_port()) as simulator, gateway_to(simulator.port) as lab:
+        await lab.heard("3d", 20)
+        run = simulator.faults.begin(KINDS[kind].model_validate({}))
+        # Long enough for the fault to bite: it happened, or the gateway noticed something.
+        frames = simulator.frames_sent
+        await wait_until_async(
+            lambda: run.times or lab.status.last_error or simulator.frames_sent > frames + 100, 10
+        )
+        await simulator.faults.clear()
+        await flows_again(lab)
+        assert_well_formed(lab)
+
+
+@pytest.mark.parametrize(
+    ("kind", "named"),
+    [
+        ("oversize", "packet size"),
+        ("undersize", "packet size"),
+        ("half_open", "no frame from"),
+        ("restart", "refused by"),
+        ("cut", "the connection to"),
+        ("wrong_counts", "frame rejected"),
+    ],
+)
+async def test_the_last_error_names_the_fault(kind: str, named: str) -> None:
+    async with Simulator(scene(), port=free_port()) as simulator, gateway_to(simulator.port) as lab:
+        await lab.heard("3d", 20)
+        simulator.faults.begin(KINDS[kind].model_validate({}))
+        await wait_until_async(lambda: named in lab.status.last_error, 15)
+        await simulator.faults.clear()
+        await flows_again(lab)
+
+
+async def test_a_proxy_that_cuts_in_the_middle_of_packets_loses_no_more_than_what_was_under_way() -> None:
+    async with (
+        Simulator(scene()) as simulator,
+        FuzzingProxy(simulator.port) as proxy,
+        gateway_to(proxy.port) as lab,
+    ):
+        for _ in range(5):
+            await flows_again(lab)
+            reconnects = lab.status.reconnects
+            proxy.cut_after(num_bytes=100)
+            await wait_until_async(partial(_more_reconnects, lab, reconnects), 10)
+        await flows_again(lab)
+        assert_well_formed(lab)
+        assert lab.status.reconnects >= 5
+
+
+class ManyFaults(RuleBasedStateMachine):
+    """Faults of the server and of the network between it and the gateway, in any order, several at once.
+
+    The loop with simulator, proxy and gateway runs in a thread of its own; rules act in it.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._loop = asyncio.new_event_loop()
+        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread.start()
+        self._stack = AsyncExitStack()
+        self._in_loop(self._start())
+
+    def _in_loop(self, work: Coroutine[Any, Any, _Result]) -> _Result:
+        return asyncio.run_coroutine_threadsafe(work, self._loop).result(60)
+
+    async def _start(self) -> None:
+        self.simulator = await self._stack.enter_async_context(Simulator(scene(), port=free_port()))
+        self.proxy = await self._stack.enter_async_context(FuzzingProxy(self.simulator.port))
+        self.lab = await self._stack.enter_async_context(gateway_to(self.proxy.port))
+        await self.lab.heard("3d")
+
+    @rule(kind=st.sampled_from(sorted(KINDS)))
+    def something_goes_wrong_with_the_server(self, kind: str) -> None:
+        async def begin() -> None:
+            self.simulator.faults.begin(KINDS[kind].model_validate({}))
+
+        self._in_loop(begin())
+
+    @rule(trouble=st.sampled_from(["cut", "cut_after", "stall", "corrupt", "split", "slow"]))
+    def something_goes_wrong_with_the_network(self, trouble: str) -> None:
+        async def begin() -> None:
+            match trouble:
+                case "cut":
+                    self.proxy.cut(reset=True)
+                case "cut_after":
+                    self.proxy.cut_after(num_bytes=77)
+                case "stall":
+                    self.proxy.to_client.stall()
+                case "corrupt":
+                    self.proxy.to_client.corrupt_share = 0.001
+                case "split":
+                    self.proxy.to_client.segment_bytes = 7
+                case _:
+                    self.proxy.to_client.bytes_per_s = 20_000.0
+
+        self._in_loop(begin())
+
+    @rule(frames=st.integers(1, 60))
+    def time_passes(self, frames: int) -> None:
+        async def passes() -> None:
+            sent = self.simulator.frames_sent + self.lab.status.reconnects
+            await wait_until_async(
+                lambda: (
+                    self.simulator.frames_sent + self.lab.status.reconnects >= sent + frames
+                    or self.simulator.faults.on_line
+                ),
+                5,
+            )
+
+        self._in_loop(passes())
+
+    @rule()
+    def all_is_well_again(self) -> None:
+        async def well() -> None:
+            self.proxy.clear()
+            await self.simulator.faults.clear()
+            await flows_again(self.lab)
+
+        self._in_loop(well())
+
+    def teardown(self) -> None:
+        try:
+            self.all_is_well_again()
+            self._in_loop(self._check())
+        finally:
+            self._in_loop(self._stack.aclose())
+            self._loop.call_soon_threadsafe(self._loop.stop)
+            self._thread.join(10)
+            self._loop.close()
+
+    async def _check(self) -> None:
+        assert_well_formed(self.lab)
+
+
+def test_several_faults_at_once() -> None:
+    run_state_machine_as_test(
+        ManyFaults,
+        settings=settings(
+            max_examples=8, stateful_step_count=8, deadline=None, suppress_health_check=list(HealthCheck)
+        ),
+    )

@@ -1,0 +1,277 @@
+"""Faults of the server as a whole as a client sees them, and whom faults hit, when and how often."""
+
+import asyncio
+import logging
+import socket
+import struct
+
+import pytest
+
+from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.simulator.faults.base import Fault
+from gateway.simulator.faults.kinds import KINDS
+from gateway.simulator.faults.replies import (
+    MissingAcknowledgements,
+    ReplyText,
+)
+from gateway.simulator.faults.server import ChangeScene, NoMeasurement, Restart
+from gateway.simulator.faults.stream import (
+    Delay,
+    Garbage,
+    HalfOpen,
+    Undersize,
+)
+from gateway.simulator.scene_settings import SceneSettings
+from tests.integration.faulty import FAST_HZ, NEVER_MS, VERSION, only, playing, well
+from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
+from tests.unit.simulator.wire import (
+    COMMAND,
+    DATA,
+    MARKERS,
+    NO_DATA,
+    Part,
+    command,
+)
+
+# The server ---------------------------------------------------------------------------------
+
+
+async def test_the_measurement_can_stop_and_start() -> None:
+    async with playing() as (simulator, client):
+        await client.ask("StreamFrames 3D")
+        await client.frames(5)
+        first = simulator.faults.begin(NoMeasurement())
+        second = simulator.faults.begin(NoMeasurement())
+        assert await client.reply() == (NO_DATA, b"")
+        simulator.faults.end(first)
+        assert simulator.elapsed_us() is None
+        simulator.faults.end(second)
+        assert numbers(await client.frames(5)) == [1, 2, 3, 4, 5]
+        await well(simulator, client)
+
+
+async def num_markers(client: RawClient) -> int:
+    reply = await client.ask("SendParameters 3D")
+    described = parse_parameters(reply[1]).parameters.markers
+    assert described is not None
+    return len(described.markers)
+
+
+async def test_a_restarted_server_has_the_same_port_a_new_measurement_and_the_new_markers() -> None:
+    async with playing() as (simulator, client):
+        await client.ask("StreamFrames 3D")
+        await client.frames(50)
+        simulator.faults.begin(Restart(away_s=600, scene=SceneSettings(markers=12, rate_hz=500)))
+        await client.rest()
+        assert not simulator.is_listening
+        with pytest.raises(ConnectionRefusedError):
+            await asyncio.open_connection("127.0.0.1", simulator.port)
+
+        await simulator.faults.clear()
+
+        async with connected(simulator) as again:
+            assert await num_markers(again) == 12
+            await again.ask("StreamFrames 3D")
+            [[part]] = await again.frames(1)
+            assert len(part.items) == 12
+            assert part.timestamp_us == (part.frame_number - 1) * 2000
+            assert only(simulator).number == 1
+
+
+async def test_a_restarted_server_comes_back_by_itself_with_its_old_scene() -> None:
+    async with playing() as (simulator, client):
+        scene = simulator.scene
+        simulator.faults.begin(Restart(away_s=0))
+        simulator.faults.begin(Restart(away_s=0.01))
+        await client.rest()
+        await until(lambda: simulator.is_listening)
+        assert simulator.scene is scene
+        async with connected(simulator) as again:
+            await well(simulator, again)
+
+
+async def test_no_measurement_runs_after_a_restart_while_another_fault_says_so() -> None:
+    async with playing() as (simulator, _):
+        run = simulator.faults.begin(NoMeasurement())
+        restart = simulator.faults.begin(Restart(away_s=600))
+        simulator.faults.end(restart)
+        await until(lambda: simulator.is_listening)
+        async with connected(simulator) as again:
+            await again.ask("StreamFrames 3D")
+            assert await again.read() == (NO_DATA, b"")
+            simulator.faults.end(run)
+            assert numbers(await again.frames(3)) == [1, 2, 3]
+
+
+async def test_a_measurement_does_not_start_while_the_server_is_away() -> None:
+    async with playing() as (simulator, _):
+        run = simulator.faults.begin(NoMeasurement())
+        simulator.faults.begin(Restart(away_s=600))
+        simulator.faults.end(run)
+        assert simulator.elapsed_us() is None
+        await simulator.faults.clear()
+        assert simulator.elapsed_us() is not None
+
+
+async def test_a_server_whose_port_was_taken_comes_back_when_it_is_free(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with playing() as (simulator, client):
+        restart = simulator.faults.begin(Restart(away_s=600))
+        await client.rest()
+        with socket.create_server(("127.0.0.1", simulator.port)):
+            simulator.faults.end(restart)
+            await until(lambda: f"port {simulator.port}: " in caplog.text)
+            assert not simulator.is_listening
+        await until(lambda: simulator.is_listening)
+        async with connected(simulator) as again:
+            assert await again.ask("Version 1.0") == VERSION
+
+
+async def frames_up_to(client: RawClient, num_markers: int) -> list[list[Part]]:
+    frames: list[list[Part]] = []
+    async with asyncio.timeout(TIMEOUT_S):
+        while not frames or len(frames[-1][0].items) != num_markers:
+            frames += await client.frames(1)
+    return frames
+
+
+async def test_the_scene_changes_in_mid_stream_and_back() -> None:
+    async with playing() as (simulator, client):
+        await client.ask("StreamFrames 3D")
+        frames = await client.frames(5)
+        scene = SceneSettings(markers=7, rate_hz=FAST_HZ, marker_label="M")
+        run = simulator.faults.begin(ChangeScene(scene=scene))
+        frames += await frames_up_to(client, num_markers=7)
+        described = simulator.scene.parameters.markers
+        assert described is not None
+        assert [marker.label for marker in described.markers] == [f"M {k}" for k in range(1, 8)]
+        simulator.faults.end(run)
+        frames += await frames_up_to(client, num_markers=2)
+        assert consecutive(frames)
+        await well(simulator, client)
+
+
+async def test_a_scene_keeps_what_does_not_change_of_the_scenarios() -> None:
+    async with playing() as (simulator, _):
+        simulator.faults.play([], scene=SceneSettings(markers=3, tools=1, rate_hz=50))
+        simulator.faults.begin(ChangeScene(scene=SceneSettings(markers=7)))
+        assert simulator.scene.rates_hz[MARKERS] == 50  # type: ignore[index] # its keys are integers
+        assert simulator.scene.parameters.tools is not None
+        assert len(simulator.scene.parameters.tools.tools) == 1
+
+
+# Whom, when and how often -------------------------------------------------------------------
+
+
+async def test_the_faults_that_are_on_stand_in_the_order_in_which_they_act() -> None:
+    async with playing() as (simulator, _):
+        delay = simulator.faults.begin(Delay())
+        simulator.faults.begin(ReplyText())
+        simulator.faults.begin(Undersize())
+        simulator.faults.begin(NoMeasurement())
+        assert simulator.faults.active == [NoMeasurement(), ReplyText(), Delay()]
+        simulator.faults.end(delay)
+        assert simulator.faults.active == [NoMeasurement(), ReplyText()]
+        await simulator.faults.clear()
+        assert simulator.faults.active == []
+
+
+async def test_a_fault_can_be_one_connections_alone() -> None:
+    async with playing() as (simulator, first), connected(simulator) as second:
+        await until(lambda: len(simulator.connections) == 2)
+        simulator.faults.begin(ReplyText(form="echo", connection=2))
+        assert await first.ask("Version 1.0") == VERSION
+        assert await second.ask("Version 1.0") == (COMMAND, b"Version 1.0")
+        simulator.faults.begin(Undersize(connection=2))
+        assert await second.exactly(8) == struct.pack(">II", 0, DATA)
+        assert await first.ask("Version 1.0") == VERSION
+        async with connected(simulator) as third:
+            assert await third.ask("Version 1.0") == VERSION
+
+
+async def test_a_connection_that_comes_later_has_the_fault_too() -> None:
+    async with playing() as (simulator, _):
+        simulator.faults.begin(ReplyText(form="echo"))
+        async with connected(simulator) as second:
+            assert await second.ask("Version 1.0") == (COMMAND, b"Version 1.0")
+
+
+async def test_a_fault_ends_when_its_time_is_over(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gateway.simulator")
+    async with playing() as (simulator, client):
+        run = simulator.faults.begin(MissingAcknowledgements(for_s=0.01))
+        await run.is_over.wait()
+        assert await client.ask("Version 1.0") == VERSION
+    told = [message for message in caplog.messages if message.startswith("Fault")]
+    assert told == [
+        "Fault begins: missing_acknowledgements,for_s=0.01",
+        "Fault ends: missing_acknowledgements,for_s=0.01 (happened so far: 0)",
+    ]
+
+
+async def test_planned_faults_come_as_often_as_they_may(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gateway.simulator")
+    async with playing() as (simulator, client):
+        simulator.faults.play(
+            [
+                Undersize(every_s=0.01, times=4),
+                ReplyText(form="echo", at_s=0, times=2),
+                Garbage(at_s=600),
+                Restart(at_s=600),
+            ]
+        )
+        assert await client.exactly(4 * 8) == struct.pack(">II", 0, DATA) * 4
+        assert await client.ask("Version 1.0") == (COMMAND, b"Version 1.0")
+        assert await client.ask("Version 1.0") == (COMMAND, b"Version 1.0")
+        assert await client.ask("Version 1.0") == VERSION
+        await well(simulator, client)
+    assert caplog.messages.count("Fault: undersize,every_s=0.01,times=4") == 4
+    assert "garbage" not in caplog.text
+
+
+async def test_a_repeated_fault_begins_again_after_its_end(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gateway.simulator")
+    async with playing() as (simulator, _):
+        simulator.faults.play([Delay(every_s=0.02, for_s=0.01)])
+        await until(lambda: caplog.text.count("Fault begins") >= 3)
+    begun_and_ended = [message.split()[1] for message in caplog.messages if message.startswith("Fault")]
+    assert begun_and_ended[:4] == ["begins:", "ends:", "begins:", "ends:"]
+
+
+@pytest.mark.parametrize(
+    "fault", [Restart(away_s=600), HalfOpen(), Delay(delay_ms=NEVER_MS), NoMeasurement()]
+)
+async def test_a_simulator_closes_whatever_is_wrong_with_it(fault: Fault) -> None:
+    async with playing() as (simulator, client):
+        client.send(command("StreamFrames 3D"))
+        await client.read()
+        simulator.faults.begin(fault)
+        simulator.faults.play([Delay(at_s=600)])
+        client.send(command("Version 1.0"))
+        await asyncio.sleep(0)
+    assert not simulator.is_listening
+    assert not simulator.connections
+    assert asyncio.all_tasks() == {asyncio.current_task()}
+
+
+@pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS.keys())
+async def test_the_server_is_well_after_any_fault_and_all_of_them_before(kind: type[Fault]) -> None:
+    async with playing() as (simulator, client):
+        await client.ask("StreamFrames")
+        simulator.faults.begin(kind())
+        for other in KINDS.values():
+            if other is not Restart:
+                simulator.faults.begin(other())
+        await simulator.faults.clear()
+        async with connected(simulator) as again:
+            assert await again.ask("Version 1.0") == VERSION
+            await again.ask("StreamFrames 3D")
+            assert consecutive(await again.frames(20))
+
+
+async def test_without_faults_nothing_stands_between_a_connection_and_its_transport() -> None:
+    async with playing() as (simulator, client):
+        await client.ask("StreamFrames 3D")
+        await client.frames(3)
+        assert only(simulator).line is None

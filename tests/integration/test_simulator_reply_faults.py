@@ -1,0 +1,247 @@
+"""Faults of replies and data frames as a client sees them; then the server is well again."""
+
+import math
+import struct
+
+import numpy as np
+import pytest
+
+from gateway.errors import FrameError
+from gateway.rtc3d.components import split_frame
+from gateway.simulator.faults.base import Fault
+from gateway.simulator.faults.frames import (
+    ConstantFrameNumbers,
+    FrozenTimestamps,
+    JumpingTimestamps,
+    Occlusion,
+    ShortEvents,
+    UnknownComponent,
+    WrongByteOrder,
+    WrongCounts,
+)
+from gateway.simulator.faults.replies import (
+    DoubledAcknowledgements,
+    FramesFirst,
+    LateAcknowledgements,
+    MinimalServer,
+    MissingAcknowledgements,
+    RefusedCommands,
+    ReplyText,
+)
+from gateway.simulator.server import Simulator
+from tests.integration.faulty import NEVER_MS, VERSION, only, playing, well
+from tests.integration.raw_client import RawClient, consecutive, numbers
+from tests.unit.simulator.wire import (
+    COMMAND,
+    DATA,
+    ERROR,
+    EVENT,
+    MARKERS,
+    NO_DATA,
+    XML,
+    Part,
+    command,
+    frame_of,
+)
+
+# Replies ------------------------------------------------------------------------------------
+
+
+async def test_a_refused_command_gets_an_error_packet_and_is_not_obeyed() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(RefusedCommands(commands=("setbyteorder",)))
+        packet_type, text = await client.ask("SetByteOrder LittleEndian")
+        assert packet_type == ERROR
+        assert text == b"Error-setbyteorder is refused"
+        await client.ask("StreamFrames 3D")
+        assert consecutive(await client.frames(3, "big"))
+        await well(simulator, client)
+
+
+async def test_a_minimal_server_streams_all_the_same() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(MinimalServer())
+        for text in ("Version 1.0", "SendParameters", "StreamFrames AllFrames", "StreamFrames 3D"):
+            assert (await client.ask(text))[0] == ERROR
+        assert await client.ask("StreamFrames FrequencyDivisor:2") == (
+            COMMAND,
+            b"OK-StreamFrames FrequencyDivisor:2",
+        )
+        assert np.diff(numbers(await client.frames(20))).tolist() == [2] * 19
+        await well(simulator, client)
+
+
+async def test_acknowledgements_can_be_missing() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(MissingAcknowledgements(commands=("version", "sendcurrentframe")))
+        client.send(command("Version 1.0"), command("SendCurrentFrame 3D"))
+        [[part]] = await client.frames(1)
+        assert part.type == MARKERS
+        assert await client.ask("SetByteOrder BigEndian") == (COMMAND, b"OK-SetByteOrder BigEndian")
+        assert (await client.ask("Fly"))[0] == ERROR
+        await well(simulator, client)
+
+
+async def test_acknowledgements_can_be_doubled() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(DoubledAcknowledgements(copies=3))
+        assert [await client.ask("Version 1.0"), await client.read(), await client.read()] == [VERSION] * 3
+        assert (await client.ask("SendParameters"))[0] == XML
+        assert (await client.ask("Fly"))[0] == ERROR
+        await well(simulator, client)
+
+
+async def test_late_acknowledgements_are_overtaken_by_everything() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(LateAcknowledgements(delay_ms=NEVER_MS, times=2))
+        client.send(command("Version 1.0"), command("StreamFrames 3D"), command("SendParameters General"))
+        assert (await client.reply())[0] == XML
+        await client.frames(10)
+        assert simulator.faults.on_line(only(simulator)) == []
+
+        await simulator.faults.clear()
+
+        assert await client.reply() == VERSION
+        assert await client.reply() == (COMMAND, b"OK-StreamFrames 3D")
+        await well(simulator, client)
+
+
+async def test_late_acknowledgements_come_by_themselves() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(LateAcknowledgements(delay_ms=1))
+        assert await client.ask("Version 1.0") == VERSION
+        assert await client.ask("Version 1.0") == VERSION
+
+
+async def test_frames_can_come_before_the_acknowledgement() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(FramesFirst(frames=3))
+        client.send(command("StreamFrames 3D"))
+        before = await client.frames(3)
+        assert await client.read() == (COMMAND, b"OK-StreamFrames 3D")
+        assert consecutive([*before, *await client.frames(10)])
+        await well(simulator, client)
+
+
+async def test_without_frames_no_data_comes_before_the_acknowledgement() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(FramesFirst(frames=3))
+        simulator.stop_measurement()
+        assert await client.ask("StreamFrames 3D") == (NO_DATA, b"")
+        assert await client.read() == (COMMAND, b"OK-StreamFrames 3D")
+        assert await client.ask("StreamFrames Stop") == (COMMAND, b"OK-StreamFrames Stop")
+
+
+@pytest.mark.parametrize(
+    ("fault", "text"),
+    [
+        (ReplyText(form="echo"), b"Version 1.0"),
+        (ReplyText(form="ok-verb"), b"ok-version"),
+    ],
+)
+async def test_replies_can_be_worded_otherwise(fault: Fault, text: bytes) -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(fault)
+        assert await client.ask("Version 1.0") == (COMMAND, text)
+        packet_type, error = await client.ask("Fly")
+        assert packet_type == ERROR
+        assert error.startswith(b"err-Unknown command")
+        assert (await client.ask("SendParameters"))[0] == XML
+        await simulator.faults.clear()
+        client.send(command("Bye"))
+        assert await client.rest() == struct.pack(">II", 11, COMMAND) + b"bye"
+
+
+# Frames -------------------------------------------------------------------------------------
+
+
+async def frames_with(simulator: Simulator, client: RawClient, fault: Fault, asked: str) -> list[list[Part]]:
+    await client.ask(f"StreamFrames {asked}")
+    await client.frames(5)
+    simulator.faults.begin(fault)
+    only_before = simulator.frames_sent - 5
+    await client.frames(only_before)
+    return await client.frames(20)
+
+
+async def test_markers_and_tools_can_be_out_of_view() -> None:
+    async with playing() as (simulator, client):
+        for markers, tool, channels in await frames_with(simulator, client, Occlusion(), "3D 6D Analog"):
+            assert all(all(map(math.isnan, item[:3])) and item[3] == 999.0 for item in markers.items)
+            assert all(map(math.isnan, tool.items[0]))
+            assert channels.items[0][0] == channels.frame_number - 1
+        await well(simulator, client)
+
+
+async def test_time_stamps_can_stand_still() -> None:
+    async with playing() as (simulator, client):
+        frames = await frames_with(simulator, client, FrozenTimestamps(), "3D")
+        [(run, _)] = simulator.faults.on_line(only(simulator))
+        assert {part.timestamp_us for [part] in frames} == {run.began_us}
+        assert run.began_us > 0
+        assert consecutive(frames)
+        await well(simulator, client)
+
+
+async def test_time_stamps_can_jump() -> None:
+    async with playing() as (simulator, client):
+        frames = await frames_with(simulator, client, JumpingTimestamps(jump_ms=-7000), "3D")
+        assert all(part.timestamp_us == (part.frame_number - 1) * 1000 - 7_000_000 for [part] in frames)
+        await well(simulator, client)
+
+
+async def test_frame_numbers_can_stand_still() -> None:
+    async with playing() as (simulator, client):
+        frames = await frames_with(simulator, client, ConstantFrameNumbers(frame_number=5), "3D")
+        assert {part.frame_number for [part] in frames} == {5}
+        assert np.diff([part.timestamp_us for [part] in frames]).tolist() == [1000] * 19
+        await well(simulator, client)
+
+
+async def test_events_can_be_short() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(ShortEvents(times=2))
+        await client.ask("StreamFrames Events")
+        for event_bytes in (16, 16, 24):
+            packet_type, body = await client.read()
+            assert packet_type == DATA
+            [part] = frame_of(body, event_bytes=event_bytes)
+            assert part.type == EVENT
+        await well(simulator, client)
+
+
+async def test_a_byte_order_can_be_acknowledged_and_ignored() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(WrongByteOrder(byte_order="big"))
+        assert await client.ask("SetByteOrder LittleEndian") == (COMMAND, b"OK-SetByteOrder LittleEndian")
+        await client.ask("StreamFrames 3D Analog")
+        assert consecutive(await client.frames(10, "big"))
+        await simulator.faults.clear()
+        client.send(command("StreamFrames Stop"))
+        assert await client.reply() == (COMMAND, b"OK-StreamFrames Stop")
+        await client.ask("StreamFrames 3D")
+        assert consecutive(await client.frames(10, "little"))
+
+
+async def test_a_component_of_unknown_type_comes_along() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(UnknownComponent(component_type=1234))
+        await client.ask("StreamFrames 3D")
+        _, body = await client.read()
+        frame = split_frame(body, "big")
+        assert frame.unknown_types == (1234,)
+        assert len(frame.components) == 1
+        await well(simulator, client)
+
+
+async def test_as_many_frames_contradict_themselves_as_asked_for() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(WrongCounts(times=3))
+        await client.ask("StreamFrames 3D")
+        for _ in range(3):
+            packet_type, body = await client.read()
+            assert packet_type == DATA
+            with pytest.raises(FrameError):
+                split_frame(body, "big")
+        assert numbers(await client.frames(1))[0] >= 4
+        await well(simulator, client)

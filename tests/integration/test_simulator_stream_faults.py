@@ -1,0 +1,227 @@
+"""Faults of the byte stream as a client sees them; then the server is well again."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from gateway.simulator.connection import Connection
+from gateway.simulator.faults.base import Fault
+from gateway.simulator.faults.line import MAX_WAITING_BYTES
+from gateway.simulator.faults.replies import (
+    LateAcknowledgements,
+)
+from gateway.simulator.faults.stream import (
+    Cut,
+    Delay,
+    Garbage,
+    HalfOpen,
+    Jitter,
+    Merge,
+    Oversize,
+    SlowReader,
+    Split,
+    Undersize,
+)
+from gateway.simulator.server import Simulator
+from tests.integration.faulty import FAST_HZ, NEVER_MS, VERSION, only, playing, waiting_bytes, well
+from tests.integration.raw_client import connected, consecutive, numbers, until
+from tests.unit.simulator.counting_scene import CountingScene
+from tests.unit.simulator.wire import (
+    COMMAND,
+    DATA,
+    ERROR,
+    XML,
+    command,
+    cut,
+    frame_of,
+)
+
+
+async def test_what_is_delayed_waits_and_keeps_its_order() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(Delay(delay_ms=NEVER_MS))
+        client.send(command("Version 1.0"), command("Fly"), command("StreamFrames 3D"))
+        await until(lambda: simulator.frames_sent > 5)
+        assert waiting_bytes(simulator) > 5 * 60
+        assert only(simulator).transport.get_write_buffer_size() == 0
+
+        await simulator.faults.clear()
+
+        assert await client.read() == VERSION
+        assert (await client.read())[0] == ERROR
+        assert await client.read() == (COMMAND, b"OK-StreamFrames 3D")
+        assert consecutive(await client.frames(20))
+        await well(simulator, client)
+
+
+async def test_a_short_delay_loses_nothing() -> None:
+    async with playing() as (simulator, client):
+        run = simulator.faults.begin(Delay(delay_ms=5))
+        await client.ask("StreamFrames 3D")
+        assert consecutive(await client.frames(50))
+        simulator.faults.end(run)
+        assert consecutive(await client.frames(50))
+        await until(lambda: only(simulator).line is None)
+
+
+async def test_jitter_split_and_merge_together_lose_and_swap_nothing() -> None:
+    async with playing() as (simulator, client):
+        faults = (Jitter(mean_ms=3), Split(pieces=5, pause_ms=0.1), Merge(window_ms=4), Delay(delay_ms=1))
+        runs = [simulator.faults.begin(fault) for fault in faults]
+        await client.ask("StreamFrames 3D")
+        frames = await client.frames(200)
+        assert consecutive(frames)
+        assert all(run.times > 200 for run in runs)
+        await simulator.faults.clear()
+        assert consecutive([*frames[-1:], *await client.frames(50)])
+        await well(simulator, client)
+
+
+async def test_split_packets_come_in_several_segments() -> None:
+    async with playing(100) as (simulator, client):
+        simulator.faults.begin(Split(pieces=10, pause_ms=0.1))
+        await client.ask("StreamFrames 3D")
+        frames = await client.frames(20)
+        assert client.segments_received() > 2 * 21
+        assert consecutive(frames)
+
+
+async def test_merged_packets_come_in_one_segment() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(Merge(window_ms=50))
+        await client.ask("StreamFrames 3D")
+        assert consecutive(await client.frames(200))
+        assert client.segments_received() < 100
+        await well(simulator, client)
+
+
+async def test_a_cut_comes_within_a_packet() -> None:
+    async with playing() as (simulator, client):
+        await client.ask("StreamFrames 3D")
+        simulator.faults.begin(Cut())
+        rest = await client.rest()
+        while len(rest) >= 8 and len(rest) >= (size := struct.unpack_from(">I", rest)[0]):
+            rest = rest[size:]
+        assert len(rest) > 8
+        async with connected(simulator) as again:
+            assert await again.ask("Version 1.0") == VERSION
+
+
+async def test_a_cut_can_be_a_reset() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(Cut(reset=True))
+        with pytest.raises(ConnectionResetError):
+            await client.rest()
+
+
+async def test_a_half_open_server_says_and_hears_nothing_and_lets_clients_connect() -> None:
+    async with playing() as (simulator, client):
+        await client.ask("StreamFrames 3D")
+        frames = await client.frames(5)
+        run = simulator.faults.begin(HalfOpen())
+        async with connected(simulator) as other:
+            other.send(command("Version 1.0"))
+            client.send(command("SendParameters General"))
+            await until(
+                lambda: waiting_bytes(simulator) == len(command("Version 1.0SendParameters General")) + 8
+            )
+            await until(lambda: run.times > 50)
+            assert not only_of(simulator, 1).transport.is_reading()
+
+            await simulator.faults.clear()
+
+            assert await other.read() == VERSION
+        while (reply := await client.read())[0] == DATA:
+            frames.append(frame_of(reply[1]))
+        assert reply[0] == XML
+        frames += await client.frames(5)
+        assert np.diff(numbers(frames)).max() > 40
+        await until(lambda: len(simulator.connections) == 1)
+        await well(simulator, client)
+
+
+def only_of(simulator: Simulator, number: int) -> Connection:
+    [connection] = [c for c in simulator.connections if c.number == number]
+    return connection
+
+
+async def test_a_slow_reader_answers_late_and_streams_on() -> None:
+    async with playing() as (simulator, client):
+        await client.ask("StreamFrames 3D")
+        simulator.faults.begin(SlowReader(bytes_per_s=0.1))
+        client.send(command("Version 1.0"))
+        await until(lambda: waiting_bytes(simulator) == len(command("Version 1.0")))
+        assert consecutive(await client.frames(only(simulator).counts.frames + 50))
+
+        await simulator.faults.clear()
+
+        assert await client.reply() == VERSION
+        await well(simulator, client)
+
+
+async def test_a_slow_reader_reads_in_the_end() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(SlowReader(bytes_per_s=2000))
+        for _ in range(3):
+            assert await client.ask("Version 1.0") == VERSION
+
+
+async def test_garbage_comes_between_two_packets_and_is_the_same_for_the_same_seed() -> None:
+    heard = []
+    for seed in (1, 1, 2):
+        async with playing() as (simulator, client):
+            assert await client.ask("Version 1.0") == VERSION
+            simulator.faults.play([], seed=seed)
+            simulator.faults.begin(Garbage(num_bytes=20))
+            heard.append(await client.exactly(20))
+            assert await client.ask("Version 1.0") == VERSION
+            await well(simulator, client)
+    assert heard[0] == heard[1] != heard[2]
+
+
+@pytest.mark.parametrize(
+    ("fault", "size"),
+    [
+        (Oversize(), 0xFFFFFFFF),
+        (Oversize(size_bytes=20_000_000), 20_000_000),
+        (Undersize(), 0),
+        (Undersize(size_bytes=7), 7),
+    ],
+)
+async def test_a_header_can_announce_a_size_that_is_wrong(fault: Fault, size: int) -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(fault)
+        assert await client.exactly(8) == struct.pack(">II", size, DATA)
+        await well(simulator, client)
+
+
+async def test_what_is_injected_waits_behind_what_is_late() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(Delay(delay_ms=NEVER_MS))
+        client.send(command("Version 1.0"))
+        await until(lambda: waiting_bytes(simulator) > 0)
+        simulator.faults.begin(Undersize(size_bytes=3))
+        await simulator.faults.clear()
+        assert await client.read() == VERSION
+        assert await client.exactly(8) == struct.pack(">II", 3, DATA)
+
+
+async def test_what_waits_has_a_limit(caplog: pytest.LogCaptureFixture) -> None:
+    scene = CountingScene(FAST_HZ, num_markers=5000)
+    async with Simulator(scene) as simulator, connected(simulator) as client:
+        simulator.faults.begin(Delay(delay_ms=NEVER_MS))
+        client.send(command("StreamFrames 3D"))
+        await until(lambda: "packets are lost" in caplog.text)
+        sent = simulator.frames_sent
+        await until(lambda: simulator.frames_sent > sent + 50)
+        assert MAX_WAITING_BYTES - 100_000 < waiting_bytes(simulator) <= MAX_WAITING_BYTES
+        assert caplog.text.count("packets are lost") == 1
+
+
+async def test_a_goodbye_is_answered_before_the_connection_ends_however_late_all_is() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(Delay(delay_ms=NEVER_MS))
+        simulator.faults.begin(LateAcknowledgements(delay_ms=NEVER_MS))
+        client.send(command("Version 1.0"), command("Bye"))
+        assert cut(await client.rest()) == [VERSION, (COMMAND, b"bye")]

@@ -1,0 +1,90 @@
+import copy
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.config import Settings
+from gateway.config_environment import PREFIX, variable_name
+from gateway.config_file import load
+from gateway.config_yaml import Location
+from gateway.errors import ConfigError
+from tests.property.test_config_properties import PIECES, SETTINGS
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("environment") / "lab.yaml"
+
+
+def locations(value: Any, location: Location = ()) -> Iterator[tuple[Location, Any]]:
+    """Yield every value in nested mappings and lists, the root aside, with what leads to it."""
+    if location:
+        yield location, value
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield from locations(item, (*location, key))
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            yield from locations(item, (*location, index))
+
+
+def as_text(value: object) -> str:
+    return yaml.safe_dump(value, default_flow_style=True)
+
+
+@given(settings=SETTINGS, data=st.data())
+def test_a_variable_does_what_the_same_value_in_the_file_does(
+    file: Path, settings: Settings, data: st.DataObject
+) -> None:
+    values = settings.model_dump(mode="json")
+    location, value = data.draw(st.sampled_from(list(locations(values))))
+    rest = copy.deepcopy(values)
+    container: Any = rest
+    for step in location[:-1]:
+        container = container[step]
+    may_be_missing = isinstance(container, dict) or location[-1] == len(container) - 1
+    if may_be_missing and data.draw(st.booleans()):
+        del container[location[-1]]
+    else:
+        container[location[-1]] = data.draw(st.sampled_from([None, "other", 7, [], {}]))
+    file.write_text(yaml.safe_dump(rest), encoding="utf-8")
+    assert load(file, {variable_name(location): as_text(value)}) == settings
+
+
+@given(settings=SETTINGS)
+def test_variables_can_say_all_that_a_file_can(settings: Settings) -> None:
+    values = settings.model_dump(mode="json")
+    variables = {
+        variable_name(location): as_text(value)
+        for location, value in locations(values)
+        if not value or not isinstance(value, list | dict)
+    }
+    assert load(None, variables) == settings
+
+
+@given(
+    variables=st.dictionaries(
+        st.lists(
+            st.sampled_from(["SOURCES", "0", "1", "LCM", "ZENOH", "CONFIG", "URL", "MODE", "", "Ä", "٣"]),
+            max_size=4,
+        ).map("__".join),
+        st.lists(st.sampled_from(PIECES), max_size=10).map("".join) | st.text(),
+        max_size=4,
+    )
+)
+def test_any_variables_give_settings_or_lines_with_a_place(file: Path, variables: dict[str, str]) -> None:
+    file.write_text("sources: [{name: lab, host: lab}]", encoding="utf-8")
+    environ = {PREFIX + name: value for name, value in variables.items()}
+    try:
+        settings = load(file, environ)
+    except ConfigError as error:
+        places = (f"{file}:", *(f"{name}: " for name in environ))
+        lines = str(error).split("\n")
+        assert all(line.startswith(places) for line in lines)
+    else:
+        assert settings.sources

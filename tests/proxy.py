@@ -1,0 +1,199 @@
+"""A TCP proxy that makes trouble: between a client and a server, in either direction, at any time.
+
+After asyncpg's TCPFuzzingProxy.
+"""
+
+import asyncio
+import contextlib
+import random
+import socket
+import struct
+from types import TracebackType
+from typing import Self
+
+_READ_BYTES = 16 * 1024
+
+
+class Way:
+    """One direction through the proxy, of all its connections. What is set counts from the next bytes on."""
+
+    def __init__(self, seed: int) -> None:
+        self._random = random.Random(seed)
+        self._open = asyncio.Event()
+        self._open.set()
+        self.passed_bytes = 0
+        self.delay_s = 0.0
+        """How late bytes pass, at least."""
+        self.segment_bytes: int | None = None
+        """How many bytes are sent at once, at most."""
+        self.bytes_per_s: float | None = None
+        """How fast they are read: the proxy keeps nothing, so the sender's buffers fill."""
+        self.corrupt_share = 0.0
+        """How many of the bytes are changed, at random."""
+
+    def stall(self) -> None:
+        """Pass nothing until ``resume``; connections stay."""
+        self._open.clear()
+
+    def resume(self) -> None:
+        self._open.set()
+
+    def clear(self) -> None:
+        """Pass everything at once and as it is."""
+        self.delay_s = self.corrupt_share = 0.0
+        self.segment_bytes = self.bytes_per_s = None
+        self.resume()
+
+    @property
+    def read_bytes(self) -> int:
+        """How many bytes to read at once."""
+        if self.bytes_per_s is None:
+            return _READ_BYTES
+        return max(1, min(_READ_BYTES, int(self.bytes_per_s / 50)))
+
+    async def send(self, data: bytes, writer: asyncio.StreamWriter) -> None:
+        if self.delay_s:
+            await asyncio.sleep(self.delay_s)
+        if self.bytes_per_s is not None:
+            await asyncio.sleep(len(data) / self.bytes_per_s)
+        await self._open.wait()
+        data = self._corrupted(data)
+        size = self.segment_bytes or max(1, len(data))
+        for start in range(0, len(data), size):
+            segment = data[start : start + size]
+            self.passed_bytes += len(segment)
+            writer.write(segment)
+            await writer.drain()
+            if self.segment_bytes is not None:
+                await asyncio.sleep(0)  # the loop's other work goes first: nobody reads two at once
+
+    def _corrupted(self, data: bytes) -> bytes:
+        if not self.corrupt_share:
+            return data
+        return bytes(
+            byte ^ self._random.randint(1, 255) if self._random.random() < self.corrupt_share else byte
+            for byte in data
+        )
+
+
+class FuzzingProxy:
+    """Passes connections to ``port`` on to ``server_port`` of this machine, with the trouble asked for."""
+
+    def __init__(self, server_port: int, *, port: int = 0, seed: int = 1) -> None:
+        self._server_port = server_port
+        self.port = port
+        self.to_client = Way(seed)
+        self.to_server = Way(seed + 1)
+        self.num_accepted = 0
+        self._connections: set[_Connection] = set()
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._server: asyncio.Server | None = None
+
+    async def __aenter__(self) -> Self:
+        await self.listen()
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.vanish()
+        if self._tasks:
+            await asyncio.wait(self._tasks)
+
+    @property
+    def num_connections(self) -> int:
+        return len(self._connections)
+
+    async def listen(self) -> None:
+        """Accept connections, again on the same port after ``vanish``."""
+        self._server = await asyncio.start_server(self._serve, "127.0.0.1", self.port)
+        self.port = self._server.sockets[0].getsockname()[1]
+
+    def vanish(self) -> None:
+        """Cut all connections and refuse new ones."""
+        if self._server is not None:
+            self._server.close()
+            self._server = None
+        self.cut(reset=True)
+
+    def cut(self, *, reset: bool = False) -> None:
+        """End all connections between two bytes, by FIN after what has passed, or by RST."""
+        for connection in list(self._connections):
+            connection.end(reset=reset)
+
+    def cut_after(self, num_bytes: int) -> None:
+        """End each connection once so many more bytes went to its client: within a packet, well chosen."""
+        for connection in self._connections:
+            connection.bytes_left = num_bytes
+
+    def clear(self) -> None:
+        """Make both ways well."""
+        self.to_client.clear()
+        self.to_server.clear()
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        task = asyncio.current_task()
+        assert task is not None
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+        self.num_accepted += 1
+        try:
+            server = await asyncio.open_connection("127.0.0.1", self._server_port, limit=_READ_BYTES)
+        except OSError:
+            writer.transport.abort()
+            return
+        connection = _Connection((reader, writer), server)
+        self._connections.add(connection)
+        try:
+            await connection.run(self.to_client, self.to_server)
+        finally:
+            self._connections.discard(connection)
+
+
+_Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+
+
+class _Connection:
+    """One client's connection and the one to the server that belongs to it."""
+
+    def __init__(self, client: _Streams, server: _Streams) -> None:
+        self._client = client
+        self._server = server
+        self._is_over = asyncio.Event()
+        self.bytes_left: int | None = None
+
+    async def run(self, to_client: Way, to_server: Way) -> None:
+        pumps = [
+            asyncio.create_task(self._pump(self._server[0], self._client[1], to_client, cuts=True)),
+            asyncio.create_task(self._pump(self._client[0], self._server[1], to_server)),
+        ]
+        try:
+            await self._is_over.wait()
+        finally:
+            self.end()
+            for pump in pumps:
+                pump.cancel()
+            await asyncio.wait(pumps)
+
+    def end(self, *, reset: bool = False) -> None:
+        for _, writer in (self._client, self._server):
+            if reset:
+                tcp = writer.get_extra_info("socket")
+                tcp.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                writer.transport.abort()
+            else:
+                writer.close()
+        self._is_over.set()
+
+    async def _pump(
+        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, way: Way, *, cuts: bool = False
+    ) -> None:
+        with contextlib.suppress(ConnectionError):
+            while data := await reader.read(way.read_bytes):
+                if cuts and self.bytes_left is not None:
+                    data = data[: self.bytes_left]
+                    self.bytes_left -= len(data)
+                await way.send(data, writer)
+                if cuts and self.bytes_left == 0:
+                    break
+        self._is_over.set()

@@ -1,0 +1,199 @@
+"""Scenario files, and the command line that plays them."""
+
+import logging
+import re
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner, Result
+
+from gateway.cli import app
+from gateway.errors import ConfigError
+from gateway.rtc3d.components import ComponentType
+from gateway.simulator.faults.kinds import COMMON, KINDS, list_of_kinds, parameters_of
+from gateway.simulator.faults.server import Restart
+from gateway.simulator.faults.stream import Cut, Delay
+from gateway.simulator.scenario import Scenario, load_scenario
+from gateway.simulator.scene_settings import SceneSettings
+
+ROOT = Path(__file__).parents[3]
+SCENARIOS = sorted((ROOT / "config/scenarios").glob("*.yaml"))
+REFERENCE = (ROOT / "docs/reference/simulator.md").read_text()
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "scenario.yaml"
+
+
+def test_a_scenario_has_a_scene_faults_and_a_seed(file: Path) -> None:
+    file.write_text(
+        """\
+scene: {markers: 20, tools: 2, analog: 8, plates: 1, rate_hz: 200, analog_rate_hz: 2000, seed: 1}
+faults:
+  - {fault: delay, delay_ms: 80, at_s: 5, for_s: 3}
+  - {fault: cut, at_s: 10}              # mid-packet
+  - {fault: restart, at_s: 15, away_s: 2, scene: {markers: 12}}
+seed: 7
+"""
+    )
+    assert load_scenario(file) == Scenario(
+        scene=SceneSettings(
+            markers=20, tools=2, analog=8, plates=1, rate_hz=200, analog_rate_hz=2000, seed=1
+        ),
+        faults=(
+            Delay(delay_ms=80, at_s=5, for_s=3),
+            Cut(at_s=10),
+            Restart(at_s=15, away_s=2, scene=SceneSettings(markers=12)),
+        ),
+        seed=7,
+    )
+
+
+def test_only_the_faults_are_needed(file: Path) -> None:
+    file.write_text("faults: [{fault: cut}]")
+    assert load_scenario(file) == Scenario(scene=SceneSettings(), faults=(Cut(),), seed=1)
+
+
+@pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.name)
+def test_every_shipped_scenario_loads(path: Path) -> None:
+    assert load_scenario(path).faults
+
+
+def test_there_is_a_shipped_scenario() -> None:
+    assert [path.name for path in SCENARIOS] == ["bad-day.yaml"]
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        (
+            "faults: [{fault: dely}]",
+            "1:18: faults[0].fault: found 'dely' (did you mean 'delay'?); accepted is ",
+        ),
+        (
+            "faults: [{delay_ms: 3}]",
+            "1:10: faults[0]: found a mapping; accepted is a mapping with the key fault",
+        ),
+        (
+            "faults: [{fault: cut, at: 3}]",
+            "1:23: faults[0].at: unknown key (did you mean 'at_s'?); known: at_s,",
+        ),
+        (
+            "faults: [{fault: cut, at_s: x}]",
+            "1:29: faults[0].at_s: found 'x'; accepted is a number of seconds",
+        ),
+        (
+            "faults: [{fault: restart, scene: {marker: 3}}]",
+            "1:35: faults[0].scene.marker: unknown key (did you mean 'markers'?)",
+        ),
+        ("faults: delay", "1:9: faults: found 'delay'; accepted is a list of faults"),
+        (
+            "scene: {markers: -1}\nfaults: []",
+            "1:18: scene.markers: found -1; accepted is a whole number from 0",
+        ),
+        ("seed: 1", "1:1: faults: missing; this key has no default"),
+        ("", "empty; accepted is a mapping, with the key faults at least"),
+    ],
+)
+def test_a_mistake_is_told_with_its_place(file: Path, line: str, expected: str) -> None:
+    file.write_text(line)
+    with pytest.raises(ConfigError, match=rf"^{re.escape(f'{file}:')} ?{re.escape(expected)}"):
+        load_scenario(file)
+
+
+def test_a_missing_file_is_told_with_an_example(file: Path) -> None:
+    with pytest.raises(ConfigError, match=r"No such file .*such as config/scenarios/bad-day\.yaml"):
+        load_scenario(file)
+
+
+# The scene ----------------------------------------------------------------------------------
+
+
+def test_a_scene_has_the_sizes_rates_and_labels_of_its_settings() -> None:
+    scene = SceneSettings(
+        markers=3, tools=1, analog=2, plates=0, rate_hz=50, analog_rate_hz=500, marker_label="M"
+    ).build()
+    assert scene.rates_hz == {
+        ComponentType.MARKERS: 50,
+        ComponentType.TOOLS: 50,
+        ComponentType.ANALOG: 500,
+    }
+    assert scene.parameters.markers is not None
+    assert [marker.label for marker in scene.parameters.markers.markers] == ["M 1", "M 2", "M 3"]
+
+
+def test_changes_of_a_scene_are_those_that_are_given() -> None:
+    base = SceneSettings(markers=3, tools=1, rate_hz=50)
+    # 24 markers are the default, but given here
+    assert base.changed_by(SceneSettings(markers=24)) == SceneSettings(markers=24, tools=1, rate_hz=50)
+    assert base.changed_by(SceneSettings()) == base
+
+
+# The command line ---------------------------------------------------------------------------
+
+
+def simulate(*arguments: str) -> Result:
+    return CliRunner().invoke(app, ["simulate", "--port", "0", "--seconds", "0.3", *arguments])
+
+
+def test_a_scenarios_faults_and_those_of_the_command_line_are_played(
+    file: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    file.write_text("faults: [{fault: undersize, at_s: 0}]")
+    result = simulate("--scenario", str(file), "--fault", "cut", "--fault", "delay,delay_ms=3", "--seed", "3")
+    assert result.exit_code == 0, result.output
+    assert [message for message in caplog.messages if message.startswith("Fault")] == [
+        "Fault: undersize,at_s=0",
+        "Fault: cut",
+        "Fault begins: delay,delay_ms=3",
+    ]
+
+
+@pytest.mark.parametrize("arguments", [["--fault", "dely"], ["--scenario", "/nowhere.yaml"]])
+def test_a_wrong_fault_or_scenario_is_an_error_of_the_configuration(arguments: list[str]) -> None:
+    assert isinstance(simulate(*arguments).exception, ConfigError)
+
+
+def test_options_change_the_scenarios_scene() -> None:
+    scenario = Scenario(scene=SceneSettings(markers=3, tools=1), faults=(Cut(),), seed=5)
+    changed = scenario.extended({"markers": 9, "rate_hz": 50.0}, [Delay()], None)
+    assert changed == Scenario(
+        scene=SceneSettings(markers=9, tools=1, rate_hz=50), faults=(Cut(), Delay()), seed=5
+    )
+    assert scenario.extended({}, [], 0).seed == 0
+
+
+def test_the_defaults_of_options_and_scenarios_are_the_same() -> None:
+    defaults = SceneSettings().model_dump(exclude={"seed", "marker_label"})
+    help_text = CliRunner().invoke(app, ["simulate", "--help"], env={"COLUMNS": "200"}).output
+    for name, value in defaults.items():
+        option = name.removesuffix("_hz").replace("_", "-")
+        assert re.search(rf"--{option}\s.*\[default: {value}\]", help_text), name
+
+
+def test_all_faults_can_be_listed() -> None:
+    result = CliRunner().invoke(app, ["simulate", "--list-faults"])
+    assert (result.exit_code, result.output) == (0, list_of_kinds() + "\n")
+
+
+# The reference ------------------------------------------------------------------------------
+
+
+def test_the_reference_has_every_kind_with_its_parameters_and_defaults() -> None:
+    rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", REFERENCE, re.MULTILINE))
+    assert set(KINDS) | set(COMMON) <= set(rows)
+    for name, kind in KINDS.items():
+        for parameter, default, _ in parameters_of(kind):
+            assert f"`{parameter}`" in rows[name], f"{name}: {parameter}"
+            assert default in rows[name], f"{name}: {parameter} is {default} by default"
+        assert ("for_s" in rows[name]) == ("for_s" in kind.model_fields), name
+
+
+def test_the_examples_of_the_reference_can_be_loaded(file: Path) -> None:
+    examples = re.findall(r"^```yaml\n(.*?)^```$", REFERENCE, re.MULTILINE | re.DOTALL)
+    assert examples
+    for example in examples:
+        file.write_text(example)
+        assert load_scenario(file).faults

@@ -1,0 +1,434 @@
+import math
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from gateway.clock import Sample, ServerClock, envelope_slope
+from tests.clock_simulation import (
+    EPOCH_UTIME,
+    Frames,
+    Numbers,
+    Times,
+    observe,
+    percentile_95_us,
+    simulate,
+    whole_us,
+)
+
+RATE_HZ = 200
+SECOND = RATE_HZ  # frames
+LEARNED = 30 * SECOND
+WRAP_US = 2**32
+
+
+def learned(frames: Frames) -> ServerClock:
+    clock = ServerClock()
+    observe(clock, frames)
+    return clock
+
+
+def samples(*points: tuple[int, int]) -> list[Sample]:
+    return [Sample(*point) for point in points]
+
+
+# --- how exact
+
+
+@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("drift_ppm", [100, -100])
+def test_after_30_s_the_capture_time_is_within_half_a_millisecond(drift_ppm: float, seed: int) -> None:
+    frames = simulate(seconds=60, rate_hz=RATE_HZ, drift_ppm=drift_ppm, seed=seed)
+    clock = ServerClock()
+    observed = observe(clock, frames)
+    assert percentile_95_us(observed.errors_us[LEARNED:]) < 100  # five times better than asked for
+    assert clock.drift_ppm == pytest.approx(drift_ppm, abs=3)
+    assert observed.has_clock[LEARNED:].all()
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(
+    ("rate_hz", "jitter_us", "outliers", "within_us"),
+    [
+        (30, 5_000, 0.0, 200),
+        (RATE_HZ, 5_000, 0.02, 200),
+        (RATE_HZ, 0, 0.0, 2),
+        (1000, 1_000, 0.0, 50),
+        # Nearly every frame waits behind another: one in thousands shows the least delay.
+        (1000, 5_000, 0.0, 1_000),
+    ],
+)
+def test_it_is_as_exact_at_other_rates_and_on_worse_networks(
+    rate_hz: float, jitter_us: float, outliers: float, within_us: float, seed: int
+) -> None:
+    frames = simulate(
+        seconds=45, rate_hz=rate_hz, drift_ppm=100, jitter_us=jitter_us, outliers=outliers, seed=seed
+    )
+    errors_us = observe(ServerClock(), frames).errors_us[int(30 * rate_hz) :]
+    assert percentile_95_us(errors_us) < within_us
+
+
+def test_a_drift_that_changes_is_followed_for_ten_minutes() -> None:
+    def warming_up(host_s: Numbers) -> Numbers:
+        return np.asarray(100 * np.sin(2 * np.pi * host_s / 600))
+
+    frames = simulate(seconds=600, rate_hz=RATE_HZ, drift_ppm=warming_up)
+    errors_us = observe(ServerClock(), frames).errors_us
+    assert max(percentile_95_us(part) for part in np.split(errors_us[LEARNED:], 19)) < 500
+
+
+@pytest.mark.parametrize("jitter_us", [0, 5_000])
+def test_errors_stay_within_the_uncertainty(jitter_us: float) -> None:
+    frames = simulate(seconds=60, rate_hz=RATE_HZ, drift_ppm=100, jitter_us=jitter_us)
+    observed = observe(ServerClock(), frames)
+    within = np.abs(observed.errors_us) <= observed.uncertainties_us
+    assert within[LEARNED:].mean() > 0.95
+    assert observed.uncertainties_us[LEARNED:].max() < 200
+
+
+def test_the_uncertainty_is_the_scatter_of_the_samples_that_the_line_does_not_touch() -> None:
+    clock = ServerClock()
+    for index, delay_us in enumerate([0, 300, 0, 0]):
+        clock.observe(index * 600_000, index, EPOCH_UTIME + index * 600_000 + delay_us)
+    assert (clock.samples, clock.uncertainty_us, clock.offset_us) == (3, 300, EPOCH_UTIME)
+
+
+def test_lag_is_how_much_later_than_the_soonest_a_frame_came() -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ)
+    lags_us = observe(ServerClock(), frames).lags_s[LEARNED:] * 1e6
+    true_us = (frames.arrivals_utime - frames.captured_utime)[LEARNED:]
+    assert np.abs(lags_us - true_us).max() < 100
+
+
+# --- the beginning
+
+
+def test_at_the_first_frame_there_is_no_clock() -> None:
+    clock = ServerClock()
+    reading = clock.observe(123, 7, EPOCH_UTIME)
+    assert reading == (EPOCH_UTIME, 0.0, False)
+    assert (clock.has_clock, clock.offset_us, clock.drift_ppm, clock.samples) == (False, 0, 0.0, 0)
+    assert clock.uncertainty_us == math.inf
+
+
+def test_there_is_a_clock_after_one_and_a_half_seconds() -> None:
+    frames = simulate(seconds=2, rate_hz=RATE_HZ)
+    observed = observe(ServerClock(), frames)
+    came_s = (frames.arrivals_utime - frames.arrivals_utime[0]) / 1e6
+    assert 1.5 <= came_s[observed.has_clock.argmax()] < 1.6
+    assert observed.has_clock[-1]
+
+
+def test_the_offset_takes_a_time_stamp_to_the_hosts_time() -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ, drift_ppm=100)
+    clock = learned(frames)
+    captured_utime = int(frames.timestamps_us[-1]) + clock.offset_us
+    assert captured_utime == pytest.approx(int(frames.captured_utime[-1]), abs=100)
+
+
+def test_samples_are_those_of_half_a_minute() -> None:
+    assert learned(simulate(seconds=5.1, rate_hz=RATE_HZ)).samples == 10
+    assert learned(simulate(seconds=60, rate_hz=RATE_HZ)).samples == 60
+
+
+def test_frames_more_seldom_than_the_windows_make_a_clock_too() -> None:
+    frames = simulate(seconds=120, rate_hz=1, drift_ppm=50)
+    observed = observe(ServerClock(), frames)
+    assert observed.has_clock[-1]
+    assert percentile_95_us(observed.errors_us[60:]) < 3_000
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_capture_times_do_not_go_back_when_a_better_line_is_lower(seed: int) -> None:
+    frames = simulate(seconds=20, rate_hz=1000, seed=seed)
+    assert (np.diff(observe(ServerClock(), frames).captures_utime) >= 0).all()
+
+
+# --- late frames
+
+
+def delayed(frames: Frames, seconds: Sequence[float], delays_s: Sequence[float]) -> Frames:
+    """Return the frames with the delays that a line through these points has at their time."""
+    return frames.with_delays(np.interp(np.arange(len(frames)) / RATE_HZ, seconds, delays_s) * 1e6)
+
+
+def test_one_late_frame_moves_nothing() -> None:
+    frames = delayed(simulate(seconds=40, rate_hz=RATE_HZ), [29.996, 30, 30.004], [0, 1, 0])
+    observed = observe(ServerClock(), frames)
+    assert observed.lags_s[LEARNED] == pytest.approx(1.0, abs=0.1)
+    assert percentile_95_us(observed.errors_us[LEARNED:]) < 100
+
+
+def test_a_pause_of_the_gateway_moves_nothing() -> None:
+    frames = delayed(simulate(seconds=60, rate_hz=RATE_HZ), [29.999, 30, 35], [0, 5, 0])
+    observed = observe(ServerClock(), frames)
+    assert observed.lags_s[LEARNED] == pytest.approx(5.0, abs=0.1)
+    assert percentile_95_us(observed.errors_us[LEARNED:]) < 100
+
+
+@pytest.mark.parametrize(
+    ("seconds", "delays_s"),
+    [
+        pytest.param([30, 40, 45, 50], [0, 0.8, 0.8, 0], id="grows and clears"),
+        pytest.param([30, 30.2, 50], [0, 0.8, 0], id="begins at once and clears slowly"),
+        pytest.param([30, 55], [0, 0.02], id="grows by 0.8 ms/s"),
+    ],
+)
+def test_a_jam_moves_nothing_and_is_told_as_lag(seconds: Sequence[float], delays_s: Sequence[float]) -> None:
+    frames = delayed(simulate(seconds=60, rate_hz=RATE_HZ), seconds, delays_s)
+    observed = observe(ServerClock(), frames)
+    assert percentile_95_us(observed.errors_us[LEARNED : 55 * SECOND]) < 500
+    true_s = (frames.arrivals_utime - frames.captured_utime) / 1e6
+    assert observed.lags_s[LEARNED : 55 * SECOND] == pytest.approx(true_s[LEARNED : 55 * SECOND], abs=0.001)
+
+
+def test_a_hiccup_every_three_seconds_moves_nothing() -> None:
+    frames = simulate(seconds=90, rate_hz=RATE_HZ)
+    index = np.arange(len(frames))
+    hiccups_us = 300_000.0 * ((index >= LEARNED) & (index % (3 * SECOND) < 1.2 * SECOND))
+    observed = observe(ServerClock(), frames.with_delays(hiccups_us))
+    assert np.abs(observed.errors_us[LEARNED:]).max() < 500
+
+
+def test_a_jam_without_end_is_the_networks_delay_after_half_a_minute() -> None:
+    frames = simulate(seconds=90, rate_hz=RATE_HZ)
+    waves_s = 0.5 + 0.2 * np.sin(np.arange(len(frames)) / RATE_HZ * 2 * np.pi / 5)
+    waves_s[:LEARNED] = 0
+    observed = observe(ServerClock(), frames.with_delays(waves_s * 1e6))
+    assert observed.lags_s[LEARNED : 58 * SECOND].min() > 0.25
+    assert observed.lags_s[65 * SECOND :].min() < 0.02
+
+
+def test_a_delay_that_stays_is_the_networks_after_half_a_minute() -> None:
+    frames = delayed(simulate(seconds=90, rate_hz=RATE_HZ), [30, 40], [0, 0.3])
+    observed = observe(ServerClock(), frames)
+    assert observed.lags_s[42 * SECOND : 58 * SECOND].min() > 0.29
+    assert observed.lags_s[75 * SECOND :].max() < 0.1
+
+
+def test_doubled_frames_are_captured_at_the_same_time() -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ)
+    doubled = Frames(
+        np.repeat(frames.timestamps_us, 2),
+        np.repeat(frames.arrivals_utime, 2) + np.tile([0, 30], len(frames)),
+        np.repeat(frames.captured_utime, 2),
+    )
+    observed = observe(ServerClock(), doubled)
+    assert not observed.restarted.any()
+    assert percentile_95_us(observed.errors_us[2 * LEARNED :]) < 100
+    captures = observed.captures_utime[2 * LEARNED :].reshape(-1, 2)
+    assert (captures[:, 0] == captures[:, 1]).all()
+
+
+def test_coarse_time_stamps_make_a_clock() -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ, drift_ppm=50)
+    coarse = frames.with_timestamps(frames.timestamps_us // 20_000 * 20_000)
+    observed = observe(ServerClock(), coarse)
+    assert observed.has_clock[LEARNED:].all()
+    assert np.abs(observed.errors_us[LEARNED:]).max() < 21_000
+
+
+# --- clocks that are set
+
+
+@pytest.mark.parametrize("by_s", [3600, 10, 0.3, 0.02, -0.02, -0.3, -10, -3600])
+def test_a_host_clock_that_is_set_is_learned_again_within_three_seconds(by_s: float) -> None:
+    frames = simulate(seconds=60, rate_hz=RATE_HZ, drift_ppm=100)
+    before, after = frames.part(0, LEARNED), frames.part(LEARNED).with_host_set(round(by_s * 1e6))
+    clock = ServerClock()
+    observed = observe(clock, before + after)
+    assert not observed.restarted.any()
+    assert observed.has_clock[LEARNED:].all()
+    assert percentile_95_us(observed.errors_us[LEARNED + 3 * SECOND :]) < 200
+    assert clock.drift_ppm == pytest.approx(100, abs=3)
+
+
+def test_a_hiccup_meanwhile_does_not_hinder_that() -> None:
+    frames = delayed(simulate(seconds=60, rate_hz=RATE_HZ), [31, 31.1, 31.9, 32], [0, 0.3, 0.3, 0])
+    set_s = 30
+    after = frames.part(set_s * SECOND).with_host_set(10_000_000)
+    observed = observe(ServerClock(), frames.part(0, set_s * SECOND) + after)
+    assert percentile_95_us(observed.errors_us[(set_s + 5) * SECOND :]) < 200
+
+
+@pytest.mark.parametrize("by_us", [60_000_000, 300_000])
+def test_time_stamps_that_jump_forward_are_learned_again_at_once(by_us: int) -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ)
+    jump = by_us * (np.arange(len(frames)) >= LEARNED)
+    observed = observe(ServerClock(), frames.with_timestamps(frames.timestamps_us + jump))
+    assert not observed.restarted.any()
+    assert (observed.captures_utime <= frames.arrivals_utime).all()
+    assert percentile_95_us(observed.errors_us[LEARNED + SECOND :]) < 200
+
+
+# --- another time base
+
+
+@pytest.mark.parametrize("start_us", [0, 5_000_000])
+def test_a_restarted_server_is_recognised_on_its_first_frame(start_us: int) -> None:
+    before = simulate(seconds=40, rate_hz=RATE_HZ, drift_ppm=100)
+    after = simulate(seconds=40, rate_hz=RATE_HZ, drift_ppm=100, seed=1, start_us=start_us)
+    after = after.with_host_set(60_000_000)
+    clock = learned(before)
+    observed = observe(clock, after)
+    assert observed.restarted.tolist() == [True] + (len(after) - 1) * [False]
+    assert observed.captures_utime[0] == after.arrivals_utime[0]
+    assert observed.has_clock.all()
+    assert percentile_95_us(observed.errors_us[SECOND:]) < 100  # the drift was known
+
+
+def test_a_frame_number_that_goes_back_is_a_restart_though_time_stamps_go_on() -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ)
+    clock = ServerClock()
+    observe(clock, frames.part(0, LEARNED), first_frame_number=1000)
+    restarted = observe(clock, frames.part(LEARNED), first_frame_number=0).restarted
+    assert restarted.tolist() == [True] + (len(restarted) - 1) * [False]
+
+
+def test_frame_numbers_may_be_constant() -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ)
+    clock = ServerClock()
+    readings = [
+        clock.observe(timestamp_us, 0, arrival_utime)
+        for timestamp_us, arrival_utime in zip(
+            frames.timestamps_us.tolist(), frames.arrivals_utime.tolist(), strict=True
+        )
+    ]
+    assert not any(reading.restarted for reading in readings)
+    assert clock.has_clock
+
+
+@pytest.mark.parametrize("lowest", [0, -(2**31)], ids=["unsigned", "signed"])
+@pytest.mark.parametrize("seconds", [20.0, 20.1, 20.2, 20.3, 20.4])
+def test_time_stamps_of_32_bits_wrap_around_without_a_trace(seconds: float, lowest: int) -> None:
+    start_us = lowest + WRAP_US - round(seconds * 1e6)
+    frames = simulate(seconds=40, rate_hz=RATE_HZ, drift_ppm=-100, start_us=start_us)
+    wrapped = frames.with_timestamps((frames.timestamps_us - lowest) % WRAP_US + lowest)
+    assert (wrapped.timestamps_us[:-1] > wrapped.timestamps_us[1:]).sum() == 1
+    clock, same = ServerClock(), ServerClock()
+    observed = observe(clock, wrapped)
+    assert not observed.restarted.any()
+    assert observed.captures_utime.tolist() == observe(same, frames).captures_utime.tolist()
+    assert clock.offset_us == same.offset_us + WRAP_US
+
+
+def test_a_restart_after_a_wrap_around_begins_with_whole_stamps() -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ, start_us=WRAP_US - 20_000_000)
+    clock = learned(frames.with_timestamps(frames.timestamps_us % WRAP_US))
+    clock.observe(0, 0, EPOCH_UTIME + 60_000_000)
+    assert clock.offset_us == EPOCH_UTIME + 60_000_000
+
+
+def test_a_server_that_loops_a_file_restarts_each_time_and_keeps_its_clock() -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ)
+    loop = 340  # frames: 1.7 s
+    looped = frames.with_timestamps(frames.timestamps_us[np.arange(len(frames)) % loop])
+    observed = observe(ServerClock(), looped)
+    assert np.flatnonzero(observed.restarted).tolist() == list(range(loop, len(frames), loop))
+    assert observed.has_clock[loop:].all()
+    assert (observed.captures_utime <= looped.arrivals_utime).all()
+    assert percentile_95_us(observed.errors_us[loop:]) < 2_000
+
+
+# --- no clock
+
+
+def random_stamps(timestamps_us: Times) -> Times:
+    return np.random.default_rng(1).integers(-(2**63), 2**63 - 1, len(timestamps_us))
+
+
+def times(factor: float) -> Callable[[Times], Times]:
+    return lambda timestamps_us: whole_us(timestamps_us * factor)
+
+
+@pytest.mark.parametrize(
+    "stamped",
+    [
+        pytest.param(np.zeros_like, id="always 0"),
+        pytest.param(lambda timestamps_us: np.full_like(timestamps_us, 2**62), id="constant"),
+        pytest.param(random_stamps, id="random"),
+        pytest.param(times(0.001), id="milliseconds"),
+        pytest.param(times(1000), id="nanoseconds"),
+        *(pytest.param(times(factor), id=f"{factor} times as fast") for factor in (0.5, 0.9, 1.1, 2)),
+    ],
+)
+def test_time_stamps_that_make_no_sense_are_no_clock(stamped: Callable[[Times], Times]) -> None:
+    frames = simulate(seconds=60, rate_hz=RATE_HZ)
+    clock = ServerClock()
+    observed = observe(clock, frames.with_timestamps(stamped(frames.timestamps_us)))
+    assert not observed.has_clock.any()
+    assert (observed.captures_utime == frames.arrivals_utime).all()
+    assert not observed.lags_s.any()
+    assert (clock.offset_us, clock.drift_ppm, clock.uncertainty_us) == (0, 0.0, math.inf)
+
+
+@pytest.mark.parametrize("factor", [0.998, 1.002])
+def test_a_rate_that_no_crystal_has_is_found_within_ten_seconds(factor: float) -> None:
+    frames = simulate(seconds=60, rate_hz=RATE_HZ)
+    observed = observe(ServerClock(), frames.with_timestamps(times(factor)(frames.timestamps_us)))
+    assert not observed.has_clock[10 * SECOND :].any()
+
+
+def test_no_greater_drift_is_told_than_crystals_have() -> None:
+    frames = simulate(seconds=12, rate_hz=RATE_HZ)
+    clock = ServerClock()
+    # Not enough to rule out the network.
+    assert observe(clock, frames.with_timestamps(times(0.9991)(frames.timestamps_us))).has_clock[-1]
+    assert clock.drift_ppm == 500
+
+
+def test_a_time_stamp_that_freezes_ends_the_clock_until_it_moves_again() -> None:
+    frames = simulate(seconds=60, rate_hz=RATE_HZ)
+    stamps = frames.timestamps_us.copy()
+    stamps[LEARNED : LEARNED + 10 * SECOND] = stamps[LEARNED]
+    frozen = frames.with_timestamps(stamps)
+    observed = observe(ServerClock(), frozen)
+    without = slice(LEARNED + round(0.6 * SECOND), LEARNED + 10 * SECOND)
+    assert not observed.has_clock[without].any()
+    assert (observed.captures_utime == frozen.arrivals_utime)[without].all()
+    assert observed.has_clock[LEARNED + 12 * SECOND :].all()
+    assert percentile_95_us(observed.errors_us[LEARNED + 12 * SECOND :]) < 200
+
+
+@pytest.mark.parametrize("stamped", [random_stamps, times(0.9)], ids=["random", "0.9 times as fast"])
+def test_after_nonsense_there_is_a_clock_again(stamped: Callable[[Times], Times]) -> None:
+    nonsense = simulate(seconds=40, rate_hz=RATE_HZ)
+    clock = learned(nonsense.with_timestamps(stamped(nonsense.timestamps_us)))
+    frames = simulate(seconds=40, rate_hz=RATE_HZ, start_us=0).with_host_set(40_000_000)
+    observed = observe(clock, frames, first_frame_number=40 * SECOND)
+    assert observed.has_clock[2 * SECOND :].all()
+    assert percentile_95_us(observed.errors_us[2 * SECOND : 5 * SECOND]) < 500
+    assert percentile_95_us(observed.errors_us[LEARNED:]) < 100
+
+
+def test_a_server_that_restarts_into_nonsense_has_no_clock_soon() -> None:
+    clock = learned(simulate(seconds=40, rate_hz=RATE_HZ))
+    frames = simulate(seconds=20, rate_hz=RATE_HZ).with_host_set(60_000_000)
+    milliseconds = frames.with_timestamps(np.arange(len(frames)) * 5)
+    assert not observe(clock, milliseconds).has_clock[2 * SECOND :].any()
+
+
+def test_a_server_that_restarts_at_nearly_every_frame_has_no_clock() -> None:
+    clock = learned(simulate(seconds=40, rate_hz=RATE_HZ))
+    frames = simulate(seconds=1, rate_hz=RATE_HZ).with_host_set(60_000_000)
+    nonsense = frames.with_timestamps(random_stamps(frames.timestamps_us))
+    assert not observe(clock, nonsense).has_clock[10:].any()
+
+
+# --- the line
+
+
+@pytest.mark.parametrize(
+    ("points", "slope"),
+    [
+        (samples((0, 0), (10, 5)), 0.5),
+        (samples((0, 5), (10, 0)), -0.5),
+        (samples((0, 0), (5, 7), (10, 10)), 1.0),
+        # The mean, 5, is below the second edge of a hull of two.
+        (samples((0, 4), (4, 0), (5, 9), (6, 9), (10, 3)), 0.5),
+        # The mean, 3.8, is below the first.
+        (samples((0, 6), (1, 9), (2, 9), (6, 0), (10, 4)), -1.0),
+    ],
+)
+def test_the_line_is_below_all_and_nearest(points: Sequence[Sample], slope: float) -> None:
+    assert envelope_slope(points) == slope
