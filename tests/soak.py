@@ -37,6 +37,8 @@ COMPONENTS: Final = ("3d", "6d", "analog", "force", "event")
 BACKOFF_S: Final = 0.5
 STALL_S: Final = 1.0
 RECOVERY_LIMIT_S: Final = 30.0
+BEGIN, END = "<!-- soak: begin -->", "<!-- soak: end -->"
+"""What the report stands between in its file."""
 
 
 class Heard:
@@ -142,13 +144,11 @@ class Soak:
             self.rounds.append((kind, time.monotonic() - well_s))
 
     def report(self) -> str:
-        """Return docs/reliability.md."""
+        """Return the report for docs/reliability.md."""
         heard, status = self.heard, self.heard.status
         stream = status.streams[0]
         start_kib, end_kib = self.memory_kib[0], self.memory_kib[-1]
         lines = [
-            "# Reliability",
-            "",
             f"Random faults for {self.minutes:g} minutes at {RATE_HZ:g} Hz (`make soak SOAK_MINUTES="
             f"{self.minutes:g}`, seed {self.seed}), {datetime.now(UTC):%Y-%m-%d}, version {__version__}, "
             f"Python {platform.python_version()}, {platform.machine()}. Each round begins one fault of the "
@@ -244,12 +244,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=30)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--report", type=Path, help="write the report there; else it is printed")
+    parser.add_argument("--report", type=Path, help="put the report into this file; else it is printed")
     options = parser.parse_args()
     soak = Soak(options.minutes, options.seed)
     asyncio.run(soak.run(Console()))
     if options.report:
-        options.report.write_text(soak.report())
+        before, _, rest = options.report.read_text().partition(BEGIN)
+        _, _, after = rest.partition(END)
+        options.report.write_text(f"{before}{BEGIN}\n\n{soak.report()}\n{END}{after}")
         print(f"report in {options.report}")
     else:
         print(soak.report())
