@@ -11,15 +11,15 @@ UNITS := rtc3d-gateway.service rtc3d-gateway@.service
 # What tests of installing use; sudo finds this one, and the service can reach it.
 SYSTEM_PYTHON ?= /usr/bin/python3
 
-.PHONY: demo test check lint types contracts generated lcm-types fuzz soak wheel install uninstall clean
+.PHONY: demo test check lint types contracts generated lcm-types fuzz soak wheel wheelhouse install uninstall clean
 
 demo: .venv/installed
 	$(BIN)/rtc3d-gateway demo
 
 test: .venv/installed
-	tests/with-netns $(BIN)/pytest $(ARGS)
+	SYSTEM_PYTHON=$(SYSTEM_PYTHON) tests/with-netns $(BIN)/pytest $(ARGS)
 
-check: lint types contracts generated test
+check: lint types contracts generated wheelhouse test
 
 lint: .venv/installed
 	$(BIN)/ruff format --check
@@ -65,8 +65,8 @@ install:
 
 # As root. What stays: $(CONFIG), the C3D files in /var/lib/rtc3d-gateway, and the user that they belong to.
 uninstall:
-	[ ! -d /run/systemd/system ] || systemctl stop 'rtc3d-gateway@*.service'
-	[ ! -d /run/systemd/system ] || systemctl disable --now $(UNITS)
+	[ ! -d /run/systemd/system ] || systemctl stop rtc3d-gateway.service 'rtc3d-gateway@*.service'
+	[ ! -d /run/systemd/system ] || systemctl disable $(UNITS)
 	rm -f $(UNITS:%=$(LIB)/systemd/system/%) $(LIB)/sysusers.d/rtc3d-gateway.conf \
 	    $(LIB)/tmpfiles.d/rtc3d-gateway.conf /usr/local/bin/rtc3d-gateway
 	rm -rf $(PREFIX)/venv
@@ -74,6 +74,8 @@ uninstall:
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
 
 # All that installing downloads, for its tests: they have no network.
+wheelhouse: build/wheelhouse/complete
+
 build/wheelhouse/complete: pyproject.toml
 	rm -rf build/wheelhouse build/wheelhouse-venv
 	$(SYSTEM_PYTHON) -m venv build/wheelhouse-venv

@@ -15,17 +15,19 @@ import typer
 from rich.console import Console
 
 from gateway import __version__, cli_configuration
-from gateway.cli_configuration import ConfigOption, ServerOption, configuration
-from gateway.config import DEFAULT_LCM_URL, Settings
+from gateway.cli_configuration import INSTALLED_CONFIG, ConfigOption, ServerOption, configuration
+from gateway.config import DEFAULT_LCM_URL
 from gateway.config_file import load
-from gateway.daemon import Gateway
 from gateway.demo import run_demo
+from gateway.doctor.examination import examine, without_settings
+from gateway.doctor.report import Report
 from gateway.echo import echo, lcm_messages, zenoh_messages
 from gateway.errors import ConfigError, GatewayError
 from gateway.log_format import LogFormat, LogLevel, set_up_log
 from gateway.params import EXIT_STATUSES, ask_lcm, ask_zenoh
 from gateway.params_forms import show
 from gateway.rtc3d.commands import SECTIONS
+from gateway.service import serve
 from gateway.simulator.faults.kinds import list_of_kinds, parse_fault
 from gateway.simulator.scenario import Scenario, load_scenario
 from gateway.simulator.scene import Scene
@@ -94,16 +96,9 @@ def run(
     log_level: LogLevelOption = LogLevel.INFO,
     log_format: LogFormatOption = LogFormat.AUTO,
 ) -> None:
-    """Run the gateway until Ctrl-C or SIGTERM."""
+    """Run the gateway until Ctrl-C or SIGTERM. SIGHUP has it load its configuration anew."""
     set_up_log(log_level, log_format)
-    asyncio.run(_run_gateway(configuration(config, server).settings))
-
-
-async def _run_gateway(settings: Settings) -> None:
-    gateway = Gateway(settings)
-    stop = asyncio.Event()
-    _stop_on_signals(stop)
-    await gateway.run(stop)
+    asyncio.run(serve(lambda: configuration(config, server).settings))
 
 
 def _stop_on_signals(stop: asyncio.Event) -> None:
@@ -117,6 +112,43 @@ def check(file: Annotated[Path, typer.Argument(help="The configuration to check.
     settings = load(file)
     names = ", ".join(source.name for source in settings.sources)
     print(f"{file}: good; {len(settings.sources)} source(s): {names}")
+
+
+@app.command()
+def doctor(
+    config: ConfigOption = None,
+    server: ServerOption = None,
+    seconds: Annotated[
+        float, typer.Option(min=0.1, max=3600, help="How long to watch each source, and wait for Zenoh.")
+    ] = 3.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Look layer by layer for what keeps data from flowing. Exit status 1 if anything is to be put right.
+
+    Without options it looks at the installed configuration, /etc/rtc3d-gateway/gateway.yaml.
+    """
+    set_up_log(LogLevel.ERROR, LogFormat.TEXT)  # what would be warned of is in the findings
+    report = Report(Console(quiet=as_json))
+    asyncio.run(_examine(report, config, server, seconds))
+    if as_json:
+        print(report.as_json())
+    if not report.is_good:
+        raise typer.Exit(1)
+
+
+async def _examine(report: Report, config: Path | None, server: str | None, seconds: float) -> None:
+    if config is None and server is None and INSTALLED_CONFIG.exists():
+        config = INSTALLED_CONFIG
+    try:
+        settings = configuration(config, server).settings
+    except ConfigError as error:
+        for finding in without_settings(error):
+            report.add(finding)
+    else:
+        origin = str(config or server or "environment")
+        async for finding in examine(settings, origin, seconds):
+            report.add(finding)
+    report.end()
 
 
 Markers = Annotated[int, typer.Option(min=0, max=10_000, help="Markers of the synthetic scene.")]

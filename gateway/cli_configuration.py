@@ -11,6 +11,8 @@ from gateway.config_file import Configuration, read, read_server
 from gateway.config_schema import schema_text
 from gateway.config_show import shown_configuration
 
+INSTALLED_CONFIG: Final = Path("/etc/rtc3d-gateway/gateway.yaml")
+
 _DEFAULT_PORT: Final = 3020
 
 ConfigOption = Annotated[

@@ -139,8 +139,8 @@ class ServerClock:
         """Return what the clock says of the frame that came at ``arrival_utime``, and learn from it.
 
         Called once per frame, in the order in which frames came. ``timestamp_us`` and ``frame_number`` are
-        those of one of its components (§7.1), always of the same type: servers may count them apart.
-        ``arrival_utime`` is µs since the Unix epoch.
+        those of one of its components (§7.1), at best always of the same type: servers may count types apart,
+        and a number that goes back is a restart. ``arrival_utime`` is µs since the Unix epoch.
         """
         restarted = False
         if timestamp_us <= self._timestamp_us or frame_number < self._frame_number:
@@ -247,7 +247,7 @@ class ServerClock:
         if judged:
             slope = envelope_slope(samples)
             self.has_clock = abs(slope) <= MAX_DRIFT + _RATE_TOLERANCE_US / span_us
-            if self.has_clock and span_us >= _DRIFT_SPAN_US:
+            if span_us >= _DRIFT_SPAN_US:
                 self._drift = min(max(slope, -MAX_DRIFT), MAX_DRIFT)
         heights_us = [
             offset_us - last.offset_us - self._drift * (timestamp_us - last.timestamp_us)

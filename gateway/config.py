@@ -46,7 +46,7 @@ class Stream(Section):
     """One TCP session with a source's server: these components at this rate."""
 
     components: Components = WIRE_ORDER
-    """What to ask for: [all], or a list of 3d, 6d, analog, force, event. Kept in WIRE_ORDER."""
+    """What to ask for: [all], or a list of 3d, 6d, analog, force, event in any order."""
 
     rate: StreamRate = AllFrames()
     """How often: all, {frequency_hz: NUMBER} or {divisor: WHOLE NUMBER}."""
@@ -171,7 +171,7 @@ class ZenohSettings(Section):
     """What all keys begin with."""
 
     config: ZenohConfig = Field(default_factory=dict, repr=False)  # it may hold a password
-    """Zenoh's own configuration: the path of a JSON5 file, or its keys inline. Not to be changed."""
+    """Zenoh's own configuration: the path of a JSON5 file, or its keys inline; without secrets."""
 
     express: Switch = False
     """Whether each message is sent at once instead of in batches."""

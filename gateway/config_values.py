@@ -226,6 +226,7 @@ def zenoh_reason(error: Exception) -> str:
     text = re.sub(r"^ *--> (\d+):(\d+)", r"line \1, column \2:", text)
     text = re.sub(r"^ *(\d+ )?\|.*\n|^ *= ", "", text, flags=re.MULTILINE)
     text = re.sub(r"(invalid (?:type|value): [a-z ]+) (?:`[^`]*`|\"(?:[^\"\\]|\\.)*\")", r"\1", text)
+    text = re.sub(r"\bSingle\(([^()]*)\)", r"\1", text)  # Rust's word for an endpoint without alternatives
     return " ".join(without_secrets(text).split())
 
 

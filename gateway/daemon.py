@@ -43,7 +43,7 @@ class Gateway:
     """
 
     def __init__(self, settings: Settings, outputs: Sequence[Output] | None = None) -> None:
-        self._settings = settings
+        self.settings = settings
         self._given_outputs = outputs
         self._outputs = self._build_outputs(settings)
         self._spool = _spool(settings)
@@ -136,16 +136,18 @@ class Gateway:
             for output in self._build_outputs(settings)
         ]
         async with self._changing:
-            before, self._settings = self._settings, settings
+            before, self.settings = self.settings, settings
+            changes = [*await self._change_outputs(outputs), *await self._change_sources(settings.sources)]
             if settings.spool != before.spool:
                 self._spool = _spool(settings)
-                for each in self._sources.values():
-                    each.spool = self._spool
-            changes = [*await self._change_outputs(outputs), *await self._change_sources(settings.sources)]
+                for source in self._sources.values():
+                    source.spool = self._spool
+                changes.append("spool changed")
             if settings.metrics != before.metrics:
                 await self._watch.close()
                 self._watch = Watch(settings.metrics, self)
                 await self._watch.start()
+                changes.append("metrics changed")
             return changes
 
     def _build_outputs(self, settings: Settings) -> list[Output]:
@@ -203,7 +205,7 @@ class Gateway:
 
     @property
     def _tool_outputs(self) -> set[str]:
-        sides = (("zenoh", self._settings.zenoh), ("lcm", self._settings.lcm))
+        sides = (("zenoh", self.settings.zenoh), ("lcm", self.settings.lcm))
         return {name for name, side in sides if side.tool_poses}
 
     def _answer_on(self, output: Output) -> None:

@@ -142,13 +142,14 @@ def xml_text(xml: bytes) -> str:
     except ParametersError:
         return f"{size} that cannot be read as parameters"
     items = (
-        ("markers", parameters.markers, "markers"),
-        ("tools", parameters.tools, "tools"),
-        ("analog channels", parameters.analog, "channels"),
-        ("force plates", parameters.force, "plates"),
-        ("events", parameters.events, "events"),
+        ("marker", parameters.markers, "markers"),
+        ("tool", parameters.tools, "tools"),
+        ("analog channel", parameters.analog, "channels"),
+        ("force plate", parameters.force, "plates"),
+        ("event", parameters.events, "events"),
     )
-    held = [f"{len(getattr(part, field))} {name}" for name, part, field in items if part is not None]
+    counts = [(len(getattr(part, field)), name) for name, part, field in items if part is not None]
+    held = [f"{count} {name}{'' if count == 1 else 's'}" for count, name in counts]
     return f"{size}: {', '.join(held) or 'no markers, tools, channels, plates or events'}"
 
 

@@ -167,7 +167,9 @@ class FanOut:
             message = None
             sequence = -1
             for lane in self._lanes[kind]:
-                if lane.pacer is not None and not lane.pacer.due(component.timestamp_us, stamp.utime):
+                if lane.pacer is not None and not lane.pacer.due(
+                    component.timestamp_us if stamp.has_clock else None, stamp.utime
+                ):
                     continue
                 if message is None or sequence != lane.sequence:
                     sequence = lane.sequence

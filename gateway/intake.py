@@ -5,7 +5,6 @@ import logging
 from collections.abc import Callable
 from typing import Final
 
-from gateway.clock import ServerClock
 from gateway.config import Source, Stream
 from gateway.message import Stamp
 from gateway.rate import LagControl
@@ -45,7 +44,9 @@ class Intake:
         self._on_lag = on_lag
         self._on_restart = on_restart
         self._loop = asyncio.get_running_loop()
-        self._clock = status.clock = ServerClock()
+        self._clock = status.clock  # outlives connections: it sees by itself when the server was restarted
+        self._counted: ComponentType | None = None
+        self._frame_number = 0  # of that component type
         self._lag = LagControl(source.max_lag_ms / 1000)
 
     def take(self, frames: list[Frame], utime: int) -> None:
@@ -72,7 +73,12 @@ class Intake:
 
     def _stamp(self, frame: Frame, utime: int) -> Stamp:
         first = frame.components[0]
-        reading = self._clock.observe(first.timestamp_us, first.frame_number, utime)
+        # Servers may count component types apart: one of them is followed, events only where nothing else is.
+        if self._counted is None or (self._counted is ComponentType.EVENT is not first.type):
+            self._counted = first.type
+        if first.type is self._counted:
+            self._frame_number = first.frame_number
+        reading = self._clock.observe(first.timestamp_us, self._frame_number, utime)
         if reading.restarted:
             self._status.restarts += 1
             self._lag.restart()
@@ -81,7 +87,7 @@ class Intake:
             self._status.lag_s = reading.lag_s
             if self._lag.observe(self._loop.time(), reading.lag_s):
                 self._on_lag(self._lag.halvings)
-        return Stamp(utime, reading.capture_utime, self._status.session)
+        return Stamp(utime, reading.capture_utime, self._status.session, self._clock.has_clock)
 
     def _note_unknown(self, types: tuple[int, ...]) -> None:
         self._status.drops["unknown component"] += len(types)

@@ -53,6 +53,8 @@ class Stamp(NamedTuple):
     utime: int
     capture_utime: int
     session: int
+    has_clock: bool = True
+    """Whether the server's time stamps make a clock; else its times tell nothing."""
 
 
 def type_name(message_type: type[Any]) -> str:

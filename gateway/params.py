@@ -161,10 +161,10 @@ def _zenoh_problem(reply: zenoh.ReplyError, patience: _Patience) -> QueryError:
     )
 
 
-def _age_s(attachment: bytes) -> float:
+def _age_s(attachment: bytes) -> float | None:
     with contextlib.suppress(ValueError, TypeError, KeyError):
         return float(json.loads(attachment)["age_s"])
-    return float("nan")
+    return None
 
 
 def ask_lcm(

@@ -1,7 +1,6 @@
 """A server's parameters (§6) as people and programs want to see them: tables, JSON, XML as it came."""
 
 import json
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any, BinaryIO, Final, Literal, NamedTuple, TextIO
@@ -35,12 +34,19 @@ _Rows = Sequence[Sequence[object]]
 
 
 class Told(NamedTuple):
-    """What one source's server says about ``sections``, and how long ago it said so (NaN: unknown)."""
+    """What one source's server says about ``sections``, and how long ago it said so; None: unknown."""
 
     source: str
     sections: Sections
     xml: bytes
-    age_s: float
+    age_s: float | None
+
+
+class _Source(NamedTuple):
+    """What was told of one source, and the age of the oldest of it."""
+
+    parameters: Parameters
+    age_s: float | None
 
 
 def show(told: Sequence[Told], form: Form, out: TextIO) -> list[QueryError]:
@@ -53,10 +59,12 @@ def show(told: Sequence[Told], form: Form, out: TextIO) -> list[QueryError]:
         _write_xml(told, out.buffer)
         return []
     problems: list[QueryError] = []
-    by_source: dict[str, tuple[Parameters, float]] = {}
+    by_source: dict[str, _Source] = {}
     for each in told:
-        parameters, age_s = by_source.get(each.source, (Parameters(), 0.0))
-        by_source[each.source] = _with_sections(parameters, each, problems), max(age_s, each.age_s)
+        before = by_source.get(each.source, _Source(Parameters(), None))
+        ages_s = [age_s for age_s in (before.age_s, each.age_s) if age_s is not None]
+        parameters = _with_sections(before.parameters, each, problems)
+        by_source[each.source] = _Source(parameters, max(ages_s, default=None))
     if form == "json":
         _write_json(by_source, out.buffer)
     else:
@@ -87,24 +95,24 @@ def _write_xml(told: Sequence[Told], out: BinaryIO) -> None:
         out.write(each.xml.rstrip(b"\0\r\n") + b"\n")
 
 
-def _write_json(by_source: dict[str, tuple[Parameters, float]], out: BinaryIO) -> None:
+def _write_json(by_source: dict[str, _Source], out: BinaryIO) -> None:
     values = {
         source: {
-            "age_s": None if math.isnan(age_s) else round(age_s, 3),
-            "parameters": json.loads(parameters_json(parameters, "") or b"{}"),
+            "age_s": each.age_s and round(each.age_s, 3),
+            "parameters": json.loads(parameters_json(each.parameters, "") or b"{}"),
         }
-        for source, (parameters, age_s) in by_source.items()
+        for source, each in by_source.items()
     }
     out.write(json.dumps(values, indent=2, ensure_ascii=False).encode() + b"\n")
 
 
-def _write_tables(by_source: dict[str, tuple[Parameters, float]], out: TextIO) -> None:
+def _write_tables(by_source: dict[str, _Source], out: TextIO) -> None:
     console = Console(file=out)
-    for source, (parameters, age_s) in by_source.items():
-        for table in _tables(source, parameters):
+    for source, each in by_source.items():
+        for table in _tables(source, each.parameters):
             console.print(table)
-        if not math.isnan(age_s):
-            console.print(Text(_plain(f"{source}: the server said so {age_s:.1f} s ago")))
+        if each.age_s is not None:
+            console.print(Text(_plain(f"{source}: the server said so {each.age_s:.1f} s ago")))
 
 
 def _tables(source: str, parameters: Parameters) -> Iterator[Table]:

@@ -1,6 +1,6 @@
 """Frames of a server whose clock is known exactly, as they come over a network. Nothing sleeps."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final, Self
 
@@ -88,6 +88,11 @@ def simulate(
     return Frames(stamps, captured, captured).with_delays(delays_us)
 
 
+def delayed(frames: Frames, rate_hz: float, seconds: Sequence[float], delays_s: Sequence[float]) -> Frames:
+    """Return the frames with the delays that a line through these points has at their time."""
+    return frames.with_delays(np.interp(np.arange(len(frames)) / rate_hz, seconds, delays_s) * 1e6)
+
+
 @dataclass(frozen=True)
 class Observed:
     """What a clock said at each frame; arrays of shape (frames,)."""
@@ -118,6 +123,13 @@ def observe(clock: ServerClock, frames: Frames, first_frame_number: int = 0) -> 
         np.array(uncertainties),
         captures_utime - frames.captured_utime,
     )
+
+
+def learned(frames: Frames) -> ServerClock:
+    """Return a clock that has seen the frames."""
+    clock = ServerClock()
+    observe(clock, frames)
+    return clock
 
 
 def percentile_95_us(errors_us: Times) -> float:

@@ -1,9 +1,12 @@
 """What tests need of the machine: without it they skip on a user's machine, and fail in CI."""
 
 import os
+from pathlib import Path
 from typing import Final
 
 import pytest
+
+_WHEELHOUSE: Final = Path(__file__).parents[1] / "build/wheelhouse/complete"
 
 _NEEDS: Final = {
     "netns": (
@@ -13,6 +16,14 @@ _NEEDS: Final = {
     "takes": (
         bool(os.environ.get("RTC3D_TAKES")),
         "needs recordings: set RTC3D_TAKES to a folder with optotrak.c3d and qualisys.c3d",
+    ),
+    "wheelhouse": (
+        _WHEELHOUSE.exists(),
+        "installs from build/wheelhouse, for there is no network here: run make wheelhouse first",
+    ),
+    "systemd": (
+        os.geteuid() == 0 and Path("/lib/systemd/systemd").exists(),
+        "boots a systemd of its own: needs to be root, and systemd installed",
     ),
 }
 """By marker: whether the machine has it, and what to do if not."""

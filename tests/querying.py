@@ -61,6 +61,8 @@ class LabServer:
                 continue
             command = body.decode("ascii")
             self.commands.append(command)
+            if command == "Bye":
+                return
             await self.open.wait()
             reply = self.answer(command)
             if reply is not None:

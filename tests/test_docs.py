@@ -38,7 +38,13 @@ def commands() -> list[str]:
 
 def test_there_is_something_to_check() -> None:
     assert {"README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/design.md"} <= set(documents())
-    assert {shlex.split(command)[1] for command in commands()} >= {"run", "check", "simulate", "echo", "params"}
+    assert {shlex.split(command)[1] for command in commands()} >= {
+        "run",
+        "check",
+        "simulate",
+        "echo",
+        "params",
+    }
     assert any(block.startswith("sources:") for block in blocks("yaml"))
 
 

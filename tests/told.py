@@ -21,14 +21,14 @@ _TOLD: Final = {
 """Objects whose texts become such messages."""
 
 _PRINTED: Final = {"cli", "cli_configuration", "demo", "echo", "listening", "params", "doctor"}
-"""Modules of commands that end with their errors, printed and not logged."""
+"""Commands that end with their errors, printed and not logged."""
 
 
 def told_patterns(package: Path) -> dict[str, str]:
     """Return a regular expression for each message, and where it is; values in it are ``.+``."""
     found: dict[str, str] = {}
     for path in sorted(package.rglob("*.py")):
-        if path.stem in _PRINTED:
+        if path.relative_to(package).parts[0].removesuffix(".py") in _PRINTED:
             continue
         module = ast.parse(path.read_text())
         for scope in _scopes(module):

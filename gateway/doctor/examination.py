@@ -44,5 +44,5 @@ def without_settings(error: ConfigError) -> Iterator[Finding]:
         ("lcm", host.LCM_CHECKS),
     ):
         for check in checks:
-            yield Patient(subject).untested(check, "the configuration must be right first")
+            yield Patient(subject).untested(check, "it needs the configuration, which failed")
     yield host.examine_clock()

@@ -1,5 +1,6 @@
 """What the doctor makes of the frames of one stream that it watched."""
 
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from gateway.doctor.finding import Finding, Patient
@@ -17,6 +18,9 @@ MIN_VISIBLE: Final = 0.5
 
 _MAX_NAMES: Final = 5
 _COUNTED: Final = {ComponentType.MARKERS: "markers", ComponentType.TOOLS: "tools"}
+
+VISIBLE: Final = frozenset(_COUNTED)
+"""The components whose items can be out of view."""
 
 
 def frames_finding(patient: Patient, watch: StreamWatch, announced: Parameters | None) -> Finding:
@@ -77,7 +81,7 @@ def _no_frames(patient: Patient, watch: StreamWatch, of: str) -> Finding:
 
 def rate_finding(patient: Patient, watch: StreamWatch, announced: Parameters | None) -> Finding:
     """Return whether each component comes at the rate announced, or at the lower one asked for."""
-    rates_hz = {
+    rates_hz: dict[ComponentType, float] = {
         component: seen.rate_hz
         for component, seen in watch.seen.items()
         if component is not ComponentType.EVENT and seen.rate_hz > 0
@@ -118,7 +122,9 @@ def rate_finding(patient: Patient, watch: StreamWatch, announced: Parameters | N
 
 
 def _held_back(
-    slow: list[ComponentType], rates_hz: dict[ComponentType, float], expected_hz: dict[ComponentType, float]
+    slow: Sequence[ComponentType],
+    rates_hz: Mapping[ComponentType, float],
+    expected_hz: Mapping[ComponentType, float],
 ) -> bool:
     """Return whether the slow ones come exactly as fast as a slower component of the stream does."""
     others_hz = [expected_hz[other] for other in rates_hz if other in expected_hz and other not in slow]
@@ -151,9 +157,9 @@ def _announced_hz(announced: Parameters | None, component: ComponentType) -> flo
         return None
     match component:
         case ComponentType.MARKERS:
-            return announced.markers and announced.markers.frequency_hz
+            return announced.markers.frequency_hz if announced.markers else None
         case ComponentType.TOOLS:
-            return announced.tools and announced.tools.frequency_hz
+            return announced.tools.frequency_hz if announced.tools else None
         case ComponentType.ANALOG:
             channels = announced.analog.channels if announced.analog else ()
             return max((channel.frequency_hz or 0 for channel in channels), default=None)

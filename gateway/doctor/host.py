@@ -14,8 +14,8 @@ from gateway.outputs.lcm_output import multicast_problem, open_lcm
 
 LCM_CHECKS: Final = ("route", "buffers")
 
-PAUSE_S: Final = 0.05
-"""How long a subscriber may pause without losing a message: a garbage collection, a late wake-up."""
+PAUSE_S: Final = 0.02
+"""How long LCM's receiving thread may have to wait for a processor without a message being lost."""
 
 _STA_UNSYNC: Final = 0x40  # linux/timex.h
 _MULTICAST: Final = ("udpm", "mpudpm")

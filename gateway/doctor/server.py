@@ -8,7 +8,7 @@ from typing import Final
 
 from gateway.config import Source
 from gateway.doctor.finding import Finding, Patient
-from gateway.doctor.frames import frames_finding, rate_finding, visibility_finding
+from gateway.doctor.frames import VISIBLE, frames_finding, rate_finding, visibility_finding
 from gateway.doctor.observation import StreamWatch
 from gateway.errors import ConnectError, LinkError
 from gateway.rtc3d.parameters import Parameters
@@ -39,7 +39,7 @@ class SourceExamination:
             checks.remove(finding.check)
             if finding.remedy:
                 for check in checks:
-                    yield self._patient.untested(check, f"{finding.check} must be right first")
+                    yield self._patient.untested(check, f"it needs {finding.check}, which failed")
                 break
         else:
             yield self._parameters()
@@ -47,7 +47,8 @@ class SourceExamination:
             for watch in self.watches:
                 yield frames_finding(self._patient, watch, self._announced)
                 yield rate_finding(self._patient, watch, self._announced)
-                yield visibility_finding(self._patient, watch, self._announced)
+                if VISIBLE.intersection(watch.stream.components):
+                    yield visibility_finding(self._patient, watch, self._announced)
         await asyncio.gather(*(watch.session.close() for watch in self.watches))
 
     @property
@@ -67,10 +68,8 @@ class SourceExamination:
         try:
             async with asyncio.timeout(self._source.connect_timeout_s):
                 found = await loop.getaddrinfo(host, self._source.port, type=socket.SOCK_STREAM)
-        except (OSError, TimeoutError) as error:
-            reason = f"no answer within {self._source.connect_timeout_s:g} s"
-            if isinstance(error, OSError) and error.strerror:
-                reason = error.strerror
+        except OSError as error:  # TimeoutError is one, without a text
+            reason = error.strerror or f"no answer within {self._source.connect_timeout_s:g} s"
             return self._patient.bad(
                 "name",
                 f"the host name {host!r} is not known: {reason}",

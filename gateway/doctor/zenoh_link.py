@@ -45,8 +45,9 @@ def examine_zenoh(settings: ZenohSettings, sources: Sequence[str], seconds: floa
     listen = [endpoint for endpoint in _endpoints(asked, "listen", mode) if not endpoint.endswith(":0")]
     quiet = zenoh_config(settings.config)
     quiet.insert_json5("listen/endpoints", "[]")
-    quiet.insert_json5("connect/timeout_ms", str(round(1000 * seconds)))
-    quiet.insert_json5("scouting/timeout", str(round(1000 * seconds)))
+    timeout_ms = str(round(1000 * seconds))
+    for key in ("connect/timeout_ms", "scouting/timeout", "transport/unicast/open_timeout"):
+        quiet.insert_json5(key, timeout_ms)
     if mode != "client":
         reachable = [_ANY_ADDRESS.sub("/127.0.0.1:", endpoint) for endpoint in listen]
         quiet.insert_json5("mode", '"peer"')
@@ -76,7 +77,7 @@ def examine_zenoh(settings: ZenohSettings, sources: Sequence[str], seconds: floa
 
 
 def _no_link(found: str, remedy: str) -> list[Finding]:
-    return [_patient.bad("link", found, remedy), _patient.untested("gateway", "link must be right first")]
+    return [_patient.bad("link", found, remedy), _patient.untested("gateway", "it needs link, which failed")]
 
 
 def _endpoints(config: zenoh.Config, side: str, mode: str) -> list[str]:

@@ -301,10 +301,9 @@ class Desk:
         except LinkError as error:
             raise QueryError(f"{name} has just lost its connection: {error}", code="no-connection") from error
         except TimeoutError:
-            text = f"no answer within {self.source.query_timeout_s:g} s"
-            raise QueryError(
-                f"{name}: {text}, {len(self._under_way)} questions wait", code="timeout"
-            ) from None
+            waited = f"no answer within {self.source.query_timeout_s:g} s"
+            text = f"{name}: {waited}; questions that wait for the server: {len(self._under_way)}"
+            raise QueryError(text, code="timeout") from None
         raise problem
 
     async def _shared(self, key: Hashable, work: Callable[[], Coroutine[Any, Any, _Result]]) -> _Result:

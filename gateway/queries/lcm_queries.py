@@ -18,6 +18,7 @@ import rtc3d
 
 from gateway.config import LcmSettings
 from gateway.errors import QueryError
+from gateway.log import log_fields
 from gateway.names import lcm_channel
 from gateway.queries.answers import unknown_section
 from gateway.queries.desk import Desk
@@ -133,7 +134,8 @@ class LcmQueries:
                 self._loop.call_soon_threadsafe(self._start, desk, request)
 
     def _start(self, desk: Desk, request: Any) -> None:
-        task = asyncio.create_task(self._answer(desk, request))
+        with log_fields(source=desk.source.name):
+            task = asyncio.create_task(self._answer(desk, request))
         self._tasks.add(task)
         task.add_done_callback(self._done)
 

@@ -17,7 +17,9 @@ from typing import Any, Final, NamedTuple
 import zenoh
 import zenoh.ext
 
+from gateway.config_values import zenoh_reason
 from gateway.errors import QueryError
+from gateway.log import log_fields
 from gateway.names import zenoh_key
 from gateway.queries.answers import (
     JSON,
@@ -174,7 +176,8 @@ class ZenohQueries:
             self._sender.submit(_refuse, query, error)
             self.results[error.code] += 1
             return
-        task = asyncio.create_task(self._answer(desk, query))
+        with log_fields(source=desk.source.name):
+            task = asyncio.create_task(self._answer(desk, query))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
@@ -236,7 +239,7 @@ def _parameters_publisher(session: zenoh.Session, key: str) -> _AnyPublisher:
         logger.warning(
             "zenoh: subscribers that come late must ask for %s themselves: %s; "
             "set timestamping: {enabled: true} in Zenoh's configuration file",
-            *(key, error),
+            *(key, zenoh_reason(error)),
         )
         return session.declare_publisher(key, encoding=XML, congestion_control=_ARRIVING, priority=_BEHIND)
 

@@ -100,6 +100,8 @@ class Simulator:
         self.stop_measurement()
         if self._server is None:
             return
+        _stop_accepting(self._server)
+        await asyncio.sleep(0)
         self._server.close()
         connections = list(self.connections)
         for connection in connections:
@@ -116,9 +118,10 @@ class Simulator:
         for connection in list(self.connections):
             connection.transport.abort()
         self.stop_measurement()
-        if self._server is not None:
-            self._server.close()
-            self._server = None
+        server, self._server = self._server, None
+        if server is not None:
+            _stop_accepting(server)
+            asyncio.get_running_loop().call_soon(server.close)
 
     async def __aenter__(self) -> Self:
         await self.start()
@@ -224,3 +227,12 @@ class Simulator:
             self.stop_measurement()
         else:
             self.schedule()
+
+
+def _stop_accepting(server: asyncio.Server) -> None:
+    """Accept no more, one round of the loop before ``close``.
+
+    A connection that asyncio is about to make when its server closes is lost, and stays open.
+    """
+    for listening in server.sockets:
+        asyncio.get_running_loop().remove_reader(listening.fileno())

@@ -332,6 +332,7 @@ def test_sources_can_be_shown_in_any_state(rig: Rig) -> None:
         rig.output.announce("lab")
         for flowing in (True, True, False, False, True):
             rig.output.show_flowing("lab", flowing)
+        rig.output.withdraw("lab")
 
     show()
     open_output(rig)

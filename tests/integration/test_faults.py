@@ -158,7 +158,7 @@ class ManyFaults(RuleBasedStateMachine):
             await wait_until_async(
                 lambda: (
                     self.simulator.frames_sent + self.lab.status.reconnects >= sent + frames
-                    or self.simulator.faults.on_line
+                    or bool(self.simulator.faults.active)
                 ),
                 5,
             )

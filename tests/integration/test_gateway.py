@@ -123,6 +123,28 @@ async def test_a_server_that_knows_stream_frames_alone_streams() -> None:
         assert "the server refused Version 1.0: err-unknown command" in running.status.limitations
 
 
+async def test_what_a_server_lacks_is_told_loudly_once_over_all_connections(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.DEBUG, "gateway.negotiation")
+
+    async def script(client: Client) -> None:
+        def answer(command: str) -> bytes:
+            if command == "Version 1.0":
+                return error("err-unknown command")
+            if command.startswith("StreamFrames") and server.connections < 3:
+                client.cut()
+            return obliging(command)
+
+        await client.commands(answer)
+
+    async with ScriptedServer(script) as server, gateway_to(server.port) as running:
+        await running.heard("3d")
+        assert running.status.limitations == ["the server refused Version 1.0: err-unknown command"]
+    refusals = [record for record in caplog.records if "refused Version" in record.message]
+    assert [record.levelname for record in refusals[:3]] == ["WARNING", "DEBUG", "DEBUG"]
+
+
 async def test_a_server_that_answers_no_command_but_streams_is_used() -> None:
     async def script(client: Client) -> None:
         await client.commands(lambda command: FRAME if command.startswith("StreamFrames") else None)
@@ -169,7 +191,12 @@ async def test_components_that_were_not_asked_for_are_not_published() -> None:
         assert running.messages("3d") == []
 
 
-async def test_bad_frames_are_counted_and_the_next_good_one_is_published() -> None:
+async def test_bad_frames_are_counted_and_the_next_good_one_is_published(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("gateway.session.HOLD_S", 0.0)
+    caplog.set_level(logging.DEBUG, "gateway.session")
+
     async def script(client: Client) -> None:
         def answer(command: str) -> bytes:
             broken = packet(3, FRAME[8:-4]) + packet(3, b"\xff" * 12) + packet(3, b"")
@@ -181,6 +208,12 @@ async def test_bad_frames_are_counted_and_the_next_good_one_is_published() -> No
         messages = await running.heard("3d", 2)
         assert [message.frame_number for message in messages] == [7, 8]
         assert running.status.drops == {"frame rejected": 3}
+        told = [
+            record
+            for record in caplog.records
+            if "frame" in record.message and record.name == "gateway.session"
+        ]
+        assert [record.levelname for record in told] == ["WARNING", "DEBUG", "DEBUG", "INFO"]
         assert "frame rejected" in running.status.last_error
 
 

@@ -110,7 +110,7 @@ async def test_everyone_hears_again_when_the_gateway_restarts(router: str, url: 
             assert ears.lcm[-1].session == 1
 
 
-async def test_whoever_comes_late_hears_what_was_told(
+async def test_the_first_to_come_late_hear_what_was_told(
     router: str, url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lcm_queries, "REPEAT_S", 0.05)
@@ -130,6 +130,31 @@ async def test_whoever_comes_late_hears_what_was_told(
             assert server.commands == asked
         finally:
             ears.close()
+            session.close()
+
+
+async def test_a_late_subscriber_with_a_history_hears_what_was_told_and_nobody_hears_it_again(
+    router: str, url: str, ears: Ears
+) -> None:
+    server = LabServer()
+    async with (
+        ScriptedServer(server.script) as listening,
+        gateway_at(listening.port, router=router, lcm_url=url),
+    ):
+        await ears.hear(server.xml)
+        late: list[bytes] = []
+        session = open_zenoh("client", connect=router)
+        try:
+            with asker_at(router) as asker:
+                await ask(asker, KEY)  # what was told before has arrived everywhere
+                told = len(ears.plain)
+                subscriber = listen_with_history(session, late)
+                await wait_until_async(lambda: late)
+                await ask(asker, KEY)
+            assert late == [server.xml]
+            assert len(ears.plain) == told
+            subscriber.undeclare()
+        finally:
             session.close()
 
 

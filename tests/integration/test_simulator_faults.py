@@ -1,6 +1,7 @@
 """Faults of the server as a whole as a client sees them, and whom faults hit, when and how often."""
 
 import asyncio
+import contextlib
 import logging
 import socket
 import struct
@@ -22,8 +23,10 @@ from gateway.simulator.faults.stream import (
     Undersize,
 )
 from gateway.simulator.scene_settings import SceneSettings
+from gateway.simulator.server import Simulator
 from tests.integration.faulty import FAST_HZ, NEVER_MS, VERSION, only, playing, well
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
+from tests.unit.simulator.counting_scene import CountingScene
 from tests.unit.simulator.wire import (
     COMMAND,
     DATA,
@@ -88,6 +91,44 @@ async def test_a_restarted_server_comes_back_by_itself_with_its_old_scene() -> N
         assert simulator.scene is scene
         async with connected(simulator) as again:
             await well(simulator, again)
+
+
+@pytest.mark.parametrize("rounds", range(6))
+async def test_a_connection_that_was_just_accepted_dies_with_the_server(rounds: int) -> None:
+    async with Simulator(CountingScene()) as simulator:
+        with socket.create_connection(("127.0.0.1", simulator.port)) as client:
+            client.setblocking(False)
+            for _ in range(rounds):  # of the loop, between which the server accepts
+                await asyncio.sleep(0)
+            simulator.faults.begin(Restart(away_s=600))
+            async with asyncio.timeout(TIMEOUT_S):
+                with contextlib.suppress(ConnectionResetError):
+                    assert await asyncio.get_running_loop().sock_recv(client, 1) == b""
+
+
+@pytest.mark.parametrize("rounds", range(6))
+async def test_a_server_that_is_about_to_come_back_can_be_restarted_again(rounds: int) -> None:
+    async with playing() as (simulator, _):
+        simulator.faults.end(simulator.faults.begin(Restart(away_s=600)))
+        for _ in range(rounds):  # of the loop, between which the server comes back
+            await asyncio.sleep(0)
+        second = simulator.faults.begin(Restart(away_s=600))
+        for _ in range(10):
+            await asyncio.sleep(0)
+        assert not simulator.is_listening
+        simulator.faults.end(second)
+        await until(lambda: simulator.is_listening)
+
+
+async def test_a_restarted_server_plays_its_recording_once_more() -> None:
+    async with Simulator(CountingScene(FAST_HZ, num_frames=30), once=True) as simulator:
+        for _ in range(2):
+            async with connected(simulator) as client:
+                await client.ask("StreamFrames 3D")
+                assert numbers(await client.frames(30)) == list(range(1, 31))
+                assert await client.read() == (NO_DATA, b"")
+            simulator.faults.begin(Restart(away_s=0))
+            await until(lambda: simulator.is_listening)
 
 
 async def test_no_measurement_runs_after_a_restart_while_another_fault_says_so() -> None:

@@ -1,6 +1,7 @@
 """What happens to a stream while its connection stays: demand, layout, lateness, states."""
 
 import asyncio
+import math
 from functools import partial
 
 import pytest
@@ -125,22 +126,37 @@ async def test_states_follow_the_server_and_show_on_the_outputs(caplog: pytest.L
     assert sum("streaming → no measurement" in change for change in changes) == 1
 
 
-async def test_late_frames_make_the_gateway_ask_for_less() -> None:
+async def test_late_frames_make_the_gateway_ask_for_less_until_they_are_in_time(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """The server's frames come in time for 3 s, and then 0.3 s late: its time stamps stay behind."""
+    monkeypatch.setattr("gateway.rate.FIRST_WAIT_S", 0.3)
+    caplog.set_level("INFO", "gateway.supervisor")
     server = Recorder()
     async with ScriptedServer(server.script) as listening, gateway_to(listening.port) as lab:
         await lab.until(lambda: server.count(START) == 1)
         loop = asyncio.get_running_loop()
         start_s = loop.time()
-        while not any("FrequencyDivisor:2" in command for command in server.commands):
-            elapsed_s = loop.time() - start_s
-            late_s = 0.3 if elapsed_s > 3 else 0.0
-            assert elapsed_s < 20
-            due = int((elapsed_s - late_s) * 200)
-            while server.number < due:
-                server.number += 1
-                assert server.client is not None
-                server.client.send(markers_frame(5 * server.number, ORIGIN))
-            await asyncio.sleep(0.005)
+
+        async def stream_until(command: str, late_after_s: float) -> None:
+            while server.commands[-1] != command:
+                elapsed_s = loop.time() - start_s
+                assert elapsed_s < 20
+                due = int((elapsed_s - (0.3 if elapsed_s > late_after_s else 0.0)) * 200)
+                while server.number < due:
+                    server.number += 1
+                    assert server.client is not None
+                    server.client.send(markers_frame(5 * server.number, ORIGIN))
+                await asyncio.sleep(0.005)
+
+        await stream_until("StreamFrames FrequencyDivisor:2", late_after_s=3)
         assert lab.status.lag_s > 0.05
         await lab.until(lambda: lab.status.rate == "FrequencyDivisor:2")
+        await stream_until(START, late_after_s=math.inf)
+        await lab.until(lambda: lab.status.rate == "AllFrames")
+        told = [(record.levelname, record.message) for record in caplog.records]
+    late, in_time = [(level, text) for level, text in told if "frames come" in text]
+    assert late[0] == "WARNING"
+    assert late[1].endswith(" ms late; asked the server for FrequencyDivisor:2")
+    assert in_time[0] == "INFO"
+    assert "frames come in time; asked the server for AllFrames, after " in in_time[1]

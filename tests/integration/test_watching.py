@@ -4,6 +4,7 @@ import asyncio
 import json
 import logging
 import re
+import sys
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from http.client import HTTPConnection
@@ -17,12 +18,14 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from gateway.config import LcmSettings, MetricsSettings, Reconnect, Settings, Source, Stream, ZenohSettings
 from gateway.daemon import Gateway
+from gateway.errors import OutputError
 from gateway.log import FIELDS, FieldsFilter
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream_state import StreamState
 from tests.networks import free_port, zenoh_keys
+from tests.toy_output import ToyOutput
 from tests.waiting import wait_until_async
 
 ROOT = Path(__file__).parents[2]
@@ -94,7 +97,8 @@ async def watched(port: int, metrics_port: int | None = None) -> AsyncIterator[W
     stop = asyncio.Event()
     task = asyncio.create_task(lab.gateway.run(stop))
     try:
-        await lab.gateway.opened.wait()
+        async with asyncio.timeout(10):
+            await lab.gateway.opened.wait()
         yield lab
     finally:
         stop.set()
@@ -332,3 +336,29 @@ async def test_what_is_logged_of_a_connection_says_of_which(caplog: pytest.LogCa
     of_the_whole = [record for record in caplog.records if record.name in {"gateway.watch", "gateway.daemon"}]
     assert of_the_whole
     assert not any(hasattr(record, "source") for record in of_the_whole)
+
+
+async def test_what_is_logged_of_status_messages_says_of_which_source(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    output = ToyOutput()
+    output.error = OutputError("no router", cause="no router")
+    sources = tuple(Source(name=name, host="127.0.0.1") for name in ("hall", "lab"))
+    gateway = Gateway(Settings(sources=sources, metrics=MetricsSettings(enabled=False)), [output])
+    with caplog.filtering(FieldsFilter()):
+        for source in gateway.sources:
+            source.publish_status()
+    told = [(getattr(record, "source", ""), record.message) for record in caplog.records]
+    assert told == [("hall", "hall to toy: no router"), ("lab", "lab to toy: no router")]
+
+
+async def test_a_program_writes_the_form_of_log_that_it_is_asked_for() -> None:
+    arguments = ("simulate", "--port", "0", "--seconds", "0.1", "--log-format", "json")
+    program = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "gateway", *arguments), stderr=asyncio.subprocess.PIPE
+    )
+    _, errors = await program.communicate()
+    assert program.returncode == 0
+    lines = [json.loads(line) for line in errors.splitlines()]
+    assert {"info"} == {line["level"] for line in lines}
+    assert all(line["logger"].startswith("gateway.simulator") for line in lines)

@@ -14,6 +14,7 @@ import zenoh
 import zenoh.ext
 
 from gateway.config_environment import variable_name
+from gateway.config_file import load
 from tests.networks import free_port
 from tests.waiting import wait_until
 
@@ -22,6 +23,7 @@ CONFIG: Final = ROOT / "config"
 FOLDER: Final = "/etc/rtc3d-gateway/tls"
 GUIDE: Final = (ROOT / "docs/how-to/secure.md").read_text(encoding="utf-8")
 FAKE: Final = b"fake"
+PASSWORD: Final = variable_name(("zenoh", "config", "transport", "auth", "usrpwd", "password"))
 
 Change = tuple[str, str]
 
@@ -142,6 +144,18 @@ def asked(asker: zenoh.Session, selector: str) -> list[bytes]:
 def alive(asker: zenoh.Session) -> list[str]:
     replies = asker.liveliness().get("mocap/*/alive", timeout=5)
     return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+
+
+@pytest.mark.parametrize("block", re.findall(r"```yaml\n(.*?)```", GUIDE, re.DOTALL))
+def test_the_guides_configurations_can_be_used(block: str, tmp_path: Path) -> None:
+    (tmp_path / "zenoh-mtls.json5").write_text(shipped("zenoh-mtls.json5"), encoding="utf-8")
+    (tmp_path / "gateway.yaml").write_text(block, encoding="utf-8")
+    environ = {PASSWORD: "geheim7"} if "usrpwd" in block else {}
+    assert load(tmp_path / "gateway.yaml", environ).sources
+
+
+def test_the_guide_names_the_variable_of_the_password() -> None:
+    assert f"{PASSWORD}=" in GUIDE
 
 
 class Lab(NamedTuple):
@@ -362,9 +376,6 @@ def test_the_plain_router_serves_everybody(tmp_path: Path) -> None:
             wait_until(lambda: asked(viewer, "mocap/lab/status"))
             other.put("mocap/lab/3d", FAKE)
             wait_until(lambda: FAKE in heard.payloads)
-
-
-PASSWORD: Final = variable_name(("zenoh", "config", "transport", "auth", "usrpwd", "password"))
 
 
 def test_a_password_from_the_environment_opens_the_link_and_is_nowhere_to_be_seen(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -79,7 +80,7 @@ def test_the_processes_own_environment_counts(file: Path, monkeypatch: pytest.Mo
 def test_values_are_yaml(
     file: Path, name: str, value: str, location: tuple[str | int, ...], expected: object
 ) -> None:
-    found = load(file, with_prefix({name: value})).model_dump(mode="json")
+    found: Any = load(file, with_prefix({name: value})).model_dump(mode="json")
     for step in location:
         found = found[step]
     assert found == expected

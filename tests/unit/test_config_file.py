@@ -71,6 +71,12 @@ def test_every_shipped_configuration_loads(path: Path) -> None:
     assert load(path).sources
 
 
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.json5")), ids=lambda path: path.name)
+def test_every_shipped_zenoh_configuration_can_be_named(path: Path, file: Path) -> None:
+    file.write_text(f"{SERVER}zenoh: {{config: {path}}}\n", encoding="utf-8")
+    assert load(file).zenoh.config == path
+
+
 def test_gateway_yaml_has_every_key_with_its_default() -> None:
     settings = load(SHIPPED / "gateway.yaml")
     [source] = settings.sources

@@ -1,4 +1,5 @@
 import logging
+from collections import Counter
 
 import numpy as np
 import pytest
@@ -104,6 +105,19 @@ def test_status_and_clock_messages_have_topics_of_their_own(memory: MemoryOutput
         (Topic("lab", ("status",), "rtc3d.status_t"), b"status"),
         (Topic("lab", ("clock",), "rtc3d.clock_t"), b"clock"),
     ]
+
+
+def test_frames_messages_and_bytes_are_counted_by_component(memory: MemoryOutput) -> None:
+    fan_out = FanOut("lab", [memory])
+    fan_out.publish(FULL, STAMP, ALL)
+    fan_out.publish(FULL, STAMP, {ComponentType.MARKERS})
+    assert fan_out.frames == dict.fromkeys(WIRE_ORDER, 1) | {ComponentType.MARKERS: 2}
+    [(_, status)] = fan_out.outputs
+    sizes: Counter[str] = Counter()
+    for topic, message in memory.messages:
+        sizes[topic.parts[0]] += len(message)
+    assert status.message_bytes == sizes
+    assert min(sizes.values()) > 0
 
 
 # Failing outputs -----------------------------------------------------------------------------

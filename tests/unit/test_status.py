@@ -9,6 +9,7 @@ from gateway import __version__
 from gateway.clock import ServerClock
 from gateway.status import (
     MAX_ERROR_LENGTH,
+    MAX_LIMITATIONS,
     FrameRate,
     OutputHealth,
     OutputStatus,
@@ -206,6 +207,23 @@ def test_a_clock_that_is_known_is_told() -> None:
         "samples": clock.samples,
     }
     assert clock.drift_ppm == pytest.approx(50, abs=1)
+
+
+def test_a_limitation_is_news_once_over_all_connections() -> None:
+    stream = StreamStatus("3d")
+    stream.begin_session()
+    assert [stream.limit(text) for text in ("no Version", "no Version", "no XML")] == [True, False, True]
+    stream.begin_session()
+    assert stream.limitations == []
+    assert [stream.limit(text) for text in ("no XML", "no Version", "no names")] == [False, False, True]
+    assert stream.limitations == ["no XML", "no Version", "no names"]
+
+
+def test_limitations_are_bounded() -> None:
+    stream = StreamStatus("3d")
+    news = [stream.limit(f"the server refused {number}") for number in range(100)]
+    assert news == [number < MAX_LIMITATIONS for number in range(100)]
+    assert len(stream.limitations) == MAX_LIMITATIONS
 
 
 @pytest.mark.parametrize("counter", ["messages", "drops"])

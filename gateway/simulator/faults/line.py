@@ -162,9 +162,7 @@ class Line:
                 _log.warning("%s: more waits than %d MiB; packets are lost", name, MAX_WAITING_BYTES >> 20)
             self._was_full = True
             return
-        for chunk in chunks:
-            previous_s = self._waiting[-1].when_s if self._waiting else 0.0
-            self._waiting.append(chunk._replace(when_s=max(chunk.when_s, previous_s)))
+        self._waiting.extend(chunks)
         self._waiting_bytes += size
         self._write_due()
 

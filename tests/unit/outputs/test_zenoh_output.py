@@ -167,6 +167,17 @@ def test_sources_are_alive_from_announcement_to_close(lab: Lab) -> None:
     assert (told[:2], set(told[2:])) == (born, gone)
 
 
+def test_a_source_is_alive_until_it_is_withdrawn(lab: Lab) -> None:
+    lab.output.announce("early")
+    lab.output.withdraw("early")
+    lab.output.announce("lab")
+    lab.output.announce("hall-2")
+    lab.open()
+    wait_until(lambda: lab.tokens("mocap/*/alive") == ["mocap/hall-2/alive", "mocap/lab/alive"])
+    lab.output.withdraw("lab")
+    wait_until(lambda: lab.tokens("mocap/*/alive") == ["mocap/hall-2/alive"])
+
+
 def test_a_server_is_shown_while_its_frames_flow(lab: Lab) -> None:
     def shown() -> list[str]:
         return lab.tokens("mocap/*/server")

@@ -1,0 +1,48 @@
+"""What the doctor finds, for tests: of servers on this machine, with Zenoh and LCM that do not leave it."""
+
+from typing import Any
+
+from gateway.config import LcmSettings, Settings, Source, Stream, ZenohSettings
+from gateway.doctor.examination import examine
+from gateway.doctor.finding import Finding, Result
+
+SECONDS = 0.3
+
+
+class Findings:
+    """What the doctor found, by subject and check."""
+
+    def __init__(self, findings: list[Finding]) -> None:
+        self.all = findings
+
+    def of(self, check: str, subject: str = "lab") -> Finding:
+        [finding] = [each for each in self.all if (each.subject, each.check) == (subject, check)]
+        return finding
+
+    def red(self, subject: str = "lab") -> list[str]:
+        return [each.check for each in self.all if each.subject == subject and each.result is Result.RED]
+
+    def reasons(self, *checks: str, subject: str = "lab") -> set[str]:
+        """Return why these were not tested."""
+        findings = [self.of(check, subject) for check in checks]
+        assert {finding.result for finding in findings} == {Result.NOT_TESTED}
+        return {finding.found for finding in findings}
+
+
+async def found(
+    *sources: Source,
+    zenoh_settings: ZenohSettings | None = None,
+    lcm: LcmSettings | None = None,
+    seconds: float = SECONDS,
+) -> Findings:
+    settings = Settings(
+        sources=sources,
+        zenoh=zenoh_settings or ZenohSettings(enabled=False),
+        lcm=lcm or LcmSettings(url="memq://"),
+    )
+    return Findings([finding async for finding in examine(settings, "lab.yaml", seconds)])
+
+
+def lab(port: int, *streams: Stream, **keys: Any) -> Source:
+    source: dict[str, Any] = {"host": "127.0.0.1", "reply_timeout_s": 0.1, "connect_timeout_s": 5.0}
+    return Source(name="lab", port=port, streams=streams or (Stream(),), **(source | keys))

@@ -1,0 +1,318 @@
+"""``rtc3d-gateway params`` and ``echo``, run as a user runs them, against a gateway that is a program too."""
+
+import asyncio
+import json
+import os
+import subprocess
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any, NamedTuple
+
+import pytest
+import zenoh
+
+from gateway.queries import lcm_queries
+from gateway.queries.answers import json_bytes
+from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
+from tests.querying import LabServer, gateway_at, is_filled
+from tests.servers import ScriptedServer
+from tests.spec_parameters import spec_xml
+from tests.waiting import wait_until_async
+
+pytestmark = pytest.mark.netns
+
+
+class Done(NamedTuple):
+    status: int
+    out: str
+    problem: str
+
+
+async def run(*arguments: str) -> Done:
+    """Run the program in a process of its own while this one's loop goes on."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "gateway", *arguments),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        env={**os.environ, "COLUMNS": "200"},
+    )
+    out, problem = await process.communicate()
+    assert process.returncode is not None
+    return Done(process.returncode, out.decode(), problem.decode())
+
+
+class Lab(NamedTuple):
+    server: LabServer
+    endpoint: str
+    url: str
+
+    def on(self, side: str) -> list[str]:
+        """Return the options with which the command reaches this gateway on a side."""
+        # Without a source's name, who is there on LCM is waited for, which takes its time.
+        lcm = ["--lcm", "--url", self.url, "--source", "lab"]
+        return lcm if side == "lcm" else ["--connect", self.endpoint]
+
+
+@asynccontextmanager
+async def lab(server: LabServer | None = None, **settings: Any) -> AsyncIterator[Lab]:
+    server, endpoint, url = server or LabServer(), free_endpoint(), lcm_url()
+    async with (
+        ScriptedServer(server.script) as listening,
+        gateway_at(listening.port, listen=endpoint, lcm_url=url, **settings) as gateway,
+    ):
+        await is_filled(gateway, server)
+        yield Lab(server, endpoint, url)
+
+
+@asynccontextmanager
+async def lab_without_server() -> AsyncIterator[tuple[int, Lab]]:
+    port, endpoint, url = free_port(), free_endpoint(), lcm_url()
+    async with gateway_at(port, listen=endpoint, lcm_url=url) as gateway:
+        [status] = gateway.sources[0].statuses
+        await wait_until_async(lambda: status.last_error)
+        yield port, Lab(LabServer(), endpoint, url)
+
+
+sides = pytest.mark.parametrize("side", ["zenoh", "lcm"])
+
+
+@sides
+async def test_a_table_is_printed_by_default(side: str) -> None:
+    async with lab(LabServer("Left knee")) as at:
+        done = await run("params", *at.on(side))
+    assert (done.status, done.problem) == (0, "")
+    for text in ("lab: general", "lab: 3D, 1 marker, 100 Hz, mm", "Left knee", "lab: the server said so "):
+        assert text in done.out
+
+
+@sides
+async def test_sections_are_shown_as_json(side: str) -> None:
+    async with lab() as at:
+        at.server.sections["3d force"] = at.server.xml
+        done = await run("params", "3d", "force", "--json", *at.on(side))
+    assert (done.status, done.problem) == (0, "")
+    source = json.loads(done.out)["lab"]
+    assert source["age_s"] >= 0
+    assert list(source["parameters"]) == ["3d", "force"]
+    assert source["parameters"]["3d"]["markers"][0]["label"].lower() == "marker 1"
+
+
+@sides
+@pytest.mark.parametrize("section", ["force", "events"])
+async def test_the_specifications_malformed_xml_is_printed_word_for_word(side: str, section: str) -> None:
+    async with lab() as at:
+        done = await run("params", section, "--xml", *at.on(side))
+    assert (done.status, done.problem) == (0, "")
+    assert done.out == spec_xml(section).decode().rstrip() + "\n"
+
+
+@sides
+async def test_fresh_asks_the_server(side: str) -> None:
+    async with lab() as at:
+        asked = at.server.count("SendParameters")
+        assert (await run("params", "--xml", *at.on(side))).out.encode().rstrip() == at.server.xml.rstrip()
+        assert at.server.count("SendParameters") == asked
+        at.server.xml = at.server.xml.replace(b"Marker 1", b"Marker of now")
+        assert "Marker of now" in (await run("params", "--xml", "--fresh", *at.on(side))).out
+        assert at.server.count("SendParameters") > asked
+
+
+@sides
+async def test_no_gateway_is_status_3(side: str) -> None:
+    options = ["--connect", free_endpoint()] if side == "zenoh" else ["--lcm", "--url", lcm_url()]
+    done = await run("params", *options)
+    assert (done.status, done.out) == (3, "")
+    assert "gateway" in done.problem
+    assert done.problem.count("\n") == 1
+
+
+async def test_a_router_without_a_gateway_is_status_3() -> None:
+    endpoint = free_endpoint()
+    router = open_zenoh("router", listen=endpoint)
+    try:
+        done = await run("params", "--connect", endpoint, "--timeout", "0.5")
+    finally:
+        router.close()
+    assert done.status == 3
+    assert done.problem.startswith("no gateway is there on Zenoh (mocap/*/alive): is it running")
+
+
+@sides
+async def test_a_source_that_nobody_serves_is_status_3(side: str) -> None:
+    async with lab() as at:
+        done = await run("params", "--timeout", "0.5", *at.on(side), "--source", "hall")
+    assert done.status == 3
+    expected = (
+        "no gateway serves source 'hall'; there are: lab"
+        if side == "zenoh"
+        else "no gateway is heard on LCM (MOCAP_HALL"
+    )
+    assert done.problem.startswith(expected)
+
+
+@sides
+async def test_a_gateway_of_another_prefix_is_none(side: str) -> None:
+    async with lab() as at:
+        done = await run("params", "--prefix", "other", "--timeout", "0.5", *at.on(side))
+    assert done.status == 3
+
+
+@sides
+async def test_a_gateway_without_its_server_is_status_4_with_the_reason(side: str) -> None:
+    async with lab_without_server() as (port, at):
+        done = await run("params", "3d", *at.on(side))
+    assert (done.status, done.out) == (4, "")
+    assert done.problem.startswith(f"source 'lab' has no connection: refused by 127.0.0.1:{port}, tried ")
+
+
+@sides
+async def test_a_server_that_does_not_answer_is_status_5(side: str) -> None:
+    async with lab() as at:
+        at.server.silent = ("SendParameters",)
+        done = await run("params", "--fresh", *at.on(side))
+    assert done.status == 5
+    assert "did not answer SendParameters within 0.3 s" in done.problem
+
+
+@sides
+async def test_a_gateway_that_does_not_answer_in_time_is_status_5(side: str) -> None:
+    async with lab(reply_timeout_s=20.0, query_timeout_s=20.0) as at:
+        at.server.silent = ("SendParameters",)
+        done = await run("params", "--fresh", "--timeout", "0.2", *at.on(side))
+    assert done.status == 5
+    assert "within 0.2 s, though a gateway is there" in done.problem
+
+
+@sides
+async def test_a_server_that_does_not_know_the_command_is_status_1(side: str) -> None:
+    async with lab() as at:
+        at.server.refused = ("SendParameters",)
+        done = await run("params", "--fresh", *at.on(side))
+    assert done.status == 1
+    assert "the server does not know SendParameters, or refuses it: err-unknown command" in done.problem
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["4d"], "unknown section '4d'; known are general, 3d, 6d, analog, force, events"),
+        (["--zenoh", "--lcm"], "--zenoh or --lcm"),
+        (["--json", "--xml"], "--json or --xml"),
+        (["--timeout", "0"], "--timeout"),
+        (["--nonsense"], "--nonsense"),
+    ],
+)
+async def test_a_wrong_command_line_is_status_2(arguments: list[str], text: str) -> None:
+    done = await run("params", *arguments)
+    assert (done.status, done.out) == (2, "")
+    assert text in " ".join(done.problem.replace("│", " ").split())
+
+
+async def test_every_source_is_shown_and_one_without_a_server_does_not_hide_the_others() -> None:
+    endpoint, server = free_endpoint(), LabServer()
+    router = open_zenoh("router", listen=endpoint)
+    try:
+        async with (
+            ScriptedServer(server.script) as listening,
+            gateway_at(listening.port, router=endpoint) as gateway,
+            gateway_at(free_port(), router=endpoint, name="hall"),
+        ):
+            await is_filled(gateway, server)
+            done = await run("params", "3d", "--json", "--connect", endpoint)
+    finally:
+        router.close()
+    assert list(json.loads(done.out)) == ["lab"]
+    assert done.status == 4
+    assert done.problem.startswith("source 'hall' has no connection")
+
+
+async def test_gateways_that_serve_sources_of_one_name_are_both_shown() -> None:
+    endpoint, first, second = free_endpoint(), LabServer("of the first"), LabServer("of the second")
+    router = open_zenoh("router", listen=endpoint)
+    try:
+        async with (
+            ScriptedServer(first.script) as a,
+            ScriptedServer(second.script) as b,
+            gateway_at(a.port, router=endpoint) as one,
+            gateway_at(b.port, router=endpoint) as other,
+        ):
+            await is_filled(one, first)
+            await is_filled(other, second)
+            done = await run("params", "--json", "--connect", endpoint)
+    finally:
+        router.close()
+    assert done.status == 0
+    told = json.loads(done.out)
+    assert list(told) == ["lab", "lab_2"]
+    labels = {source["parameters"]["3d"]["markers"][0]["label"] for source in told.values()}
+    assert labels == {"of the first", "of the second"}
+
+
+async def test_several_sources_are_found_on_lcm() -> None:
+    url, first, second = lcm_url(), LabServer("of the first"), LabServer("of the second")
+    async with (
+        ScriptedServer(first.script) as a,
+        ScriptedServer(second.script) as b,
+        gateway_at(a.port, lcm_url=url) as one,
+        gateway_at(b.port, lcm_url=url, name="hall-2") as other,
+    ):
+        await is_filled(one, first)
+        await is_filled(other, second)
+        done = await run("params", "--json", "--lcm", "--url", url)
+    assert (done.status, done.problem) == (0, "")
+    labels = {
+        name: source["parameters"]["3d"]["markers"][0]["label"]
+        for name, source in json.loads(done.out).items()
+    }
+    assert labels == {"lab": "of the first", "hall-2": "of the second"}
+
+
+async def test_a_gateway_that_is_just_coming_back_is_asked_again() -> None:
+    """The first query finds nobody, as around a reconnection; a later one does."""
+    endpoint = free_endpoint()
+    session = open_zenoh("peer", listen=endpoint)
+    queries: list[zenoh.Query] = []
+
+    def on_query(query: zenoh.Query) -> None:
+        queries.append(query)
+        with query:
+            if len(queries) > 2:
+                query.reply("mocap/lab/parameters", spec_xml("3d"), attachment=json_bytes({"age_s": 3.5}))
+
+    token = session.liveliness().declare_token("mocap/lab/alive")
+    session.declare_queryable("mocap/lab/**", on_query)
+    try:
+        done = await run("params", "--json", "--connect", endpoint)
+    finally:
+        token.undeclare()
+        session.close()
+    assert (done.status, done.problem) == (0, "")
+    assert json.loads(done.out)["lab"]["age_s"] == 3.5
+    assert len(queries) == 3
+
+
+async def test_echo_prints_parameters_that_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(lcm_queries, "REPEAT_S", 0.05)
+    async with lab() as at:
+        echo = asyncio.create_task(
+            run(
+                "echo",
+                "--component",
+                "parameters",
+                "--count",
+                "1",
+                "--seconds",
+                "20",
+                "--connect",
+                at.endpoint,
+            )
+        )
+        lcm = await run(
+            "echo", "--component", "parameters", "--count", "1", "--seconds", "20", "--lcm", "--url", at.url
+        )
+        on_zenoh = await echo
+    size = len(at.server.xml)
+    assert on_zenoh.out.startswith(f"mocap/lab/parameters {size} bytes of XML: 1 marker, 0 tools")
+    assert "session 1: " in lcm.out
+    assert f"{size} bytes of XML: 1 marker, 0 tools" in lcm.out

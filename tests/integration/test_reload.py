@@ -1,0 +1,296 @@
+"""A gateway that is given other settings while it runs, on real Zenoh and LCM."""
+
+import asyncio
+import json
+from collections import defaultdict
+from collections.abc import AsyncIterator, Iterator, Mapping
+from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.config import (
+    LcmSettings,
+    MetricsSettings,
+    Reconnect,
+    Settings,
+    Source,
+    SpoolSettings,
+    ZenohSettings,
+)
+from gateway.daemon import Gateway
+from gateway.decode import decode
+from gateway.errors import ConfigError
+from gateway.listening import LcmListener, ZenohListener, open_zenoh
+from gateway.outputs.lcm_output import open_lcm
+from gateway.rtc3d.components import ComponentType
+from gateway.simulator.server import Simulator
+from gateway.simulator.synthetic import SyntheticScene
+from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
+from tests.querying import LabServer, ask, ask_all, asker_at
+from tests.servers import Client, ScriptedServer, ok, packet
+from tests.waiting import wait_until_async
+
+pytestmark = pytest.mark.netns
+
+MARKERS = ComponentType.MARKERS
+
+
+def simulator() -> Simulator:
+    return Simulator(SyntheticScene(markers=1, tools=0, analog=0, plates=0, rate_hz=200))
+
+
+class Site:
+    """What settings of these tests have in common: addresses that nobody else has."""
+
+    def __init__(self) -> None:
+        self.endpoint = free_endpoint()
+        self.url = lcm_url()
+
+    def settings(self, sources: Mapping[str, int], **sections: Any) -> Settings:
+        """Return settings with sources by name and port; other sections stand over those here."""
+        reconnect = Reconnect(first_delay_s=0.01, max_delay_s=0.05)
+        return Settings(
+            sources=tuple(
+                Source(name=name, host="127.0.0.1", port=port, reconnect=reconnect)
+                for name, port in sources.items()
+            ),
+            **{
+                "zenoh": self.zenoh(),
+                "lcm": self.lcm(),
+                "metrics": MetricsSettings(enabled=False),
+                **sections,
+            },
+        )
+
+    def zenoh(self, **keys: Any) -> ZenohSettings:
+        return ZenohSettings(**{"config": zenoh_keys("peer", listen=self.endpoint), **keys})
+
+    def lcm(self, **keys: Any) -> LcmSettings:
+        return LcmSettings(**{"url": self.url, **keys})
+
+
+@asynccontextmanager
+async def running(settings: Settings) -> AsyncIterator[Gateway]:
+    gateway = Gateway(settings)
+    stop = asyncio.Event()
+    task = asyncio.create_task(gateway.run(stop))
+    try:
+        await gateway.opened.wait()
+        yield gateway
+    finally:
+        stop.set()
+        async with asyncio.timeout(10):
+            await task
+
+
+class Ears:
+    """What subscribers heard of markers: (session, sequence) by key or channel, in order."""
+
+    def __init__(self) -> None:
+        self.numbers: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
+
+    def take(self, name: str, message: bytes) -> None:
+        markers = decode(message)
+        self.numbers[name].append((markers.session, markers.sequence))
+
+    async def more(self, name: str, count: int = 20) -> None:
+        wanted = len(self.numbers[name]) + count
+        await wait_until_async(lambda: len(self.numbers[name]) >= wanted)
+
+    def assert_whole(self, name: str) -> None:
+        sequences = [sequence for _, sequence in self.numbers[name]]
+        assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
+
+
+@contextmanager
+def ears_at(site: Site) -> Iterator[Ears]:
+    ears = Ears()
+    session = open_zenoh(site.endpoint)
+    ZenohListener(session, "*/*/3d", ears.take)
+    listener = LcmListener(open_lcm(site.url), ".*_3D", ears.take)
+    try:
+        yield ears
+    finally:
+        listener.close()
+        session.close()
+
+
+async def test_equal_settings_change_nothing() -> None:
+    site = Site()
+    async with simulator() as server, running(site.settings({"lab": server.port})) as gateway:
+        with ears_at(site) as ears:
+            await ears.more("mocap/lab/3d")
+            [source], outputs = gateway.sources, gateway.outputs
+            assert await gateway.reload(site.settings({"lab": server.port})) == []
+            assert (list(gateway.sources), gateway.outputs) == ([source], outputs)
+            await ears.more("mocap/lab/3d")
+            ears.assert_whole("mocap/lab/3d")
+            assert len(server.connections) == 1
+
+
+async def test_a_source_that_changes_leaves_the_others_alone_and_goes_on_with_its_numbers() -> None:
+    site = Site()
+    async with (
+        simulator() as kept,
+        simulator() as first,
+        simulator() as second,
+        running(site.settings({"kept": kept.port, "moved": first.port})) as gateway,
+    ):
+        with ears_at(site) as ears:
+            names = ("mocap/kept/3d", "MOCAP_KEPT_3D", "mocap/moved/3d", "MOCAP_MOVED_3D")
+            for name in names:
+                await ears.more(name)
+            changes = await gateway.reload(site.settings({"kept": kept.port, "moved": second.port}))
+            assert changes == ["source moved changed"]
+            assert not first.connections
+            for name in names:
+                await ears.more(name)
+                ears.assert_whole(name)
+            assert {session for session, _ in ears.numbers["mocap/kept/3d"]} == {1}
+            assert [session for session, _ in ears.numbers["mocap/moved/3d"]][-1] == 2
+
+
+async def test_sources_come_and_go_with_their_keys_channels_and_answers() -> None:
+    site, server, other = Site(), LabServer("of lab"), LabServer("of new")
+    async with (
+        ScriptedServer(server.script) as lab,
+        ScriptedServer(other.script) as new,
+        running(site.settings({"lab": lab.port, "gone": lab.port})) as gateway,
+    ):
+        with asker_at(site.endpoint) as asker:
+            await wait_until_async(lambda: server.count("SendParameters") >= 14)
+            changes = await gateway.reload(site.settings({"new": new.port, "lab": lab.port}))
+            assert changes == ["source gone removed", "source new added"]
+            assert [source.source.name for source in gateway.sources] == ["new", "lab"]
+            assert server.count("Bye") == 1
+            await wait_until_async(lambda: other.count("SendParameters") >= 7)
+            assert b"of new" in (await ask(asker, "mocap/new/parameters")).payload
+            assert b"of lab" in (await ask(asker, "mocap/lab/parameters")).payload
+            assert await ask_all(asker, "mocap/gone/parameters") == []
+            alive = await asyncio.to_thread(lambda: list(asker.liveliness().get("mocap/*/alive", timeout=5)))
+            keys = {str(reply.ok.key_expr) for reply in alive if reply.ok}
+            assert keys == {"mocap/lab/alive", "mocap/new/alive"}
+
+
+async def test_an_output_that_changes_is_opened_anew_and_the_other_loses_nothing() -> None:
+    site = Site()
+    async with simulator() as server, running(site.settings({"lab": server.port})) as gateway:
+        with ears_at(site) as ears:
+            await ears.more("mocap/lab/3d")
+            await ears.more("MOCAP_LAB_3D")
+            changed = site.settings({"lab": server.port}, lcm=site.lcm(prefix="OTHER"))
+            assert await gateway.reload(changed) == ["output lcm changed"]
+            await ears.more("OTHER_LAB_3D")
+            await ears.more("mocap/lab/3d")
+            ears.assert_whole("mocap/lab/3d")
+            before, after = ears.numbers["MOCAP_LAB_3D"], ears.numbers["OTHER_LAB_3D"]
+            assert after[0][1] > before[-1][1]
+            assert len(server.connections) == 1
+
+
+async def test_zenoh_is_opened_anew_at_the_same_address_and_tells_what_is_known() -> None:
+    site, server = Site(), LabServer("known")
+    async with (
+        ScriptedServer(server.script) as lab,
+        running(site.settings({"lab": lab.port})) as gateway,
+    ):
+        await wait_until_async(lambda: server.count("SendParameters") >= 7)
+        changed = site.settings({"lab": lab.port}, zenoh=site.zenoh(prefix="other"))
+        assert await gateway.reload(changed) == ["output zenoh changed"]
+        await wait_until_async(lambda: gateway.outputs[0].health().connected)
+        heard: list[bytes] = []
+        with asker_at(site.endpoint) as asker:
+            subscriber = asker.declare_subscriber(
+                "other/lab/parameters", lambda sample: heard.append(sample.payload.to_bytes())
+            )
+            assert b"known" in (await ask(asker, "other/lab/parameters")).payload
+            await wait_until_async(lambda: heard)
+            assert b"known" in heard[0]
+            assert await ask_all(asker, "mocap/lab/parameters") == []
+            subscriber.undeclare()
+
+
+async def test_outputs_are_switched_off_and_on() -> None:
+    site = Site()
+    async with simulator() as server, running(site.settings({"lab": server.port})) as gateway:
+        with ears_at(site) as ears:
+            await ears.more("MOCAP_LAB_3D")
+            off = site.settings({"lab": server.port}, lcm=site.lcm(enabled=False))
+            assert await gateway.reload(off) == ["output lcm removed"]
+            assert [output.name for output in gateway.outputs] == ["zenoh"]
+            heard = len(ears.numbers["MOCAP_LAB_3D"])
+            assert await gateway.reload(site.settings({"lab": server.port})) == ["output lcm added"]
+            await ears.more("MOCAP_LAB_3D")
+            assert ears.numbers["MOCAP_LAB_3D"][heard][1] == ears.numbers["MOCAP_LAB_3D"][heard - 1][1] + 1
+
+
+async def test_other_contents_of_zenohs_own_file_count(tmp_path: Path) -> None:
+    site, file = Site(), tmp_path / "zenoh.json5"
+    other = free_endpoint()
+    file.write_text(json.dumps(zenoh_keys("peer", listen=site.endpoint)))
+    settings = site.settings({"lab": free_port()}, zenoh=site.zenoh(config=file))
+    async with running(settings) as gateway:
+        assert await gateway.reload(settings) == []
+        file.write_text(json.dumps(zenoh_keys("peer", listen=other)))
+        assert await gateway.reload(settings) == ["output zenoh changed"]
+        await wait_until_async(lambda: gateway.outputs[0].health().connected)
+        with asker_at(other) as asker:
+            await ask(asker, "mocap/lab/status")
+
+
+async def test_what_zenoh_refuses_is_refused_whole(tmp_path: Path) -> None:
+    site, file = Site(), tmp_path / "zenoh.json5"
+    async with simulator() as server, running(site.settings({"lab": server.port})) as gateway:
+        with ears_at(site) as ears:
+            await ears.more("mocap/lab/3d")
+            file.write_text("{no_such_key: 1}")
+            refused = site.settings({"other": server.port}, zenoh=site.zenoh(config=file))
+            with pytest.raises(ConfigError, match="no_such_key"):
+                await gateway.reload(refused)
+            await ears.more("mocap/lab/3d")
+            ears.assert_whole("mocap/lab/3d")
+            assert [source.source.name for source in gateway.sources] == ["lab"]
+
+
+async def test_files_go_to_the_new_folder(tmp_path: Path) -> None:
+    clients: list[Client] = []
+
+    async def script(client: Client) -> None:
+        clients.append(client)
+        await client.commands(lambda command: ok(f"OK-{command}"))
+
+    site, before, after = Site(), tmp_path / "before", tmp_path / "after"
+    async with ScriptedServer(script) as server:
+        settings = site.settings({"lab": server.port}, spool=SpoolSettings(directory=str(before)))
+        async with running(settings) as gateway:
+            changed = site.settings({"lab": server.port}, spool=SpoolSettings(directory=str(after)))
+            await wait_until_async(lambda: clients)
+            assert await gateway.reload(changed) == ["spool changed"]
+            clients[0].send(packet(5, b"a file"))
+            await wait_until_async(lambda: after.exists() and list(after.glob("lab-*.c3d")))
+            assert not before.exists()
+            assert len(clients) == 1
+
+
+async def test_metrics_move_to_another_port() -> None:
+    site, before, after = Site(), free_port(), free_port()
+    async with running(site.settings({"lab": free_port()}, metrics=MetricsSettings(port=before))) as gateway:
+        changed = gateway.settings.model_copy(update={"metrics": MetricsSettings(port=after)})
+        assert await gateway.reload(changed) == ["metrics changed"]
+        _, writer = await asyncio.open_connection("127.0.0.1", after)
+        writer.close()
+        with pytest.raises(ConnectionRefusedError):
+            await asyncio.open_connection("127.0.0.1", before)
+
+
+async def test_a_stop_in_the_middle_of_a_reload_closes_everything() -> None:
+    site = Site()
+    async with simulator() as first, simulator() as second:
+        async with running(site.settings({"lab": first.port})) as gateway:
+            await wait_until_async(lambda: first.connections)
+            reloading = asyncio.create_task(gateway.reload(site.settings({"lab": second.port})))
+            await wait_until_async(lambda: not first.connections)
+        assert await reloading == ["source lab changed"]
+        await wait_until_async(lambda: not second.connections)

@@ -1,0 +1,13 @@
+import re
+from pathlib import Path
+
+from gateway.doctor import host, server, zenoh_link
+
+GUIDE = (Path(__file__).parents[3] / "docs/how-to/troubleshoot.md").read_text(encoding="utf-8")
+
+
+def test_the_guide_has_every_check_in_its_order() -> None:
+    table = GUIDE.partition("## What is looked at")[2].partition("\n## ")[0]
+    checks = re.findall(r"^\| [^|]*\| (\w+) \|", table, re.MULTILINE)
+    listed = ["file", *server.CHECKS, *zenoh_link.CHECKS, *host.LCM_CHECKS, "clock"]
+    assert [check for check in checks if check != "check"] == listed
