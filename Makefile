@@ -59,16 +59,18 @@ install:
 	systemd-sysusers rtc3d-gateway.conf
 	systemd-tmpfiles --create rtc3d-gateway.conf
 	[ -e $(CONFIG)/gateway.yaml ] || install -m 644 config/gateway.yaml $(CONFIG)/gateway.yaml
+	install -m 644 config/gateway.schema.json $(CONFIG)/gateway.schema.json
 	ln -sfn $(PREFIX)/venv/bin/rtc3d-gateway /usr/local/bin/rtc3d-gateway
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
 	@echo 'Name your server in $(CONFIG)/gateway.yaml; then: systemctl enable --now rtc3d-gateway'
 
-# As root. What stays: $(CONFIG), the C3D files in /var/lib/rtc3d-gateway, and the user that they belong to.
+# As root. What stays: the configurations in $(CONFIG), the C3D files in /var/lib/rtc3d-gateway, and the user that
+# they belong to.
 uninstall:
 	[ ! -d /run/systemd/system ] || systemctl stop rtc3d-gateway.service 'rtc3d-gateway@*.service'
 	[ ! -d /run/systemd/system ] || systemctl disable $(UNITS)
 	rm -f $(UNITS:%=$(LIB)/systemd/system/%) $(LIB)/sysusers.d/rtc3d-gateway.conf \
-	    $(LIB)/tmpfiles.d/rtc3d-gateway.conf /usr/local/bin/rtc3d-gateway
+	    $(LIB)/tmpfiles.d/rtc3d-gateway.conf /usr/local/bin/rtc3d-gateway $(CONFIG)/gateway.schema.json
 	rm -rf $(PREFIX)/venv
 	-rmdir $(PREFIX)
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
