@@ -10,6 +10,7 @@ import pytest
 from tests.clones import ROOT, clone_into, files_in
 from tests.networks import free_endpoint
 from tests.systemd.machine import CLONE, DROP_INS, Machine, Service
+from tests.systemd.page import typed
 
 
 @pytest.fixture(scope="session")
@@ -24,7 +25,7 @@ def machine() -> Iterator[Machine]:
         booted = Machine(int(process.stdout.readline()))
         clone_into(booted.path(CLONE))
         before = files_in(booted.path(CLONE))
-        asyncio.run(booted.make("install"))
+        asyncio.run(booted.type(typed("Install", 1)))
         booted.left_in_clone = files_in(booted.path(CLONE)) - before
         yield booted
 

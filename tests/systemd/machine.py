@@ -57,10 +57,24 @@ class Machine:
         assert not check or outcome.status == 0, f"{' '.join(command)}: {outcome.text}"
         return outcome
 
-    async def make(self, target: str) -> None:
-        """Run ``make`` in the clone at CLONE."""
-        environment = pip_environment(_REPOSITORY / WHEELHOUSE.relative_to(ROOT))
-        await self.run("make", "-C", CLONE, target, f"PYTHON={SYSTEM_PYTHON}", environment=environment)
+    async def type(self, commands: str, check: bool = True) -> Outcome:
+        """Have a shell run ``commands`` in the clone at CLONE; pip takes what is downloaded already."""
+        environment = pip_environment(_REPOSITORY / WHEELHOUSE.relative_to(ROOT)) | {"PYTHON": SYSTEM_PYTHON}
+        script = f"cd {CLONE}\n{commands}"
+        return await self.run("sh", "-c", script, check=check, environment=environment)
+
+    async def files(self) -> dict[str, str]:
+        """Return all files and folders that somebody could change, with size and time of change.
+
+        What systemd writes for itself is left out; the rest of the machine cannot be written to.
+        """
+        places = ("/dev/shm", "/etc", "/home", "/opt", "/root", "/run", "/tmp", "/usr/local", "/var")
+        own = ("/run/systemd", "/run/log", "/run/overlay", "/run/repository", "/var/lib/systemd", CLONE)
+        skipped = [part for path in own for part in ("-path", path, "-prune", "-o")]
+        # Of a folder the name alone: its time changes with what is in it, which is listed itself.
+        each = ("-type", "d", "-printf", r"%p\t\n", "-o", "-printf", r"%p\t%s %T@\n")
+        listed = await self.run("find", *places, *skipped, *each)
+        return dict(line.rsplit("\t", 1) for line in listed.text.splitlines())
 
     async def show(self, name: str, unit: str = UNIT) -> str:
         """Return a property of a unit."""

@@ -1,13 +1,23 @@
-"""``make install`` and ``make uninstall``, on a machine that may be changed."""
+"""What docs/how-to/service.md has people type, on a machine that may be changed."""
+
+import json
+import shutil
 
 import pytest
 
-from tests.systemd.machine import CONFIG, UNIT, Machine
+from tests.networks import free_port, zenoh_keys
+from tests.systemd.machine import CONFIG, UNIT, Machine, Service
+from tests.systemd.page import exposure, typed
 
 pytestmark = [pytest.mark.systemd, pytest.mark.wheelhouse, pytest.mark.netns]
 
 PROGRAM = "/usr/local/bin/rtc3d-gateway"
+PREFIX = "/opt/rtc3d-gateway"
+VENV = f"{PREFIX}/venv"
 UNITS = "/usr/local/lib/systemd/system"
+SCHEMA = "/etc/rtc3d-gateway/gateway.schema.json"
+SECRETS = "/etc/rtc3d-gateway/gateway.env"
+INSTANCE = "rtc3d-gateway@hall-2.service"
 
 
 async def test_the_program_runs_from_its_own_environment(machine: Machine) -> None:
@@ -15,12 +25,26 @@ async def test_the_program_runs_from_its_own_environment(machine: Machine) -> No
     assert (await machine.run(PROGRAM, "--version")).text.startswith("rtc3d-gateway ")
     await machine.run(PROGRAM, "check", CONFIG)
     where = "import gateway, os; print(os.path.realpath(gateway.__file__))"
-    location = await machine.run("/opt/rtc3d-gateway/venv/bin/python", "-c", where)
-    assert location.text.startswith("/opt/rtc3d-gateway/venv/lib")
+    location = await machine.run(f"{VENV}/bin/python", "-c", where)
+    assert location.text.startswith(f"{VENV}/lib")
 
 
 def test_installing_leaves_nothing_in_the_clone(machine: Machine) -> None:
     assert machine.left_in_clone == set()
+
+
+@pytest.mark.skipif(shutil.which("apt-get") is None, reason="the page is about Debian's packages")
+async def test_the_packages_that_installing_takes_exist(machine: Machine) -> None:
+    packages = typed("Install").partition("apt-get install ")[2].split()
+    assert packages
+    await machine.run("apt-get", "install", "--simulate", *packages)
+
+
+def test_the_configuration_comes_with_the_schema_that_its_first_line_names(machine: Machine) -> None:
+    first_line = machine.path(CONFIG).read_text().partition("\n")[0]
+    assert first_line == "# yaml-language-server: $schema=gateway.schema.json"
+    assert json.loads(machine.path(SCHEMA).read_text())["properties"]["sources"]
+    assert machine.path(SCHEMA).stat().st_mode & 0o777 == 0o644
 
 
 @pytest.mark.parametrize("unit", [UNIT, "rtc3d-gateway@two.service"])
@@ -36,17 +60,75 @@ async def test_what_is_secret_is_for_the_service_and_root_alone(machine: Machine
     assert secrets.stat().st_mode & 0o7777 == 0o750
 
 
-async def test_uninstalling_leaves_the_configuration_and_installing_takes_it_as_it_is(
-    machine: Machine,
-) -> None:
-    machine.path(CONFIG).write_text("sources: [{name: mine, host: 192.0.2.20}]\n")
-    await machine.run("systemctl", "enable", UNIT, "rtc3d-gateway@two.service")
-    await machine.make("uninstall")
+async def test_the_page_tells_how_locked_up_the_service_is(machine: Machine) -> None:
+    text = (await machine.type(typed("What systemd does for it"))).text
+    assert f"exposure level for {UNIT}: {exposure()} " in text
+
+
+async def test_the_page_leads_to_a_service_that_waits_for_its_server(service: Service) -> None:
+    machine, away = service.machine, free_port()
+    service.configure({"lab": away})
+    assert "good" in (await machine.type(typed("Name the server"))).text
+    started = (await machine.type(typed("Start"))).text
+    assert "active (running)" in started
+    assert 'Status: "lab: ' in started
+    assert await machine.show("UnitFileState") == "enabled"
+    await service.says(f"lab: waiting for 127.0.0.1:{away}, ")
+    assert f"127.0.0.1:{away}" in (await machine.type(typed("See what happened"))).text
+    other = free_port()
+    service.configure({"lab": other})
+    await machine.type(typed("Change the configuration"))
+    await service.says(f"lab: waiting for 127.0.0.1:{other}, ")
+
+
+async def test_the_page_leads_to_a_second_instance(service: Service) -> None:
+    service.configure({"lab": free_port()})
+    await service.machine.type(typed("Several instances"))
+    await service.machine.until("StatusText", "lab: waiting for", INSTANCE)
+    assert await service.machine.show("UnitFileState", INSTANCE) == "enabled"
+
+
+async def test_a_secret_reaches_the_gateway_and_nobody_else(service: Service) -> None:
+    machine = service.machine
+    await machine.type(typed("Secrets"))
+    assert (await machine.run("stat", "--format=%a %U:%G", SECRETS)).text == "640 root:rtc3d-gateway\n"
+    [line] = [line for line in typed("Secrets", 1).splitlines() if line.startswith("RTC3D_GATEWAY__")]
+    zenoh = zenoh_keys("peer", listen=service.endpoint) | {"transport": {"auth": {"usrpwd": {"user": "me"}}}}
+    service.configure({"lab": free_port()}, zenoh={"config": zenoh})
+    machine.path(SECRETS).write_text(line.replace("…", "open-sesame"))
     try:
-        for path in (PROGRAM, "/opt/rtc3d-gateway", f"{UNITS}/{UNIT}", f"{UNITS}/rtc3d-gateway@.service"):
+        await service.start()
+        await service.says("lab: waiting for")
+        environment = machine.path(f"/proc/{await service.main_pid()}/environ").read_text()
+        assert line.replace("…", "open-sesame") in environment.split("\0")
+        assert "open-sesame" not in (await machine.run("systemctl", "show", UNIT)).text
+        assert not any("open-sesame" in entry["MESSAGE"] for entry in await machine.journal())
+    finally:
+        machine.path(SECRETS).unlink()
+
+
+async def test_upgrading_and_removing_leave_the_configuration(machine: Machine) -> None:
+    mine = "sources: [{name: mine, host: 192.0.2.20}]\n"
+    machine.path(CONFIG).write_text(mine)
+    await machine.type(typed("Upgrade"))
+    assert machine.path(CONFIG).read_text() == mine
+    await machine.run("systemctl", "enable", UNIT, INSTANCE)
+    await machine.run("cp", "--archive", "--link", VENV, "/opt/kept")  # so that installing again is short
+    await machine.type(typed("Remove"))
+    try:
+        for path in (
+            PROGRAM,
+            "/opt/rtc3d-gateway",
+            f"{UNITS}/{UNIT}",
+            f"{UNITS}/rtc3d-gateway@.service",
+            SCHEMA,
+        ):
             assert not machine.path(path).exists(), path
         left = await machine.run("systemctl", "list-unit-files", "rtc3d-gateway*", check=False)
         assert "0 unit files" in left.text
+        assert machine.path(CONFIG).read_text() == mine
     finally:
-        await machine.make("install")
-    assert machine.path(CONFIG).read_text() == "sources: [{name: mine, host: 192.0.2.20}]\n"
+        await machine.run("mkdir", "--parents", PREFIX)
+        await machine.run("mv", "/opt/kept", VENV)
+        await machine.type(typed("Install", 1))
+    assert machine.path(CONFIG).read_text() == mine

@@ -3,10 +3,12 @@
 import asyncio
 import re
 import shlex
+import socket
 import subprocess
 from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pytest
 
@@ -23,6 +25,7 @@ from tests.waiting import wait_until_async
 pytestmark = [pytest.mark.systemd, pytest.mark.wheelhouse, pytest.mark.netns]
 
 STATE = "/var/lib/rtc3d-gateway"
+STRAY = "/var/tmp"
 
 
 def simulator(port: int = 0) -> Simulator:
@@ -39,6 +42,15 @@ async def test_the_service_says_how_its_sources_are(service: Service) -> None:
         said = await service.machine.show("StatusText")
         assert re.fullmatch(r"lab: waiting for [\d.:]+, \d+ (try|tries); sim: streaming \d+\.\d Hz", said)
         assert await service.machine.show("ActiveState") == "active"
+
+
+async def test_a_start_is_over_when_the_outputs_are_open(service: Service) -> None:
+    metrics = free_port()
+    service.configure({"lab": free_port()}, metrics={"port": metrics})
+    await service.start()
+    host, _, port = service.endpoint.removeprefix("tcp/").partition(":")
+    for each in (int(port), metrics):
+        socket.create_connection((host, each)).close()  # refused if nobody listens
 
 
 async def test_a_server_may_be_switched_off_and_on(service: Service) -> None:
@@ -255,7 +267,7 @@ def test_both_units_are_the_same_but_for_the_name_of_the_configuration() -> None
         [line for line in (ROOT / "systemd" / name).read_text().splitlines() if not line.startswith("# ")]
         for name in (UNIT, "rtc3d-gateway@.service")
     )
-    named = "\n".join(one).replace("gateway.yaml", "%i.yaml")
+    named = "\n".join(one).replace("gateway.yaml", "%i.yaml").replace("gateway.env", "%i.env")
     named = named.replace("Description=RTC3D gateway", "Description=RTC3D gateway of %i.yaml")
     named = named.replace("StateDirectory=rtc3d-gateway", "StateDirectory=rtc3d-gateway/%i")
     assert named == "\n".join(other)
@@ -272,22 +284,49 @@ async def test_the_journal_has_fields(service: Service) -> None:
     assert entries[0]["PRIORITY"] == "6"
 
 
-async def test_files_are_kept_in_the_state_directory_and_nothing_is_written_elsewhere(
-    service: Service,
-) -> None:
+def file_server() -> ScriptedServer:
+    """Return a server that sends a C3D file by itself."""
+
     async def script(client: Client) -> None:
         client.send(packet(5, b"a C3D file"))
         await client.commands(lambda command: ok(f"OK-{command}"))
 
-    async with ScriptedServer(script) as server:
+    return ScriptedServer(script)
+
+
+async def kept_file(service: Service) -> Path:
+    folder = service.machine.path(f"{STATE}/c3d")
+    await wait_until_async(lambda: list(folder.glob("lab-*.c3d")))
+    return next(folder.glob("lab-*.c3d"))
+
+
+async def test_the_service_can_write_to_its_state_directory_alone(service: Service) -> None:
+    async with file_server() as server:
         service.configure({"lab": server.port})
         await service.start()
-        kept = service.machine.path(f"{STATE}/c3d")
-        await wait_until_async(lambda: list(kept.glob("lab-*.c3d")))
-        [file] = kept.glob("lab-*.c3d")
-        assert file.read_bytes() == b"a C3D file"
+        assert (await kept_file(service)).read_bytes() == b"a C3D file"
         mounts = await service.machine.run("cat", f"/proc/{await service.main_pid()}/mountinfo")
     # Where the service could write at all, the kernel's own file systems and its private /tmp aside.
     places = [line.split(maxsplit=6)[4:6] for line in mounts.text.splitlines()]
     writable = {path for path, options in places if "rw" in options.split(",")}
     assert {path for path in writable if not re.match("/(proc|sys|dev|tmp|var/tmp)(/|$)", path)} == {STATE}
+
+
+async def test_the_service_writes_nowhere_else_even_where_it_could(service: Service) -> None:
+    machine = service.machine
+    async with file_server() as server:
+        service.configure({"lab": server.port}, lcm={"enabled": True}, metrics={"port": free_port()})
+        shown = f"{STRAY}/by-the-test"  # what a stray file would look like
+        await service.drop_in(
+            *("ProtectSystem=no", "PrivateTmp=no", "ReadOnlyPaths=", "InaccessiblePaths="),
+            *(f"ExecStopPost=/bin/touch {shown}",),
+        )
+        before = await machine.files()
+        await service.start()
+        await kept_file(service)
+        assert (await service.reload()).status == 0
+        await machine.run("systemctl", "stop", UNIT)
+        after = await machine.files()
+    changed = {path for path in before.keys() | after.keys() if before.get(path) != after.get(path)}
+    assert {path for path in changed if not path.startswith(STATE)} == {shown}
+    assert any(path.startswith(f"{STATE}/c3d/lab-") for path in changed)
