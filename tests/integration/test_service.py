@@ -89,6 +89,17 @@ class Site:
         wait_until(lambda: condition(self.systemd))
 
 
+@contextmanager
+def subscriber(endpoint: str) -> Iterator[subprocess.Popen[str]]:
+    """Run a process that subscribes, and prints a line for each message."""
+    command = [sys.executable, "-c", SUBSCRIBER, json.dumps(zenoh_keys("client", connect=endpoint))]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
 @pytest.fixture
 def site(tmp_path: Path) -> Site:
     return Site(tmp_path)
@@ -158,15 +169,10 @@ def test_a_zenoh_that_does_not_open_does_not_hold_up_the_end(site: Site) -> None
 
 
 async def test_a_subscriber_that_does_not_read_does_not_hold_up_the_end(site: Site) -> None:
-    keys = json.dumps(zenoh_keys("client", connect=site.endpoint))
-    subscriber = [sys.executable, "-c", SUBSCRIBER, keys]
     scene = SyntheticScene(markers=3000, tools=0, analog=0, plates=0, rate_hz=200)  # 48 kB a frame
     async with Simulator(scene) as server:
         site.configure(server.port)
-        with (
-            site.running() as process,
-            subprocess.Popen(subscriber, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as frozen,
-        ):
+        with site.running() as process, subscriber(site.endpoint) as frozen:
             assert frozen.stdout is not None
             assert await asyncio.to_thread(frozen.stdout.readline) == "heard\n"
             frozen.send_signal(signal.SIGSTOP)
@@ -174,4 +180,3 @@ async def test_a_subscriber_that_does_not_read_does_not_hold_up_the_end(site: Si
             await wait_until_async(lambda: server.frames_sent > full)
             process.terminate()
             assert await asyncio.to_thread(process.wait, STOP_S) == 0
-            frozen.kill()
