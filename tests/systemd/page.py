@@ -16,7 +16,7 @@ def typed(heading: str, number: int = 0) -> str:
     return _AS_ROOT + blocks[number]
 
 
-def exposure() -> str:
-    """Return the figure of systemd-analyze security."""
-    [figure] = re.findall(r"gives an exposure of (\d\.\d) ", _PAGE)
-    return str(figure)
+def exposure() -> tuple[str, str]:
+    """Return the figure of systemd-analyze security, and the version of systemd that it is of."""
+    [(figure, version)] = re.findall(r"gives an exposure of (\d\.\d) with systemd (\d+) ", _PAGE)
+    return figure, version
