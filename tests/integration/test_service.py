@@ -114,7 +114,10 @@ def test_start_and_stop_are_told(site: Site) -> None:
         process.terminate()
         assert process.wait(STOP_S) == 0
     assert site.systemd.stages == ["READY=1", "STOPPING=1"]
-    assert site.systemd.texts.index("READY=1") == 2  # who is ready has a status to show, and is alive
+    before = site.systemd.texts[: site.systemd.texts.index("READY=1")]
+    assert before[0] == "WATCHDOG=1"  # who is ready is alive, and has a status to show
+    assert [text.partition(": ")[0] for text in before[1:]] == ["STATUS=lab"]
+    assert "zenoh" not in before[1]  # else it would say that the session is not open yet
 
 
 def test_a_hangup_loads_the_configuration_anew(site: Site) -> None:
