@@ -8,6 +8,7 @@ configuration. Topics: /lab/markers, and a pose for each tool, as /lab/tool_Tool
 
 import re
 import sys
+from array import array
 from urllib.parse import unquote
 
 import rclpy
@@ -39,7 +40,7 @@ class Bridge(Node):
         cloud = ros2_values.cloud(sample.payload.to_bytes())
         message = PointCloud2(header=self._header(cloud.stamp), height=1, width=cloud.width, fields=FIELDS)
         message.point_step, message.row_step = 12, 12 * cloud.width
-        message.is_bigendian, message.is_dense, message.data = False, False, cloud.data
+        message.is_bigendian, message.is_dense, message.data = False, False, array("B", cloud.data)
         self._markers.publish(message)
 
     def on_tool(self, sample: zenoh.Sample) -> None:

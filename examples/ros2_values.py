@@ -1,4 +1,4 @@
-"""What ROS 2 messages hold, from the gateway's messages: no ROS needed. examples/ros2_bridge.py fills them in.
+"""What ROS 2 messages hold, from the gateway's messages, without ROS. examples/ros2_bridge.py fills them in.
 
 ROS counts in metres, with quaternions x, y, z, w and stamps in seconds and nanoseconds.
 """
@@ -36,7 +36,7 @@ class Pose(NamedTuple):
 
 
 class Cloud(NamedTuple):
-    """What sensor_msgs/PointCloud2 holds, with the fields x, y, z: float32, little-endian, 12 bytes a point."""
+    """What sensor_msgs/PointCloud2 holds: x, y, z of each point as float32, little-endian."""
 
     stamp: Stamp
     width: int
