@@ -27,6 +27,7 @@ from gateway.simulator.scenario import load_scenario
 from tests.documents import ROOT, Block, all_blocks, blocks, documents
 
 REFERENCE = (ROOT / "docs/reference/messages.md").read_text()
+WHAT_IS_LOST = (ROOT / "docs/explanation/what-is-lost.md").read_text()
 PROGRAM = "rtc3d-gateway"
 WRAPPERS = {"sudo", "tests/with-netns"}
 FOLDERS = ("benchmarks", "config", "docs", "examples", "lcm_types", "systemd", "tests")
@@ -152,3 +153,14 @@ def test_the_reference_has_the_fingerprint_and_sizes_of_every_type() -> None:
         item_bytes = ITEM_DTYPES[component].itemsize
         assert sizes[message_type.__name__] == (str(MESSAGE_HEADER_BYTES), str(item_bytes))
     assert sizes["tool_pose_t"] == (f"{len(rtc3d.tool_pose_t().encode())} in all", "")
+
+
+def test_every_cause_of_a_drop_is_told_and_no_other() -> None:
+    told = set(re.findall(r"^\| `([a-z ]+)` \| (?:stream|output|LCM) \|", WHAT_IS_LOST, re.MULTILINE))
+    for_others = {"demo.py", "memory_output.py"}
+    sources = [path for path in ROOT.glob("gateway/**/*.py") if path.name not in for_others]
+    text = "\n".join(path.read_text() for path in sources)
+    counted = set(re.findall(r'(?:\bdrops\[|\bcause=|_drop\()"([^"]+)"', text))
+    assert len(counted) > 7
+    assert counted <= told
+    assert {cause for cause in told if f'"{cause}"' not in text} == set()
