@@ -164,3 +164,11 @@ def test_every_cause_of_a_drop_is_told_and_no_other() -> None:
     assert len(counted) > 7
     assert counted <= told
     assert {cause for cause in told if f'"{cause}"' not in text} == set()
+
+
+def test_the_design_names_every_module() -> None:
+    layers = (ROOT / "docs/design.md").read_text().partition("\n## Layers\n")[2].partition("\n## ")[0]
+    modules = {path.stem for path in ROOT.glob("gateway/*.py")} | {
+        path.parent.name for path in ROOT.glob("gateway/*/__init__.py")
+    }
+    assert modules - {"__init__", "__main__"} <= set(re.findall(r"`(\w+)`", layers))
