@@ -36,7 +36,7 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
     cases = _cases(quick)
     rows = []
     for number, (side, count, routed) in enumerate(cases):
-        progress.step(f"{side}, {count} subscriber{"s" * (count != 1)}{', routed' if routed else ''}", number / len(cases))
+        progress.step(f"{side}, {count} subscribers{', routed' if routed else ''}", number / len(cases))
         rows.append(_case(side, count, routed, lasting_s, pairs))
     return {"rows": rows}
 

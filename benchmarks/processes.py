@@ -131,7 +131,7 @@ class Program:
             os.sched_setaffinity(0, _CORES[:1])  # inherited
         try:
             self.process = subprocess.Popen(  # noqa: S603 - programs of ours
-                self.command, cwd=ROOT, env=os.environ | dict(self.environment)
+                self.command, cwd=ROOT, env=os.environ | dict(self.environment), stdout=subprocess.DEVNULL
             )
         finally:
             leave_measured_core()

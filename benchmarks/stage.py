@@ -2,6 +2,8 @@
 
 import contextlib
 import tempfile
+import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -108,7 +110,7 @@ class Stage:
         def all_heard() -> bool:
             for name in self.programs:
                 self.pace(name, _FIRST_FRAMES, 1000)
-            return all(len(topics) >= wanted for each in self.listeners for topics in each.ask("heard"))
+            return all(len(counts) >= wanted for counts in self.heard())
 
         processes.wait_until(all_heard, "every subscriber hears the gateway and the relay")
         self.take()
@@ -126,6 +128,17 @@ class Stage:
         before_s = 0.0 if program is None else processes.cpu_s(program.pid)
         sent: Sent = self.sender.ask(request)
         return sent, 0.0 if program is None else processes.cpu_s(program.pid) - before_s
+
+    def heard(self) -> list[Counter[str]]:
+        """Return how many messages of each topic every subscriber has had since the last ``take``."""
+        return [counts for listener in self.listeners for counts in listener.ask("heard")]
+
+    def settle(self, messages: int) -> None:
+        """Return once every subscriber has had so many messages in all, or a second brought none."""
+        before: list[Counter[str]] = []
+        while (heard := self.heard()) != before and any(each.total() < messages for each in heard):
+            before = heard
+            time.sleep(1.0)
 
     def take(self) -> list[Any]:
         """Return what every subscriber heard since the last time, a ``Heard`` each."""

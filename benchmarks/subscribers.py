@@ -66,7 +66,7 @@ _COMPONENTS: Final = frozenset({"3d", "6d", "analog", "force", "event", "3D", "6
 
 
 def subscribe(wanted: Subscription) -> Iterator[Any]:
-    """Work of a Worker. Requests: "heard" gives how many messages each has had, "take" all of it, and forgets."""
+    """Work of a Worker. Requests: "heard" gives how many messages of each topic each has had, "take" all of it, and forgets."""
     parts: list[Any] = []
     for _ in range(wanted.zenoh):
         parts.append(_ZenohSubscriber(wanted))
@@ -76,7 +76,7 @@ def subscribe(wanted: Subscription) -> Iterator[Any]:
         request = yield None
         while True:
             if request == "heard":
-                request = yield [part.topics() for part in parts]
+                request = yield [part.counts() for part in parts]
             else:
                 request = yield [part.take() for part in parts]
     finally:
@@ -95,13 +95,11 @@ class _ZenohSubscriber:
     def _on_sample(self, sample: zenoh.Sample) -> None:
         self._heard.take(str(sample.key_expr), sample.payload.to_bytes())
 
-    def topics(self) -> set[str]:
-        if self._reads:
-            return set(self._heard.messages)
-        found = set()
-        while (sample := self._subscriber.handler.try_recv()) is not None:
-            found.add(str(sample.key_expr))
-        return found
+    def counts(self) -> Counter[str]:
+        if not self._reads:
+            while (sample := self._subscriber.handler.try_recv()) is not None:
+                self._on_sample(sample)
+        return self._heard.messages
 
     def take(self) -> Heard:
         heard, self._heard = self._heard, Heard()
@@ -137,11 +135,11 @@ class _LcmSubscriber:
         while not self._stop.is_set():
             connection.handle_timeout(100)
 
-    def topics(self) -> set[str]:
+    def counts(self) -> Counter[str]:
         for each in self._lcms:
             while not self._reads and each.handle_timeout(0):
                 pass
-        return set(self._heard.messages)
+        return self._heard.messages
 
     def take(self) -> Heard:
         if not self._reads:
