@@ -115,15 +115,15 @@ async def gateway_at(
     """Run a gateway of the source "lab", whose server is at ``port`` of this machine.
 
     It is on Zenoh as a peer that listens at an endpoint or as a client of a router, or on LCM, or on
-    both. Waits are short; ``source`` has other settings of the source.
+    both. ``source`` has other settings of the source.
     """
     defaults: dict[str, Any] = {
         "name": "lab",
         "host": "127.0.0.1",
         "port": port,
         "reconnect": Reconnect(first_delay_s=0.01, max_delay_s=0.05),
-        "reply_timeout_s": 0.3,
-        "query_timeout_s": 2.0,
+        "reply_timeout_s": 5.0,
+        "query_timeout_s": 10.0,
         "stall_timeout_s": 60.0,
     }
     # An interval of 0 cannot be configured: here every fresh question is one.

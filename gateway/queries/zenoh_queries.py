@@ -11,7 +11,6 @@ import logging
 import threading
 from collections import Counter
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any, Final, NamedTuple
 
 import zenoh
@@ -34,6 +33,7 @@ from gateway.queries.answers import (
     parse_questions,
 )
 from gateway.queries.desk import Desk
+from gateway.queries.sender import Sender
 
 MAX_PENDING: Final = 4096
 """How many queries are worked on at once; the next is told to come again."""
@@ -78,8 +78,8 @@ class ZenohQueries:
         self._tasks: set[asyncio.Task[None]] = set()
         # To a peer that has stopped reading, sending blocks for 5 s, until Zenoh closes the link. So it
         # is done in a thread, and in no more than one: two that block there stop all of Zenoh meanwhile.
-        self._sender = ThreadPoolExecutor(1, "zenoh-send")
-        self._long_sender = ThreadPoolExecutor(1, "zenoh-send-long")
+        self._sender = Sender("zenoh-send")
+        self._long_sender = Sender("zenoh-send-long")
         self._closed = False
         self.results: Counter[str] = Counter()
         """Queries by result: ok, or the code of the error."""
@@ -155,7 +155,7 @@ class ZenohQueries:
 
     def _tell(self, put: Callable[..., None], *arguments: Any) -> None:
         if not self._closed:
-            self._sender.submit(_guarded, put, *arguments)
+            self._sender.submit(functools.partial(_guarded, put, *arguments))
 
     async def close(self) -> None:
         """Give up the queries under way; their askers see no reply at once."""
@@ -163,8 +163,8 @@ class ZenohQueries:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        for threads in (self._sender, self._long_sender):
-            threads.shutdown(wait=False, cancel_futures=True)
+        for sender in (self._sender, self._long_sender):
+            sender.close()
 
     def _take(self, source: str, query: zenoh.Query) -> None:
         desk = self._desks.get(source)
@@ -173,7 +173,7 @@ class ZenohQueries:
             return
         if len(self._tasks) >= MAX_PENDING:
             error = QueryError("the gateway has too many queries; try again", code="busy")
-            self._sender.submit(_refuse, query, error)
+            self._sender.submit(functools.partial(_refuse, query, error))
             self.results[error.code] += 1
             return
         with log_fields(source=desk.source.name):
@@ -192,11 +192,11 @@ class ZenohQueries:
         else:
             is_long = any(len(answer.payload) > LONG_ANSWER_BYTES for answer in answers.values())
             sender = self._long_sender if is_long else self._sender
-            await self._loop.run_in_executor(sender, _give, query, answers)
+            await asyncio.wrap_future(sender.submit(functools.partial(_give, query, answers)))
             self.results["ok"] += 1
 
     async def _refuse(self, query: zenoh.Query, error: QueryError) -> None:
-        await self._loop.run_in_executor(self._sender, _refuse, query, error)
+        await asyncio.wrap_future(self._sender.submit(functools.partial(_refuse, query, error)))
         self.results[error.code] += 1
 
     async def _answers(self, desk: Desk, query: zenoh.Query) -> dict[str, Answer]:

@@ -79,6 +79,25 @@ class PacketReader:
         """How many bytes of an unfinished packet are held."""
         return len(self._partial)
 
+    @property
+    def is_between_packets(self) -> bool:
+        """Whether the stream can be read on, and the next byte begins a packet."""
+        return not self._partial and self.error is None
+
+    @property
+    def missing_bytes(self) -> int:
+        """How many bytes complete the unfinished packet, or its header; 0 between two packets."""
+        if not self._partial:
+            return 0
+        if len(self._partial) < HEADER.size:
+            return HEADER.size - len(self._partial)
+        size, _ = HEADER.unpack_from(self._partial)
+        return int(size) - len(self._partial)
+
+    def skip(self, num_bytes: int) -> None:
+        """Note packets that were taken past the reader, between two of its own."""
+        self._offset += num_bytes
+
     def feed(self, data: bytes) -> list[Packet]:
         """Take the next bytes of the stream and return the packets that they complete, in order.
 

@@ -173,7 +173,7 @@ async def test_without_a_server_the_reason_is_told_and_since_when() -> None:
     ],
 )
 async def test_what_a_server_does_not_give_is_told(attribute: str, code: str, text: str) -> None:
-    async with lab() as (server, _, peer):
+    async with lab(reply_timeout_s=0.3) as (server, _, peer):
         setattr(server, attribute, ("SendParameters",))
         reply = await peer.ask(fresh=True)
         assert reply.error_code == code

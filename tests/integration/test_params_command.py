@@ -168,7 +168,7 @@ async def test_a_gateway_without_its_server_is_status_4_with_the_reason(side: st
 
 @sides
 async def test_a_server_that_does_not_answer_is_status_5(side: str) -> None:
-    async with lab() as at:
+    async with lab(reply_timeout_s=0.3) as at:
         at.server.silent = ("SendParameters",)
         done = await run("params", "--fresh", *at.on(side))
     assert done.status == 5

@@ -24,7 +24,6 @@ from gateway.decode import decode
 from gateway.errors import ConfigError
 from gateway.listening import LcmListener, ZenohListener, open_zenoh
 from gateway.outputs.lcm_output import open_lcm
-from gateway.rtc3d.components import ComponentType
 from gateway.simulator.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
@@ -33,8 +32,6 @@ from tests.servers import Client, ScriptedServer, ok, packet
 from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
-
-MARKERS = ComponentType.MARKERS
 
 
 def simulator() -> Simulator:

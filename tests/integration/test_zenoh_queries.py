@@ -102,7 +102,7 @@ async def test_a_server_without_single_sections_gives_all_for_one() -> None:
 async def test_a_server_that_sends_all_whatever_is_asked_gives_all_for_one() -> None:
     server = LabServer()
     server.sections = {}
-    async with lab(server, reply_timeout_s=0.1) as (_, _, _, asker):
+    async with lab(server) as (_, _, _, asker):
         markers = (await ask(asker, "mocap/lab/parameters/3d?format=json")).json
         assert [marker["label"] for marker in markers["markers"]] == ["Marker 1"]
 
@@ -184,7 +184,7 @@ async def test_a_server_that_does_not_know_send_parameters_leads_to_that_sentenc
 
 
 async def test_a_server_that_does_not_answer_leads_to_an_error_before_the_asker_gives_up() -> None:
-    async with lab() as (server, port, _, asker):
+    async with lab(reply_timeout_s=0.3) as (server, port, _, asker):
         server.silent = ("SendParameters",)
         reply = await ask(asker, "mocap/lab/parameters?fresh=true")
         assert reply.code == "timeout"
