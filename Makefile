@@ -11,7 +11,8 @@ UNITS := rtc3d-gateway.service rtc3d-gateway@.service
 # What tests of installing use; sudo finds this one, and the service can reach it.
 SYSTEM_PYTHON ?= /usr/bin/python3
 
-.PHONY: demo test check lint types contracts generated docs lcm-types fuzz soak wheel wheelhouse install uninstall clean
+.PHONY: demo test check lint types contracts generated docs lcm-types fuzz soak bench bench-quick zenohd \
+    wheel wheelhouse install uninstall clean
 
 demo: .venv/installed
 	$(BIN)/rtc3d-gateway demo
@@ -109,6 +110,27 @@ SOAK_MINUTES ?= 30
 
 soak: .venv/installed
 	tests/with-netns $(BIN)/python -m tests.soak --minutes $(SOAK_MINUTES) --report docs/reliability.md
+
+# Measures against bare Zenoh and LCM, into benchmarks/results.json and docs/performance.md: half an hour, on a
+# quiet machine. PARTS="ceiling loss" measures these only; bench-quick is rough, and leaves the document alone.
+PARTS ?=
+
+bench: .venv/bench zenohd
+	tests/with-netns $(BIN)/python -m benchmarks $(PARTS)
+
+bench-quick: .venv/bench
+	tests/with-netns $(BIN)/python -m benchmarks --quick $(PARTS)
+
+.venv/bench: .venv/installed
+	$(BIN)/pip install --quiet --group bench
+	touch $@
+
+# The real router, of the version of eclipse-zenoh, for the benchmarks: five minutes, once. Without cargo they
+# do with a Python session as the router, and say so.
+zenohd: .venv/installed
+	version=$$($(BIN)/python -c 'from importlib.metadata import version; print(version("eclipse-zenoh"))'); \
+	if command -v cargo >/dev/null; then cargo install zenohd --quiet --version $$version --locked --root build/zenohd; \
+	else echo "no cargo here: without zenohd"; fi
 
 clean:
 	rm -rf .venv build dist
