@@ -58,7 +58,7 @@ class LcmQueries:
     The desks may change: ``serve`` and ``dismiss`` tell of one that came or went. ``drops`` are the
     counters, by the source's name, of what was not answered. ``declare`` is called once LCM is open.
     Where ``shared`` is true somebody else handles that LCM object, as with memq://; else a thread of
-    this object does. With ``settings.queries_url`` requests come, and replies go, there instead.
+    this object does.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class LcmQueries:
         self._drops = drops
         self._shared = shared
         self._loop = asyncio.get_running_loop()
-        self._queries_url = settings.queries_url
+        self._url, self._queries_url = settings.effective_url, settings.effective_queries_url
         self._lcm: lcm.LCM | None = None
         self._asked: lcm.LCM | None = None  # where requests come and replies go
         self._subscriptions: dict[str, lcm.LCMSubscription] = {}  # by the source's name
@@ -88,9 +88,9 @@ class LcmQueries:
         """Requests by result: ok, or the code of the error."""
 
     def declare(self, connection: lcm.LCM) -> None:
-        """Tell parameters on an open LCM object; listen for requests on it, or on ``queries_url``."""
+        """Tell parameters on an open LCM object; listen for requests on ``queries_url``."""
         self._lcm = self._asked = connection
-        if self._queries_url is not None:
+        if self._queries_url != self._url:
             try:
                 self._asked = open_lcm(self._queries_url)
             except OutputError as error:
