@@ -38,9 +38,9 @@ generated: .venv/installed
 	$(BIN)/lcm-gen --python --ppath build/lcm_types lcm_types/rtc3d/*.lcm
 	diff -r --exclude='*.lcm' --exclude=__pycache__ build/lcm_types lcm_types
 
-# The site, in build/site; a link that leads nowhere ends it.
+# The site, in build/site; a link that leads nowhere ends it. (With --quiet, mkdocs would not see its own warnings.)
 docs: .venv/installed
-	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # lcm-gen appends to an existing __init__.py, so the old files go first.
 lcm-types: .venv/installed
