@@ -195,6 +195,9 @@ class LcmSettings(Section):
     url: LcmUrl | None = None
     """Where to publish; null is the environment's LCM_DEFAULT_URL, else LCM's own, on this host only."""
 
+    queries_url: LcmUrl | None = None
+    """Where requests are awaited and answered; null is where the rest is published."""
+
     max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
     """The highest rate of each component named; frames beyond it are left out, evenly."""
 

@@ -155,7 +155,7 @@ class FanOut:
             if message:
                 fan.newest = message
         for index in plan.tools:
-            self._tools.publish(frame.component(index), stamp)
+            self._tools.publish(frame, index, stamp)
 
     def _plan(self, layout: Layout, wanted: frozenset[ComponentType]) -> _Plan:
         """Return what is done with frames of a layout that is new, and tell if counts have changed."""

@@ -78,13 +78,9 @@ class ZenohPublisher:
         self._key = zenoh_key(output.settings.prefix, topic.source, *topic.parts)
         self._type_name = topic.type_name
         self._publisher: zenoh.Publisher | None = None
-        self._matched = False
         self._closed = False
-
-    @property
-    def wanted(self) -> bool:
+        self.wanted = False
         """Whether a subscriber matches the key now."""
-        return self._matched and not self._closed
 
     def bind(self, session: zenoh.Session) -> None:
         """Declare the publisher on an open session."""
@@ -101,28 +97,32 @@ class ZenohPublisher:
         """See again whether anybody listens: a notification may have been missed."""
         if self._publisher is not None:
             # Zenoh's type stub says bool here; it is the same MatchingStatus that listeners get.
-            self._matched = cast(zenoh.MatchingStatus, self._publisher.matching_status).matching
+            self.wanted = cast(zenoh.MatchingStatus, self._publisher.matching_status).matching
 
     def _on_matching(self, status: zenoh.MatchingStatus) -> None:
-        self._matched = status.matching  # from Zenoh's thread; setting a flag is all it does
+        # From Zenoh's thread; setting a flag is all it does.
+        self.wanted = status.matching and not self._closed
 
     def publish(self, message: bytes) -> None:
         """Hand ``message`` to Zenoh; raises OutputError while not open, or a client without a router."""
-        if self._closed:
-            raise OutputError(f"Zenoh key {self._key} is closed; ask for a new publisher", cause="closed")
-        health = self._output.health()
-        if self._publisher is None or not health.connected:
-            cause = "not open" if self._output.session is None else "no router"
-            raise OutputError(health.problem, cause=cause)
+        if self._publisher is None or self._output.session is None or self._output.lacks_router:
+            raise self._refusal()
         try:
             self._publisher.put(message)
         except zenoh.ZError as error:
             text = f"Zenoh did not take a message for {self._key}: {zenoh_reason(error)}"
             raise OutputError(text, cause="put failed") from error
 
+    def _refusal(self) -> OutputError:
+        if self._closed:
+            return OutputError(f"Zenoh key {self._key} is closed; ask for a new publisher", cause="closed")
+        cause = "not open" if self._output.session is None else "no router"
+        return OutputError(self._output.health().problem, cause=cause)
+
     def close(self) -> None:
         """Undeclare the publisher."""
         self._closed = True
+        self.wanted = False
         self._output.forget(self)
         publisher, self._publisher = self._publisher, None
         if publisher is not None:

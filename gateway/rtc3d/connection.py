@@ -232,8 +232,12 @@ class Connection:
         if not self._reader.is_between_packets:
             start = min(self._reader.missing_bytes, len(data))
             self._take(data[:start], events)
-        # Most of what comes is frames laid out like those before, with nothing awaited but them.
-        if self.state is State.STREAMING and self.under_way is None and self._reader.is_between_packets:
+        # Most of what comes is frames laid out like those before; what they answer: _answer_with_frame.
+        if (
+            self.state is State.STREAMING
+            and not isinstance(self.under_way, SendCurrentFrame)
+            and self._reader.is_between_packets
+        ):
             end = self._layouts.cut(data, start, events)
             self._reader.skip(end - start)
             start = end

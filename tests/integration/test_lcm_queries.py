@@ -104,6 +104,42 @@ async def test_a_reply_has_the_requests_id_and_requester_the_xml_and_its_age() -
         assert (reply.error, reply.error_code) == ("", "")
 
 
+async def test_requests_may_come_on_a_url_of_their_own() -> None:
+    data_url, queries_url = lcm_url(), lcm_url()
+    server = LabServer()
+    async with (
+        ScriptedServer(server.script) as listening,
+        gateway_at(listening.port, lcm_url=data_url, queries_url=queries_url) as gateway,
+    ):
+        await is_filled(gateway, server)
+        viewer, asker = Peer(data_url), Peer(queries_url)
+        try:
+            viewer.send(request(1))  # nobody is there
+            assert (await asker.ask(2)).xml.encode() == server.xml
+            await wait_until_async(lambda: viewer.statuses)
+            assert not viewer.replies
+            assert not asker.statuses
+        finally:
+            viewer.close()
+            asker.close()
+
+
+async def test_a_url_for_requests_that_does_not_open_stops_nothing_else(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    data_url, nobody = lcm_url(), f"tcpq://127.0.0.1:{free_port()}"
+    async with (
+        ScriptedServer(LabServer().script) as listening,
+        gateway_at(listening.port, lcm_url=data_url, queries_url=nobody),
+    ):
+        viewer = Peer(data_url)
+        try:
+            await wait_until_async(lambda: viewer.statuses)
+        finally:
+            viewer.close()
+    assert f"lcm: nobody can ask: LCM does not open {nobody}" in caplog.text
+
+
 @pytest.mark.parametrize("section", SECTIONS)
 async def test_each_section_comes_verbatim(section: str) -> None:
     async with lab() as (_, _, peer):
