@@ -4,7 +4,6 @@ import re
 
 import pytest
 
-from benchmarks import parts, report
 from benchmarks.stage import GATEWAY, RELAY, Stage
 from benchmarks.subscribers import Heard
 from benchmarks.workloads import DENSE, Frames, cuts
