@@ -137,7 +137,7 @@ def test_every_mistake_is_told_at_once() -> None:
         "max_packet_bytes, max_c3d_bytes, "
         "query_timeout_s, fresh_interval_s, remote_control",
         "sources.1.host": "missing; this key has no default",
-        "lcm": "found nothing; accepted is a mapping with any of the keys enabled, prefix, url, "
+        "lcm": "found nothing; accepted is a mapping with any of the keys enabled, prefix, url, queries_url, "
         "max_rate_hz, tool_poses",
         "zenho": "unknown key (did you mean 'zenoh'?); known: sources, spool, zenoh, lcm, metrics",
     }
