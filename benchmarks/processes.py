@@ -171,8 +171,7 @@ def run_measured(command: Sequence[str]) -> None:
 def gateway(file: Path, settings: dict[str, Any]) -> Program:
     """Return the gateway as users run it, with ``settings`` in the configuration ``file``."""
     file.write_text(yaml.safe_dump(settings))
-    level = os.environ.get("BENCH_LOG_LEVEL", "error")
-    command = [sys.executable, "-m", "gateway", "run", "--config", str(file), "--log-level", level]
+    command = [sys.executable, "-m", "gateway", "run", "--config", str(file), "--log-level", "error"]
     return Program(command, measured=True)
 
 
