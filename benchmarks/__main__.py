@@ -14,9 +14,13 @@ from benchmarks import parts, processes, report
 def main() -> int:
     """Measure, keep the figures, print the tables, and put them into the document."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks")
-    parser.add_argument("parts", nargs="*", metavar="PART", help=f"of {', '.join(parts.NAMES)}; all unless given")
+    parser.add_argument(
+        "parts", nargs="*", metavar="PART", help=f"of {', '.join(parts.NAMES)}; all unless given"
+    )
     parser.add_argument("--quick", action="store_true", help="rough figures, which the document does not get")
-    parser.add_argument("--render", action="store_true", help="measure nothing, only write the document's tables")
+    parser.add_argument(
+        "--render", action="store_true", help="measure nothing, only write the document's tables"
+    )
     options = parser.parse_args()
     if unknown := set(options.parts) - set(parts.NAMES):
         parser.error(f"there is no part {', '.join(sorted(unknown))}")

@@ -3,7 +3,7 @@
 import math
 import statistics
 from collections.abc import Sequence
-from typing import Any, Self
+from typing import Self
 
 
 class Pair:
@@ -53,8 +53,3 @@ def percentile(values: Sequence[float], per_cent: float) -> float:
     """Return the least value that so many per cent of all are not above (nearest rank)."""
     ordered = sorted(values)
     return ordered[max(0, math.ceil(len(ordered) * per_cent / 100) - 1)]
-
-
-def spread(values: Sequence[float]) -> dict[str, Any]:
-    """Return the median of figures, the least and the greatest."""
-    return {"median": statistics.median(values), "least": min(values), "greatest": max(values)}

@@ -1,5 +1,6 @@
-"""Part 3: from the server's send to the subscriber's callback, beside the bare relay and a plain TCP client."""
+"""Part 3: from the server's send to the subscriber's callback, beside the bare relay and a TCP client."""
 
+from itertools import chain
 from typing import Any, Final
 
 from benchmarks.comparing import Pair, percentile, table_cell
@@ -38,9 +39,19 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
     for number, (side, (zenoh, lcm)) in enumerate(_SIDES.items()):
         subscribers = [(int(zenoh), int(lcm))]
         clients = (GATEWAY, RELAY, PLAIN)
-        with Stage(
-            DENSE, zenoh=zenoh, lcm=lcm, subscribers=subscribers, reads=True, component="3d", clients=clients
-        ) as stage, Worker(subscribe_tcp, stage.ports[PLAIN], *_shape()) as plain:
+        with (
+            Stage(
+                DENSE,
+                zenoh=zenoh,
+                lcm=lcm,
+                subscribers=subscribers,
+                reads=True,
+                component="3d",
+                questions_apart=True,
+                clients=clients,
+            ) as stage,
+            Worker(subscribe_tcp, stage.ports[PLAIN], *_shape()) as plain,
+        ):
             for rate_hz, each_s in lasting_s.items():
                 progress.step(f"{side}, {rate_hz} Hz", (number + list(lasting_s).index(rate_hz) / 3) / 2)
                 ages_us: dict[str, list[list[float]]] = {name: [] for name in _NAMES}
@@ -71,11 +82,15 @@ def _figures(ages_us: dict[str, list[list[float]]]) -> dict[str, Any]:
     return {
         "messages": {name: sum(map(len, runs)) for name, runs in ages_us.items()},
         "runs_us": {
-            f"p{each:g}": {name: [round(percentile(run, each), 1) for run in runs] for name, runs in ages_us.items()}
+            f"p{each:g}": {
+                name: [round(percentile(run, each), 1) for run in runs] for name, runs in ages_us.items()
+            }
             for each in _PERCENTILES
         },
         "all_us": {
-            f"p{each:g}": {name: round(percentile(sum(runs, []), each), 1) for name, runs in ages_us.items()}
+            f"p{each:g}": {
+                name: round(percentile(list(chain(*runs)), each), 1) for name, runs in ages_us.items()
+            }
             for each in _PERCENTILES
         },
     }
@@ -101,13 +116,13 @@ def goals(result: dict[str, Any]) -> list[Goal]:
     """Return the worst ratios of gateway to relay."""
     found = []
     for name, goal in (("p50", GOAL_P50), ("p99", GOAL_P99)):
-        ratios = [_pair(row, name).ratio for row in result["rows"]]
+        ratios = sorted(_pair(row, name).ratio for row in result["rows"])
         found.append(
             Goal(
                 f"{name} latency against the bare relay",
                 f"at most {goal:.2f}",
-                f"{max(ratios):.2f} in the worst case, {sorted(ratios)[len(ratios) // 2]:.2f} in the median one",
-                max(ratios) <= goal,
+                f"{ratios[-1]:.2f} in the worst case, {ratios[len(ratios) // 2]:.2f} in the median one",
+                ratios[-1] <= goal,
             )
         )
     return found

@@ -4,7 +4,6 @@ from typing import Any, Final
 
 from benchmarks.report import Goal, Progress, Table
 from benchmarks.stage import GATEWAY, Stage
-from benchmarks.subscribers import Heard
 from benchmarks.workloads import DENSE
 
 TITLE: Final = "Loss: the dense workload to 4 Zenoh and 4 LCM subscribers"
@@ -35,23 +34,25 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
                 "subscriber": f"{('Zenoh', 'LCM')[number % 2]} {number // 2 + 1}",
                 "sent": frames * _COMPONENTS,
                 "received": heard.messages.total(),
-                "lost": _lost(heard, sent.first, frames),
+                "lost": heard.missing(sent.first, frames, _COMPONENTS),
             }
             for number, heard in enumerate(stage.take())
         ]
-    return {"seconds": seconds, "sent_hz": round(frames / sent.took_s, 1), "cpu_share": cpu_s / sent.took_s, "rows": rows}
-
-
-def _lost(heard: Heard, first: int, frames: int) -> int:
-    """Return how many of the frames' messages are missing; one that came twice makes up for none."""
-    wanted = set(range(first, first + frames))
-    return frames * _COMPONENTS - sum(len(wanted.intersection(numbers)) for numbers in heard.numbers.values())
+    return {
+        "seconds": seconds,
+        "sent_hz": round(frames / sent.took_s, 1),
+        "cpu_share": cpu_s / sent.took_s,
+        "rows": rows,
+    }
 
 
 def tables(result: dict[str, Any]) -> list[Table]:
     """Return what is shown of the figures."""
     columns = ["subscriber", "messages sent", "received", "lost"]
-    rows = [[row["subscriber"], *(str(row[name]) for name in ("sent", "received", "lost"))] for row in result["rows"]]
+    rows = [
+        [row["subscriber"], *(str(row[name]) for name in ("sent", "received", "lost"))]
+        for row in result["rows"]
+    ]
     note = f"{result['seconds']} s at {result['sent_hz']:g} frames per second, five messages each."
     return [Table(TITLE, columns, rows, note)]
 

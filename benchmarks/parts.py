@@ -16,7 +16,7 @@ def part(name: str) -> ModuleType:
 
 def sections(results: dict[str, Any]) -> dict[str, list[Table]]:
     """Return the tables of each part that has results, those of the goals and the machine with them."""
-    measured = {name: results[name] for name in NAMES if name in results}
+    measured: dict[str, Any] = {name: results[name] for name in NAMES if name in results}
     goals = [goal for name, result in measured.items() for goal in part(name).goals(result)]
     return {
         "machine": [machines_table(measured)],

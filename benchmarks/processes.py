@@ -28,6 +28,17 @@ _START_S: Final = 30.0
 _END_S: Final = 10.0
 
 
+@contextlib.contextmanager
+def _on_measured_core() -> Iterator[None]:
+    """What is started within has the first processor, and no other: it is inherited."""
+    before = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, _CORES[:1])
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, before)
+
+
 def leave_measured_core() -> None:
     """Keep this process, and what it starts from now on, off the measured processor."""
     os.sched_setaffinity(0, _CORES[1:] or _CORES)
@@ -119,7 +130,7 @@ def _work(pipe: Connection, work: Callable[..., Any], *arguments: object) -> Non
 
 @dataclass
 class Program:
-    """A program that runs as long as the context lasts; ``measured``, it has the first processor to itself."""
+    """A program that runs as long as the context lasts; ``measured``, on the first processor."""
 
     command: Sequence[str]
     measured: bool = False
@@ -127,14 +138,10 @@ class Program:
     process: subprocess.Popen[bytes] = field(init=False)
 
     def __enter__(self) -> Self:
-        if self.measured:
-            os.sched_setaffinity(0, _CORES[:1])  # inherited
-        try:
+        with _on_measured_core() if self.measured else contextlib.nullcontext():
             self.process = subprocess.Popen(  # noqa: S603 - programs of ours
                 self.command, cwd=ROOT, env=os.environ | dict(self.environment), stdout=subprocess.DEVNULL
             )
-        finally:
-            leave_measured_core()
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -153,13 +160,10 @@ class Program:
 
 def run_measured(command: Sequence[str]) -> None:
     """Run a program on the first processor to its end; raises RuntimeError with what it said if it failed."""
-    os.sched_setaffinity(0, _CORES[:1])
-    try:
+    with _on_measured_core():
         done = subprocess.run(  # noqa: S603 - programs of ours
             command, cwd=ROOT, check=False, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
         )
-    finally:
-        leave_measured_core()
     if done.returncode:
         raise RuntimeError(done.stdout)
 
@@ -167,8 +171,7 @@ def run_measured(command: Sequence[str]) -> None:
 def gateway(file: Path, settings: dict[str, Any]) -> Program:
     """Return the gateway as users run it, with ``settings`` in the configuration ``file``."""
     file.write_text(yaml.safe_dump(settings))
-    level = os.environ.get("BENCH_LOG_LEVEL", "error")
-    command = [sys.executable, "-m", "gateway", "run", "--config", str(file), "--log-level", level]
+    command = [sys.executable, "-m", "gateway", "run", "--config", str(file), "--log-level", "error"]
     return Program(command, measured=True)
 
 
@@ -191,9 +194,7 @@ def relay(plan: dict[str, Any]) -> Program:
     return Program([sys.executable, "-m", "benchmarks.relay", json.dumps(plan)], measured=True)
 
 
-def zenoh_keys(
-    mode: str, *, connect: Sequence[str] = (), listen: Sequence[str] = ()
-) -> dict[str, Any]:
+def zenoh_keys(mode: str, *, connect: Sequence[str] = (), listen: Sequence[str] = ()) -> dict[str, Any]:
     """Return Zenoh's configuration of a session that meets others at these endpoints only."""
     return {
         "mode": mode,
@@ -208,12 +209,16 @@ def router(endpoint: str) -> contextlib.AbstractContextManager[object]:
     """Return a Zenoh router that listens at ``endpoint`` while the context lasts: see ``router_kind``."""
     if not ZENOHD.exists():
         return Worker(_python_router, endpoint)
-    return Program([str(ZENOHD), "--listen", endpoint, "--no-multicast-scouting"], environment={"RUST_LOG": "error"})
+    return Program(
+        [str(ZENOHD), "--listen", endpoint, "--no-multicast-scouting"], environment={"RUST_LOG": "error"}
+    )
 
 
 def router_kind() -> str:
     """Return which router ``router`` runs, in words."""
-    return "zenohd" if ZENOHD.exists() else "a Python session in mode router (`make zenohd` builds the real one)"
+    return (
+        "zenohd" if ZENOHD.exists() else "a Python session in mode router (`make zenohd` builds the real one)"
+    )
 
 
 def _python_router(endpoint: str) -> Iterator[None]:

@@ -1,4 +1,4 @@
-"""Part 7: answers from the cache while the lab workload streams: how long they take, how many there can be."""
+"""Part 7: answers from the cache while the lab workload streams: how long they take, how many there are."""
 
 import threading
 import time
@@ -21,7 +21,7 @@ _WAIT_S: Final = 5.0
 
 
 def ask(endpoint: str, seconds: float) -> Iterator[Any]:
-    """Work of a Worker: first ask at a steady pace whether answers have come or not, then one after the other.
+    """Work of a Worker: ask at a steady pace whether answers have come or not, then one after the other.
 
     The first request gives how long each answer took, ms; the second how many came per second.
     """
@@ -106,5 +106,8 @@ def tables(result: dict[str, Any]) -> list[Table]:
 def goals(result: dict[str, Any]) -> list[Goal]:
     """Return the median, and whether all were answered and nothing was lost."""
     fine = result["asked"] == result["answered"] and not result["lost"] and result["ms"]["p50"] < GOAL_MS
-    found = f"{result['ms']['p50']:.2f} ms; {result['asked'] - result['answered']} without answer, {result['lost']} lost"
-    return [Goal("answer from the cache, p50, and the stream", f"below {GOAL_MS:g} ms, nothing lost", found, fine)]
+    unanswered = result["asked"] - result["answered"]
+    found = f"{result['ms']['p50']:.2f} ms; {unanswered} without answer, {result['lost']} lost"
+    return [
+        Goal("answer from the cache, p50, and the stream", f"below {GOAL_MS:g} ms, nothing lost", found, fine)
+    ]

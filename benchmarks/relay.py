@@ -8,6 +8,7 @@ import json
 import signal
 import sys
 from functools import partial
+from typing import Any
 
 import lcm
 import zenoh
@@ -16,14 +17,16 @@ from gateway.outputs.zenoh_output import LCM_ENCODING, zenoh_config
 
 
 class Relay(asyncio.Protocol):
-    def __init__(self, cuts, ended):
-        self.cuts, self.ended = cuts, ended
-        self.rest = bytes(16)  # a message begins up to 16 bytes before its packet: the gateway's prefix is longer
+    """One connection; ``cuts`` are (first byte, last byte, the calls that take what is between)."""
 
-    def connection_made(self, transport):
+    def __init__(self, cuts: list[tuple[int, int, tuple[Any, ...]]], ended: asyncio.Event) -> None:
+        self.cuts, self.ended = cuts, ended
+        self.rest = bytes(16)  # the gateway's prefix is longer than what precedes the first component
+
+    def connection_made(self, transport: Any) -> None:  # noqa: D102
         transport.write(b"\0\0\0\x1e\0\0\0\x01StreamFrames AllFrames")
 
-    def data_received(self, data):
+    def data_received(self, data: bytes) -> None:  # noqa: D102
         data = self.rest + data
         at, end = 16, len(data)
         while end - at >= 8 and end - at >= (size := int.from_bytes(data[at : at + 4])):
@@ -35,33 +38,36 @@ class Relay(asyncio.Protocol):
             at += size
         self.rest = data[at - 16 :]
 
-    def connection_lost(self, exc):
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002, D102
         self.ended.set()
 
 
-async def main(port, cuts):
-    stop = asyncio.Event()
-    asyncio.get_running_loop().add_signal_handler(signal.SIGTERM, stop.set)
+async def main(port: int, cuts: Any) -> None:
+    """Connect, again and again, until SIGTERM."""
+    loop, stop = asyncio.get_running_loop(), asyncio.Event()
+    loop.add_signal_handler(signal.SIGTERM, stop.set)
     while not stop.is_set():
         ended = asyncio.Event()
-        await asyncio.get_running_loop().create_connection(lambda: Relay(cuts, ended), "127.0.0.1", port)
-        await asyncio.wait([asyncio.create_task(e.wait()) for e in (ended, stop)], return_when="FIRST_COMPLETED")
-
-
-def sends(plan, session, channels, component, schema):
-    if session:
-        encoding = zenoh.Encoding(LCM_ENCODING).with_schema(schema)
-        drop = zenoh.CongestionControl.DROP
-        yield session.declare_publisher(f"mocap/{plan['name']}/{component}", encoding=encoding, congestion_control=drop).put
-    if channels:
-        yield partial(channels.publish, f"MOCAP_{plan['name'].upper()}_{component.upper()}")
+        await loop.create_connection(partial(Relay, cuts, ended), "127.0.0.1", port)
+        waits = [asyncio.create_task(event.wait()) for event in (ended, stop)]
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
 
 
 if __name__ == "__main__":
     plan = json.loads(sys.argv[1])
     session = zenoh.open(zenoh_config(plan["zenoh"])) if plan["zenoh"] else None
     channels = lcm.LCM(plan["lcm"]) if plan["lcm"] else None
-    cuts = [(first, last, tuple(sends(plan, session, channels, *names))) for first, last, *names in plan["cuts"]]
+    cuts = []
+    for first, last, component, schema in plan["cuts"]:
+        sends: list[Any] = []
+        if session:
+            key = f"mocap/{plan['name']}/{component}"
+            encoding = zenoh.Encoding(LCM_ENCODING).with_schema(schema)
+            drop = zenoh.CongestionControl.DROP
+            sends.append(session.declare_publisher(key, encoding=encoding, congestion_control=drop).put)
+        if channels:
+            sends.append(partial(channels.publish, f"MOCAP_{plan['name'].upper()}_{component.upper()}"))
+        cuts.append((first, last, tuple(sends)))
     asyncio.run(main(plan["port"], cuts))
     if session:
         session.close()

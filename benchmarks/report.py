@@ -97,7 +97,11 @@ def machine() -> dict[str, str]:
     """Return on what the figures were measured, and with what."""
     model = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], cwd=ROOT, capture_output=True, text=True, check=False
+        ["git", "describe", "--always", "--dirty"],  # noqa: S607 - wherever git is
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     return {
         "processor": model[1] if model else platform.machine(),
@@ -136,7 +140,7 @@ def machines_table(results: dict[str, Any]) -> Table:
 
 
 def rendered(document: str, sections: dict[str, list[Table]]) -> str:
-    """Return the document with the tables of each section between its markers; what has none stays as it is."""
+    """Return the document with each section's tables between its markers; what has none stays as it is."""
     for name, tables in sections.items():
         text = "\n\n".join(table.markdown() for table in tables)
         before, start, rest = document.partition(f"<!-- {name} -->\n")

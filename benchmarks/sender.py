@@ -7,7 +7,7 @@ import queue
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Generator
 from typing import Final, NamedTuple
 
 from benchmarks.workloads import Frames, Workload
@@ -41,7 +41,7 @@ class Sent(NamedTuple):
     took_s: float
 
 
-def send(workload: Workload, clients: list[str]) -> Iterator[dict[str, int] | Sent]:
+def send(workload: Workload, clients: list[str]) -> Generator[dict[str, int] | Sent, Blast | Paced, None]:
     """Work of a Worker: listen for each client on a port of its own, tell the ports, then do as asked.
 
     A client is sent its frames on one connection, which ends then; the next request waits for the next.

@@ -31,7 +31,8 @@ _FIRST_FRAMES: Final = 20
 class Stage:
     """A context in which the gateway and the relay serve ``subscribers`` on Zenoh, LCM, or both.
 
-    Subscribers are processes of several each: (Zenoh subscribers, LCM subscribers) in each tuple.
+    Subscribers are processes of several each: (Zenoh subscribers, LCM subscribers) in each tuple. With
+    ``questions_apart`` the gateway awaits questions on an LCM URL of their own, as the relay awaits none.
     """
 
     workload: Workload
@@ -41,6 +42,7 @@ class Stage:
     routed: bool = False
     reads: bool = False
     component: str = "*"
+    questions_apart: bool = False
     clients: Sequence[str] = _BOTH
     programs: dict[str, Program] = field(init=False, default_factory=dict)
     listeners: list[Worker] = field(init=False, default_factory=list)
@@ -86,7 +88,11 @@ class Stage:
         return {
             "sources": [processes.source(GATEWAY, self.ports[GATEWAY])],
             "zenoh": {"enabled": self.zenoh, "config": keys},
-            "lcm": {"enabled": self.lcm, "url": self.lcm_urls[GATEWAY]},
+            "lcm": {
+                "enabled": self.lcm,
+                "url": self.lcm_urls[GATEWAY],
+                "queries_url": f"udpm://239.255.76.67:{free_port()}?ttl=0" if self.questions_apart else None,
+            },
             "metrics": {"port": free_port()},
         }
 

@@ -6,7 +6,7 @@ import struct
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from typing import Any, Final
 
@@ -15,6 +15,7 @@ import zenoh
 
 from gateway.message import PREFIX
 from gateway.rtc3d.commands import StreamFrames
+from gateway.rtc3d.components import BY_KEY
 from gateway.rtc3d.packets import HEADER, PacketType, encode_packet
 
 LCM_BUFFER_BYTES: Final = 4_000_000
@@ -61,17 +62,24 @@ class Heard:
         self.numbers.setdefault(topic, []).append(number)
         self.ages_us.setdefault(topic, []).append(now_us - stamp_us)
 
+    def missing(self, first: int, frames: int, components: int) -> int:
+        """Return how many messages of the frames from ``first`` are missing; doubled ones count once."""
+        wanted = set(range(first, first + frames))
+        return frames * components - sum(len(wanted.intersection(each)) for each in self.numbers.values())
 
-_COMPONENTS: Final = frozenset({"3d", "6d", "analog", "force", "event", "3D", "6D", "ANALOG", "FORCE", "EVENT"})
+
+_COMPONENTS: Final = frozenset(BY_KEY) | frozenset(map(str.upper, BY_KEY))
 
 
-def subscribe(wanted: Subscription) -> Iterator[Any]:
-    """Work of a Worker. Requests: "heard" gives how many messages of each topic each has had, "take" all of it, and forgets."""
-    parts: list[Any] = []
-    for _ in range(wanted.zenoh):
-        parts.append(_ZenohSubscriber(wanted))
-    for _ in range(wanted.lcm):
-        parts.append(_LcmSubscriber(wanted))
+def subscribe(wanted: Subscription) -> Generator[Any, str, None]:
+    """Work of a Worker, whose requests are about all that each subscriber has had so far.
+
+    "heard" gives how many messages of each topic, "take" gives a ``Heard``, and forgets.
+    """
+    parts: list[_ZenohSubscriber | _LcmSubscriber] = [
+        *(_ZenohSubscriber(wanted) for _ in range(wanted.zenoh)),
+        *(_LcmSubscriber(wanted) for _ in range(wanted.lcm)),
+    ]
     try:
         request = yield None
         while True:
@@ -110,7 +118,7 @@ class _ZenohSubscriber:
 
 
 class _LcmSubscriber:
-    """Listens on each URL. Without ``reads`` LCM's own threads take messages from sockets, and queues drop them."""
+    """Listens on each URL. Without ``reads`` LCM's own threads take messages, and its queues drop them."""
 
     def __init__(self, wanted: Subscription) -> None:
         component = ".+" if wanted.component == "*" else wanted.component.upper()

@@ -1,5 +1,6 @@
 """What the servers of the benchmarks send: how much, how often, and the bytes of it."""
 
+import struct
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
@@ -7,7 +8,6 @@ import numpy as np
 
 from gateway.message import PREFIX
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.components import split_frame as split
 from gateway.rtc3d.packets import HEADER
 from gateway.simulator.frames import FrameBuilder
 from gateway.simulator.synthetic import SyntheticScene
@@ -15,8 +15,8 @@ from gateway.simulator.synthetic import SyntheticScene
 _EVENT_US: Final = 500_000
 """When the synthetic scene has its first event."""
 
-_COMPONENT_HEADER_BYTES: Final = 8
-"""A component's size and type, which its message leaves out."""
+_COMPONENT: Final = struct.Struct(">II")
+"""A component's size and type (§7.1), which its message leaves out."""
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ class Workload:
 
 
 LAB: Final = Workload(markers=55, tools=6, analog=69, plates=2, rate_hz=200, analog_rate_hz=2000)
-"""A gait laboratory; its analog channels have a stream of their own."""
+"""A gait laboratory; its analog channels and force plates have a stream of their own."""
 
 DENSE: Final = Workload(markers=100, tools=10, analog=32, plates=2, rate_hz=1000, analog_rate_hz=1000)
 """Five components in every frame. The workload ``blast`` is this, as fast as TCP takes it."""
 
 LAB_STREAMS: Final[list[dict[str, Any]]] = [
-    {"components": ["3d", "6d", "force", "event"], "backlog": "all"},
-    {"components": ["analog"], "backlog": "all"},
+    {"components": ["3d", "6d", "event"], "backlog": "all"},
+    {"components": ["analog", "force"], "backlog": "all"},
 ]
 
 
@@ -73,13 +73,14 @@ class Cut(NamedTuple):
 
 
 def cuts(packet: bytes) -> list[Cut]:
-    """Return, for each component of the packet, as many bytes as its message has, its content at their end."""
+    """Return, for each component of a packet, as many bytes as its message has, its content at their end."""
     found = []
     at = HEADER.size + 4  # behind the packet's header and the count of components
-    for component in split(packet[HEADER.size :], "big").components:
-        last = at + _COMPONENT_HEADER_BYTES + len(component.content)
-        found.append(Cut(component.type, at + _COMPONENT_HEADER_BYTES - PREFIX.size, last))
-        at = last
+    while at < len(packet):
+        size, number = _COMPONENT.unpack_from(packet, at)
+        first = at + _COMPONENT.size - PREFIX.size
+        found.append(Cut(ComponentType(number), first, at + size))
+        at += size
     return found
 
 
