@@ -11,7 +11,8 @@ UNITS := rtc3d-gateway.service rtc3d-gateway@.service
 # What tests of installing use; sudo finds this one, and the service can reach it.
 SYSTEM_PYTHON ?= /usr/bin/python3
 
-.PHONY: demo test check lint types contracts generated lcm-types fuzz soak wheel wheelhouse install uninstall clean
+.PHONY: demo test check lint types contracts generated docs lcm-types fuzz soak bench bench-quick zenohd \
+    wheel wheelhouse install uninstall clean
 
 demo: .venv/installed
 	$(BIN)/rtc3d-gateway demo
@@ -19,7 +20,7 @@ demo: .venv/installed
 test: .venv/installed
 	SYSTEM_PYTHON=$(SYSTEM_PYTHON) tests/with-netns $(BIN)/pytest $(ARGS)
 
-check: lint types contracts generated wheelhouse test
+check: lint types contracts generated docs wheelhouse test
 
 lint: .venv/installed
 	$(BIN)/ruff format --check
@@ -36,6 +37,10 @@ generated: .venv/installed
 	rm -rf build/lcm_types && mkdir -p build/lcm_types
 	$(BIN)/lcm-gen --python --ppath build/lcm_types lcm_types/rtc3d/*.lcm
 	diff -r --exclude='*.lcm' --exclude=__pycache__ build/lcm_types lcm_types
+
+# The site, in build/site; a link that leads nowhere ends it. (With --quiet, mkdocs would not see its own warnings.)
+docs: .venv/installed
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
 # lcm-gen appends to an existing __init__.py, so the old files go first.
 lcm-types: .venv/installed
@@ -107,6 +112,27 @@ SOAK_MINUTES ?= 30
 
 soak: .venv/installed
 	tests/with-netns $(BIN)/python -m tests.soak --minutes $(SOAK_MINUTES) --report docs/reliability.md
+
+# Measures against bare Zenoh and LCM, into benchmarks/results.json and docs/performance.md: half an hour, on a
+# quiet machine. PARTS="ceiling loss" measures these only; bench-quick is rough, and leaves the document alone.
+PARTS ?=
+
+bench: .venv/bench zenohd
+	tests/with-netns $(BIN)/python -m benchmarks $(PARTS)
+
+bench-quick: .venv/bench
+	tests/with-netns $(BIN)/python -m benchmarks --quick $(PARTS)
+
+.venv/bench: .venv/installed
+	$(BIN)/pip install --quiet --group bench
+	touch $@
+
+# The real router, of the version of eclipse-zenoh, for the benchmarks: five minutes, once. Without cargo they
+# do with a Python session as the router, and say so.
+zenohd: .venv/installed
+	version=$$($(BIN)/python -c 'from importlib.metadata import version; print(version("eclipse-zenoh"))'); \
+	cargo install zenohd --quiet --version $$version --locked --root build/zenohd \
+	|| echo 'no zenohd: a Python session will be the router'
 
 clean:
 	rm -rf .venv build dist

@@ -328,6 +328,9 @@ def params_command(
     ] = False,
     connect: Connect = None,
     url: Url = None,
+    queries_url: Annotated[
+        str | None, typer.Option(metavar="URL", help="LCM's URL for requests: the gateway's lcm.queries_url.")
+    ] = None,
     prefix: Prefix = None,
     timeout: Annotated[float, typer.Option(min=0.1, help="How many seconds to wait for answers.")] = 5.0,
 ) -> None:
@@ -343,7 +346,15 @@ def params_command(
     if unknown := set(asked) - set(SECTIONS):
         raise typer.BadParameter(f"unknown section {min(unknown)!r}; known are {', '.join(SECTIONS)}")
     if lcm:
-        outcome = ask_lcm(prefix or "MOCAP", source, asked, fresh=fresh, url=_lcm_url(url), timeout_s=timeout)
+        outcome = ask_lcm(
+            prefix or "MOCAP",
+            source,
+            asked,
+            fresh=fresh,
+            url=_lcm_url(url),
+            queries_url=queries_url,
+            timeout_s=timeout,
+        )
     else:
         outcome = ask_zenoh(prefix or "mocap", source, asked, fresh=fresh, connect=connect, timeout_s=timeout)
     problems = [

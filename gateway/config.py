@@ -9,6 +9,7 @@ import os
 import re
 from pathlib import Path
 from typing import Annotated, Final, Self
+from urllib.parse import urlsplit, urlunsplit
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
@@ -183,6 +184,24 @@ class ZenohSettings(Section):
     """Whether each tool's pose is published on a key of its own, while someone listens."""
 
 
+def lcm_queries_url(url: str) -> str:
+    """Return where requests go unless told otherwise: to the next port, where a URL is multicast's.
+
+    Whoever listens on a multicast URL is sent all that anybody sends there, the gateway its own messages
+    too: that would double what LCM costs it, and more. Others pass on only what is subscribed to.
+    """
+    parts = urlsplit(url)
+    try:
+        port = parts.port or 7667
+    except ValueError:  # LCM itself refuses it
+        return url
+    if parts.scheme != "udpm":
+        return url
+    host = parts.hostname or "239.255.76.67"
+    other = port + 1 if port < 65535 else port - 1
+    return urlunsplit(parts._replace(netloc=f"{host}:{other}"))
+
+
 class LcmSettings(Section):
     """How data and answers go to LCM."""
 
@@ -194,6 +213,9 @@ class LcmSettings(Section):
 
     url: LcmUrl | None = None
     """Where to publish; null is the environment's LCM_DEFAULT_URL, else LCM's own, on this host only."""
+
+    queries_url: LcmUrl | None = None
+    """Where requests are awaited and answered; null is the port after that of url."""
 
     max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
     """The highest rate of each component named; frames beyond it are left out, evenly."""
@@ -208,6 +230,11 @@ class LcmSettings(Section):
         The environment's is not checked here: LCM itself says what it cannot use.
         """
         return self.url or os.environ.get("LCM_DEFAULT_URL") or DEFAULT_LCM_URL
+
+    @property
+    def effective_queries_url(self) -> str:
+        """``queries_url``, else what belongs to ``effective_url``."""
+        return self.queries_url or lcm_queries_url(self.effective_url)
 
 
 class SpoolSettings(Section):

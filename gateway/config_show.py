@@ -50,6 +50,7 @@ class _Origins:
         if settings.lcm.url is None:
             values["lcm"]["url"] = settings.lcm.effective_url
             self._resolved["lcm", "url"] = _variable("LCM_DEFAULT_URL")
+        values["lcm"]["queries_url"] = settings.lcm.effective_queries_url
         if settings.spool.directory is None:
             values["spool"]["directory"] = str(settings.spool.effective_directory)
             self._resolved["spool", "directory"] = _variable("STATE_DIRECTORY", "XDG_STATE_HOME")

@@ -8,7 +8,8 @@ from typing import Final
 from gateway.config import Source, Stream
 from gateway.message import Stamp
 from gateway.rate import LagControl
-from gateway.rtc3d.components import ComponentType, Frame
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import Frame
 from gateway.status import StreamStatus
 
 logger = logging.getLogger(__name__)
@@ -60,9 +61,9 @@ class Intake:
         status.last_frame_utime = utime
         last = frames[-1]
         for frame in frames:
-            if frame.unknown_types:
-                self._note_unknown(frame.unknown_types)
-            if not frame.components:
+            if frame.layout.unknown_types:
+                self._note_unknown(frame.layout.unknown_types)
+            if not frame.contents:
                 continue
             stamp = self._stamp(frame, utime)
             if self._lag.behind and self.skips and frame is not last:
@@ -72,22 +73,25 @@ class Intake:
                 self._publish(frame, stamp, self._wanted)
 
     def _stamp(self, frame: Frame, utime: int) -> Stamp:
-        first = frame.components[0]
+        layout = frame.layout
+        frame_number, timestamp_us = layout.number_and_time(frame.contents[0])
+        first = layout.parts[0].type
         # Servers may count component types apart: one of them is followed, events only where nothing else is.
-        if self._counted is None or (self._counted is ComponentType.EVENT is not first.type):
-            self._counted = first.type
-        if first.type is self._counted:
-            self._frame_number = first.frame_number
-        reading = self._clock.observe(first.timestamp_us, self._frame_number, utime)
-        if reading.restarted:
+        if self._counted is None or self._counted is ComponentType.EVENT:
+            self._counted = first
+        if first is self._counted:
+            self._frame_number = frame_number
+        clock = self._clock
+        capture_utime, lag_s, restarted = clock.observe(timestamp_us, self._frame_number, utime)
+        if restarted:
             self._status.restarts += 1
             self._lag.restart()
             self._on_restart()
-        elif self._clock.has_clock:
-            self._status.lag_s = reading.lag_s
-            if self._lag.observe(self._loop.time(), reading.lag_s):
+        elif clock.has_clock:
+            self._status.lag_s = lag_s
+            if self._lag.observe(self._loop.time(), lag_s):
                 self._on_lag(self._lag.halvings)
-        return Stamp(utime, reading.capture_utime, self._status.session, self._clock.has_clock)
+        return Stamp(utime, capture_utime, self._status.session, clock.has_clock)
 
     def _note_unknown(self, types: tuple[int, ...]) -> None:
         self._status.drops["unknown component"] += len(types)

@@ -16,11 +16,13 @@ from gateway.rtc3d.components import (
     ITEM_DTYPES,
     LONG_EVENT,
     SHORT_EVENT,
+    ByteOrder,
     Component,
     ComponentType,
     Items,
     big_endian_content,
 )
+from gateway.rtc3d.frames import Part
 
 MESSAGE_TYPES: Final[dict[ComponentType, type[Any]]] = {
     ComponentType.MARKERS: rtc3d.markers_t,
@@ -37,10 +39,12 @@ PREFIX: Final = struct.Struct(">8sqqqi")
 MESSAGE_HEADER_BYTES: Final = PREFIX.size + 16
 """Where the items begin: after the prefix, frame number, time stamp and count."""
 
-_FINGERPRINTS: Final[dict[ComponentType, bytes]] = {
+FINGERPRINTS: Final[dict[ComponentType, bytes]] = {
     component: message_type._get_packed_fingerprint()  # noqa: SLF001 - lcm-gen offers no other way
     for component, message_type in MESSAGE_TYPES.items()
 }
+"""The first 8 bytes of each component's messages: lcm-gen's hash of the type."""
+
 _POSE_FINGERPRINT: Final[bytes] = rtc3d.tool_pose_t._get_packed_fingerprint()  # noqa: SLF001 - as above
 # Frame number, time stamp, visible, position, orientation, error.
 _POSE: Final = struct.Struct(">iq?8f")
@@ -63,17 +67,22 @@ def type_name(message_type: type[Any]) -> str:
 
 
 def splice(component: Component, stamp: Stamp, sequence: int) -> bytes:
-    """Return the component's LCM message; sizes and counts were checked by ``split_frame``."""
-    content = component.content
-    if component.byte_order == "little" or component.type is ComponentType.EVENT:
-        content = _canonical_content(component)
+    """Return the component's LCM message; sizes and counts were checked when its frame was split.
+
+    The fan-out does the same, with FINGERPRINTS, for contents that are canonical as they come.
+    """
     prefix = PREFIX.pack(
-        _FINGERPRINTS[component.type], stamp.utime, stamp.capture_utime, sequence, stamp.session
+        FINGERPRINTS[component.type], stamp.utime, stamp.capture_utime, sequence, stamp.session
     )
-    return b"".join((prefix, content))
+    return prefix + canonical_content(component)
 
 
-def _canonical_content(component: Component) -> bytes | memoryview:
+def is_canonical(part: Part, byte_order: ByteOrder) -> bool:
+    """Return whether the contents of such components go into messages as they come."""
+    return byte_order == "big" and part.item_bytes == ITEM_DTYPES[part.type].itemsize
+
+
+def canonical_content(component: Component) -> bytes:
     """Return the content in big-endian form, events with 24 bytes each (field note 6)."""
     if component.type is not ComponentType.EVENT or component.item_bytes != SHORT_EVENT.itemsize:
         return big_endian_content(component)
@@ -84,6 +93,11 @@ def _canonical_content(component: Component) -> bytes | memoryview:
     events["timestamp"] = component.timestamp_us
     header = struct.pack(">iqI", component.frame_number, component.timestamp_us, len(events))
     return header + events.tobytes()
+
+
+def timestamp_us_of(content: bytes) -> int:
+    """Return the time stamp of a canonical content."""
+    return int.from_bytes(content[4:12], "big", signed=True)
 
 
 def metres_per_unit(unit: str) -> float | None:

@@ -8,10 +8,10 @@ import time
 import uuid
 from typing import Any, Final, NamedTuple
 
-import lcm
 import rtc3d
 import zenoh
 
+from gateway.config import lcm_queries_url
 from gateway.decode import decode
 from gateway.errors import OutputError, ProtocolError, QueryError
 from gateway.listening import LcmListener, open_zenoh
@@ -168,14 +168,23 @@ def _age_s(attachment: bytes) -> float | None:
 
 
 def ask_lcm(
-    prefix: str, source: str | None, sections: Sections, *, fresh: bool, url: str, timeout_s: float
+    prefix: str,
+    source: str | None,
+    sections: Sections,
+    *,
+    fresh: bool,
+    url: str,
+    queries_url: str | None = None,
+    timeout_s: float,
 ) -> Outcome:
     """Ask for all sections at once: the gateway of ``source``, or of every source that is heard of.
 
+    Sources are heard of on ``url`` and asked on ``queries_url``, by default the one that belongs to it.
     Raises OutputError if LCM does not open or does not send.
     """
     outcome = Outcome([], [])
-    asker = _LcmAsker(open_lcm(url), prefix, sections, fresh=fresh)
+    queries_url = queries_url or lcm_queries_url(url)
+    asker = _LcmAsker(url, queries_url, prefix, sections, fresh=fresh)
     try:
         patience = _Patience(timeout_s)
         while source is None and not patience.has_looked:
@@ -208,8 +217,8 @@ def ask_lcm(
 class _LcmAsker:
     """Sends requests, and hears replies and who is there."""
 
-    def __init__(self, connection: lcm.LCM, prefix: str, sections: Sections, *, fresh: bool) -> None:
-        self._lcm = connection
+    def __init__(self, url: str, queries_url: str, prefix: str, sections: Sections, *, fresh: bool) -> None:
+        self._lcm = open_lcm(queries_url)
         self._prefix = prefix
         self._request = rtc3d.parameters_request_t()
         self._request.requester = f"rtc3d-gateway params {uuid.uuid4()}"
@@ -221,8 +230,11 @@ class _LcmAsker:
         self.replies: dict[str, Any] = {}
         """``parameters_reply_t`` by source."""
         self._all_came = threading.Event()
-        channels = f"{re.escape(prefix)}_.+_(STATUS|PARAMETERS_REPLY)"
-        self._listener = LcmListener(connection, channels, self._take)
+        channels = f"{re.escape(prefix)}_.+_"
+        self._listeners = [
+            LcmListener(self._lcm, f"{channels}PARAMETERS_REPLY", self._take),
+            LcmListener(open_lcm(url), f"{channels}STATUS", self._take),
+        ]
 
     def _take(self, _channel: str, data: bytes) -> None:
         try:
@@ -254,7 +266,8 @@ class _LcmAsker:
             self._all_came.wait(min(_AGAIN_S, patience.left_s or _AGAIN_S))
 
     def close(self) -> None:
-        self._listener.close()
+        for listener in self._listeners:
+            listener.close()
 
 
 def _nobody_on_lcm(name: str, url: str) -> QueryError:

@@ -18,7 +18,7 @@ from gateway.errors import (
 )
 from gateway.log import HOLD_S, FailureLog
 from gateway.rtc3d.commands import Bye, Command, Version
-from gateway.rtc3d.components import ByteOrder, ComponentType, Frame
+from gateway.rtc3d.components import ByteOrder, ComponentType
 from gateway.rtc3d.connection import (
     Answered,
     Broken,
@@ -31,6 +31,7 @@ from gateway.rtc3d.connection import (
     State,
     Stray,
 )
+from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.packets import Packet, text_of
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.status import StreamStatus, now_utime

@@ -60,7 +60,7 @@ class SourceGateway:
                     source.streams, self.statuses, self.supervisors, strict=True
                 )
             ],
-            self.fan_out.newest,
+            lambda: self.fan_out.newest,
             lambda: self._newest_status,
             self._last_c3d,
             self._record,

@@ -109,6 +109,7 @@ async def gateway_at(
     listen: str | None = None,
     router: str | None = None,
     lcm_url: str | None = None,
+    queries_url: str | None = None,
     spool: Path | None = None,
     **source: Any,
 ) -> AsyncIterator[Gateway]:
@@ -134,7 +135,7 @@ async def gateway_at(
     settings = Settings(
         sources=(lab,),
         zenoh=ZenohSettings(enabled=bool(listen or router), config=keys),
-        lcm=LcmSettings(enabled=lcm_url is not None, url=lcm_url),
+        lcm=LcmSettings(enabled=lcm_url is not None, url=lcm_url, queries_url=queries_url),
         spool=SpoolSettings(directory=None if spool is None else str(spool)),
         metrics=MetricsSettings(enabled=False),
     )

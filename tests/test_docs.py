@@ -1,51 +1,79 @@
-"""The documents tell the truth as far as a machine can see: links, commands, configurations, byte tables."""
+"""The documents tell the truth as far as a machine can see: links, commands, configurations, byte tables.
+
+The tutorial's commands are run as well, in tests/integration/test_tutorial.py; those of other pages are
+parsed by the program, because they name servers that nobody has.
+"""
 
 import re
 import shlex
+import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 import rtc3d
 import typer.core
+import yaml
+import zenoh
 
 from gateway import config_file
 from gateway.cli import app
+from gateway.config import Settings
 from gateway.decode import MESSAGE_TYPES_BY_NAME
 from gateway.message import MESSAGE_HEADER_BYTES, MESSAGE_TYPES
 from gateway.rtc3d.components import ITEM_DTYPES
+from gateway.simulator.scenario import load_scenario
+from tests.documents import ROOT, Block, all_blocks, blocks, documents
 
-ROOT = Path(__file__).parents[1]
-README = (ROOT / "README.md").read_text()
 REFERENCE = (ROOT / "docs/reference/messages.md").read_text()
+WHAT_IS_LOST = (ROOT / "docs/explanation/what-is-lost.md").read_text()
 PROGRAM = "rtc3d-gateway"
+WRAPPERS = {"sudo", "tests/with-netns"}
+FOLDERS = ("benchmarks", "config", "docs", "examples", "lcm_types", "systemd", "tests")
+OTHERS = {"scrape_configs", "groups"}
+"""First keys of YAML that is Prometheus'; tests/integration/test_watching.py looks at it."""
 
 
-def documents() -> list[str]:
-    folders = (ROOT.glob("*.md"), *(ROOT.glob(f"{name}/**/*.md") for name in ("docs", "config", "examples")))
-    return sorted(str(path.relative_to(ROOT)) for paths in folders for path in paths)
+def commands() -> list[tuple[str, tuple[str, ...]]]:
+    """Return the words of each command in the documents, with its place, without what is behind a pipe."""
+    found = []
+    for block in all_blocks("sh"):
+        text = re.sub(r"\\\n", " ", block.text)
+        for line in re.sub(r"'[^']*'", lambda quoted: quoted[0].replace("\n", " "), text).splitlines():
+            try:
+                words = shlex.split(line, comments=True)
+            except ValueError:
+                continue  # a quotation over several lines: a shell's own
+            while words and (words[0] in WRAPPERS or re.match(r"\w+=", words[0])):
+                words.pop(0)
+            end = next((i for i, word in enumerate(words) if re.fullmatch(r"[|>&;]+", word)), len(words))
+            if words[:end]:
+                found.append((block.place, tuple(words[:end])))
+    return found
 
 
-def blocks(language: str) -> list[str]:
-    """Return the contents of README's fenced blocks of one language."""
-    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+COMMANDS = commands()
+OURS = [(place, words) for place, words in COMMANDS if Path(words[0]).name == PROGRAM]
 
 
-def commands() -> list[str]:
-    """Return the lines of README's sh blocks that run the program, without comments."""
-    lines = [line for block in blocks("sh") for line in block.replace("\\\n", " ").splitlines()]
-    return [shlex.join(words) for line in lines if PROGRAM in (words := shlex.split(line, comments=True))]
+def variables_behind(block: Block) -> list[tuple[str, str]]:
+    """Return the variables that the page says to set for a configuration, in the next block."""
+    variable = re.compile(r"^(RTC3D_GATEWAY__\w+)=(.*)$", re.MULTILINE)
+    there = blocks(block.document)
+    return [pair for each in there[there.index(block) + 1 :][:1] for pair in variable.findall(each.text)]
+
+
+def of(some: list[Block]) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("block", [pytest.param(block, id=block.place) for block in some])
 
 
 def test_there_is_something_to_check() -> None:
     assert {"README.md", "CHANGELOG.md", "CONTRIBUTING.md", "docs/design.md"} <= set(documents())
-    assert {shlex.split(command)[1] for command in commands()} >= {
-        "run",
-        "check",
-        "simulate",
-        "echo",
-        "params",
-    }
-    assert any(block.startswith("sources:") for block in blocks("yaml"))
+    group = typer.main.get_command(app)
+    assert isinstance(group, typer.core.TyperGroup)
+    assert {words[1] for _, words in OURS} == group.commands.keys()
+    assert {block.document for block in all_blocks("yaml")} >= {"README.md", "docs/tutorial.md"}
 
 
 @pytest.mark.parametrize("document", documents())
@@ -56,20 +84,63 @@ def test_relative_links_point_to_files(document: str) -> None:
     assert [link for link in relative if not (path.parent / link).exists()] == []
 
 
-@pytest.mark.parametrize("block", [block for block in blocks("yaml") if block.startswith("sources:")])
-def test_configurations_can_be_loaded(block: str, tmp_path: Path) -> None:
-    file = tmp_path / "gateway.yaml"
-    file.write_text(block)
-    assert config_file.load(file).sources
+@of(all_blocks("yaml"))
+def test_yaml_is_what_a_program_takes(block: Block, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in variables_behind(block):
+        monkeypatch.setenv(name, value)
+    content = yaml.safe_load(block.text)
+    file = tmp_path / "file.yaml"
+    file.write_text(block.text)
+    if content.keys() & {"scene", "faults"}:
+        assert load_scenario(file).faults
+    elif content.keys() <= Settings.model_fields.keys():
+        for other in ROOT.glob("config/*.json5"):
+            shutil.copy(other, tmp_path)
+        assert config_file.load(file).sources
+    else:
+        assert content.keys() <= OTHERS
 
 
-@pytest.mark.parametrize("command", commands())
-def test_commands_have_these_subcommands_and_options(command: str) -> None:
-    name, *arguments = shlex.split(command)[1:]
-    group = typer.main.get_command(app)
-    assert isinstance(group, typer.core.TyperGroup)
-    assert name in group.commands
-    group.commands[name].make_context(name, arguments)  # raises UsageError; runs nothing
+@of(all_blocks("json5"))
+def test_json5_is_zenohs(block: Block) -> None:
+    text = block.text if block.text.lstrip().startswith("{") else f"{{{block.text}}}"
+    assert zenoh.Config.from_json5(text)
+
+
+@pytest.mark.parametrize(("place", "words"), [pytest.param(*each, id=each[0]) for each in OURS])
+def test_commands_have_these_subcommands_and_options(place: str, words: tuple[str, ...]) -> None:
+    command = typer.main.get_command(app)
+    _, *arguments = words
+    while isinstance(command, typer.core.TyperGroup):
+        assert arguments[0] in command.commands, f"{place}: no {arguments[0]}"
+        command, *arguments = command.commands[arguments[0]], *arguments[1:]
+    command.make_context(PROGRAM, arguments)  # raises UsageError; runs nothing
+
+
+def test_files_and_make_targets_that_commands_name_are_there() -> None:
+    targets = set(re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for place, (program, *arguments) in COMMANDS:
+        if program == "make" and "-C" not in arguments:
+            assert {word for word in arguments if "=" not in word} <= targets, place
+        for word in (program, *arguments):
+            if word.startswith(FOLDERS) and "/" in word and "/build/" not in word:
+                assert list(ROOT.glob(word.partition("::")[0])), f"{place}: {word}"
+
+
+def test_python_is_what_a_type_checker_takes(tmp_path: Path) -> None:
+    """Each block is a whole program, with its imports. Those that need a gateway are run by other tests."""
+    files = []
+    for number, block in enumerate(all_blocks("python")):
+        file = tmp_path / f"block_{number}.py"
+        file.write_text(f"# {block.place}\n{block.text}")
+        files.append(str(file))
+    assert len(files) > 5
+    checked = subprocess.run(
+        [sys.executable, "-m", "mypy", "--allow-any-generics", "--allow-untyped-calls",
+         "--disable-error-code=union-attr", *files],
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert checked.returncode == 0, checked.stdout + checked.stderr
 
 
 def test_the_reference_has_the_fingerprint_and_sizes_of_every_type() -> None:
@@ -82,3 +153,22 @@ def test_the_reference_has_the_fingerprint_and_sizes_of_every_type() -> None:
         item_bytes = ITEM_DTYPES[component].itemsize
         assert sizes[message_type.__name__] == (str(MESSAGE_HEADER_BYTES), str(item_bytes))
     assert sizes["tool_pose_t"] == (f"{len(rtc3d.tool_pose_t().encode())} in all", "")
+
+
+def test_every_cause_of_a_drop_is_told_and_no_other() -> None:
+    told = set(re.findall(r"^\| `([a-z ]+)` \| (?:stream|output|LCM) \|", WHAT_IS_LOST, re.MULTILINE))
+    for_others = {"demo.py", "memory_output.py"}
+    sources = [path for path in ROOT.glob("gateway/**/*.py") if path.name not in for_others]
+    text = "\n".join(path.read_text() for path in sources)
+    counted = set(re.findall(r'(?:\bdrops\[|\bcause=|_drop\()"([^"]+)"', text))
+    assert len(counted) > 7
+    assert counted <= told
+    assert {cause for cause in told if f'"{cause}"' not in text} == set()
+
+
+def test_the_design_names_every_module() -> None:
+    layers = (ROOT / "docs/design.md").read_text().partition("\n## Layers\n")[2].partition("\n## ")[0]
+    modules = {path.stem for path in ROOT.glob("gateway/*.py")} | {
+        path.parent.name for path in ROOT.glob("gateway/*/__init__.py")
+    }
+    assert modules - {"__init__", "__main__"} <= set(re.findall(r"`(\w+)`", layers))

@@ -8,7 +8,8 @@ import numpy.typing as npt
 from gateway.config import Source, Stream
 from gateway.message import MESSAGE_HEADER_BYTES
 from gateway.negotiation import Negotiation
-from gateway.rtc3d.components import Component, ComponentType, Frame
+from gateway.rtc3d.components import Component, ComponentType
+from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.session import Handlers, Session
 from gateway.status import StreamStatus

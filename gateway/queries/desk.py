@@ -30,7 +30,8 @@ from gateway.queries.answers import (
 )
 from gateway.queries.known import Known, Sections, known_from
 from gateway.rtc3d.commands import SECTIONS, Command, SendCurrentFrame, SendParameters
-from gateway.rtc3d.components import BY_KEY, Component, ComponentType, byte_order_of, split_frame
+from gateway.rtc3d.components import BY_KEY, Component, ComponentType
+from gateway.rtc3d.frames import byte_order_of, split_frame
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.status import StreamStatus, now_utime
@@ -69,7 +70,7 @@ class _Refusal(NamedTuple):
 class Desk:
     """Answers questions about one source.
 
-    ``newest`` holds the newest message of each component. ``last_c3d`` raises QueryError if there is
+    ``newest`` returns the newest message of each component. ``last_c3d`` raises QueryError if there is
     none. ``record`` starts (True) or stops a recording, and gives False if no connection is there to do
     it. ``changed`` is called with all parameters when a server says something else than before.
     """
@@ -78,7 +79,7 @@ class Desk:
         self,
         source: Source,
         streams: Sequence[StreamAccess],
-        newest: Mapping[ComponentType, bytes],
+        newest: Callable[[], Mapping[ComponentType, bytes]],
         status_message: Callable[[], bytes],
         last_c3d: Callable[[], Coroutine[Any, Any, Answer]],
         record: Callable[[bool], bool],
@@ -237,7 +238,7 @@ class Desk:
         if stream.ask() is None:
             raise QueryError(self.connection_problem(), code="no-connection")
         if stream.status.state is StreamState.STREAMING:
-            message = self._newest.get(kind)
+            message = self._newest().get(kind)
             if message is None or _session_of(message) != session:
                 raise QueryError(
                     f"no {question.name} has come from source {self.source.name!r} in this session",

@@ -17,9 +17,10 @@ import lcm
 import rtc3d
 
 from gateway.config import LcmSettings
-from gateway.errors import QueryError
+from gateway.errors import OutputError, QueryError
 from gateway.log import log_fields
 from gateway.names import lcm_channel
+from gateway.outputs.lcm_output import open_lcm
 from gateway.queries.answers import unknown_section
 from gateway.queries.desk import Desk
 from gateway.rtc3d.commands import SECTIONS
@@ -73,7 +74,9 @@ class LcmQueries:
         self._drops = drops
         self._shared = shared
         self._loop = asyncio.get_running_loop()
+        self._url, self._queries_url = settings.effective_url, settings.effective_queries_url
         self._lcm: lcm.LCM | None = None
+        self._asked: lcm.LCM | None = None  # where requests come and replies go
         self._subscriptions: dict[str, lcm.LCMSubscription] = {}  # by the source's name
         self._thread: threading.Thread | None = None
         self._closing = threading.Event()
@@ -85,20 +88,27 @@ class LcmQueries:
         """Requests by result: ok, or the code of the error."""
 
     def declare(self, connection: lcm.LCM) -> None:
-        """Listen for requests on an open LCM object."""
-        self._lcm = connection
+        """Tell parameters on an open LCM object; listen for requests on ``queries_url``."""
+        self._lcm = self._asked = connection
+        if self._queries_url != self._url:
+            try:
+                self._asked = open_lcm(self._queries_url)
+            except OutputError as error:
+                self._asked = None
+                logger.warning("lcm: nobody can ask: %s, that is lcm.queries_url", error)
+                return
         for source in self._desks:
             self.serve(source)
-        if not self._shared:
+        if self._asked is not connection or not self._shared:
             self._thread = threading.Thread(target=self._handle, name="lcm-requests", daemon=True)
             self._thread.start()
 
     def serve(self, source: str) -> None:
         """Begin to answer for a source whose desk has come."""
-        if self._lcm is None or source in self._subscriptions:
+        if self._asked is None or source in self._subscriptions:
             return
         channel = lcm_channel(self._prefix, source, "PARAMETERS_REQUEST")
-        subscription = self._lcm.subscribe(f"^{channel}$", lambda _channel, data: self._take(source, data))
+        subscription = self._asked.subscribe(f"^{channel}$", lambda _channel, data: self._take(source, data))
         subscription.set_queue_capacity(MAX_PENDING)
         self._subscriptions[source] = subscription
 
@@ -111,9 +121,9 @@ class LcmQueries:
         self._told.pop(source, None)
 
     def _handle(self) -> None:
-        while not self._closing.is_set() and self._lcm is not None:
+        while not self._closing.is_set() and self._asked is not None:
             try:
-                self._lcm.handle_timeout(_POLL_MS)
+                self._asked.handle_timeout(_POLL_MS)
             except OSError as error:
                 logger.debug("handling LCM requests: %s", error)
                 self._closing.wait(_POLL_MS / 1000)
@@ -156,7 +166,7 @@ class LcmQueries:
         else:
             reply.xml, reply.age_s = _text(known.xml), known.age_s
         self.results[reply.error_code or "ok"] += 1
-        self._publish(desk.source.name, "PARAMETERS_REPLY", reply)
+        self._publish(self._asked, desk.source.name, "PARAMETERS_REPLY", reply)
 
     def tell_parameters(self, source: str, xml: bytes) -> None:
         """Publish a source's parameters, now and again every REPEAT_S seconds."""
@@ -178,14 +188,14 @@ class LcmQueries:
 
     def _repeat(self, source: str, told: _Told) -> None:
         told.message.utime = now_utime()
-        self._publish(source, "PARAMETERS", told.message)
+        self._publish(self._lcm, source, "PARAMETERS", told.message)
         told.message.sequence += 1
         told.again_at_s = time.monotonic() + REPEAT_S
 
-    def _publish(self, source: str, name: str, message: Any) -> None:
-        if self._lcm is not None:
+    def _publish(self, connection: lcm.LCM | None, source: str, name: str, message: Any) -> None:
+        if connection is not None:
             try:
-                self._lcm.publish(lcm_channel(self._prefix, source, name), message.encode())
+                connection.publish(lcm_channel(self._prefix, source, name), message.encode())
             except OSError as error:
                 logger.debug("%s: %s not sent on LCM: %s", source, name, error)
 
@@ -197,10 +207,10 @@ class LcmQueries:
         await asyncio.gather(*self._tasks, return_exceptions=True)
         if self._thread is not None:
             await asyncio.to_thread(self._thread.join, _JOIN_S)
-        if self._lcm is not None:
+        if self._asked is not None:
             for subscription in self._subscriptions.values():
-                self._lcm.unsubscribe(subscription)
-            self._lcm = None
+                self._asked.unsubscribe(subscription)
+        self._lcm = self._asked = None
 
 
 def _decoded(data: bytes) -> Any | None:

@@ -32,16 +32,8 @@ from gateway.rtc3d.commands import (
     Version,
     encode_command,
 )
-from gateway.rtc3d.components import (
-    LONG_EVENT,
-    ByteOrder,
-    ComponentType,
-    Frame,
-    build_component,
-    build_frame,
-    byte_order_of,
-    split_frame,
-)
+from gateway.rtc3d.components import LONG_EVENT, ByteOrder, ComponentType, build_component
+from gateway.rtc3d.frames import Frame, KnownLayouts, build_frame, byte_order_of, split_frame
 from gateway.rtc3d.packets import (
     DEFAULT_MAX_C3D_BYTES,
     DEFAULT_MAX_PACKET_BYTES,
@@ -179,6 +171,7 @@ class Connection:
         self._agreed_order: ByteOrder = "big"
         self._owed: deque[Command] = deque(maxlen=_REMEMBERED)
         self._answered: deque[Command] = deque(maxlen=_REMEMBERED)
+        self._layouts = KnownLayouts()
         self.state = State.IDLE
         self.byte_order: ByteOrder | None = None
         """The order in which frames come; None before the first one that has a component."""
@@ -235,15 +228,30 @@ class Connection:
     def receive(self, data: bytes) -> list[Event]:
         """Take bytes from the server and return what they mean, in order. Never raises."""
         events: list[Event] = []
+        reader = self._reader
+        start = 0
+        if not (is_between := reader.is_between_packets):
+            start = min(reader.missing_bytes, len(data))
+            self._take(data[:start], events)
+            is_between = reader.is_between_packets
+        # Most of what comes is frames laid out like those before; what they answer: _answer_with_frame.
+        if is_between and self.state is State.STREAMING and not isinstance(self.under_way, SendCurrentFrame):
+            end = self._layouts.cut(data, start, events)
+            reader.offset += end - start
+            start = end
+        if start < len(data):
+            self._take(data[start:], events)
+        if reader.error is not None and self.state is not State.CLOSED:
+            self.end()
+            events.append(Broken(reader.error))
+        return events
+
+    def _take(self, data: bytes, events: list[Event]) -> None:
         for packet in self._reader.feed(data):
             if packet.type == PacketType.DATA:
                 self._on_frame(packet, events)
             else:
                 self._on_packet(packet, events)
-        if self._reader.error is not None and self.state is not State.CLOSED:
-            self.end()
-            events.append(Broken(self._reader.error))
-        return events
 
     def _move(self, reason: Input) -> None:
         self.state = _TRANSITIONS.get((self.state, reason), self.state)
@@ -266,11 +274,12 @@ class Connection:
         if self.state is not State.STREAMING:
             self._move(Input.FRAME)
         events.append(frame)
+        self._layouts.learn(frame.layout)
 
     def _first_frame(self, body: bytes, events: list[Event]) -> Frame:
         byte_order = byte_order_of(body, self._agreed_order)
         frame = split_frame(body, byte_order)
-        if frame.components or frame.unknown_types:
+        if frame.layout.parts or frame.unknown_types:
             self.byte_order = byte_order
             if byte_order != self._agreed_order:
                 events.append(OtherByteOrder(byte_order))
@@ -282,7 +291,7 @@ class Connection:
                 self._owed.append(self.under_way)  # its acknowledgement
                 self._answer(packet, events)
             case SendCurrentFrame(components=wanted):
-                present = {component.type for component in frame.components}
+                present = {part.type for part in frame.layout.parts}
                 # A streamed frame without what was asked for is not the answer to it.
                 if not wanted or not present or present.intersection(wanted):
                     self._answer(packet, events)

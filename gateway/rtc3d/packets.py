@@ -70,7 +70,8 @@ class PacketReader:
         self._max_packet_bytes = max_packet_bytes
         self._max_c3d_bytes = max_c3d_bytes
         self._partial = bytearray()
-        self._offset = 0  # in the stream, of the first byte in _partial
+        self.offset = 0
+        """Where in the stream the next packet begins; whoever takes packets past the reader counts them."""
         self.error: PacketError | None = None
         """Set once a size field was below 8 or above its limit: the stream has no further packets."""
 
@@ -78,6 +79,21 @@ class PacketReader:
     def buffered_bytes(self) -> int:
         """How many bytes of an unfinished packet are held."""
         return len(self._partial)
+
+    @property
+    def is_between_packets(self) -> bool:
+        """Whether the stream can be read on, and the next byte begins a packet."""
+        return not self._partial and self.error is None
+
+    @property
+    def missing_bytes(self) -> int:
+        """How many bytes complete the unfinished packet, or its header; 0 between two packets."""
+        if not self._partial:
+            return 0
+        if len(self._partial) < HEADER.size:
+            return HEADER.size - len(self._partial)
+        size, _ = HEADER.unpack_from(self._partial)
+        return int(size) - len(self._partial)
 
     def feed(self, data: bytes) -> list[Packet]:
         """Take the next bytes of the stream and return the packets that they complete, in order.
@@ -106,7 +122,7 @@ class PacketReader:
             size, packet_type = HEADER.unpack_from(source, start)
             limit = self._max_c3d_bytes if packet_type == PacketType.C3D else self._max_packet_bytes
             if not HEADER.size <= size <= limit:
-                self.error = _size_error(size, packet_type, self._offset + start, limit)
+                self.error = _size_error(size, packet_type, self.offset + start, limit)
                 start = available
                 break
             end = start + size
@@ -114,7 +130,7 @@ class PacketReader:
                 break
             packets.append(Packet(packet_type, bytes(source[start + HEADER.size : end])))
             start = end
-        self._offset += start
+        self.offset += start
         return packets, start
 
 

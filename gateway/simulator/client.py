@@ -22,7 +22,8 @@ from gateway.rtc3d.commands import (
     Version,
     parse_command,
 )
-from gateway.rtc3d.components import ByteOrder, ComponentType, byte_order_of, split_frame
+from gateway.rtc3d.components import ByteOrder, ComponentType
+from gateway.rtc3d.frames import byte_order_of, split_frame
 from gateway.rtc3d.packets import Packet, PacketType, encode_packet, text_of
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import build_parameters

@@ -7,15 +7,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gateway.rtc3d.components import (
-    SHORT_EVENT,
-    WIRE_ORDER,
-    ByteOrder,
-    ComponentType,
-    Items,
-    build_component,
-    build_frame,
-)
+from gateway.rtc3d.components import SHORT_EVENT, WIRE_ORDER, ByteOrder, ComponentType, Items, build_component
+from gateway.rtc3d.frames import build_frame
 from gateway.rtc3d.packets import PacketType, encode_packet
 from gateway.simulator.scene import NO_EVENTS, Scene
 

@@ -22,8 +22,8 @@ with atheris.instrument_imports(include=["gateway"]):
     from gateway.errors import CommandError, ConfigError, FrameError, ParametersError, ProtocolError
     from gateway.message import Stamp, splice
     from gateway.rtc3d.commands import SendParameters, StreamFrames, Version, parse_command
-    from gateway.rtc3d.components import byte_order_of, split_frame
     from gateway.rtc3d.connection import Connection, State
+    from gateway.rtc3d.frames import byte_order_of, split_frame
     from gateway.rtc3d.packets import PacketReader
     from gateway.rtc3d.parameters_xml import build_parameters, parse_parameters
 

@@ -59,7 +59,7 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
           config: {{listen: {{endpoints: ["{endpoint}"]}}, scouting: {{multicast: {{enabled: false}}}}}}
         """
     )
-    simulate = [*PROGRAM, "simulate", "--port", str(port), "--markers", "3", "--rate", "100"]
+    simulate = [*PROGRAM, "simulate", "--port", str(port), "--markers", "20", "--rate", "100"]
     gateway = [*PROGRAM, "run", "--config", str(config), "--log-level", "debug"]
     with running(*simulate, ready="RTC3D server on"), running(*gateway, ready="zenoh: the session is open"):
         yield endpoint
@@ -74,7 +74,7 @@ def printed_positions(text: str) -> list[tuple[int, list[float]]]:
 
 
 def assert_of_the_scene(text: str, at_least: int) -> None:
-    scene = SyntheticScene(markers=3, tools=4, analog=16, plates=2, rate_hz=100, analog_rate_hz=2000)
+    scene = SyntheticScene(markers=20, tools=4, analog=16, plates=2, rate_hz=100, analog_rate_hz=2000)
     printed = printed_positions(text)
     assert len(printed) >= at_least
     for number, position in printed:

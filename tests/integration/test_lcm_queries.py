@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import pytest
 import rtc3d
 
+from gateway.config import lcm_queries_url
 from gateway.daemon import Gateway
 from gateway.decode import decode
 from gateway.listening import LcmListener
@@ -28,11 +29,14 @@ REQUEST, REPLY = "MOCAP_LAB_PARAMETERS_REQUEST", "MOCAP_LAB_PARAMETERS_REPLY"
 class Peer:
     """A program on LCM that asks, and hears all replies and statuses."""
 
-    def __init__(self, url: str) -> None:
-        self._lcm = open_lcm(url)
+    def __init__(self, url: str, queries_url: str | None = None) -> None:
+        self._lcm = open_lcm(queries_url or lcm_queries_url(url))
         self.replies: list[rtc3d.parameters_reply_t] = []
         self.statuses: list[rtc3d.status_t] = []
-        self._listener = LcmListener(self._lcm, f"{REPLY}|MOCAP_LAB_STATUS", self._take)
+        self._listeners = [
+            LcmListener(self._lcm, REPLY, self._take),
+            LcmListener(open_lcm(url), "MOCAP_LAB_STATUS", self._take),
+        ]
 
     def _take(self, channel: str, data: bytes) -> None:
         heard: list[Any] = self.replies if channel == REPLY else self.statuses
@@ -59,7 +63,8 @@ class Peer:
         return sum(count.count for count in output.drops if count.name == cause)
 
     def close(self) -> None:
-        self._listener.close()
+        for listener in self._listeners:
+            listener.close()
 
 
 def request(
@@ -102,6 +107,41 @@ async def test_a_reply_has_the_requests_id_and_requester_the_xml_and_its_age() -
         assert reply.xml.encode() == server.xml
         assert 0 <= reply.age_s < 60
         assert (reply.error, reply.error_code) == ("", "")
+
+
+async def test_requests_may_come_on_a_url_of_their_own() -> None:
+    data_url, queries_url = lcm_url(), lcm_url()
+    server = LabServer()
+    async with (
+        ScriptedServer(server.script) as listening,
+        gateway_at(listening.port, lcm_url=data_url, queries_url=queries_url) as gateway,
+    ):
+        await is_filled(gateway, server)
+        elsewhere, peer = Peer(data_url, data_url), Peer(data_url, queries_url)
+        try:
+            elsewhere.send(request(1))  # nobody is there
+            assert (await peer.ask(2)).xml.encode() == server.xml
+            assert not peer.answers(1)
+            assert not elsewhere.replies
+        finally:
+            elsewhere.close()
+            peer.close()
+
+
+async def test_a_url_for_requests_that_does_not_open_stops_nothing_else(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    data_url, nobody = lcm_url(), f"tcpq://127.0.0.1:{free_port()}"
+    async with (
+        ScriptedServer(LabServer().script) as listening,
+        gateway_at(listening.port, lcm_url=data_url, queries_url=nobody),
+    ):
+        viewer = Peer(data_url)
+        try:
+            await wait_until_async(lambda: viewer.statuses)
+        finally:
+            viewer.close()
+    assert f"lcm: nobody can ask: LCM does not open {nobody}" in caplog.text
 
 
 @pytest.mark.parametrize("section", SECTIONS)

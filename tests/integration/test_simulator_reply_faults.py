@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from gateway.errors import FrameError
-from gateway.rtc3d.components import split_frame
+from gateway.rtc3d.frames import split_frame
 from gateway.simulator.faults.base import Fault
 from gateway.simulator.faults.frames import (
     ConstantFrameNumbers,

@@ -30,6 +30,7 @@ from tests.waiting import wait_until_async
 
 ROOT = Path(__file__).parents[2]
 OPERATIONS = (ROOT / "docs/operations.md").read_text()
+REFERENCE = (ROOT / "docs/reference/metrics.md").read_text()
 DASHBOARD: dict[str, Any] = json.loads((ROOT / "config/grafana/rtc3d-gateway.json").read_text())
 STREAMS = (
     Stream(components=(ComponentType.MARKERS, ComponentType.TOOLS)),
@@ -177,11 +178,22 @@ def test_every_metric_has_samples(families: dict[str, Metric]) -> None:
     assert [family.name for family in families.values() if not family.samples] == []
 
 
-def test_the_documents_table_is_the_truth(families: dict[str, Metric]) -> None:
-    rows = re.findall(r"^\| `((?:rtc3d|process)_\w+)` \| (\w+) \| ([\w, ]*?) ?\| ", OPERATIONS, re.MULTILINE)
-    told = {(name, kind, frozenset(filter(None, labels.split(", ")))) for name, kind, labels in rows}
+def unit(name: str) -> str:
+    """Return the unit that a metric's name tells."""
+    last = name.removesuffix("_total").rpartition("_")[2]
+    return {"seconds": "s", "bytes": "bytes", "ratio": "1"}.get(last, "")
+
+
+def test_the_references_table_is_the_truth(families: dict[str, Metric]) -> None:
+    rows = re.findall(
+        r"^\| `((?:rtc3d|process)_\w+)` \| (\w+) \| ([\w, ]*?) ?\| (\w*) ?\| ", REFERENCE, re.MULTILINE
+    )
+    told = {
+        (name, kind, frozenset(filter(None, labels.split(", "))), told_unit)
+        for name, kind, labels, told_unit in rows
+    }
     scraped = {
-        (sample.name, family.type, frozenset(sample.labels))
+        (sample.name, family.type, frozenset(sample.labels), unit(sample.name))
         for family in families.values()
         for sample in family.samples
     }

@@ -13,13 +13,11 @@ from gateway.rtc3d.components import (
     SHORT_EVENT,
     Component,
     ComponentType,
-    Frame,
     big_endian_content,
     build_component,
-    build_frame,
-    byte_order_of,
-    split_frame,
 )
+from gateway.rtc3d.frames import Frame, build_frame, byte_order_of, split_frame
+from tests.servers import packet
 from tests.strategies import damaged
 from tests.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME, ByteOrder
 
@@ -245,3 +243,27 @@ def test_any_bytes_have_a_byte_order_in_which_they_make_sense_or_give_a_frame_er
     else:
         assert makes_sense[found]
         assert found == expected or not makes_sense[expected]
+
+
+# Layouts -------------------------------------------------------------------------------------
+
+
+@settings(max_examples=300)
+@given(any_bodies, st.data(), orders)
+def test_a_layout_recognises_what_is_split_alike_and_nothing_else(
+    body: bytes, data: st.DataObject, order: ByteOrder
+) -> None:
+    split = split_or_none(body, order)
+    if split is None:
+        return
+    # Mostly a changed byte or two: in what may differ, or in what may not.
+    other = bytearray(body)
+    for _ in range(data.draw(st.integers(0, 2))):
+        other[data.draw(st.integers(0, len(other) - 1))] = data.draw(st.integers(0, 255))
+    found = split.layout.cut(packet(3, bytes(other)), 0)
+    expected = split_or_none(bytes(other), order)
+    if expected is None or expected.layout is not split.layout:
+        assert found is None
+    else:
+        assert found is not None
+        assert found.components == expected.components

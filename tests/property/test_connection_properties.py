@@ -14,10 +14,11 @@ from gateway.rtc3d.commands import (
     StreamFrames,
     Version,
 )
-from gateway.rtc3d.connection import Answered, Connection, Refused
-from tests.servers import packet
+from gateway.rtc3d.connection import Answered, Connection, FrameRejected, Refused, State
+from gateway.rtc3d.frames import Frame, split_frame
+from tests.servers import ok, packet
 from tests.strategies import damaged, pieces_of
-from tests.vectors import FULL_FRAME
+from tests.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME
 
 FRAME = packet(3, FULL_FRAME["big"])
 COMMANDS: list[Command] = [
@@ -61,6 +62,34 @@ def test_splits_do_not_change_the_events(data: st.DataObject) -> None:
     expected = whole.receive(stream)
     got = [event for piece in data.draw(pieces_of(stream)) for event in cut.receive(piece)]
     assert [type(event) for event in got] == [type(event) for event in expected]
+
+
+OTHER_FRAME = packet(3, FRAME_WITH_UNKNOWN["big"])
+CONTRADICTION = packet(3, FULL_FRAME["big"] + b"\0")
+streamed_packets = st.lists(
+    st.sampled_from([FRAME, FRAME, OTHER_FRAME, CONTRADICTION, packet(4), packet(9, b"?"), ok("OK")]),
+    max_size=30,
+)
+
+
+@given(streamed_packets, st.data())
+def test_frames_are_the_same_whether_recognised_by_their_layout_or_not(
+    packets: list[bytes], data: st.DataObject
+) -> None:
+    connection = Connection()
+    connection.send(StreamFrames())
+    connection.receive(FRAME + OTHER_FRAME)
+    events = [
+        event for piece in data.draw(pieces_of(b"".join(packets))) for event in connection.receive(piece)
+    ]
+    frames = [event for event in events if isinstance(event, Frame)]
+    expected = [split_frame(sent[8:], "big") for sent in packets if sent in (FRAME, OTHER_FRAME)]
+    assert [frame.components for frame in frames] == [frame.components for frame in expected]
+    rejected = [event for event in events if isinstance(event, FrameRejected)]
+    assert len(rejected) == packets.count(CONTRADICTION)
+    states = {FRAME: State.STREAMING, OTHER_FRAME: State.STREAMING, packet(4): State.NO_MEASUREMENT}
+    changes = [states[sent] for sent in packets if sent in states]
+    assert connection.state is (changes[-1] if changes else State.STREAMING)
 
 
 @given(st.data())

@@ -6,7 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.message import MESSAGE_TYPES, Stamp, message_items, splice, tool_poses
-from gateway.rtc3d.components import Component, ComponentType, split_frame
+from gateway.rtc3d.components import Component, ComponentType
+from gateway.rtc3d.frames import split_frame
 from tests.vectors import ByteOrder
 
 ORDERS: tuple[ByteOrder, ...] = ("big", "little")

@@ -12,6 +12,7 @@ from gateway.config import (
     Source,
     Stream,
     ZenohSettings,
+    lcm_queries_url,
 )
 from gateway.config_section import shown
 from gateway.config_values import ChannelPrefix, SourceName
@@ -120,6 +121,21 @@ def test_no_lcm_url_is_that_of_the_environment_else_this_host(monkeypatch: pytes
     assert LcmSettings(url="memq://").effective_url == "memq://"
 
 
+@pytest.mark.parametrize(
+    ("url", "queries_url"),
+    [
+        ("udpm://239.255.76.67:7667?ttl=1", "udpm://239.255.76.67:7668?ttl=1"),
+        ("udpm://239.1.2.3:65535", "udpm://239.1.2.3:65534"),
+        ("udpm://?ttl=1&recv_buf_size=2000000", "udpm://239.255.76.67:7668?ttl=1&recv_buf_size=2000000"),
+        *((url, url) for url in ("mpudpm://", "memq://", "tcpq://lab:7700", "udpm://239.1.2.3:lcm")),
+    ],
+)
+def test_requests_go_to_the_next_port_where_whoever_listens_gets_all(url: str, queries_url: str) -> None:
+    assert lcm_queries_url(url) == queries_url
+    assert LcmSettings.model_construct(url=url).effective_queries_url == queries_url
+    assert LcmSettings(url="memq://", queries_url="tcpq://lab:1").effective_queries_url == "tcpq://lab:1"
+
+
 def test_one_side_must_be_on() -> None:
     off = {"enabled": False}
     assert mistakes(Settings, {"sources": [source()], "zenoh": off, "lcm": off}) == [
@@ -137,7 +153,7 @@ def test_every_mistake_is_told_at_once() -> None:
         "max_packet_bytes, max_c3d_bytes, "
         "query_timeout_s, fresh_interval_s, remote_control",
         "sources.1.host": "missing; this key has no default",
-        "lcm": "found nothing; accepted is a mapping with any of the keys enabled, prefix, url, "
+        "lcm": "found nothing; accepted is a mapping with any of the keys enabled, prefix, url, queries_url, "
         "max_rate_hz, tool_poses",
         "zenho": "unknown key (did you mean 'zenoh'?); known: sources, spool, zenoh, lcm, metrics",
     }

@@ -219,7 +219,7 @@ sources:
 """
     assert refused(file, text) == [
         "lab.yaml:1:7: lcm.enable: unknown key (did you mean 'enabled'?); "
-        "known: enabled, prefix, url, max_rate_hz, tool_poses",
+        "known: enabled, prefix, url, queries_url, max_rate_hz, tool_poses",
         "lab.yaml:2:17: zenoh.prefix: found '/mocap'; accepted is a Zenoh key of at most 128 characters, "
         "such as mocap or site/mocap, without space, * $ # ? and without / at an end or doubled",
         "lab.yaml:4:5: sources[0].name: missing; this key has no default",

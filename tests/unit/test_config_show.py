@@ -78,7 +78,9 @@ def test_what_is_shown_is_a_configuration_of_the_same_effect(file: Path) -> None
     again.write_text(shown_configuration(configuration), encoding="utf-8")
     directory = configuration.settings.spool.effective_directory
     spool = configuration.settings.spool.model_copy(update={"directory": str(directory)})
-    assert load(again, {}) == configuration.settings.model_copy(update={"spool": spool})
+    before = configuration.settings.lcm
+    lcm = before.model_copy(update={"queries_url": before.effective_queries_url})
+    assert load(again, {}) == configuration.settings.model_copy(update={"spool": spool, "lcm": lcm})
 
 
 def test_odd_keys_and_values_stay_what_they_are(file: Path) -> None:

@@ -8,7 +8,8 @@ import rtc3d
 from gateway.decode import MESSAGE_TYPES_BY_NAME, decode, one_line, to_json
 from gateway.errors import ProtocolError
 from gateway.message import Stamp, splice, tool_poses
-from gateway.rtc3d.components import Component, split_frame
+from gateway.rtc3d.components import Component
+from gateway.rtc3d.frames import split_frame
 from gateway.status import OutputHealth, OutputStatus, StreamStatus, clock_message, status_message
 from gateway.stream_state import StreamState
 from tests.vectors import ANALOG, COMPONENTS, FORCE, LONG_EVENTS, MARKERS, TOOLS, ComponentVector

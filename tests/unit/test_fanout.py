@@ -4,27 +4,21 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from gateway import fanout
+from gateway import ways
 from gateway.decode import decode
 from gateway.errors import OutputError
 from gateway.fanout import FanOut
 from gateway.message import Stamp, splice
 from gateway.names import Topic
 from gateway.outputs.memory_output import MemoryOutput
-from gateway.rtc3d.components import (
-    ITEM_DTYPES,
-    WIRE_ORDER,
-    ComponentType,
-    Frame,
-    build_component,
-    build_frame,
-    split_frame,
-)
+from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, ComponentType, build_component
+from gateway.rtc3d.frames import Frame, build_frame, split_frame
 from tests.toy_output import ToyOutput
 from tests.vectors import EMPTY_FRAME, FULL_FRAME
 
 STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1)
 ALL = frozenset(WIRE_ORDER)
+MARKERS = frozenset({ComponentType.MARKERS})
 FULL = split_frame(FULL_FRAME["big"], "big")
 
 
@@ -68,7 +62,7 @@ def test_the_source_is_announced_on_every_output() -> None:
 def test_each_component_counts_for_itself_and_across_sessions(memory: MemoryOutput) -> None:
     fan_out = FanOut("lab", [memory])
     fan_out.publish(FULL, STAMP, ALL)
-    fan_out.publish(FULL, STAMP, {ComponentType.MARKERS})
+    fan_out.publish(FULL, STAMP, MARKERS)
     fan_out.publish(FULL, STAMP._replace(session=2), ALL)
     messages = [(topic.parts, decode(message)) for topic, message in memory.messages]
     counted = {
@@ -79,7 +73,7 @@ def test_each_component_counts_for_itself_and_across_sessions(memory: MemoryOutp
 
 
 def test_components_that_the_stream_does_not_want_are_not_published(memory: MemoryOutput) -> None:
-    FanOut("lab", [memory]).publish(FULL, STAMP, {ComponentType.TOOLS, ComponentType.EVENT})
+    FanOut("lab", [memory]).publish(FULL, STAMP, frozenset({ComponentType.TOOLS, ComponentType.EVENT}))
     assert [topic.parts for topic, _ in memory.messages] == [("6d",), ("event",)]
 
 
@@ -91,7 +85,7 @@ def test_an_empty_frame_publishes_nothing(memory: MemoryOutput) -> None:
 def test_the_newest_message_of_each_component_is_kept(memory: MemoryOutput) -> None:
     fan_out = FanOut("lab", [memory])
     fan_out.publish(FULL, STAMP, ALL)
-    fan_out.publish(FULL, STAMP, {ComponentType.MARKERS})
+    fan_out.publish(FULL, STAMP, MARKERS)
     newest = {kind.key: decode(message).sequence for kind, message in fan_out.newest.items()}
     assert newest == {"3d": 1, "6d": 0, "analog": 0, "force": 0, "event": 0}
 
@@ -110,7 +104,7 @@ def test_status_and_clock_messages_have_topics_of_their_own(memory: MemoryOutput
 def test_frames_messages_and_bytes_are_counted_by_component(memory: MemoryOutput) -> None:
     fan_out = FanOut("lab", [memory])
     fan_out.publish(FULL, STAMP, ALL)
-    fan_out.publish(FULL, STAMP, {ComponentType.MARKERS})
+    fan_out.publish(FULL, STAMP, MARKERS)
     assert fan_out.frames == dict.fromkeys(WIRE_ORDER, 1) | {ComponentType.MARKERS: 2}
     [(_, status)] = fan_out.outputs
     sizes: Counter[str] = Counter()
@@ -147,20 +141,20 @@ def test_a_message_refused_still_counts_so_that_the_gap_shows() -> None:
     output = ToyOutput()
     fan_out = FanOut("lab", [output])
     for output.error in (None, OutputError("no router", cause="no router"), None):
-        fan_out.publish(FULL, STAMP, {ComponentType.MARKERS})
+        fan_out.publish(FULL, STAMP, MARKERS)
     assert [decode(message).sequence for _, message in output.messages] == [0, 2]
 
 
 def test_a_failing_output_is_told_once_loudly_then_quietly_and_when_it_is_over(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(fanout, "HOLD_S", 0.0)
-    caplog.set_level(logging.DEBUG, "gateway.fanout")
+    monkeypatch.setattr(ways, "HOLD_S", 0.0)
+    caplog.set_level(logging.DEBUG, "gateway.ways")
     output = ToyOutput()
     fan_out = FanOut("lab", [output])
     lost = OutputError("no Zenoh router is connected: start zenohd", cause="no router")
     for output.error in (None, lost, lost, lost, None, None):
-        fan_out.publish(FULL, STAMP, {ComponentType.MARKERS})
+        fan_out.publish(FULL, STAMP, MARKERS)
     warning, *repeats, recovery = caplog.records
     assert (warning.levelno, warning.getMessage()) == (logging.WARNING, f"lab to toy: {lost}")
     assert [record.levelno for record in repeats] == [logging.DEBUG, logging.DEBUG]
@@ -172,7 +166,7 @@ def test_messages_that_fail_by_turns_are_one_failure(caplog: pytest.LogCaptureFi
     output = ToyOutput()
     fan_out = FanOut("lab", [output])
     for output.error in [OutputError("too large", cause="send failed"), None] * 5:
-        fan_out.publish(FULL, STAMP, {ComponentType.MARKERS})
+        fan_out.publish(FULL, STAMP, MARKERS)
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     assert fan_out.outputs[0][1].messages == {"3d": 5}
 
@@ -197,7 +191,7 @@ def test_events_are_never_left_out_whatever_the_limit() -> None:
     output.max_rate_hz = {ComponentType.EVENT: 0.001}
     fan_out = FanOut("lab", [output])
     for _ in range(3):
-        fan_out.publish(FULL, STAMP, {ComponentType.EVENT})
+        fan_out.publish(FULL, STAMP, frozenset({ComponentType.EVENT}))
     assert [decode(message).sequence for _, message in output.messages] == [0, 1, 2]
 
 

@@ -3,7 +3,8 @@
 from gateway.decode import decode
 from gateway.fanout import FanOut
 from gateway.message import Stamp
-from gateway.rtc3d.components import WIRE_ORDER, split_frame
+from gateway.rtc3d.components import WIRE_ORDER
+from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool
 from tests.toy_output import ToyOutput
 from tests.vectors import FULL_FRAME

@@ -8,7 +8,8 @@ import pytest
 from gateway.fanout import FanOut
 from gateway.message import Stamp
 from gateway.names import Topic
-from gateway.rtc3d.components import WIRE_ORDER, Frame, split_frame
+from gateway.rtc3d.components import WIRE_ORDER
+from gateway.rtc3d.frames import Frame, split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters3D, Parameters6D, Tool
 from tests.toy_output import ToyOutput
 

@@ -6,15 +6,8 @@ import pytest
 from gateway.config import Source, Stream
 from gateway.intake import Intake
 from gateway.message import Stamp
-from gateway.rtc3d.components import (
-    ITEM_DTYPES,
-    LONG_EVENT,
-    ComponentType,
-    Frame,
-    build_component,
-    build_frame,
-    split_frame,
-)
+from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, build_component
+from gateway.rtc3d.frames import Frame, build_frame, split_frame
 from gateway.status import StreamStatus
 
 BOOT_UTIME = 1_700_000_000_000_000
@@ -104,6 +97,6 @@ async def test_a_restart_is_told_and_is_no_lateness(lab: Lab) -> None:
 
 async def test_frames_without_components_are_counted_and_no_more(lab: Lab) -> None:
     before = lab.status.frames_in
-    lab.intake.take([Frame((), ())], BOOT_UTIME)
+    lab.intake.take([split_frame(build_frame([]), "big")], BOOT_UTIME)
     assert lab.status.frames_in == before + 1
     assert not lab.published

@@ -17,7 +17,8 @@ from gateway.message import (
     tool_poses,
     type_name,
 )
-from gateway.rtc3d.components import ITEM_DTYPES, Component, ComponentType, split_frame
+from gateway.rtc3d.components import ITEM_DTYPES, Component, ComponentType
+from gateway.rtc3d.frames import split_frame
 from tests.vectors import (
     ALL_ONES,
     ANALOG,

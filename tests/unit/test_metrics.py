@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
@@ -11,8 +12,10 @@ from gateway import __version__
 from gateway.config import MetricsSettings, Settings, Source, Stream
 from gateway.daemon import Gateway
 from gateway.loop_delay import LoopDelay
+from gateway.message import Stamp
 from gateway.metrics import metrics_page, metrics_registry
-from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.components import ComponentType, build_component
+from gateway.rtc3d.frames import build_frame, split_frame
 from gateway.stream_state import StreamInput, StreamState
 from tests.toy_output import ToyOutput
 
@@ -131,7 +134,10 @@ async def test_messages_and_bytes_are_told_by_component_and_output(lab: Lab) -> 
 
 
 async def test_frames_are_told_by_the_components_that_are_configured(lab: Lab) -> None:
-    lab.source.fan_out.frames[ComponentType.ANALOG] = 12
+    analog = build_component(ComponentType.ANALOG, 1, 1, np.zeros(3, ">f4"))
+    frame = split_frame(build_frame([analog]), "big")
+    for _ in range(12):
+        lab.source.fan_out.publish(frame, Stamp(2, 1, 1), frozenset({ComponentType.ANALOG}))
     told = {labels["component"]: value for labels, value in lab.samples("component_frames_total")}
     assert told == {"3d": 0, "6d": 0, "analog": 12}
 

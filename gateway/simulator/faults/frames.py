@@ -20,10 +20,8 @@ from gateway.rtc3d.components import (
     ComponentType,
     Items,
     build_component,
-    build_frame,
-    byte_order_of,
-    split_frame,
 )
+from gateway.rtc3d.frames import build_frame, byte_order_of, split_frame
 from gateway.rtc3d.packets import HEADER, PacketType, encode_packet
 from gateway.simulator.faults.base import Chunk, LineFault, Run, type_of
 

@@ -75,7 +75,7 @@ class Rig:
                     lambda: self.server.ask if self.server.connected else None,
                 )
             ],
-            self.newest,
+            lambda: self.newest,
             lambda: b"",
             self._last_c3d,
             self._record,

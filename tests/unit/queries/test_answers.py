@@ -21,7 +21,8 @@ from gateway.queries.answers import (
     schema_answer,
 )
 from gateway.rtc3d.commands import SECTIONS
-from gateway.rtc3d.components import WIRE_ORDER, ComponentType, split_frame
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import General, Parameters, ParametersForce, Plate, Point
 from tests.vectors import FULL_FRAME
 

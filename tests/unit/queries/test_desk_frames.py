@@ -7,7 +7,8 @@ import pytest
 
 from gateway.errors import QueryError, ServerError
 from gateway.message import Stamp, splice
-from gateway.rtc3d.components import ComponentType, split_frame
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.stream_state import StreamState
 from tests.servers import markers_frame

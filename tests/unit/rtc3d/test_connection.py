@@ -17,7 +17,7 @@ from gateway.rtc3d.commands import (
     StreamFrames,
     Version,
 )
-from gateway.rtc3d.components import ComponentType, Frame
+from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.connection import (
     Answered,
     Broken,
@@ -30,6 +30,7 @@ from gateway.rtc3d.connection import (
     State,
     Stray,
 )
+from gateway.rtc3d.frames import Frame
 from tests.servers import error, ok, packet
 from tests.vectors import EMPTY_FRAME, FULL_FRAME, START_RECORDING, STOP_RECORDING
 
@@ -389,3 +390,24 @@ def test_a_size_out_of_bounds_ends_the_connection_after_what_came_before() -> No
     assert "1213486160" in str(events[-1].error)  # "HTTP"
     assert connection.state is State.CLOSED
     assert connection.receive(FRAME) == []
+
+
+# Frames recognised by their layout -------------------------------------------------------------
+
+
+def test_a_known_frame_after_no_data_is_streaming_again() -> None:
+    connection = after(STREAM)
+    connection.receive(FRAME + NO_DATA)
+    states = [connection.state]
+    [frame] = connection.receive(FRAME)
+    assert isinstance(frame, Frame)
+    assert [*states, connection.state] == [State.NO_MEASUREMENT, State.STREAMING]
+
+
+def test_a_broken_stream_is_told_by_its_place_after_known_frames() -> None:
+    connection = after(STREAM)
+    connection.receive(FRAME)
+    *frames, broken = connection.receive(FRAME + FRAME + bytes(8))
+    assert [type(event) for event in frames] == [Frame, Frame]
+    assert isinstance(broken, Broken)
+    assert broken.error.offset == 3 * len(FRAME)

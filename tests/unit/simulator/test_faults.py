@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.errors import ConfigError, FrameError
-from gateway.rtc3d.components import split_frame
+from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet
 from gateway.simulator.faults.base import Chunk, Fault, LineFault, Run
 from gateway.simulator.faults.frames import (

@@ -5,7 +5,8 @@ import re
 import pytest
 
 from gateway.errors import FrameError
-from gateway.rtc3d.components import ComponentType, byte_order_of, split_frame
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import byte_order_of, split_frame
 from tests.vectors import (
     ANALOG,
     COMPONENTS,

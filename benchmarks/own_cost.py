@@ -1,0 +1,228 @@
+"""Part 1: CPU time per five-component frame, from the bytes of the socket to messages ready for the outputs.
+
+Beside it what lcm-gen's own decoding and encoding of the same five messages costs. pyperf measures each in
+processes of its own, which take turns; one of them by hand: python -m benchmarks.own_cost frame_per_read
+"""
+
+import asyncio
+import functools
+import statistics
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, Final
+
+from benchmarks.comparing import Pair, table_cell
+from benchmarks.processes import run_measured
+from benchmarks.report import Goal, Progress, Table
+from benchmarks.workloads import DENSE, Frames
+from gateway.config import MetricsSettings, Settings, Source
+from gateway.daemon import Gateway
+from gateway.decode import decode
+from gateway.names import Topic
+from gateway.outputs.memory_output import MemoryOutput
+from gateway.session import Session
+from gateway.simulator.server import Simulator
+from gateway.stream_state import StreamState
+from tests.waiting import wait_until_async
+
+TITLE: Final = "Own cost of one frame of five components, from TCP's bytes to messages"
+GATEWAY: Final = "frame_per_read"
+BATCH: Final = "frames_in_one_read"
+LCM_GEN: Final = "lcm_gen"
+GOAL_US: Final = 5.0
+GOAL_TIMES: Final = 50.0
+_BATCH_FRAMES: Final = 64
+_BLOCK_FRAMES: Final = 64 * 16
+_LOOPS: Final = {GATEWAY: _BLOCK_FRAMES * 16, BATCH: _BLOCK_FRAMES * 16, LCM_GEN: 1000}
+
+
+class _Kept:
+    """A publisher that keeps the newest message, and no more."""
+
+    wanted = True
+    message = b""
+
+    def publish(self, message: bytes) -> None:
+        self.message = message
+
+    def close(self) -> None:
+        pass
+
+
+class _KeepingOutput(MemoryOutput):
+    """An output that costs as little as one can; all else is the gateway's own."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.kept: dict[tuple[str, ...], _Kept] = {}
+
+    def publisher(self, topic: Topic) -> Any:
+        return self.kept.setdefault(topic.parts, _Kept())
+
+
+class _Fed:
+    """A running gateway, connected to a server that is silent; its session is fed by hand."""
+
+    def __init__(self) -> None:
+        self._loop = asyncio.new_event_loop()
+        self._output = _KeepingOutput()
+        self._frames = Frames(DENSE.packet(), _BLOCK_FRAMES)
+        self._number = 1
+        self._session = self._loop.run_until_complete(self._connect())
+
+    async def _connect(self) -> Session:
+        self._server = Simulator(DENSE.scene())
+        await self._server.start()
+        self._server.stop_measurement()
+        source = Source(name="lab", host="127.0.0.1", port=self._server.port, max_lag_ms=60_000.0)
+        self._stop = asyncio.Event()
+        gateway = Gateway(Settings(sources=(source,), metrics=MetricsSettings(enabled=False)), [self._output])
+        self._running = self._loop.create_task(gateway.run(self._stop))
+        [serving] = gateway.sources
+        await wait_until_async(lambda: serving.statuses[0].state is StreamState.NO_MEASUREMENT)
+        session = serving.supervisors[0].session
+        assert session is not None  # noqa: S101 - it has just told of its state
+        return session
+
+    def run(self, loops: int, per_read: int) -> float:
+        """Feed ``loops`` frames, so many in each read; return how long it took, s."""
+        return self._loop.run_until_complete(self._feed(loops, per_read))
+
+    async def _feed(self, loops: int, per_read: int) -> float:
+        size = self._frames.packet_bytes
+        feed = _feeder(self._session)
+        took_s = 0.0
+        for first in range(0, loops, _BLOCK_FRAMES):
+            self._frames.stamp(self._number, time.monotonic_ns() // 1000)
+            self._number += _BLOCK_FRAMES
+            data = bytes(self._frames.data[: min(_BLOCK_FRAMES, loops - first) * size])
+            reads = [data[at : at + per_read * size] for at in range(0, len(data), per_read * size)]
+            began_s = time.process_time()
+            for read in reads:
+                feed(read)
+            took_s += time.process_time() - began_s
+        return took_s
+
+    def messages(self) -> list[bytes]:
+        """Return the newest message of every component."""
+        self.run(1, 1)
+        return [
+            kept.message for parts, kept in self._output.kept.items() if parts[0] not in {"status", "clock"}
+        ]
+
+    def close(self) -> None:
+        """Stop all of it."""
+        self._stop.set()
+        self._loop.run_until_complete(self._running)
+        self._loop.run_until_complete(self._server.close())
+
+
+def _feeder(session: Any) -> Any:
+    """Return what asyncio does with bytes that a socket gave, for either kind of its protocols."""
+    if not isinstance(session, asyncio.BufferedProtocol):
+        return session.data_received
+
+    def feed(data: bytes) -> None:
+        while data:
+            buffer = memoryview(session.get_buffer(-1))
+            count = min(len(buffer), len(data))
+            buffer[:count] = data[:count]
+            session.buffer_updated(count)
+            data = data[count:]
+
+    return feed
+
+
+def expected_s(quick: bool) -> float:
+    """Return about how long it takes."""
+    return 15 if quick else 80
+
+
+def measure(quick: bool, progress: Progress) -> dict[str, Any]:
+    """Return the CPU time per frame of each, µs."""
+    import pyperf  # noqa: PLC0415 - the tests of the benchmarks do without
+
+    values: dict[str, list[float]] = {GATEWAY: [], BATCH: [], LCM_GEN: []}
+    rounds = 2 if quick else 7
+    sizes = ["--processes=1", "--warmups=1", "--values=2" if quick else "--values=5"]
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(rounds):
+            progress.step(f"round {number + 1} of {rounds}", number / rounds)
+            for name, each in values.items():
+                file = Path(folder) / f"{name}-{number}.json"
+                command = [sys.executable, "-m", "benchmarks.own_cost", name, "--output", str(file)]
+                run_measured([*command, *sizes, f"--loops={_LOOPS[name]}"])
+                each.append(1e6 * pyperf.Benchmark.load(str(file)).median())
+    return {"cpu_us_per_frame": {name: [float(f"{x:.4g}") for x in each] for name, each in values.items()}}
+
+
+def tables(result: dict[str, Any]) -> list[Table]:
+    """Return what is shown of the figures."""
+    values = result["cpu_us_per_frame"]
+    rows = []
+    for text, name in (
+        ("gateway, a frame in each read", GATEWAY),
+        (f"gateway, {_BATCH_FRAMES} frames in each read", BATCH),
+        ("lcm-gen: decode and encode the same five messages", LCM_GEN),
+    ):
+        ratio = "" if name == LCM_GEN else table_cell(_against_lcm_gen(values, name))
+        rows.append([text, f"{statistics.median(values[name]):.2f}", ratio])
+    return [Table(TITLE, ["what", "CPU µs per frame", "lcm-gen's cost is so many times it"], rows)]
+
+
+def goals(result: dict[str, Any]) -> list[Goal]:
+    """Return the cost, and how much less it is than lcm-gen's."""
+    pair = _against_lcm_gen(result["cpu_us_per_frame"], GATEWAY)
+    cost_us, times = pair.median(GATEWAY), pair.ratio
+    return [
+        Goal(
+            "own cost per five-component frame",
+            f"at most {GOAL_US:g} µs",
+            f"{cost_us:.1f} µs",
+            cost_us <= GOAL_US,
+        ),
+        Goal(
+            "own cost, against lcm-gen's decode and encode",
+            f"at least {GOAL_TIMES:g} times less",
+            f"{times:.1f} times less",
+            times >= GOAL_TIMES,
+        ),
+    ]
+
+
+def _against_lcm_gen(values: dict[str, list[float]], name: str) -> Pair:
+    return Pair.of({LCM_GEN: values[LCM_GEN], name: values[name]})
+
+
+def main() -> None:
+    """Measure one of them with pyperf, in one of its worker processes."""
+    import pyperf  # noqa: PLC0415 - as above
+
+    name = sys.argv.pop(1)
+    fed = functools.cache(_Fed)
+    decoded = functools.cache(lambda: [(message, type(decode(message))) for message in fed().messages()])
+
+    def feed(loops: int) -> float:
+        return fed().run(loops, 1 if name == GATEWAY else _BATCH_FRAMES)
+
+    def decode_and_encode(loops: int) -> float:
+        messages = decoded()
+        began_s = time.process_time()
+        for _ in range(loops):
+            for message, message_type in messages:
+                message_type.decode(message).encode()
+        return time.process_time() - began_s
+
+    def pass_name_on(command: list[str], _: object) -> None:
+        command.insert(command.index("benchmarks.own_cost") + 1, name)
+
+    runner = pyperf.Runner(add_cmdline_args=pass_name_on, program_args=("-m", "benchmarks.own_cost"))
+    runner.bench_time_func(name, decode_and_encode if name == LCM_GEN else feed)
+    if fed.cache_info().currsize:
+        fed().close()
+
+
+if __name__ == "__main__":
+    main()

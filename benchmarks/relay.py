@@ -1,0 +1,73 @@
+"""The ceiling: a relay that publishes what comes on a TCP connection without looking into it.
+
+For each packet it cuts out as many bytes as the gateway's messages have, and hands them to the same calls.
+"""
+
+import asyncio
+import json
+import signal
+import sys
+from functools import partial
+from typing import Any
+
+import lcm
+import zenoh
+
+from gateway.outputs.zenoh_output import LCM_ENCODING, zenoh_config
+
+
+class Relay(asyncio.Protocol):
+    """One connection; ``cuts`` are (first byte, last byte, the calls that take what is between)."""
+
+    def __init__(self, cuts: list[tuple[int, int, tuple[Any, ...]]], ended: asyncio.Event) -> None:
+        self.cuts, self.ended = cuts, ended
+        self.rest = bytes(16)  # the gateway's prefix is longer than what precedes the first component
+
+    def connection_made(self, transport: Any) -> None:  # noqa: D102
+        transport.write(b"\0\0\0\x1e\0\0\0\x01StreamFrames AllFrames")
+
+    def data_received(self, data: bytes) -> None:  # noqa: D102
+        data = self.rest + data
+        at, end = 16, len(data)
+        while end - at >= 8 and end - at >= (size := int.from_bytes(data[at : at + 4])):
+            if data[at + 7] == 3:
+                for first, last, sends in self.cuts:
+                    message = data[at + first : at + last]
+                    for send in sends:
+                        send(message)
+            at += size
+        self.rest = data[at - 16 :]
+
+    def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002, D102
+        self.ended.set()
+
+
+async def main(port: int, cuts: Any) -> None:
+    """Connect, again and again, until SIGTERM."""
+    loop, stop = asyncio.get_running_loop(), asyncio.Event()
+    loop.add_signal_handler(signal.SIGTERM, stop.set)
+    while not stop.is_set():
+        ended = asyncio.Event()
+        await loop.create_connection(partial(Relay, cuts, ended), "127.0.0.1", port)
+        waits = [asyncio.create_task(event.wait()) for event in (ended, stop)]
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+
+
+if __name__ == "__main__":
+    plan = json.loads(sys.argv[1])
+    session = zenoh.open(zenoh_config(plan["zenoh"])) if plan["zenoh"] else None
+    channels = lcm.LCM(plan["lcm"]) if plan["lcm"] else None
+    cuts = []
+    for first, last, component, schema in plan["cuts"]:
+        sends: list[Any] = []
+        if session:
+            key = f"mocap/{plan['name']}/{component}"
+            encoding = zenoh.Encoding(LCM_ENCODING).with_schema(schema)
+            drop = zenoh.CongestionControl.DROP
+            sends.append(session.declare_publisher(key, encoding=encoding, congestion_control=drop).put)
+        if channels:
+            sends.append(partial(channels.publish, f"MOCAP_{plan['name'].upper()}_{component.upper()}"))
+        cuts.append((first, last, tuple(sends)))
+    asyncio.run(main(plan["port"], cuts))
+    if session:
+        session.close()

@@ -1,0 +1,150 @@
+"""What the benchmarks found: results in a file, tables for people, and those of docs/performance.md."""
+
+import json
+import os
+import platform
+import re
+import subprocess
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from rich.console import Console
+from rich.table import Table as RichTable
+
+from benchmarks.processes import ROOT, router_kind
+
+DOCUMENT: Final = ROOT / "docs" / "performance.md"
+RESULTS: Final = ROOT / "benchmarks" / "results.json"
+QUICK_RESULTS: Final = ROOT / "benchmarks" / "results-quick.json"
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table for people; ``note`` stands below it."""
+
+    title: str
+    columns: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    note: str = ""
+
+    def markdown(self) -> str:
+        """Return the table as Markdown has it, its first column to the left."""
+        lines = [
+            f"**{self.title}**",
+            "",
+            f"| {' | '.join(self.columns)} |",
+            "|---|" + "---:|" * (len(self.columns) - 1),
+            *(f"| {' | '.join(row)} |" for row in self.rows),
+        ]
+        return "\n".join([*lines, "", self.note] if self.note else lines)
+
+    def show(self, console: Console) -> None:
+        """Print it."""
+        table = RichTable(title=self.title, title_justify="left", caption=self.note or None)
+        for number, name in enumerate(self.columns):
+            table.add_column(name, justify="right" if number else "left")
+        for row in self.rows:
+            table.add_row(*row)
+        console.print(table)
+
+
+class Goal(NamedTuple):
+    """What was to be reached, and whether it was."""
+
+    what: str
+    goal: str
+    found: str
+    reached: bool
+
+
+def goals_table(goals: Iterable[Goal]) -> Table:
+    """Return what was to be reached and what was."""
+    rows = [(*goal[:3], "yes" if goal.reached else "**no**") for goal in goals]
+    return Table("Goals", ["what", "goal", "measured", "reached"], rows)
+
+
+class Progress:
+    """Tells which part runs, how far all is, and how long it may take yet, one line each."""
+
+    def __init__(self, expected_s: dict[str, float]) -> None:
+        self._expected_s = expected_s
+        self._began_s = time.monotonic()
+        self._part = ""
+
+    def begin(self, part: str) -> None:
+        """Note that a part begins."""
+        self._part = part
+
+    def step(self, text: str, done: float) -> None:
+        """Tell what comes next in the part, of which ``done`` (0 to 1) is done."""
+        names = list(self._expected_s)
+        at = names.index(self._part)
+        left_s = sum(list(self._expected_s.values())[at:]) - done * self._expected_s[self._part]
+        passed_s = time.monotonic() - self._began_s
+        print(
+            f"[{passed_s // 60:2.0f}:{passed_s % 60:02.0f}] part {at + 1} of {len(names)}, {self._part} "
+            f"{done:4.0%}: {text}; about {max(1, round(left_s / 60))} min left",
+            flush=True,
+        )
+
+
+def machine() -> dict[str, str]:
+    """Return on what the figures were measured, and with what."""
+    model = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
+    commit = subprocess.run(
+        ["git", "describe", "--always", "--dirty"],  # noqa: S607 - wherever git is
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return {
+        "processor": model[1] if model else platform.machine(),
+        "cores": str(os.cpu_count()),
+        "kernel": platform.release(),
+        "Python": platform.python_version(),
+        "eclipse-zenoh": version("eclipse-zenoh"),
+        "lcm": version("lcm"),
+        "router": router_kind(),
+        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
+        "commit": commit.stdout.strip() or "unknown",
+    }
+
+
+def load(file: Path) -> dict[str, Any]:
+    """Return the results in the file, by part."""
+    results: dict[str, Any] = json.loads(file.read_text()) if file.exists() else {}
+    return results
+
+
+def merge(file: Path, part: str, result: dict[str, Any]) -> None:
+    """Put a part's result into the file; those of other parts stay."""
+    results = load(file) | {part: {"machine": machine(), **result}}
+    file.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
+
+
+def machines_table(results: dict[str, Any]) -> Table:
+    """Return on what the parts were measured, a column for those that were measured alike."""
+    parts: dict[tuple[str, ...], list[str]] = {}
+    names: list[str] = []
+    for part, result in results.items():
+        names = list(result["machine"])
+        parts.setdefault(tuple(result["machine"].values()), []).append(part)
+    rows = [[name, *(values[at] for values in parts)] for at, name in enumerate(names)]
+    return Table("Machine", ["parts", *(", ".join(each) for each in parts.values())], rows)
+
+
+def rendered(document: str, sections: dict[str, list[Table]]) -> str:
+    """Return the document with each section's tables between its markers; what has none stays as it is."""
+    for name, tables in sections.items():
+        text = "\n\n".join(table.markdown() for table in tables)
+        before, start, rest = document.partition(f"<!-- {name} -->\n")
+        _, end, after = rest.partition(f"<!-- end of {name} -->")
+        if start and end:
+            document = f"{before}{start}\n{text}\n\n{end}{after}"
+    return document

@@ -1,0 +1,182 @@
+"""Subscribers of what the gateway and the relay publish, several in one process, each for itself."""
+
+import json
+import socket
+import struct
+import threading
+import time
+from collections import Counter
+from collections.abc import Generator, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import lcm
+import zenoh
+
+from gateway.message import PREFIX
+from gateway.rtc3d.commands import StreamFrames
+from gateway.rtc3d.components import BY_KEY
+from gateway.rtc3d.packets import HEADER, PacketType, encode_packet
+
+LCM_BUFFER_BYTES: Final = 4_000_000
+"""What subscribers that must lose nothing give as ``recv_buf_size``, as the documents tell."""
+
+_QUEUE_MESSAGES: Final = 100_000
+_CONTENT: Final = struct.Struct(">iq")  # frame number and time stamp, behind the prefix in every message
+_KEPT: Final = 1000
+
+
+@dataclass(frozen=True)
+class Subscription:
+    """Who subscribes to what: ``zenoh`` and ``lcm`` subscribers, each with a session of its own.
+
+    ``component`` is one, or "*" for all five; with ``reads`` every message is taken up in Python, else by the
+    libraries alone, which is the least that a subscriber can cost its host.
+    """
+
+    zenoh_config: dict[str, Any]
+    lcm_urls: tuple[str, ...]
+    zenoh: int = 0
+    lcm: int = 0
+    component: str = "*"
+    reads: bool = True
+
+
+@dataclass
+class Heard:
+    """What one subscriber received: messages and bytes by topic; frame numbers and ages by topic."""
+
+    messages: Counter[str] = field(default_factory=Counter)
+    message_bytes: Counter[str] = field(default_factory=Counter)
+    numbers: dict[str, list[int]] = field(default_factory=dict)
+    ages_us: dict[str, list[float]] = field(default_factory=dict)
+
+    def take(self, topic: str, message: bytes) -> None:
+        """Note one message of a component."""
+        now_us = time.monotonic_ns() / 1000
+        if topic.rpartition("/")[2] not in _COMPONENTS and topic.rpartition("_")[2] not in _COMPONENTS:
+            return
+        number, stamp_us = _CONTENT.unpack_from(message, PREFIX.size)
+        self.messages[topic] += 1
+        self.message_bytes[topic] += len(message)
+        self.numbers.setdefault(topic, []).append(number)
+        self.ages_us.setdefault(topic, []).append(now_us - stamp_us)
+
+    def missing(self, first: int, frames: int, components: int) -> int:
+        """Return how many messages of the frames from ``first`` are missing; doubled ones count once."""
+        wanted = set(range(first, first + frames))
+        return frames * components - sum(len(wanted.intersection(each)) for each in self.numbers.values())
+
+
+_COMPONENTS: Final = frozenset(BY_KEY) | frozenset(map(str.upper, BY_KEY))
+
+
+def subscribe(wanted: Subscription) -> Generator[Any, str, None]:
+    """Work of a Worker, whose requests are about all that each subscriber has had so far.
+
+    "heard" gives how many messages of each topic, "take" gives a ``Heard``, and forgets.
+    """
+    parts: list[_ZenohSubscriber | _LcmSubscriber] = [
+        *(_ZenohSubscriber(wanted) for _ in range(wanted.zenoh)),
+        *(_LcmSubscriber(wanted) for _ in range(wanted.lcm)),
+    ]
+    try:
+        request = yield None
+        while True:
+            if request == "heard":
+                request = yield [part.counts() for part in parts]
+            else:
+                request = yield [part.take() for part in parts]
+    finally:
+        for part in parts:
+            part.close()
+
+
+class _ZenohSubscriber:
+    def __init__(self, wanted: Subscription) -> None:
+        self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(wanted.zenoh_config)))
+        self._heard = Heard()
+        self._reads = wanted.reads
+        handler: Any = self._on_sample if wanted.reads else zenoh.handlers.RingChannel(_KEPT)
+        self._subscriber = self._session.declare_subscriber(f"mocap/*/{wanted.component}", handler)
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        self._heard.take(str(sample.key_expr), sample.payload.to_bytes())
+
+    def counts(self) -> Counter[str]:
+        if not self._reads:
+            while (sample := self._subscriber.handler.try_recv()) is not None:
+                self._on_sample(sample)
+        return self._heard.messages
+
+    def take(self) -> Heard:
+        heard, self._heard = self._heard, Heard()
+        return heard
+
+    def close(self) -> None:
+        self._session.close()
+
+
+class _LcmSubscriber:
+    """Listens on each URL. Without ``reads`` LCM's own threads take messages, and its queues drop them."""
+
+    def __init__(self, wanted: Subscription) -> None:
+        component = ".+" if wanted.component == "*" else wanted.component.upper()
+        self._lcms = [lcm.LCM(f"{url}&recv_buf_size={LCM_BUFFER_BYTES}") for url in wanted.lcm_urls]
+        self._heard = Heard()
+        self._reads = wanted.reads
+        self._subscriptions = [
+            each.subscribe(f"MOCAP_[A-Z]+_{component}", self._on_message) for each in self._lcms
+        ]
+        for subscription in self._subscriptions:
+            subscription.set_queue_capacity(_QUEUE_MESSAGES)
+        self._stop = threading.Event()
+        self._threads = [threading.Thread(target=self._handle, args=(each,)) for each in self._lcms]
+        if wanted.reads:
+            for thread in self._threads:
+                thread.start()
+
+    def _on_message(self, channel: str, message: bytes) -> None:
+        self._heard.take(channel, message)
+
+    def _handle(self, connection: lcm.LCM) -> None:
+        while not self._stop.is_set():
+            connection.handle_timeout(100)
+
+    def counts(self) -> Counter[str]:
+        for each in self._lcms:
+            while not self._reads and each.handle_timeout(0):
+                pass
+        return self._heard.messages
+
+    def take(self) -> Heard:
+        if not self._reads:
+            for subscription in self._subscriptions:
+                subscription.set_queue_capacity(1)
+        heard, self._heard = self._heard, Heard()
+        return heard
+
+    def close(self) -> None:
+        self._stop.set()
+        for thread in self._threads:
+            if thread.is_alive():
+                thread.join()
+
+
+def subscribe_tcp(port: int, packet_bytes: int, offset: int) -> Iterator[Any]:
+    """Work of a Worker: a plain TCP client. Each request gives the ages of the frames of one connection, µs.
+
+    ``offset`` is that of a frame number in the packets, which have ``packet_bytes`` each.
+    """
+    yield None
+    while True:
+        ages_us: list[float] = []
+        command = encode_packet(PacketType.COMMAND, str(StreamFrames()).encode())
+        with socket.create_connection(("127.0.0.1", port)) as connection:
+            connection.sendall(command)
+            size, _ = HEADER.unpack(connection.recv(HEADER.size, socket.MSG_WAITALL))
+            connection.recv(size - HEADER.size, socket.MSG_WAITALL)
+            while len(packet := connection.recv(packet_bytes, socket.MSG_WAITALL)) == packet_bytes:
+                now_us = time.monotonic_ns() / 1000
+                ages_us.append(now_us - _CONTENT.unpack_from(packet, offset)[1])
+        yield ages_us

@@ -1,0 +1,78 @@
+"""A ROS 2 node that publishes tools as PoseStamped and markers as PointCloud2, from a gateway's Zenoh keys.
+
+    python examples/ros2_bridge.py tcp/192.0.2.5:7447 lab
+
+Needs rclpy (a sourced ROS 2), eclipse-zenoh and numpy, and ``zenoh: {tool_poses: true}`` in the gateway's
+configuration. Topics: /lab/markers, and a pose for each tool, as /lab/tool_Tool_1.
+"""
+
+import re
+import sys
+from array import array
+from urllib.parse import unquote
+
+import rclpy
+import ros2_values
+import zenoh
+from geometry_msgs.msg import PoseStamped
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.qos import qos_profile_sensor_data
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Header
+
+FIELDS = [
+    PointField(name=name, offset=offset, datatype=PointField.FLOAT32, count=1)
+    for name, offset in (("x", 0), ("y", 4), ("z", 8))
+]
+
+
+class Bridge(Node):
+    """Publishes what comes for one source; poses are in the frame that is called like it."""
+
+    def __init__(self, source: str) -> None:
+        super().__init__("rtc3d_bridge")
+        self._source = source
+        self._markers = self.create_publisher(PointCloud2, f"{source}/markers", qos_profile_sensor_data)
+        self._tools: dict[str, Publisher] = {}
+
+    def on_markers(self, sample: zenoh.Sample) -> None:
+        cloud = ros2_values.cloud(sample.payload.to_bytes())
+        message = PointCloud2(header=self._header(cloud.stamp), height=1, width=cloud.width, fields=FIELDS)
+        message.point_step, message.row_step = 12, 12 * cloud.width
+        message.is_bigendian, message.is_dense, message.data = False, False, array("B", cloud.data)
+        self._markers.publish(message)
+
+    def on_tool(self, sample: zenoh.Sample) -> None:
+        pose = ros2_values.pose(sample.payload.to_bytes())
+        if pose is None:
+            return
+        message = PoseStamped(header=self._header(pose.stamp))
+        position, orientation = message.pose.position, message.pose.orientation
+        position.x, position.y, position.z = pose.position_m
+        orientation.x, orientation.y, orientation.z, orientation.w = pose.orientation_xyzw
+        label = unquote(str(sample.key_expr).rpartition("/")[2])
+        if label not in self._tools:
+            topic = f"{self._source}/" + re.sub(r"\W", "_", f"tool_{label}", flags=re.ASCII)
+            self._tools[label] = self.create_publisher(PoseStamped, topic, qos_profile_sensor_data)
+        self._tools[label].publish(message)
+
+    def _header(self, stamp: ros2_values.Stamp) -> Header:
+        header = Header(frame_id=self._source)
+        header.stamp.sec, header.stamp.nanosec = stamp
+        return header
+
+
+def main() -> None:
+    endpoint, source = sys.argv[1:3]
+    config = zenoh.Config.from_json5(f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}}}')
+    rclpy.init()
+    bridge = Bridge(source)
+    with zenoh.open(config) as session:
+        session.declare_subscriber(f"mocap/{source}/3d", bridge.on_markers)
+        session.declare_subscriber(f"mocap/{source}/6d/*", bridge.on_tool)
+        rclpy.spin(bridge)
+
+
+if __name__ == "__main__":
+    main()

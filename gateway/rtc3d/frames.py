@@ -1,0 +1,254 @@
+"""Data frames (§7.1): split into components, recognised by how the ones before were laid out, built.
+
+Frame after frame of a stream has the same components with as many items, so nothing but numbers, times
+and items differs. ``split_frame`` reads a frame field by field; a ``Layout`` that it has found recognises
+the next ones by comparing all that stays in one go, and cuts them in another.
+"""
+
+import struct
+from collections.abc import Callable, Iterable
+from functools import cached_property, lru_cache
+from typing import Any, Final, NamedTuple
+
+from gateway.errors import FrameError
+from gateway.rtc3d.components import (
+    HEADER_BYTES,
+    ITEM_DTYPES,
+    KNOWN_HEADER,
+    NUMBER_AND_TIME,
+    SHORT_EVENT,
+    ByteOrder,
+    Component,
+    ComponentType,
+)
+from gateway.rtc3d.packets import HEADER, PacketType
+
+_SIZE_AND_TYPE: Final = {"big": struct.Struct(">II"), "little": struct.Struct("<II")}
+_COUNT: Final = {"big": struct.Struct(">I"), "little": struct.Struct("<I")}
+_ITEM_BYTES: Final = {int(component): (component, dtype.itemsize) for component, dtype in ITEM_DTYPES.items()}
+_Unpack = Callable[[bytes, int], tuple[bytes, ...]]
+
+_KEY_BYTES: Final = 12  # a packet's size and type, and the frame's component count
+_MAX_LAYOUTS: Final = 32
+
+
+class Part(NamedTuple):
+    """What a layout says of a known component; ``item_bytes`` is 16 or 24 for events, else the item's own."""
+
+    type: ComponentType
+    num_items: int
+    item_bytes: int
+
+
+class _Header(NamedTuple):
+    """What stays of a component's header; ``part`` is None where the type is unknown."""
+
+    size: int
+    type: int
+    part: Part | None
+
+
+class Layout:
+    """All that frames laid out alike have in common; ``layout_of`` gives the same object for the same layout.
+
+    ``parts`` are the known components in their order, ``unknown_types`` the types of those skipped, and
+    ``packet_bytes`` is the size of the whole packet.
+    """
+
+    def __init__(self, byte_order: ByteOrder, headers: tuple[_Header, ...]) -> None:
+        self.byte_order: ByteOrder = byte_order
+        self.parts = tuple(header.part for header in headers if header.part is not None)
+        self.unknown_types = tuple(header.type for header in headers if header.part is None)
+        self.packet_bytes = _KEY_BYTES + sum(header.size for header in headers)
+        self.number_and_time = NUMBER_AND_TIME[byte_order].unpack_from
+        """Called with a component's content: its frame number and time stamp in µs."""
+        self._headers = headers
+
+    @cached_property
+    def key(self) -> bytes:
+        """The first 12 bytes of the packets: size, type, component count."""
+        return HEADER.pack(self.packet_bytes, PacketType.DATA) + _COUNT[self.byte_order].pack(
+            len(self._headers)
+        )
+
+    @cached_property
+    def _constants(self) -> tuple[bytes, ...]:
+        """What ``_constants_at`` finds in every packet of this layout."""
+        constants = [self.key]
+        for header in self._headers:
+            constants.append(_SIZE_AND_TYPE[self.byte_order].pack(header.size, header.type))
+            if header.part is not None:
+                constants.append(_COUNT[self.byte_order].pack(header.part.num_items))
+        return tuple(constants)
+
+    @cached_property
+    def _constants_at(self) -> _Unpack:
+        fields = [
+            f"8s{header.size - 8}x" if header.part is None else f"8s12x4s{header.size - HEADER_BYTES}x"
+            for header in self._headers
+        ]
+        return struct.Struct(f">{_KEY_BYTES}s{''.join(fields)}").unpack_from
+
+    @cached_property
+    def _contents_at(self) -> _Unpack:
+        fields = [
+            f"{header.size}x" if header.part is None else f"8x{header.size - 8}s" for header in self._headers
+        ]
+        return struct.Struct(f">{_KEY_BYTES}x{''.join(fields)}").unpack_from
+
+    def cut(self, data: bytes, start: int) -> "Frame | None":
+        """Return the frame in the packet at ``start``; None if it is laid out otherwise.
+
+        The packet's ``packet_bytes`` must be there. Two calls of struct do it: a dense frame takes 0.8 µs,
+        and ``split_frame`` 4 µs.
+        """
+        if self._constants_at(data, start) != self._constants:
+            return None
+        return Frame(self, self._contents_at(data, start))
+
+
+layout_of = lru_cache(256)(Layout)
+
+
+class Frame:
+    """A data frame: its layout, and what each of its known components holds after size and type.
+
+    That is frame number, time stamp, count and items, in the layout's byte order.
+    """
+
+    __slots__ = ("contents", "layout")
+
+    def __init__(self, layout: Layout, contents: tuple[bytes, ...]) -> None:
+        self.layout = layout
+        self.contents = contents
+
+    @property
+    def components(self) -> tuple[Component, ...]:
+        """The known components, as they came."""
+        return tuple(self.component(index) for index in range(len(self.contents)))
+
+    def component(self, index: int) -> Component:
+        """Return the known component at ``index``."""
+        part, content = self.layout.parts[index], self.contents[index]
+        frame_number, timestamp_us = self.layout.number_and_time(content)
+        return Component(
+            part.type,
+            frame_number,
+            timestamp_us,
+            part.num_items,
+            part.item_bytes,
+            self.layout.byte_order,
+            content,
+        )
+
+    @property
+    def unknown_types(self) -> tuple[int, ...]:
+        """The types of the components that were skipped as unknown."""
+        return self.layout.unknown_types
+
+
+class KnownLayouts:
+    """The layouts of a connection's frames so far, at most 32: with no, one or two events, for example."""
+
+    def __init__(self) -> None:
+        self._by_key: dict[bytes, Layout] = {}
+
+    def learn(self, layout: Layout) -> None:
+        """Keep a layout; when there are too many all others are forgotten."""
+        if len(self._by_key) >= _MAX_LAYOUTS:
+            self._by_key.clear()
+        self._by_key[layout.key] = layout
+
+    def cut(self, data: bytes, start: int, frames: list[Any]) -> int:
+        """Append the frames that are in the packets from ``start`` on and return where these end.
+
+        That is at the first packet which is unfinished, no frame, or laid out as none before.
+        """
+        total = len(data)
+        while total - start >= _KEY_BYTES:
+            layout = self._by_key.get(data[start : start + _KEY_BYTES])
+            if layout is None or total - start < layout.packet_bytes:
+                break
+            frame = layout.cut(data, start)
+            if frame is None:
+                break
+            frames.append(frame)
+            start += layout.packet_bytes
+        return start
+
+
+def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
+    """Split a type-3 packet's body into components (§7.1).
+
+    Components of unknown type are skipped by their size. Raises FrameError where a size or count
+    contradicts another or the body's length; nothing of such a frame can be trusted.
+    """
+    total = len(body)
+    if total < 4:
+        raise FrameError(f"data frame of {total} bytes: too short for its component count")
+    (component_count,) = _COUNT[byte_order].unpack_from(body)
+    headers: list[_Header] = []
+    contents: list[bytes] = []
+    start = 4
+    for index in range(component_count):
+        if total - start >= HEADER_BYTES:
+            size, kind, _, _, count = KNOWN_HEADER[byte_order].unpack_from(body, start)
+        elif total - start >= 8:
+            size, kind = _SIZE_AND_TYPE[byte_order].unpack_from(body, start)
+            count = 0
+        else:
+            raise FrameError(
+                f"data frame announces {component_count} components; its {total} bytes end after {index}"
+            )
+        end = start + size
+        if size < 8 or end > total:
+            raise FrameError(
+                f"component {index + 1} of {component_count} (type {kind}) has size {size}; "
+                f"{total - start} bytes are left in the frame"
+            )
+        part = _part(kind, size, count)
+        headers.append(_Header(size, kind, part))
+        if part is not None:
+            contents.append(body[start + 8 : end])
+        start = end
+    if start != total:
+        raise FrameError(f"{total - start} bytes follow the last of the frame's {component_count} components")
+    return Frame(layout_of(byte_order, tuple(headers)), tuple(contents))
+
+
+def _part(kind: int, size: int, count: int) -> Part | None:
+    """Return what the component is; None for an unknown type. Raises FrameError if size and count differ."""
+    known = _ITEM_BYTES.get(kind)
+    if known is None:
+        return None
+    component, item_bytes = known
+    if size == HEADER_BYTES + count * item_bytes:
+        return Part(component, count, item_bytes)
+    # Events in the specification's form (field note 6).
+    if component is ComponentType.EVENT and size == HEADER_BYTES + count * SHORT_EVENT.itemsize:
+        return Part(component, count, SHORT_EVENT.itemsize)
+    raise FrameError(f"{component.key} component of {size} bytes announces {count} items")
+
+
+def byte_order_of(body: bytes, expected: ByteOrder) -> ByteOrder:
+    """Return the byte order in which the frame makes sense, ``expected`` if it does in both.
+
+    Some servers acknowledge a byte order and then ignore it (field note 4). Raises FrameError, the
+    one for ``expected``, if the frame makes sense in neither.
+    """
+    other: ByteOrder = "little" if expected == "big" else "big"
+    try:
+        split_frame(body, expected)
+    except FrameError as error:
+        try:
+            split_frame(body, other)
+        except FrameError:
+            raise error from None
+        return other
+    return expected
+
+
+def build_frame(components: Iterable[bytes], byte_order: ByteOrder = "big") -> bytes:
+    """Return a type-3 packet's body from components that ``build_component`` made."""
+    parts = list(components)
+    return _COUNT[byte_order].pack(len(parts)) + b"".join(parts)

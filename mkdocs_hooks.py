@@ -1,0 +1,32 @@
+"""Puts the files of the repository that pages link to into the site, so that the links hold there as well."""
+
+import posixpath
+import re
+from pathlib import Path
+
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files, InclusionLevel
+
+ROOT = Path(__file__).parent
+LINK = re.compile(r"\]\(([^)\s#]+)[^)\s]*\)")
+
+
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add each file above docs/ that a page links to, as text that a browser shows."""
+    for page in files.documentation_pages():
+        for link in LINK.findall(page.content_string):
+            uri = posixpath.normpath(posixpath.join(posixpath.dirname(page.src_uri), link))
+            path = (ROOT / config["docs_dir"] / uri).resolve()
+            if uri.startswith("../") and path.is_file() and files.get_file_from_path(uri) is None:
+                name = path.relative_to(ROOT)
+                file = File(
+                    uri,
+                    src_dir=None,
+                    dest_dir=config["site_dir"],
+                    use_directory_urls=False,
+                    dest_uri=f"files/{name}.txt",
+                    inclusion=InclusionLevel.INCLUDED,  # though it stands above docs/
+                )
+                file.content_bytes = path.read_bytes()
+                files.append(file)
+    return files
