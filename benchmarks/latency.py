@@ -47,7 +47,6 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
                 subscribers=subscribers,
                 reads=True,
                 component="3d",
-                questions_apart=True,
                 clients=clients,
             ) as stage,
             Worker(subscribe_tcp, stage.ports[PLAIN], *_shape()) as plain,

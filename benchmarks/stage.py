@@ -27,12 +27,19 @@ _BOTH: Final = (GATEWAY, RELAY)
 _FIRST_FRAMES: Final = 20
 
 
+def lcm_url(port: int) -> str:
+    """Return an LCM URL; another port for each who publishes, and ten apart: gateways take the next one, too.
+
+    Whoever listens on a URL is sent all that anybody sends there, and has the work of sorting it out.
+    """
+    return f"udpm://239.255.76.67:{port}?ttl=0"
+
+
 @dataclass
 class Stage:
     """A context in which the gateway and the relay serve ``subscribers`` on Zenoh, LCM, or both.
 
-    Subscribers are processes of several each: (Zenoh subscribers, LCM subscribers) in each tuple. With
-    ``questions_apart`` the gateway awaits questions on an LCM URL of their own, as the relay awaits none.
+    Subscribers are processes of several each: (Zenoh subscribers, LCM subscribers) in each tuple.
     """
 
     workload: Workload
@@ -42,7 +49,6 @@ class Stage:
     routed: bool = False
     reads: bool = False
     component: str = "*"
-    questions_apart: bool = False
     clients: Sequence[str] = _BOTH
     programs: dict[str, Program] = field(init=False, default_factory=dict)
     listeners: list[Worker] = field(init=False, default_factory=list)
@@ -53,9 +59,7 @@ class Stage:
             self.sender = stack.enter_context(Worker(send, self.workload, list(self.clients)))
             self.ports: dict[str, int] = self.sender.started
             endpoints = {name: f"tcp/127.0.0.1:{free_port()}" for name in (*_BOTH, "router")}
-            # Apart, because whoever subscribes on a URL gets and sorts out all that is sent on it: a gateway
-            # listens for requests, and would be kept busy by the relay.
-            self.lcm_urls = {name: f"udpm://239.255.76.67:{free_port()}?ttl=0" for name in _BOTH}
+            self.lcm_urls = {GATEWAY: lcm_url(7670), RELAY: lcm_url(7680)}
             if self.routed:
                 stack.enter_context(processes.router(endpoints["router"]))
             for name in _BOTH:
@@ -88,11 +92,7 @@ class Stage:
         return {
             "sources": [processes.source(GATEWAY, self.ports[GATEWAY])],
             "zenoh": {"enabled": self.zenoh, "config": keys},
-            "lcm": {
-                "enabled": self.lcm,
-                "url": self.lcm_urls[GATEWAY],
-                "queries_url": f"udpm://239.255.76.67:{free_port()}?ttl=0" if self.questions_apart else None,
-            },
+            "lcm": {"enabled": self.lcm, "url": self.lcm_urls[GATEWAY]},
             "metrics": {"port": free_port()},
         }
 
