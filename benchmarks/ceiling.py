@@ -96,7 +96,7 @@ def tables(result: dict[str, Any]) -> list[Table]:
         )
     columns = ["output", "way", "subscribers", "gateway frames/s", "relay frames/s", "ratio"]
     columns += ["gateway CPU µs/frame", "relay CPU µs/frame", "ratio", "relay busy"]
-    note = f"Where the relay is busy less than {_BUSY:.0%} it waits for the subscribers: not counted for the goal."
+    note = f"A relay that is busy less than {_BUSY:.0%} waits for subscribers: not counted for the goal."
     return [Table(TITLE, columns, rows, note)]
 
 

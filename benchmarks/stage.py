@@ -1,6 +1,7 @@
 """The gateway and the bare relay side by side: one sender, both measured, and their subscribers."""
 
 import contextlib
+import math
 import tempfile
 import time
 from collections import Counter
@@ -118,7 +119,12 @@ class Stage:
                 self.pace(name, _FIRST_FRAMES, 1000)
             return all(len(counts) >= wanted for counts in self.heard())
 
-        processes.wait_until(all_heard, "every subscriber hears the gateway and the relay")
+        try:
+            processes.wait_until(all_heard, f"every subscriber hears {wanted} topics")
+        except TimeoutError as error:
+            error.add_note(f"so far they have had {self.heard()}")
+            raise
+        self.settle(math.inf, quiet_s=0.2)
         self.take()
 
     def blast(self, name: str, frames: int) -> tuple[Sent, float]:
@@ -139,12 +145,12 @@ class Stage:
         """Return how many messages of each topic every subscriber has had since the last ``take``."""
         return [counts for listener in self.listeners for counts in listener.ask("heard")]
 
-    def settle(self, messages: int) -> None:
-        """Return once every subscriber has had so many messages in all, or a second brought none."""
+    def settle(self, messages: float, quiet_s: float = 1.0) -> None:
+        """Return once every subscriber has had so many messages in all, or ``quiet_s`` brought none."""
         before: list[Counter[str]] = []
         while (heard := self.heard()) != before and any(each.total() < messages for each in heard):
             before = heard
-            time.sleep(1.0)
+            time.sleep(quiet_s)
 
     def take(self) -> list[Any]:
         """Return what every subscriber heard since the last time, a ``Heard`` each."""
