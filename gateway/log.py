@@ -52,14 +52,12 @@ class FailureLog:
         self._hold_s = hold_s
         self._times = 0
         self._first_s = self._last_s = 0.0
-
-    @property
-    def failing(self) -> bool:
+        self.failing = False
         """Whether a failure was told that is not over."""
-        return self._times > 0
 
     def failed(self, text: str) -> None:
         """Tell that it failed, ``text`` saying what happened and what to do."""
+        self.failing = True
         self._times += 1
         self._last_s = time.monotonic()
         if self._times == 1:
@@ -79,4 +77,5 @@ class FailureLog:
                 return
             text = f"{text}, after {now_s - self._first_s:.1f} s and {self._times} failures"
             self._times = 0
+            self.failing = False
         self._logger.info("%s: %s", self._subject, text)

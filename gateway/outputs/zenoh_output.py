@@ -105,7 +105,7 @@ class ZenohPublisher:
 
     def publish(self, message: bytes) -> None:
         """Hand ``message`` to Zenoh; raises OutputError while not open, or a client without a router."""
-        if self._publisher is None or self._output.session is None or self._output.lacks_router:
+        if self._publisher is None or self._output.is_cut_off:
             raise self._refusal()
         try:
             self._publisher.put(message)
@@ -157,6 +157,8 @@ class ZenohOutput:
         self._alive: dict[str, zenoh.LivelinessToken | None] = {}
         self._flowing: dict[str, zenoh.LivelinessToken | None] = {}
         self._transports = 0
+        self.is_cut_off = True
+        """Whether nothing can leave: not open, or without its router. Kept, because every message asks."""
         self._problem = f"the Zenoh session is not open yet; {_REMEDY}"
         self._closing = threading.Event()
         self._opener = threading.Thread(target=self._open, name="zenoh-open", daemon=True)
@@ -198,6 +200,7 @@ class ZenohOutput:
                 for source in self._flowing:
                     self._flowing[source] = self._token(session, source, "server")
                 self._session = session
+                self._look()
                 for declare in self._declarations:
                     declare(session)
             self._problem = ""
@@ -206,6 +209,11 @@ class ZenohOutput:
 
     def _on_transport(self, event: zenoh.TransportEvent) -> None:
         self._transports += 1 if event.kind == zenoh.SampleKind.PUT else -1
+        self._look()
+
+    def _look(self) -> None:
+        """See whether anything can leave; ``maintain`` does so again, should two threads have crossed."""
+        self.is_cut_off = self._session is None or self.lacks_router
 
     def _token(self, session: zenoh.Session, source: str, name: str) -> zenoh.LivelinessToken:
         return session.liveliness().declare_token(zenoh_key(self.settings.prefix, source, name))
@@ -257,6 +265,7 @@ class ZenohOutput:
 
     def maintain(self) -> None:
         """Tell of a router lost or found; Zenoh itself reconnects."""
+        self._look()
         if self._session is None:
             return
         with self._lock:
@@ -282,6 +291,7 @@ class ZenohOutput:
             self._opener.join(_JOIN_S)  # an open() that blocks is left behind; it closes what it opens
         with self._lock:
             session, self._session = self._session, None
+            self._look()
             self._alive.clear()
             self._flowing.clear()
             self._problem = "the Zenoh session is closed; start the gateway again"

@@ -228,24 +228,22 @@ class Connection:
     def receive(self, data: bytes) -> list[Event]:
         """Take bytes from the server and return what they mean, in order. Never raises."""
         events: list[Event] = []
+        reader = self._reader
         start = 0
-        if not self._reader.is_between_packets:
-            start = min(self._reader.missing_bytes, len(data))
+        if not (is_between := reader.is_between_packets):
+            start = min(reader.missing_bytes, len(data))
             self._take(data[:start], events)
+            is_between = reader.is_between_packets
         # Most of what comes is frames laid out like those before; what they answer: _answer_with_frame.
-        if (
-            self.state is State.STREAMING
-            and not isinstance(self.under_way, SendCurrentFrame)
-            and self._reader.is_between_packets
-        ):
+        if is_between and self.state is State.STREAMING and not isinstance(self.under_way, SendCurrentFrame):
             end = self._layouts.cut(data, start, events)
-            self._reader.skip(end - start)
+            reader.offset += end - start
             start = end
         if start < len(data):
             self._take(data[start:], events)
-        if self._reader.error is not None and self.state is not State.CLOSED:
+        if reader.error is not None and self.state is not State.CLOSED:
             self.end()
-            events.append(Broken(self._reader.error))
+            events.append(Broken(reader.error))
         return events
 
     def _take(self, data: bytes, events: list[Event]) -> None:

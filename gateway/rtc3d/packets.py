@@ -70,7 +70,8 @@ class PacketReader:
         self._max_packet_bytes = max_packet_bytes
         self._max_c3d_bytes = max_c3d_bytes
         self._partial = bytearray()
-        self._offset = 0  # in the stream, of the first byte in _partial
+        self.offset = 0
+        """Where in the stream the next packet begins; whoever takes packets past the reader counts them."""
         self.error: PacketError | None = None
         """Set once a size field was below 8 or above its limit: the stream has no further packets."""
 
@@ -93,10 +94,6 @@ class PacketReader:
             return HEADER.size - len(self._partial)
         size, _ = HEADER.unpack_from(self._partial)
         return int(size) - len(self._partial)
-
-    def skip(self, num_bytes: int) -> None:
-        """Note packets that were taken past the reader, between two of its own."""
-        self._offset += num_bytes
 
     def feed(self, data: bytes) -> list[Packet]:
         """Take the next bytes of the stream and return the packets that they complete, in order.
@@ -125,7 +122,7 @@ class PacketReader:
             size, packet_type = HEADER.unpack_from(source, start)
             limit = self._max_c3d_bytes if packet_type == PacketType.C3D else self._max_packet_bytes
             if not HEADER.size <= size <= limit:
-                self.error = _size_error(size, packet_type, self._offset + start, limit)
+                self.error = _size_error(size, packet_type, self.offset + start, limit)
                 start = available
                 break
             end = start + size
@@ -133,7 +130,7 @@ class PacketReader:
                 break
             packets.append(Packet(packet_type, bytes(source[start + HEADER.size : end])))
             start = end
-        self._offset += start
+        self.offset += start
         return packets, start
 
 
