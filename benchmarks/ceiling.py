@@ -1,6 +1,5 @@
 """Part 2: the gateway against a bare relay, blasted: frames per second and CPU time per frame."""
 
-from itertools import chain
 from typing import Any, Final
 
 from benchmarks.comparing import Pair, table_cell
@@ -12,21 +11,20 @@ TITLE: Final = "Ceiling: gateway against a bare relay, as fast as TCP delivers"
 GOAL: Final = 0.95
 
 _SIDES: Final = {"Zenoh": (True, False), "LCM": (False, True), "both": (True, True)}
-_ONE_URL: Final = "LCM, questions on its URL"
-"""The gateway as it comes, which then is sent its own messages; the relay awaits no questions."""
 _PER_PROCESS: Final = 4
 _FIRST_FRAMES: Final = 2_000
+_BUSY: Final = 0.7
+"""A relay that uses less of its processor waits for the subscribers, and its throughput is theirs."""
 
 
 def _cases(quick: bool) -> list[tuple[str, int, bool]]:
     counts = (0, 1, 4) if quick else (0, 1, 4, 16)
-    cases = [
+    return [
         (side, count, routed)
         for side, (zenoh, _) in _SIDES.items()
         for routed in ((False, True) if zenoh and not quick else (False,))
         for count in counts
     ]
-    return [*cases, (_ONE_URL, 1, False)]
 
 
 def expected_s(quick: bool) -> float:
@@ -46,7 +44,7 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
 
 
 def _case(side: str, count: int, routed: bool, lasting_s: float, pairs: int) -> dict[str, Any]:
-    zenoh, lcm = _SIDES.get(side, (False, True))
+    zenoh, lcm = _SIDES[side]
     in_processes = [
         (min(_PER_PROCESS, count - first) * zenoh, min(_PER_PROCESS, count - first) * lcm)
         for first in range(0, count, _PER_PROCESS)
@@ -54,7 +52,11 @@ def _case(side: str, count: int, routed: bool, lasting_s: float, pairs: int) -> 
     rates = Pair(GATEWAY, RELAY)
     costs_us = Pair(GATEWAY, RELAY)
     with Stage(
-        DENSE, zenoh=zenoh, lcm=lcm, subscribers=in_processes, routed=routed, questions_apart=side != _ONE_URL
+        DENSE,
+        zenoh=zenoh,
+        lcm=lcm,
+        subscribers=in_processes,
+        routed=routed,
     ) as stage:
         stage.blast(GATEWAY, _FIRST_FRAMES)  # what is done for the first time is done now
         sent, _ = stage.blast(RELAY, _FIRST_FRAMES)
@@ -89,27 +91,26 @@ def tables(result: dict[str, Any]) -> list[Table]:
                 f"{costs.median(GATEWAY):.1f}",
                 f"{costs.median(RELAY):.1f}",
                 table_cell(costs),
+                f"{_relay_busy(row):.0%}",
             ]
         )
     columns = ["output", "way", "subscribers", "gateway frames/s", "relay frames/s", "ratio"]
-    columns += ["gateway CPU µs/frame", "relay CPU µs/frame", "ratio"]
-    return [Table(TITLE, columns, rows)]
+    columns += ["gateway CPU µs/frame", "relay CPU µs/frame", "ratio", "relay busy"]
+    note = f"A relay that is busy less than {_BUSY:.0%} waits for subscribers: not counted for the goal."
+    return [Table(TITLE, columns, rows, note)]
 
 
 def goals(result: dict[str, Any]) -> list[Goal]:
-    """Return the worst ratio and the median one, and that of the gateway as it comes."""
-    ratios: dict[str, list[float]] = {side: [] for side in (*_SIDES, _ONE_URL)}
-    for row in result["rows"]:
-        ratios[row["side"]].append(Pair.of(row["frames_per_s"]).ratio)
-    [as_it_comes] = ratios.pop(_ONE_URL)
-    found = sorted(chain(*ratios.values()))
-    text = f"{found[0]:.2f} in the worst case, {found[len(found) // 2]:.2f} in the median one"
-    return [
-        Goal("blast throughput against the bare relay", f"at least {GOAL}", text, found[0] >= GOAL),
-        Goal(
-            "the same, LCM with questions on its URL",
-            f"at least {GOAL}",
-            f"{as_it_comes:.2f}",
-            as_it_comes >= GOAL,
-        ),
-    ]
+    """Return the worst ratio and the median one, of the cases in which the subscribers are not the limit."""
+    busy = [row for row in result["rows"] if _relay_busy(row) >= _BUSY] or result["rows"]
+    ratios = sorted(Pair.of(row["frames_per_s"]).ratio for row in busy)
+    found = (
+        f"{ratios[0]:.2f} in the worst of {len(ratios)} cases, {ratios[len(ratios) // 2]:.2f} in the median"
+    )
+    return [Goal("blast throughput against the bare relay", f"at least {GOAL}", found, ratios[0] >= GOAL)]
+
+
+def _relay_busy(row: dict[str, Any]) -> float:
+    """Return which share of its processor the relay used."""
+    cost_us, rate = Pair.of(row["cpu_us_per_frame"]), Pair.of(row["frames_per_s"])
+    return cost_us.median(RELAY) * rate.median(RELAY) / 1e6

@@ -9,7 +9,7 @@ from typing import Self
 
 from benchmarks import processes
 from benchmarks.processes import Program, Worker, free_port, zenoh_keys
-from benchmarks.stage import GATEWAY
+from benchmarks.stage import GATEWAY, lcm_url
 from benchmarks.subscribers import Heard, Subscription, subscribe
 from benchmarks.workloads import LAB, LAB_STREAMS
 
@@ -25,18 +25,18 @@ class Lab:
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:
             folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rtc3d-bench-")))
-            port, lcm_url = free_port(), f"udpm://239.255.76.67:{free_port()}?ttl=0"
+            port, url = free_port(), lcm_url(7690)
             self.endpoint = f"tcp/127.0.0.1:{free_port()}"
             stack.enter_context(Program([sys.executable, "-m", "gateway", "simulate", *_options(port)]))
             settings = {
                 "sources": [processes.source(GATEWAY, port, LAB_STREAMS)],
                 "zenoh": {"config": zenoh_keys("peer", listen=[self.endpoint])},
-                "lcm": {"url": lcm_url},
+                "lcm": {"url": url},
                 "metrics": {"port": free_port()},
             }
             self.gateway = stack.enter_context(processes.gateway(folder / "gateway.yaml", settings))
             wanted = Subscription(
-                zenoh_keys("peer", connect=[self.endpoint]), (lcm_url,), zenoh=1, lcm=1, reads=self.reads
+                zenoh_keys("peer", connect=[self.endpoint]), (url,), zenoh=1, lcm=1, reads=self.reads
             )
             self._listener = stack.enter_context(Worker(subscribe, wanted))
             processes.wait_until(

@@ -47,7 +47,6 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
                 subscribers=subscribers,
                 reads=True,
                 component="3d",
-                questions_apart=True,
                 clients=clients,
             ) as stage,
             Worker(subscribe_tcp, stage.ports[PLAIN], *_shape()) as plain,
@@ -69,10 +68,12 @@ def _shape() -> tuple[int, int]:
 def _run(stage: Stage, plain: Worker, name: str, rate_hz: float, lasting_s: float) -> list[float]:
     if name == PLAIN:
         plain.send("one connection")
-    stage.pace(name, round(rate_hz * lasting_s), rate_hz)
+    frames = round(rate_hz * lasting_s)
+    stage.pace(name, frames, rate_hz)
     if name == PLAIN:
         ages_us: list[float] = plain.reply()
         return ages_us
+    stage.settle(frames, quiet_s=0.2)
     [heard] = stage.take()
     return [age_us for ages_us in heard.ages_us.values() for age_us in ages_us]
 

@@ -1,6 +1,7 @@
 """The gateway and the bare relay side by side: one sender, both measured, and their subscribers."""
 
 import contextlib
+import math
 import tempfile
 import time
 from collections import Counter
@@ -27,12 +28,19 @@ _BOTH: Final = (GATEWAY, RELAY)
 _FIRST_FRAMES: Final = 20
 
 
+def lcm_url(port: int) -> str:
+    """Return an LCM URL; another port for each who publishes, and ten apart: gateways take the next one, too.
+
+    Whoever listens on a URL is sent all that anybody sends there, and has the work of sorting it out.
+    """
+    return f"udpm://239.255.76.67:{port}?ttl=0"
+
+
 @dataclass
 class Stage:
     """A context in which the gateway and the relay serve ``subscribers`` on Zenoh, LCM, or both.
 
-    Subscribers are processes of several each: (Zenoh subscribers, LCM subscribers) in each tuple. With
-    ``questions_apart`` the gateway awaits questions on an LCM URL of their own, as the relay awaits none.
+    Subscribers are processes of several each: (Zenoh subscribers, LCM subscribers) in each tuple.
     """
 
     workload: Workload
@@ -42,7 +50,6 @@ class Stage:
     routed: bool = False
     reads: bool = False
     component: str = "*"
-    questions_apart: bool = False
     clients: Sequence[str] = _BOTH
     programs: dict[str, Program] = field(init=False, default_factory=dict)
     listeners: list[Worker] = field(init=False, default_factory=list)
@@ -53,9 +60,7 @@ class Stage:
             self.sender = stack.enter_context(Worker(send, self.workload, list(self.clients)))
             self.ports: dict[str, int] = self.sender.started
             endpoints = {name: f"tcp/127.0.0.1:{free_port()}" for name in (*_BOTH, "router")}
-            # Apart, because whoever subscribes on a URL gets and sorts out all that is sent on it: a gateway
-            # listens for requests, and would be kept busy by the relay.
-            self.lcm_urls = {name: f"udpm://239.255.76.67:{free_port()}?ttl=0" for name in _BOTH}
+            self.lcm_urls = {GATEWAY: lcm_url(7670), RELAY: lcm_url(7680)}
             if self.routed:
                 stack.enter_context(processes.router(endpoints["router"]))
             for name in _BOTH:
@@ -88,11 +93,7 @@ class Stage:
         return {
             "sources": [processes.source(GATEWAY, self.ports[GATEWAY])],
             "zenoh": {"enabled": self.zenoh, "config": keys},
-            "lcm": {
-                "enabled": self.lcm,
-                "url": self.lcm_urls[GATEWAY],
-                "queries_url": f"udpm://239.255.76.67:{free_port()}?ttl=0" if self.questions_apart else None,
-            },
+            "lcm": {"enabled": self.lcm, "url": self.lcm_urls[GATEWAY]},
             "metrics": {"port": free_port()},
         }
 
@@ -118,7 +119,12 @@ class Stage:
                 self.pace(name, _FIRST_FRAMES, 1000)
             return all(len(counts) >= wanted for counts in self.heard())
 
-        processes.wait_until(all_heard, "every subscriber hears the gateway and the relay")
+        try:
+            processes.wait_until(all_heard, f"every subscriber hears {wanted} topics")
+        except TimeoutError as error:
+            error.add_note(f"so far they have had {self.heard()}")
+            raise
+        self.settle(math.inf, quiet_s=0.2)
         self.take()
 
     def blast(self, name: str, frames: int) -> tuple[Sent, float]:
@@ -139,12 +145,12 @@ class Stage:
         """Return how many messages of each topic every subscriber has had since the last ``take``."""
         return [counts for listener in self.listeners for counts in listener.ask("heard")]
 
-    def settle(self, messages: int) -> None:
-        """Return once every subscriber has had so many messages in all, or a second brought none."""
+    def settle(self, messages: float, quiet_s: float = 1.0) -> None:
+        """Return once every subscriber has had so many messages in all, or ``quiet_s`` brought none."""
         before: list[Counter[str]] = []
         while (heard := self.heard()) != before and any(each.total() < messages for each in heard):
             before = heard
-            time.sleep(1.0)
+            time.sleep(quiet_s)
 
     def take(self) -> list[Any]:
         """Return what every subscriber heard since the last time, a ``Heard`` each."""
