@@ -26,7 +26,7 @@ from gateway.rtc3d.packets import HEADER, PacketType
 _SIZE_AND_TYPE: Final = {"big": struct.Struct(">II"), "little": struct.Struct("<II")}
 _COUNT: Final = {"big": struct.Struct(">I"), "little": struct.Struct("<I")}
 _ITEM_BYTES: Final = {int(component): (component, dtype.itemsize) for component, dtype in ITEM_DTYPES.items()}
-_Unpack = Callable[[bytes, int], tuple[bytes, ...]]
+_Unpack = Callable[[bytes, int], tuple[Any, ...]]
 
 _KEY_BYTES: Final = 12  # a packet's size and type, and the frame's component count
 _MAX_LAYOUTS: Final = 32
@@ -72,22 +72,23 @@ class Layout:
         )
 
     @cached_property
-    def _constants(self) -> tuple[bytes, ...]:
-        """What ``_constants_at`` finds in every packet of this layout."""
-        constants = [self.key]
+    def _constants(self) -> tuple[bytes | int, ...]:
+        """What ``_constants_at`` finds in every packet of this layout: key, sizes, types, counts."""
+        constants: list[bytes | int] = [self.key]
         for header in self._headers:
-            constants.append(_SIZE_AND_TYPE[self.byte_order].pack(header.size, header.type))
+            constants += (header.size, header.type)
             if header.part is not None:
-                constants.append(_COUNT[self.byte_order].pack(header.part.num_items))
+                constants.append(header.part.num_items)
         return tuple(constants)
 
     @cached_property
     def _constants_at(self) -> _Unpack:
         fields = [
-            f"8s{header.size - 8}x" if header.part is None else f"8s12x4s{header.size - HEADER_BYTES}x"
+            f"II{header.size - 8}x" if header.part is None else f"II12xI{header.size - HEADER_BYTES}x"
             for header in self._headers
         ]
-        return struct.Struct(f">{_KEY_BYTES}s{''.join(fields)}").unpack_from
+        mark = ">" if self.byte_order == "big" else "<"
+        return struct.Struct(f"{mark}{_KEY_BYTES}s{''.join(fields)}").unpack_from
 
     @cached_property
     def _contents_at(self) -> _Unpack:
@@ -152,12 +153,13 @@ class KnownLayouts:
 
     def __init__(self) -> None:
         self._by_key: dict[bytes, Layout] = {}
+        self._newest: Layout | None = None
 
     def learn(self, layout: Layout) -> None:
         """Keep a layout; when there are too many all others are forgotten."""
         if len(self._by_key) >= _MAX_LAYOUTS:
             self._by_key.clear()
-        self._by_key[layout.key] = layout
+        self._by_key[layout.key] = self._newest = layout
 
     def cut(self, data: bytes, start: int, frames: list[Any]) -> int:
         """Append the frames that are in the packets from ``start`` on and return where these end.
@@ -165,15 +167,17 @@ class KnownLayouts:
         That is at the first packet which is unfinished, no frame, or laid out as none before.
         """
         total = len(data)
-        while total - start >= _KEY_BYTES:
-            layout = self._by_key.get(data[start : start + _KEY_BYTES])
-            if layout is None or total - start < layout.packet_bytes:
-                break
+        layout = self._newest
+        while layout is not None and total - start >= layout.packet_bytes:
             frame = layout.cut(data, start)
-            if frame is None:
-                break
-            frames.append(frame)
-            start += layout.packet_bytes
+            if frame is not None:
+                frames.append(frame)
+                start += layout.packet_bytes
+            else:
+                known = self._by_key.get(data[start : start + _KEY_BYTES])
+                if known is layout:  # looked alike, and is not
+                    break
+                layout = known
         return start
 
 
