@@ -70,6 +70,8 @@ class Input(Enum):
     END = "the connection ended"
 
 
+_STREAMING: Final = State.STREAMING  # looking an enum's member up takes 0.07 µs, at every read
+
 _TRANSITIONS: Final[dict[tuple[State, Input], State]] = {
     (State.IDLE, Input.STREAM): State.ASKED,
     (State.ASKED, Input.REFUSED): State.IDLE,
@@ -235,7 +237,7 @@ class Connection:
             self._take(data[:start], events)
             is_between = reader.is_between_packets
         # Most of what comes is frames laid out like those before; what they answer: _answer_with_frame.
-        if is_between and self.state is State.STREAMING and not isinstance(self.under_way, SendCurrentFrame):
+        if is_between and self.state is _STREAMING and not isinstance(self.under_way, SendCurrentFrame):
             end = self._layouts.cut(data, start, events)
             reader.offset += end - start
             start = end

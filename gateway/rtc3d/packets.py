@@ -70,6 +70,8 @@ class PacketReader:
         self._max_packet_bytes = max_packet_bytes
         self._max_c3d_bytes = max_c3d_bytes
         self._partial = bytearray()
+        self.is_between_packets = True
+        """Whether the stream can be read on, and the next byte begins a packet."""
         self.offset = 0
         """Where in the stream the next packet begins; whoever takes packets past the reader counts them."""
         self.error: PacketError | None = None
@@ -79,11 +81,6 @@ class PacketReader:
     def buffered_bytes(self) -> int:
         """How many bytes of an unfinished packet are held."""
         return len(self._partial)
-
-    @property
-    def is_between_packets(self) -> bool:
-        """Whether the stream can be read on, and the next byte begins a packet."""
-        return not self._partial and self.error is None
 
     @property
     def missing_bytes(self) -> int:
@@ -106,11 +103,12 @@ class PacketReader:
         if not self._partial:
             packets, used = self._cut(data)
             self._partial += data[used:]
-            return packets
-        self._partial += data
-        with memoryview(self._partial) as view:
-            packets, used = self._cut(view)
-        del self._partial[:used]
+        else:
+            self._partial += data
+            with memoryview(self._partial) as view:
+                packets, used = self._cut(view)
+            del self._partial[:used]
+        self.is_between_packets = not self._partial and self.error is None
         return packets
 
     def _cut(self, source: bytes | memoryview) -> tuple[list[Packet], int]:
