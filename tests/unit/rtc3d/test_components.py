@@ -11,12 +11,12 @@ from gateway.rtc3d.components import (
     MISSING_RELIABILITY,
     SHORT_EVENT,
     WIRE_ORDER,
-    Component,
     ComponentType,
     big_endian_content,
     build_component,
 )
 from gateway.rtc3d.frames import build_frame, split_frame
+from tests.unit.rtc3d.wire import frame, only_component
 from tests.vectors import (
     ANALOG,
     COMPONENTS,
@@ -32,15 +32,6 @@ Array = npt.NDArray[Any]
 
 each_component = pytest.mark.parametrize("vector", COMPONENTS, ids=[vector.name for vector in COMPONENTS])
 both_orders = pytest.mark.parametrize("order", ["big", "little"])
-
-
-def frame(order: ByteOrder, *components: bytes) -> bytes:
-    return len(components).to_bytes(4, order) + b"".join(components)
-
-
-def only_component(body: bytes, order: ByteOrder) -> Component:
-    (component,) = split_frame(body, order).components
-    return component
 
 
 def values_of(items: Array, field: str) -> Array:

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gateway.rtc3d.components import LONG_EVENT, SHORT_EVENT, Component, ComponentType, build_component
+from gateway.rtc3d.components import LONG_EVENT, SHORT_EVENT, ComponentType, build_component
 from gateway.rtc3d.frames import Frame, KnownLayouts, Layout, build_frame, byte_order_of, split_frame
 from tests.servers import packet
+from tests.unit.rtc3d.wire import frame, only_component
 from tests.vectors import (
     ANALOG,
     EMPTY_FRAME,
@@ -24,15 +25,6 @@ from tests.vectors import (
 )
 
 both_orders = pytest.mark.parametrize("order", ["big", "little"])
-
-
-def frame(order: ByteOrder, *components: bytes) -> bytes:
-    return len(components).to_bytes(4, order) + b"".join(components)
-
-
-def only_component(body: bytes, order: ByteOrder) -> Component:
-    (component,) = split_frame(body, order).components
-    return component
 
 
 @both_orders

@@ -7,6 +7,7 @@ import pytest
 from gateway.errors import FrameError
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import byte_order_of, split_frame
+from tests.unit.rtc3d.wire import frame
 from tests.vectors import (
     ANALOG,
     COMPONENTS,
@@ -22,10 +23,6 @@ from tests.vectors import (
 
 each_component = pytest.mark.parametrize("vector", COMPONENTS, ids=[vector.name for vector in COMPONENTS])
 both_orders = pytest.mark.parametrize("order", ["big", "little"])
-
-
-def frame(order: ByteOrder, *components: bytes, count: int | None = None) -> bytes:
-    return (len(components) if count is None else count).to_bytes(4, order) + b"".join(components)
 
 
 def changed(
