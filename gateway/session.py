@@ -277,7 +277,7 @@ class Session(asyncio.Protocol):
             self._transport.abort()
 
     def _flush(self) -> None:
-        if self._transport is not None:
+        if self._transport is not None and not self._transport.is_closing():
             self._transport.write(self._connection.bytes_to_send())
 
 
