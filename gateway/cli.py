@@ -16,7 +16,7 @@ from rich.console import Console
 
 from gateway import __version__, cli_configuration
 from gateway.cli_configuration import INSTALLED_CONFIG, ConfigOption, ServerOption, configuration
-from gateway.config import DEFAULT_LCM_URL
+from gateway.config import effective_lcm_url
 from gateway.config_file import load
 from gateway.demo import run_demo
 from gateway.doctor.examination import examine, without_settings
@@ -295,7 +295,7 @@ def echo_command(
     if zenoh and lcm:
         raise typer.BadParameter("give --zenoh or --lcm; one at a time")
     if lcm:
-        opened = lcm_messages(prefix or "MOCAP", source, component, _lcm_url(url))
+        opened = lcm_messages(prefix or "MOCAP", source, component, effective_lcm_url(url))
     else:
         opened = zenoh_messages(prefix or "mocap", source, component, connect)
     with opened as messages:
@@ -306,10 +306,6 @@ def echo_command(
     if count is not None and printed < count:
         print(f"{printed} of {count} messages came in {seconds:g} s", file=sys.stderr)
         raise typer.Exit(1)
-
-
-def _lcm_url(url: str | None) -> str:
-    return url or os.environ.get("LCM_DEFAULT_URL") or DEFAULT_LCM_URL
 
 
 @app.command("params")
@@ -351,7 +347,7 @@ def params_command(
             source,
             asked,
             fresh=fresh,
-            url=_lcm_url(url),
+            url=effective_lcm_url(url),
             queries_url=queries_url,
             timeout_s=timeout,
         )

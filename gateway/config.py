@@ -184,6 +184,14 @@ class ZenohSettings(Section):
     """Whether each tool's pose is published on a key of its own, while someone listens."""
 
 
+def effective_lcm_url(url: str | None) -> str:
+    """Return ``url``, else the environment's LCM_DEFAULT_URL, else DEFAULT_LCM_URL.
+
+    The environment's is not checked here: LCM itself says what it cannot use.
+    """
+    return url or os.environ.get("LCM_DEFAULT_URL") or DEFAULT_LCM_URL
+
+
 def lcm_queries_url(url: str) -> str:
     """Return where requests go unless told otherwise: to the next port, where a URL is multicast's.
 
@@ -225,11 +233,8 @@ class LcmSettings(Section):
 
     @property
     def effective_url(self) -> str:
-        """``url``, else the environment's LCM_DEFAULT_URL, else DEFAULT_LCM_URL.
-
-        The environment's is not checked here: LCM itself says what it cannot use.
-        """
-        return self.url or os.environ.get("LCM_DEFAULT_URL") or DEFAULT_LCM_URL
+        """What ``effective_lcm_url`` makes of ``url``."""
+        return effective_lcm_url(self.url)
 
     @property
     def effective_queries_url(self) -> str:
