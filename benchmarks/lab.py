@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import Self
 
 from benchmarks import processes
-from benchmarks.processes import Program, Worker, free_port, zenoh_keys
+from benchmarks.processes import Program, Worker, zenoh_keys
 from benchmarks.stage import GATEWAY, lcm_url
 from benchmarks.subscribers import Heard, Subscription, subscribe
 from benchmarks.workloads import LAB, LAB_STREAMS
+from tests.networks import free_port
 
 _COMPONENTS = 5
 

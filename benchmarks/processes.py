@@ -8,7 +8,6 @@ import json
 import multiprocessing
 import os
 import re
-import socket
 import subprocess
 import sys
 import time
@@ -64,12 +63,6 @@ def _kib(file: str, name: str) -> int:
     if found is None:
         raise RuntimeError(f"{file} has no {name}")
     return int(found[1]) * 1024
-
-
-def free_port() -> int:
-    """Return a TCP port of 127.0.0.1 that nobody listens on."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
 
 
 class Worker:

@@ -11,11 +11,12 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from benchmarks import processes
-from benchmarks.processes import Program, Worker, free_port, zenoh_keys
+from benchmarks.processes import Program, Worker, zenoh_keys
 from benchmarks.sender import Blast, Paced, Sent, send
 from benchmarks.subscribers import Subscription, subscribe
 from benchmarks.workloads import Workload, cuts
 from gateway.message import MESSAGE_TYPES, type_name
+from tests.networks import free_port
 
 GATEWAY: Final = "lab"
 RELAY: Final = "raw"
