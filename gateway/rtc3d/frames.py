@@ -59,6 +59,7 @@ class Layout:
         self.byte_order: ByteOrder = byte_order
         self.parts = tuple(header.part for header in headers if header.part is not None)
         self.first_type = self.parts[0].type if self.parts else None
+        """Of the first known component; None in a frame without any."""
         self.unknown_types = tuple(header.type for header in headers if header.part is None)
         self.packet_bytes = _KEY_BYTES + sum(header.size for header in headers)
         self.number_and_time = NUMBER_AND_TIME[byte_order].unpack_from
@@ -66,6 +67,7 @@ class Layout:
         self.key = HEADER.pack(self.packet_bytes, PacketType.DATA) + _COUNT[byte_order].pack(len(headers))
         """The first 12 bytes of the packets: size, type, component count."""
         self.headers = headers
+        """What stays of every component's header, those of unknown type included."""
 
 
 layout_of = lru_cache(256)(Layout)
@@ -135,8 +137,8 @@ class _Template:
     def cut(self, data: bytes, start: int) -> Frame | None:
         """Return the frame in the packet at ``start``; None if it is laid out otherwise.
 
-        The packet's ``packet_bytes`` must be there. Two calls of struct do it: a dense frame takes 0.8 µs,
-        and ``split_frame`` 4 µs.
+        The packet's ``packet_bytes`` must be there. Two calls of struct do it: a dense frame takes 0.4 µs
+        compiled and 0.7 µs not, ``split_frame`` 4 µs.
         """
         if self._constants_at(data, start) != self._constants:
             return None
