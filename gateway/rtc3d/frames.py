@@ -1,7 +1,7 @@
 """Data frames (§7.1): split into components, recognised by how the ones before were laid out, built.
 
 Frame after frame of a stream has the same components with as many items, so nothing but numbers, times
-and items differs. ``split_frame`` reads a frame field by field; a template of the ``Layout`` that it has found
+and items differs. ``split_frame`` reads a frame field by field; a template of the ``Layout`` that it finds
 recognises the next ones by comparing all that stays in one go, and cuts them in another.
 """
 
