@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 
+from tests.clones import skip_if_plain
 from tests.networks import free_port, zenoh_keys
 from tests.systemd.machine import CONFIG, UNIT, Machine, Service
 from tests.systemd.page import exposure, typed
@@ -27,6 +28,11 @@ async def test_the_program_runs_from_its_own_environment(machine: Machine) -> No
     where = "import gateway, os; print(os.path.realpath(gateway.__file__))"
     location = await machine.run(f"{VENV}/bin/python", "-c", where)
     assert location.text.startswith(f"{VENV}/lib")
+
+
+async def test_the_program_is_compiled_where_there_is_a_compiler(machine: Machine) -> None:
+    skip_if_plain(machine.said_installing)
+    assert (await machine.run(PROGRAM, "--version")).text.endswith(" (compiled)\n")
 
 
 def test_installing_leaves_nothing_in_the_clone(machine: Machine) -> None:
