@@ -62,7 +62,7 @@ def test_each_component_counts_for_itself_and_across_sessions(memory: MemoryOutp
     fan_out = FanOut("lab", [memory])
     fan_out.publish(FULL, STAMP, ALL)
     fan_out.publish(FULL, STAMP, MARKERS)
-    fan_out.publish(FULL, STAMP._replace(session=2), ALL)
+    fan_out.publish(FULL, Stamp(STAMP.utime, STAMP.capture_utime, 2), ALL)
     messages = [(topic.parts, decode(message)) for topic, message in memory.messages]
     counted = {
         key: [(message.sequence, message.session) for parts, message in messages if parts == (key,)]
