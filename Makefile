@@ -15,7 +15,7 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
 .PHONY: demo test test-compiled check lint types contracts generated docs lcm-types fuzz soak bench bench-quick zenohd \
-    wheel wheelhouse install uninstall clean
+    wheel compiled wheelhouse install uninstall clean
 
 demo: .venv/installed
 	$(BIN)/rtc3d-gateway demo
@@ -25,10 +25,9 @@ test: .venv/installed
 
 # The tests of what is compiled, and of what stands on it, with the compiled modules in place of the sources.
 # What rate.py waits cannot be shortened there, and takes 14 s.
-COMPILED_TESTS := $(addprefix tests/,packaging/test_compiled.py unit/rtc3d unit/outputs contract \
-    $(patsubst %,unit/test_%.py,clock clock_changes fanout fanout_outputs fanout_tools intake message pacing rate) \
-    $(patsubst %,property/test_%_properties.py,clock components connection message pacing packets) \
-    $(patsubst %,integration/test_%.py,gateway streams faults)) \
+COMPILED_TESTS := tests/packaging/test_compiled.py tests/contract tests/unit/rtc3d tests/unit/outputs \
+    $(foreach name,clock components connection fanout faults gateway intake message pacing packets rate streams, \
+        $(wildcard tests/*/test_$(name)*.py)) \
     --deselect tests/integration/test_streams.py::test_late_frames_make_the_gateway_ask_for_less_until_they_are_in_time
 
 test-compiled: build/compiled/complete
@@ -84,6 +83,8 @@ wheel:
 	$(call pip,$(PYTHON),wheel --quiet --no-deps --wheel-dir dist)
 
 # The gateway compiled, to be tested and measured: PYTHONSAFEPATH=1 PYTHONPATH=build/compiled puts it before the sources.
+compiled: build/compiled/complete
+
 build/compiled/complete: .venv/installed $(shell find $(SOURCES) ! -path '*__pycache__*')
 	rm -rf build/compiled
 	$(call pip,$(BIN)/python,install --quiet --no-deps --target build/compiled)
