@@ -4,7 +4,6 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from gateway import ways
 from gateway.decode import decode
 from gateway.errors import OutputError
 from gateway.fanout import FanOut
@@ -145,10 +144,10 @@ def test_a_message_refused_still_counts_so_that_the_gap_shows() -> None:
     assert [decode(message).sequence for _, message in output.messages] == [0, 2]
 
 
+@pytest.mark.usefixtures("no_hold")
 def test_a_failing_output_is_told_once_loudly_then_quietly_and_when_it_is_over(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr(ways, "HOLD_S", 0.0)
     caplog.set_level(logging.DEBUG, "gateway.ways")
     output = ToyOutput()
     fan_out = FanOut("lab", [output])
