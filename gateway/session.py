@@ -96,6 +96,9 @@ class Session(asyncio.Protocol):
         self._status.move(StreamInput.DIAL, self.server)
         try:
             async with asyncio.timeout(self._source.connect_timeout_s):
+                # create_connection will look it up again, but uvloop cannot end a lookup there: what comes
+                # of one given up is logged as an error, and the next waits behind it.
+                await asyncio.to_thread(socket.getaddrinfo, self._source.host, self._source.port)
                 self._transport, _ = await self._loop.create_connection(
                     lambda: self, self._source.host, self._source.port
                 )

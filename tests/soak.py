@@ -155,8 +155,8 @@ class Soak:
             f"{self.minutes:g}`, seed {self.seed}), {datetime.now(UTC):%Y-%m-%d}, version {__version__}, "
             f"Python {platform.python_version()}, uvloop {version('uvloop')}, {platform.machine()}. "
             "Each round begins one fault of the simulator (see `rtc3d-gateway simulate --list-faults`), "
-            f"ends it 0.3 to 3 s later, and waits for data. The gateway's stall_timeout_s is {STALL_S:g}, its longest wait to reconnect "
-            f"{BACKOFF_S:g} s.",
+            "ends it 0.3 to 3 s later, and waits for data. "
+            f"The gateway's stall_timeout_s is {STALL_S:g}, its longest wait to reconnect {BACKOFF_S:g} s.",
             "",
             "| what | count |",
             "|---|--:|",
