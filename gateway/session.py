@@ -1,4 +1,4 @@
-"""One TCP connection to an RT server, used once: asyncio's shell over ``rtc3d.connection``."""
+"""One TCP connection to an RT server, used once: the event loop's shell over ``rtc3d.connection``."""
 
 import asyncio
 import contextlib
@@ -199,7 +199,7 @@ class Session(asyncio.Protocol):
                     await self._lost.wait()
         self._transport.abort()
 
-    # What asyncio calls.
+    # What the event loop calls.
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """Have the kernel look for a server that has vanished. The loop has turned Nagle off (§2.1).

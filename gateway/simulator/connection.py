@@ -52,7 +52,7 @@ class SentCounts:
 class Connection(asyncio.Protocol):
     """One client's TCP connection: packets in to its Client, replies and due frames out.
 
-    Nagle's algorithm is off (§2.1): asyncio does that for every TCP connection. Each packet is
+    Nagle's algorithm is off (§2.1): the loop does that for every TCP connection. Each packet is
     written at once and alone, since common clients read one with one recv (field note 15). A client
     that does not read is not read from either, and its frames are dropped.
     """

@@ -5,7 +5,6 @@ import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -87,21 +86,17 @@ class SlowNameServer:
                 self._socket.sendto(question[:2] + b"\x81\x82" + question[4:], client)  # SERVFAIL
 
 
-@pytest.fixture
-def slow_dns(tmp_path: Path) -> Iterator[tuple[SlowNameServer, list[str]]]:
-    """Return a name server that is slow, and what begins a command that asks it."""
+def asking_this_machine(tmp_path: Path) -> list[str]:
+    """Return what begins a command that has a name server of this machine."""
     resolver, switch = tmp_path / "resolv.conf", tmp_path / "nsswitch.conf"
     resolver.write_text("nameserver 127.0.0.1\noptions timeout:1 attempts:1\n")
     switch.write_text("hosts: files dns\n")
-    prefix = ["unshare", "--mount", "sh", "-ec", WITH_NAMESERVER, "sh", str(resolver), str(switch)]
-    yield SlowNameServer(), prefix
+    return ["unshare", "--mount", "sh", "-ec", WITH_NAMESERVER, "sh", str(resolver), str(switch)]
 
 
 @pytest.mark.netns
-def test_a_name_server_that_answers_too_late_is_one_problem_and_not_two(
-    slow_dns: tuple[SlowNameServer, list[str]], tmp_path: Path
-) -> None:
-    server, prefix = slow_dns
+def test_a_name_server_that_answers_too_late_is_one_problem_and_not_two(tmp_path: Path) -> None:
+    server = SlowNameServer()
     source = {
         "name": "lab",
         "host": "mocap-pc.example.",
@@ -116,7 +111,7 @@ def test_a_name_server_that_answers_too_late_is_one_problem_and_not_two(
     }
     file = tmp_path / "gateway.json"
     file.write_text(yaml.safe_dump(configuration))
-    command = [*prefix, sys.executable, "-m", "gateway", "run", "--config", str(file)]
+    command = [*asking_this_machine(tmp_path), sys.executable, "-m", "gateway", "run", "--config", str(file)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
             wait_until(lambda: len(server.questions) > 16)
