@@ -13,6 +13,8 @@ import time
 from pathlib import Path
 from typing import Any, Final
 
+import uvloop
+
 from benchmarks.comparing import Pair, table_cell
 from benchmarks.processes import PLAIN_PYTHON, run_measured
 from benchmarks.report import Goal, Progress, Table
@@ -78,7 +80,7 @@ class _Fed:
     """A running gateway, connected to a server that is silent; its session is fed by hand."""
 
     def __init__(self) -> None:
-        self._loop = asyncio.new_event_loop()
+        self._loop = uvloop.new_event_loop()
         self._output = _KeepingOutput()
         self._frames = Frames(DENSE.packet(), _BLOCK_FRAMES)
         self._number = 1

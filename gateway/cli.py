@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
+import uvloop
 from rich.console import Console
 
 from gateway import __version__, cli_configuration, fanout
@@ -99,7 +100,7 @@ def run(
 ) -> None:
     """Run the gateway until Ctrl-C or SIGTERM. SIGHUP has it load its configuration anew."""
     set_up_log(log_level, log_format)
-    asyncio.run(serve(lambda: configuration(config, server).settings))
+    uvloop.run(serve(lambda: configuration(config, server).settings))
 
 
 def _stop_on_signals(stop: asyncio.Event) -> None:
@@ -130,7 +131,7 @@ def doctor(
     """
     set_up_log(LogLevel.ERROR, LogFormat.TEXT)  # what would be warned of is in the findings
     report = Report(Console(quiet=as_json))
-    asyncio.run(_examine(report, config, server, seconds))
+    uvloop.run(_examine(report, config, server, seconds))
     if as_json:
         print(report.as_json())
     if not report.is_good:
@@ -231,7 +232,7 @@ def simulate(
     planned = Scenario(faults=()) if scenario is None else load_scenario(scenario)
     planned = planned.extended(given, map(parse_fault, fault or ()), seed)
     scene = planned.scene.build() if c3d is None else Take(c3d)
-    asyncio.run(_run_simulator(Simulator(scene, host=host, port=port, once=once), planned, seconds))
+    uvloop.run(_run_simulator(Simulator(scene, host=host, port=port, once=once), planned, seconds))
 
 
 def _is_given(context: typer.Context, option: str) -> bool:
@@ -265,7 +266,7 @@ def demo(
     """Show it all at work: simulator, gateway and a subscriber on each side, and count what is lost."""
     set_up_log(LogLevel.WARNING)
     scene = _scene(c3d, markers, tools, analog, plates, rate, analog_rate)
-    if not asyncio.run(run_demo(scene, seconds, Console(), udpm=udpm)):
+    if not uvloop.run(run_demo(scene, seconds, Console(), udpm=udpm)):
         raise typer.Exit(1)
 
 

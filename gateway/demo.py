@@ -8,6 +8,7 @@ every component sent can be accounted for.
 import asyncio
 import contextlib
 import socket
+import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass, field
@@ -137,13 +138,12 @@ async def _until(condition: Callable[[], bool], timeout_s: float, failure: str) 
 
 async def _show(heard: dict[str, _Heard], seconds: float, console: Console) -> None:
     """Show the table live for ``seconds``; not where the output is no terminal."""
-    loop = asyncio.get_running_loop()
-    start_s = loop.time()
+    start_s = time.monotonic()
     before: dict[str, Counter[str]] = {side: Counter() for side in _SIDES}
     with Live(console=console, auto_refresh=False, transient=True) as live:
-        while (elapsed_s := loop.time() - start_s) < seconds:
+        while (elapsed_s := time.monotonic() - start_s) < seconds:
             await asyncio.sleep(min(_REFRESH_S, seconds - elapsed_s))
-            now_s = loop.time() - start_s
+            now_s = time.monotonic() - start_s
             rates = {
                 side: {
                     key: (each.received[key] - before[side][key]) / (now_s - elapsed_s)

@@ -20,7 +20,7 @@ _fields: ContextVar[Mapping[str, str]] = ContextVar("log fields")
 def log_fields(**fields: str) -> Iterator[None]:
     """Give every record of the block these of FIELDS, and of the tasks and callbacks that it starts.
 
-    So a connection's records carry them without every call having to name them: asyncio runs
+    So a connection's records carry them without every call having to name them: the event loop runs
     callbacks in the context that they were registered in.
     """
     token = _fields.set({**_fields.get({}), **fields})

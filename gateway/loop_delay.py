@@ -1,6 +1,7 @@
 """How long the event loop keeps what is due waiting, every frame included."""
 
 import asyncio
+import time
 from typing import Final
 
 _PERIOD_S: Final = 0.1
@@ -24,9 +25,8 @@ class LoopDelay:
 
     def start(self) -> None:
         """Begin to measure."""
-        loop = asyncio.get_running_loop()
-        self._window_end_s = loop.time() + _WINDOW_S
-        self._call(loop)
+        self._window_end_s = time.monotonic() + _WINDOW_S
+        self._call()
 
     def close(self) -> None:
         """Stop measuring."""
@@ -34,18 +34,19 @@ class LoopDelay:
             self._timer.cancel()
 
     def note(self, now_s: float, delay_s: float) -> None:
-        """Take one delay, found at the loop's time ``now_s``."""
+        """Take one delay, found at ``now_s`` of the monotonic clock."""
         self.last_s = delay_s
         if now_s >= self._window_end_s:
             self._max_before_s, self._max_s = self._max_s, 0.0
             self._window_end_s = now_s + _WINDOW_S
         self._max_s = max(self._max_s, delay_s)
 
-    def _call(self, loop: asyncio.AbstractEventLoop) -> None:
-        self._due_s = loop.time() + _PERIOD_S
-        self._timer = loop.call_at(self._due_s, self._called, loop)
+    def _call(self) -> None:
+        # Not the loop's own time, which uvloop keeps in whole milliseconds.
+        self._due_s = time.monotonic() + _PERIOD_S
+        self._timer = asyncio.get_running_loop().call_later(_PERIOD_S, self._called)
 
-    def _called(self, loop: asyncio.AbstractEventLoop) -> None:
-        now_s = loop.time()
-        self.note(now_s, max(0.0, now_s - self._due_s))
-        self._call(loop)
+    def _called(self) -> None:
+        now_s = time.monotonic()
+        self.note(now_s, max(0.0, now_s - self._due_s))  # uvloop's timers may be up to 1 ms early
+        self._call()

@@ -1,4 +1,4 @@
-"""One TCP connection to an RT server, used once: asyncio's shell over ``rtc3d.connection``."""
+"""One TCP connection to an RT server, used once: the event loop's shell over ``rtc3d.connection``."""
 
 import asyncio
 import contextlib
@@ -6,7 +6,7 @@ import logging
 import socket
 from collections.abc import Callable
 from time import monotonic, time_ns
-from typing import Final, NamedTuple, cast
+from typing import Final, NamedTuple
 
 from gateway.config import Source, Stream
 from gateway.errors import (
@@ -97,7 +97,12 @@ class Session(asyncio.Protocol):
         self._status.move(StreamInput.DIAL, self.server)
         try:
             async with asyncio.timeout(self._source.connect_timeout_s):
-                await self._loop.create_connection(lambda: self, self._source.host, self._source.port)
+                # create_connection will look it up again, but uvloop cannot end a lookup there: what comes
+                # of one given up is logged as an error, and the next waits behind it.
+                await asyncio.to_thread(socket.getaddrinfo, self._source.host, self._source.port)
+                self._transport, _ = await self._loop.create_connection(
+                    lambda: self, self._source.host, self._source.port
+                )
         except TimeoutError:
             raise ConnectError(
                 f"no answer from {self.server} within {self._source.connect_timeout_s:g} s; "
@@ -189,18 +194,20 @@ class Session(asyncio.Protocol):
             self._flush()
             # The rest of the stream is read on: closing with data unread would reset the connection,
             # and the server might never see the Bye.
-            # OSError: the server has just reset the connection, and asyncio has yet to say so.
-            with contextlib.suppress(TimeoutError, OSError):
+            with contextlib.suppress(TimeoutError):
                 self._transport.write_eof()
                 async with asyncio.timeout(_BYE_S):
                     await self._lost.wait()
         self._transport.abort()
 
-    # What asyncio calls.
+    # What the event loop calls.
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Keep the transport. asyncio has turned Nagle off (§2.1)."""
-        self._transport = cast(asyncio.Transport, transport)
+        """Have the kernel look for a server that has vanished. The loop has turned Nagle off (§2.1).
+
+        The transport is kept once ``connect`` has it: if that is cancelled before, uvloop closes the
+        transport without a call of ``connection_lost``.
+        """
         sock = transport.get_extra_info("socket")
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
 
@@ -278,7 +285,7 @@ class Session(asyncio.Protocol):
             self._transport.abort()
 
     def _flush(self) -> None:
-        if self._transport is not None and not self._transport.is_closing():
+        if self._transport is not None:
             self._transport.write(self._connection.bytes_to_send())
 
 

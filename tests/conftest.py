@@ -1,12 +1,18 @@
-"""What tests need of the machine: without it they skip on a user's machine, and fail in CI."""
+"""The event loop of tests, which is the gateway's; and what they need of the machine.
 
+Without that they skip on a user's machine, and fail in CI.
+"""
+
+import asyncio
 import itertools
 import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Final
 
 import pytest
+import uvloop
 
 from gateway.log import HOLD_S
 
@@ -31,6 +37,10 @@ _NEEDS: Final = {
     ),
 }
 """By marker: whether the machine has it, and what to do if not."""
+
+
+def pytest_asyncio_loop_factories() -> Mapping[str, Callable[[], asyncio.AbstractEventLoop]]:
+    return {"uvloop": uvloop.new_event_loop}
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

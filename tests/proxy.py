@@ -60,6 +60,8 @@ class Way:
         data = self._corrupted(data)
         size = self.segment_bytes or max(1, len(data))
         for start in range(0, len(data), size):
+            if writer.is_closing():
+                return
             segment = data[start : start + size]
             self.passed_bytes += len(segment)
             writer.write(segment)
@@ -178,8 +180,9 @@ class _Connection:
     def end(self, *, reset: bool = False) -> None:
         for _, writer in (self._client, self._server):
             if reset:
-                tcp = writer.get_extra_info("socket")
-                tcp.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+                if not writer.is_closing():  # else its socket may be closed already
+                    tcp = writer.get_extra_info("socket")
+                    tcp.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
                 writer.transport.abort()
             else:
                 writer.close()

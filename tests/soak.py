@@ -17,9 +17,11 @@ import tempfile
 import time
 from collections import Counter, defaultdict
 from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final
 
+import uvloop
 from rich.console import Console
 
 from gateway import __version__
@@ -151,10 +153,10 @@ class Soak:
         lines = [
             f"Random faults for {self.minutes:g} minutes at {RATE_HZ:g} Hz (`make soak SOAK_MINUTES="
             f"{self.minutes:g}`, seed {self.seed}), {datetime.now(UTC):%Y-%m-%d}, version {__version__}, "
-            f"Python {platform.python_version()}, {platform.machine()}. Each round begins one fault of the "
-            "simulator (see `rtc3d-gateway simulate --list-faults`), ends it 0.3 to 3 s later, and waits for "
-            f"data. The gateway's stall_timeout_s is {STALL_S:g}, its longest wait to reconnect "
-            f"{BACKOFF_S:g} s.",
+            f"Python {platform.python_version()}, uvloop {version('uvloop')}, {platform.machine()}. "
+            "Each round begins one fault of the simulator (see `rtc3d-gateway simulate --list-faults`), "
+            "ends it 0.3 to 3 s later, and waits for data. "
+            f"The gateway's stall_timeout_s is {STALL_S:g}, its longest wait to reconnect {BACKOFF_S:g} s.",
             "",
             "| what | count |",
             "|---|--:|",
@@ -247,7 +249,7 @@ def main() -> None:
     parser.add_argument("--report", type=Path, help="put the report into this file; else it is printed")
     options = parser.parse_args()
     soak = Soak(options.minutes, options.seed)
-    asyncio.run(soak.run(Console()))
+    uvloop.run(soak.run(Console()))
     if options.report:
         before, _, rest = options.report.read_text().partition(BEGIN)
         _, _, after = rest.partition(END)

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import time
 from collections import Counter, deque
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, cast
@@ -51,7 +52,7 @@ class SentCounts:
 class Connection(asyncio.Protocol):
     """One client's TCP connection: packets in to its Client, replies and due frames out.
 
-    Nagle's algorithm is off (§2.1): asyncio does that for every TCP connection. Each packet is
+    Nagle's algorithm is off (§2.1): the loop does that for every TCP connection. Each packet is
     written at once and alone, since common clients read one with one recv (field note 15). A client
     that does not read is not read from either, and its frames are dropped.
     """
@@ -67,7 +68,7 @@ class Connection(asyncio.Protocol):
         self._inbox: deque[Packet] = deque()
         self._is_full = False  # MAX_UNREAD_BYTES wait for the client to read
         self._was_full = False
-        self._first_sent_s: float | None = None  # loop times of this session's first and newest frame
+        self._first_sent_s: float | None = None  # monotonic times of this session's first and newest frame
         self._last_sent_s = 0.0
         self.closed: asyncio.Future[None] = self._loop.create_future()
         self.counts = SentCounts()
@@ -152,7 +153,7 @@ class Connection(asyncio.Protocol):
             self.send(packet)
             self.counts.add(components)
             self._simulator.counts.add(components)
-            self._last_sent_s = self._loop.time()
+            self._last_sent_s = time.monotonic()
             if self._first_sent_s is None:
                 self._first_sent_s = self._last_sent_s
             if not self._can_send():

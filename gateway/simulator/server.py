@@ -2,6 +2,8 @@
 
 import asyncio
 import logging
+import math
+import time
 from collections import Counter
 from collections.abc import Sequence
 from types import TracebackType
@@ -49,7 +51,7 @@ class Simulator:
         self._event_bytes = event_bytes
         self._once = once
         self._builders: dict[frozenset[ComponentType], FrameBuilder] = {}
-        self._started_s: float | None = None  # loop time of the measurement's start
+        self._started_us: int | None = None  # monotonic time of the measurement's start
         self._end_us: int | None = None  # of a measurement that is one pass of the scene
         self._has_measured = False
         self._server: asyncio.Server | None = None
@@ -100,8 +102,6 @@ class Simulator:
         self.stop_measurement()
         if self._server is None:
             return
-        _stop_accepting(self._server)
-        await asyncio.sleep(0)
         self._server.close()
         connections = list(self.connections)
         for connection in connections:
@@ -120,8 +120,7 @@ class Simulator:
         self.stop_measurement()
         server, self._server = self._server, None
         if server is not None:
-            _stop_accepting(server)
-            asyncio.get_running_loop().call_soon(server.close)
+            server.close()
 
     async def __aenter__(self) -> Self:
         await self.start()
@@ -137,9 +136,9 @@ class Simulator:
 
     def start_measurement(self) -> None:
         """Begin a measurement, unless one runs: frame numbers and time stamps start anew, streams go on."""
-        if self._started_s is not None:
+        if self._started_us is not None:
             return
-        self._started_s = asyncio.get_running_loop().time()
+        self._started_us = _now_us()
         self._has_measured = True
         if self._once and self.scene.num_frames is not None:
             self._end_us = time_us(self.scene.num_frames, exact_rate(self.scene.measurement_rate_hz))
@@ -151,9 +150,9 @@ class Simulator:
 
     def stop_measurement(self) -> None:
         """End the measurement, if one runs: clients that wait for frames get a No Data packet."""
-        if self._started_s is None:
+        if self._started_us is None:
             return
-        self._started_s = None
+        self._started_us = None
         _log.info("Measurement stopped")
         for connection in list(self.connections):
             for packet in connection.client.measurement_stopped():
@@ -170,9 +169,9 @@ class Simulator:
 
     def elapsed_us(self) -> int | None:
         """Return the time since the measurement's start in µs, None if none runs."""
-        if self._started_s is None:
+        if self._started_us is None:
             return None
-        elapsed_us = int((asyncio.get_running_loop().time() - self._started_s) * 1e6)
+        elapsed_us = _now_us() - self._started_us
         # what would be due at the end itself is the first frame of another pass
         return elapsed_us if self._end_us is None else min(elapsed_us, self._end_us - 1)
 
@@ -208,14 +207,14 @@ class Simulator:
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        if self._started_s is None:
+        if self._started_us is None:
             return
         due = [self._end_us, *(connection.due_us for connection in self.connections)]
         next_us = min((due_us for due_us in due if due_us is not None), default=None)
         if next_us is not None:
-            # a microsecond later, lest the rounding of float seconds wakes us just before it
-            when_s = self._started_s + (next_us + 1) / 1e6
-            self._timer = asyncio.get_running_loop().call_at(when_s, self._send_due)
+            # uvloop rounds to whole milliseconds: up here, lest it wakes us again and again just before it.
+            wait_ms = math.ceil((self._started_us + next_us - _now_us()) / 1000)
+            self._timer = asyncio.get_running_loop().call_later(max(0, wait_ms) / 1000, self._send_due)
 
     def _send_due(self) -> None:
         elapsed_us = self.elapsed_us()
@@ -229,10 +228,5 @@ class Simulator:
             self.schedule()
 
 
-def _stop_accepting(server: asyncio.Server) -> None:
-    """Accept no more, one round of the loop before ``close``.
-
-    A connection that asyncio is about to make when its server closes is lost, and stays open.
-    """
-    for listening in server.sockets:
-        asyncio.get_running_loop().remove_reader(listening.fileno())
+def _now_us() -> int:
+    return time.monotonic_ns() // 1000

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import uvloop
 import yaml
 from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
@@ -125,7 +126,7 @@ def families() -> dict[str, Metric]:
             await lab.until(lambda: all(s.messages["status"] for _, s in lab.source.fan_out.outputs))
             return await lab.scrape()
 
-    return asyncio.run(run())
+    return uvloop.run(run())
 
 
 @pytest.fixture(scope="module")

@@ -1,11 +1,11 @@
 """One machine for all tests here, with the gateway installed; and its service, anew for each."""
 
-import asyncio
 import shutil
 import subprocess
 from collections.abc import AsyncIterator, Iterator
 
 import pytest
+import uvloop
 
 from tests.clones import ROOT, clone_into, files_in
 from tests.networks import free_endpoint
@@ -25,7 +25,7 @@ def machine() -> Iterator[Machine]:
         booted = Machine(int(process.stdout.readline()))
         clone_into(booted.path(CLONE))
         before = files_in(booted.path(CLONE))
-        booted.said_installing = asyncio.run(booted.type(typed("Install", 1))).text
+        booted.said_installing = uvloop.run(booted.type(typed("Install", 1))).text
         booted.left_in_clone = files_in(booted.path(CLONE)) - before
         yield booted
 

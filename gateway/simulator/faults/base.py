@@ -53,7 +53,7 @@ class Chunk(NamedTuple):
     """Bytes to be sent to a client: at first one packet, with one send."""
 
     when_s: float
-    """The loop's time at which they are to leave, unless earlier ones leave later."""
+    """When they are to leave, on the monotonic clock in s, unless earlier ones leave later."""
     data: bytes
     joins: bool = False
     """Whether they go into one send with those before them, if these leave now as well."""

@@ -6,6 +6,7 @@ import asyncio
 import itertools
 import logging
 import math
+import time
 from collections import deque
 from typing import TYPE_CHECKING, Final
 
@@ -55,7 +56,7 @@ class Line:
     def send(self, packet: bytes) -> None:
         """Send one packet as the faults have it."""
         runs = self._runs()
-        chunks = [Chunk(self._loop.time(), packet)]
+        chunks = [Chunk(time.monotonic(), packet)]
         acted = []
         for run, fault in runs:
             changed = fault.outgoing(chunks, run)
@@ -128,7 +129,7 @@ class Line:
 
     def inject(self, data: bytes) -> None:
         """Send bytes that no fault is to change, after all that waits."""
-        self._queue([Chunk(self._loop.time(), data)])
+        self._queue([Chunk(time.monotonic(), data)])
 
     def hold_for(self, reply: bytes, delay_s: float) -> None:
         """Send a reply so much later; whatever else is sent overtakes it."""
@@ -167,7 +168,7 @@ class Line:
         self._write_due()
 
     def _write_due(self, now_s: float | None = None) -> None:
-        now_s = self._loop.time() if now_s is None else now_s
+        now_s = time.monotonic() if now_s is None else now_s
         while self._waiting and self._waiting[0].when_s <= now_s:
             data = self._waiting.popleft().data
             while self._waiting and self._waiting[0].joins and self._waiting[0].when_s <= now_s:
@@ -178,7 +179,8 @@ class Line:
             self._sending.cancel()
             self._sending = None
         if self._waiting:
-            self._sending = self._loop.call_at(self._waiting[0].when_s, self._write_due)
+            wait_ms = math.ceil(1000 * (self._waiting[0].when_s - now_s))  # see Simulator.schedule
+            self._sending = self._loop.call_later(wait_ms / 1000, self._write_due)
         else:
             self._leave_if_idle()
 
