@@ -26,7 +26,8 @@ test: .venv/installed
 # The tests of what is compiled, and of what stands on it, with the compiled modules in place of the sources.
 # What rate.py waits cannot be shortened there, and takes 14 s.
 COMPILED_TESTS := tests/packaging/test_compiled.py tests/contract tests/unit/rtc3d tests/unit/outputs \
-    $(foreach name,clock components connection fanout faults gateway intake message pacing packets rate streams, \
+    tests/integration/test_faults.py::test_several_faults_at_once \
+    $(foreach name,clock components connection fanout gateway intake message pacing packets rate streams, \
         $(wildcard tests/*/test_$(name)*.py)) \
     --deselect tests/integration/test_streams.py::test_late_frames_make_the_gateway_ask_for_less_until_they_are_in_time
 
