@@ -151,11 +151,21 @@ class Program:
         return self.process.pid
 
 
-def run_measured(command: Sequence[str]) -> None:
+PLAIN_PYTHON: Final = {"PYTHONPATH": str(ROOT)}
+"""The environment of a program that takes the gateway's modules from the sources, not from build/compiled."""
+
+
+def run_measured(command: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
     """Run a program on the first processor to its end; raises RuntimeError with what it said if it failed."""
     with _on_measured_core():
         done = subprocess.run(  # noqa: S603 - programs of ours
-            command, cwd=ROOT, check=False, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+            command,
+            cwd=ROOT,
+            env=os.environ | dict(environment or {}),
+            check=False,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
         )
     if done.returncode:
         raise RuntimeError(done.stdout)

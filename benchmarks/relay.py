@@ -5,12 +5,12 @@ For each packet it cuts out as many bytes as the gateway's messages have, and ha
 
 import asyncio
 import json
-import signal
 import sys
 from functools import partial
 from typing import Any
 
 import lcm
+import uvloop
 import zenoh
 
 from gateway.outputs.zenoh_output import LCM_ENCODING, zenoh_config
@@ -19,7 +19,7 @@ from gateway.outputs.zenoh_output import LCM_ENCODING, zenoh_config
 class Relay(asyncio.Protocol):
     """One connection; ``cuts`` are (first byte, last byte, the calls that take what is between)."""
 
-    def __init__(self, cuts: list[tuple[int, int, tuple[Any, ...]]], ended: asyncio.Event) -> None:
+    def __init__(self, cuts: list[tuple[int, int, list[Any]]], ended: asyncio.Event) -> None:
         self.cuts, self.ended = cuts, ended
         self.rest = bytes(16)  # the gateway's prefix is longer than what precedes the first component
 
@@ -42,32 +42,25 @@ class Relay(asyncio.Protocol):
         self.ended.set()
 
 
-async def main(port: int, cuts: Any) -> None:
-    """Connect, again and again, until SIGTERM."""
-    loop, stop = asyncio.get_running_loop(), asyncio.Event()
-    loop.add_signal_handler(signal.SIGTERM, stop.set)
-    while not stop.is_set():
+async def main(plan: dict[str, Any]) -> None:
+    """Connect, again and again, until the process is ended."""
+    session = zenoh.open(zenoh_config(plan["zenoh"])) if plan["zenoh"] else None
+    channels = lcm.LCM(plan["lcm"]) if plan["lcm"] else None
+    cuts: list[tuple[int, int, list[Any]]] = []
+    for first, last, component, schema in plan["cuts"]:
+        cuts.append((first, last, []))
+        if session:
+            key = f"mocap/{plan['name']}/{component}"
+            encoding, drop = zenoh.Encoding(LCM_ENCODING).with_schema(schema), zenoh.CongestionControl.DROP
+            cuts[-1][2].append(session.declare_publisher(key, encoding=encoding, congestion_control=drop).put)
+        if channels:
+            cuts[-1][2].append(partial(channels.publish, f"MOCAP_{plan['name']}_{component}".upper()))
+    while True:
         ended = asyncio.Event()
-        await loop.create_connection(partial(Relay, cuts, ended), "127.0.0.1", port)
-        waits = [asyncio.create_task(event.wait()) for event in (ended, stop)]
-        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        loop = asyncio.get_running_loop()
+        await loop.create_connection(partial(Relay, cuts, ended), "127.0.0.1", plan["port"])
+        await ended.wait()
 
 
 if __name__ == "__main__":
-    plan = json.loads(sys.argv[1])
-    session = zenoh.open(zenoh_config(plan["zenoh"])) if plan["zenoh"] else None
-    channels = lcm.LCM(plan["lcm"]) if plan["lcm"] else None
-    cuts = []
-    for first, last, component, schema in plan["cuts"]:
-        sends: list[Any] = []
-        if session:
-            key = f"mocap/{plan['name']}/{component}"
-            encoding = zenoh.Encoding(LCM_ENCODING).with_schema(schema)
-            drop = zenoh.CongestionControl.DROP
-            sends.append(session.declare_publisher(key, encoding=encoding, congestion_control=drop).put)
-        if channels:
-            sends.append(partial(channels.publish, f"MOCAP_{plan['name'].upper()}_{component.upper()}"))
-        cuts.append((first, last, tuple(sends)))
-    asyncio.run(main(plan["port"], cuts))
-    if session:
-        session.close()
+    uvloop.run(main(json.loads(sys.argv[1])))

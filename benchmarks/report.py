@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 
 from benchmarks.processes import ROOT, router_kind
+from gateway import fanout
 
 DOCUMENT: Final = ROOT / "docs" / "performance.md"
 RESULTS: Final = ROOT / "benchmarks" / "results.json"
@@ -111,6 +112,7 @@ def machine() -> dict[str, str]:
         "eclipse-zenoh": version("eclipse-zenoh"),
         "lcm": version("lcm"),
         "router": router_kind(),
+        "straight path": "plain Python" if fanout.__file__.endswith(".py") else "compiled",
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
         "commit": commit.stdout.strip() or "unknown",
     }

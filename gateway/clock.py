@@ -29,8 +29,6 @@ from collections.abc import Sequence
 from itertools import islice, pairwise
 from typing import Final, NamedTuple
 
-_new_tuple = tuple.__new__  # half the time of a NamedTuple's own constructor, once for every frame
-
 MAX_DRIFT: Final = 500e-6
 """Crystals are within 100e-6 of their rate. Beyond this, the stamps are not µs of a clock."""
 
@@ -58,19 +56,6 @@ _FROZEN_US: Final = 500_000
 _WRAP_US: Final = 1 << 32
 _WRAP_TOLERANCE_US: Final = 1_000_000
 _NO_TIMESTAMP_US: Final = 1 << 63  # none is as great: they are signed and have 64 bits
-
-
-class Reading(NamedTuple):
-    """What the clock says of one frame.
-
-    ``capture_utime`` is when it was captured, µs since the Unix epoch, never later than it came.
-    ``lag_s`` is by how much it came later than the soonest possible, at least 0, and 0 without a clock.
-    ``restarted`` tells that with this frame the server's time or frame numbers began anew.
-    """
-
-    capture_utime: int
-    lag_s: float
-    restarted: bool
 
 
 class Sample(NamedTuple):
@@ -137,8 +122,12 @@ class ServerClock:
         """On how many frames of least delay the line rests, at most 60."""
         return len(self._samples)
 
-    def observe(self, timestamp_us: int, frame_number: int, arrival_utime: int) -> Reading:
-        """Return what the clock says of the frame that came at ``arrival_utime``, and learn from it.
+    def observe(self, timestamp_us: int, frame_number: int, arrival_utime: int) -> tuple[int, float, bool]:
+        """Learn from the frame that came at ``arrival_utime``; return its (capture_utime, lag_s, restarted).
+
+        ``capture_utime`` is when it was captured, µs since the Unix epoch, never later than it came.
+        ``lag_s`` is by how much it came later than the soonest possible, at least 0, and 0 without a clock.
+        ``restarted`` tells that with this frame the server's time or frame numbers began anew.
 
         Called once per frame, in the order in which frames came. ``timestamp_us`` and ``frame_number`` are
         those of one of its components (§7.1), at best always of the same type: servers may count types apart,
@@ -164,17 +153,17 @@ class ServerClock:
                 self._line_timestamp_us, self._line_utime = server_us, arrival_utime
                 capture_utime = arrival_utime
                 lag_us = 0
-            self._least_lag_us = lag_us
+            self._least_lag_us = float(lag_us)
             self._least = Sample(server_us, arrival_utime - server_us)
 
         if not self.has_clock:
             self._capture_utime = arrival_utime
-            return _new_tuple(Reading, (arrival_utime, 0.0, restarted))
+            return arrival_utime, 0.0, restarted
         # A new line may be below the one before; a subscriber's time is not to go back for that.
         if capture_utime < self._capture_utime:
             capture_utime = min(self._capture_utime, arrival_utime)
         self._capture_utime = capture_utime
-        return _new_tuple(Reading, (capture_utime, lag_us * 1e-6, restarted))
+        return capture_utime, lag_us * 1e-6, restarted
 
     def _take_irregular(self, timestamp_us: int, frame_number: int, arrival_utime: int) -> bool:
         """Prepare for a frame that is the first or does not follow the last; return whether it restarts."""

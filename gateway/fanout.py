@@ -1,13 +1,12 @@
 """From one source's frames to every output: splice each component once, hand it to all."""
 
 import logging
-from collections.abc import Callable, Collection, Sequence
-from typing import Final, NamedTuple
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Final
 
 from gateway.message import (
     FINGERPRINTS,
     MESSAGE_TYPES,
-    PREFIX,
     Stamp,
     canonical_content,
     is_canonical,
@@ -38,15 +37,24 @@ class _Fan:
         self.newest: bytes | None = None
 
 
-class _Plan(NamedTuple):
-    """What is done with frames of one layout."""
+class _Plan:
+    """What is done with the ``wanted`` components of frames of one layout."""
 
-    fans: tuple[tuple[_Fan, int], ...]
-    """Of each component that is wanted, with its index in the frame."""
-    is_canonical: bool
-    """Whether the contents go into messages as they come."""
-    tools: tuple[int, ...]
-    """Which components are tools with messages of their own."""
+    def __init__(
+        self,
+        layout: Layout,
+        wanted: frozenset[ComponentType],
+        fans: Mapping[ComponentType, _Fan],
+        *,
+        with_tools: bool,
+    ) -> None:
+        parts = [(part.type, index) for index, part in enumerate(layout.parts) if part.type in wanted]
+        self.fans = [(fans[kind], index) for kind, index in parts]
+        """Of each component that is wanted, with its index in the frame."""
+        self.is_canonical = all(is_canonical(part, layout.byte_order) for part in layout.parts)
+        """Whether the contents go into messages as they come."""
+        self.tools = [index for kind, index in parts if with_tools and kind is ComponentType.TOOLS]
+        """Which components are tools with messages of their own."""
 
 
 class FanOut:
@@ -126,8 +134,6 @@ class FanOut:
         # The inner loop of the gateway: attributes instead of dictionaries, and calls only to what sends.
         plan = self._plans.get((frame.layout, wanted)) or self._plan(frame.layout, wanted)
         contents = frame.contents if plan.is_canonical else tuple(map(canonical_content, frame.components))
-        utime, capture_utime, session, has_clock = stamp
-        pack = PREFIX.pack
         for fan, index in plan.fans:
             content = contents[index]
             fan.frames += 1
@@ -135,13 +141,13 @@ class FanOut:
             spliced = -1  # the number in it, if any
             for lane in fan.lanes:
                 if lane.pacer is not None and not lane.pacer.due(
-                    timestamp_us_of(content) if has_clock else None, utime
+                    timestamp_us_of(content) if stamp.has_clock else None, stamp.utime
                 ):
                     continue
                 sequence = lane.sequence
                 if spliced != sequence:
                     spliced = sequence
-                    message = pack(fan.fingerprint, utime, capture_utime, sequence, session) + content
+                    message = fan.fingerprint + stamp.packed(sequence) + content
                 lane.sequence = sequence + 1
                 try:
                     lane.publish(message)
@@ -164,19 +170,7 @@ class FanOut:
                 self._note_count(part)
         if len(self._plans) >= _MAX_PLANS:
             self._plans.clear()
-        plan = self._plans[layout, wanted] = _Plan(
-            tuple(
-                (self._fans[part.type], index)
-                for index, part in enumerate(layout.parts)
-                if part.type in wanted
-            ),
-            all(is_canonical(part, layout.byte_order) for part in layout.parts),
-            tuple(
-                index
-                for index, part in enumerate(layout.parts)
-                if part.type is ComponentType.TOOLS and part.type in wanted and self._tools.is_used
-            ),
-        )
+        plan = self._plans[layout, wanted] = _Plan(layout, wanted, self._fans, with_tools=self._tools.is_used)
         return plan
 
     def _note_count(self, part: Part) -> None:

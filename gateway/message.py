@@ -7,7 +7,7 @@ have the component's own fields in its own order, and no value is decoded or enc
 import math
 import struct
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 import rtc3d
@@ -33,10 +33,15 @@ MESSAGE_TYPES: Final[dict[ComponentType, type[Any]]] = {
 }
 """The LCM type of each component's messages."""
 
-PREFIX: Final = struct.Struct(">8sqqqi")
-"""36 bytes: fingerprint, utime, capture_utime, sequence, session."""
+FINGERPRINT_BYTES: Final = 8
 
-MESSAGE_HEADER_BYTES: Final = PREFIX.size + 16
+STAMP: Final = struct.Struct(">qqqi")
+"""What follows the fingerprint: utime, capture_utime, sequence, session."""
+
+PREFIX_BYTES: Final = FINGERPRINT_BYTES + STAMP.size
+"""36: what of a message is ours; the component's own bytes follow."""
+
+MESSAGE_HEADER_BYTES: Final = PREFIX_BYTES + 16
 """Where the items begin: after the prefix, frame number, time stamp and count."""
 
 FINGERPRINTS: Final[dict[ComponentType, bytes]] = {
@@ -51,14 +56,31 @@ _POSE: Final = struct.Struct(">iq?8f")
 _METRES: Final = {"m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "in": 0.0254}
 
 
-class Stamp(NamedTuple):
-    """When a frame came and was captured (µs since the Unix epoch), and in which connection."""
+class Stamp:
+    """When a frame came and was captured (µs since the Unix epoch), and in which connection.
 
-    utime: int
-    capture_utime: int
-    session: int
-    has_clock: bool = True
-    """Whether the server's time stamps make a clock; else its times tell nothing."""
+    ``has_clock`` is whether the server's time stamps make a clock; else its times tell nothing.
+    """
+
+    __slots__ = ("_packed", "_sequence", "capture_utime", "has_clock", "session", "utime")
+
+    def __init__(self, utime: int, capture_utime: int, session: int, has_clock: bool = True) -> None:
+        self.utime = utime
+        self.capture_utime = capture_utime
+        self.session = session
+        self.has_clock = has_clock
+        self._sequence = 0  # the one in _packed
+        self._packed = b""
+
+    def packed(self, sequence: int) -> bytes:
+        """Return what follows the fingerprint in a message with this number: 28 bytes.
+
+        Of one frame most messages have the same number: the bytes are kept.
+        """
+        if sequence != self._sequence or not self._packed:
+            self._sequence = sequence
+            self._packed = STAMP.pack(self.utime, self.capture_utime, sequence, self.session)
+        return self._packed
 
 
 def type_name(message_type: type[Any]) -> str:
@@ -71,10 +93,7 @@ def splice(component: Component, stamp: Stamp, sequence: int) -> bytes:
 
     The fan-out does the same, with FINGERPRINTS, for contents that are canonical as they come.
     """
-    prefix = PREFIX.pack(
-        FINGERPRINTS[component.type], stamp.utime, stamp.capture_utime, sequence, stamp.session
-    )
-    return prefix + canonical_content(component)
+    return FINGERPRINTS[component.type] + stamp.packed(sequence) + canonical_content(component)
 
 
 def is_canonical(part: Part, byte_order: ByteOrder) -> bool:
@@ -113,8 +132,7 @@ def tool_poses(
     ``sequences`` holds one sequence number per tool; ``metres`` is the size of the component's unit.
     """
     return [
-        PREFIX.pack(_POSE_FINGERPRINT, stamp.utime, stamp.capture_utime, sequence, stamp.session)
-        + _pose(component, tool, metres)
+        _POSE_FINGERPRINT + stamp.packed(sequence) + _pose(component, tool, metres)
         for tool, sequence in zip(component.items().tolist(), sequences, strict=True)
     ]
 

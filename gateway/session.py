@@ -5,6 +5,7 @@ import contextlib
 import logging
 import socket
 from collections.abc import Callable
+from time import monotonic, time_ns
 from typing import Final, NamedTuple
 
 from gateway.config import Source, Stream
@@ -34,7 +35,7 @@ from gateway.rtc3d.connection import (
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.packets import Packet, text_of
 from gateway.rtc3d.parameters_xml import ParsedParameters
-from gateway.status import StreamStatus, now_utime
+from gateway.status import StreamStatus
 from gateway.stream_state import StreamInput
 
 _BYE_S: Final = 0.5
@@ -53,8 +54,8 @@ logger = logging.getLogger(__name__)
 class Handlers(NamedTuple):
     """Who takes what a session receives. Called from the event loop; they must not wait."""
 
-    frames: Callable[[list[Frame], int], None]
-    """Frames that came together, oldest first, and the host's time of it in µs since the Unix epoch."""
+    frames: Callable[[list[Frame], int, float], None]
+    """Frames that came together, oldest first; when, in µs since the Unix epoch and in s of monotonic()."""
     parameters: Callable[[bytes, ParsedParameters], None]
     """The server's XML as it came, and what it says."""
     file: Callable[[bytes], None]
@@ -113,7 +114,7 @@ class Session(asyncio.Protocol):
             ) from error
         except OSError as error:
             raise ConnectError(_connect_text(self.server, error)) from error
-        self._last_frame_s = self._loop.time()
+        self._last_frame_s = monotonic()
         self._status.move(StreamInput.CONNECTED, self.server)
 
     async def ask(self, command: Command) -> Packet:
@@ -153,7 +154,7 @@ class Session(asyncio.Protocol):
     async def ended(self) -> None:
         """Wait for the end, and for silence; raises LinkError with the reason."""
         while True:
-            quiet_s = self._loop.time() - self._last_frame_s
+            quiet_s = monotonic() - self._last_frame_s
             wait_s = self._source.stall_timeout_s - quiet_s
             if wait_s <= 0:
                 await self._on_silence()
@@ -181,7 +182,7 @@ class Session(asyncio.Protocol):
             pass
         except ReplyTimeoutError as error:
             raise SilenceError(f"{error}, and sends no frames; connecting again") from None
-        self._last_frame_s = self._loop.time()
+        self._last_frame_s = monotonic()
 
     async def close(self) -> None:
         """Say Bye, and end the connection at the latest half a second later."""
@@ -212,7 +213,7 @@ class Session(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Take bytes; the straight path from here to the outputs is calls, not tasks."""
-        utime = now_utime()
+        utime = time_ns() // 1000
         self._status.bytes_in += len(data)
         frames: list[Frame] = []
         for event in self._connection.receive(data):
@@ -223,8 +224,8 @@ class Session(asyncio.Protocol):
         if self._connection.state is not self._seen:
             self._on_state()
         if frames:
-            self._last_frame_s = self._loop.time()
-            self.handlers.frames(frames, utime)
+            self._last_frame_s = now_s = monotonic()
+            self.handlers.frames(frames, utime, now_s)
             if self._rejected.failing:
                 self._rejected.recovered("frames are good again")
 
@@ -237,7 +238,7 @@ class Session(asyncio.Protocol):
 
     def _on_state(self) -> None:
         self._seen = self._connection.state
-        self._last_frame_s = self._loop.time()
+        self._last_frame_s = monotonic()
         self._status.byte_order = self._connection.byte_order or ""
         if self._seen in _INPUTS:
             self._status.move(_INPUTS[self._seen], self.server)

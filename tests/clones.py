@@ -3,15 +3,34 @@
 import os
 import shutil
 import subprocess
+import tomllib
 from pathlib import Path
 from typing import Final
+
+import pytest
 
 ROOT: Final = Path(__file__).parents[1]
 WHEELHOUSE: Final = ROOT / "build/wheelhouse"
 """All that installing downloads, by ``make wheelhouse``."""
 
+WHEELHOUSE_PYTHON: Final = ROOT / "build/wheelhouse-venv/bin/python"
+"""SYSTEM_PYTHON with pip, which Debian's has not."""
+
 SYSTEM_PYTHON: Final = os.environ.get("SYSTEM_PYTHON", "/usr/bin/python3")
 """The Python to install with: one that services can reach, which a developer's own is often not."""
+
+_PROJECT: Final = tomllib.loads((ROOT / "pyproject.toml").read_text())
+
+COMPILED_MODULES: Final[list[str]] = _PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["hooks"]["mypyc"][
+    "include"
+]
+"""The files that are compiled where there is a C compiler, from ROOT."""
+
+
+def skip_if_plain(said: str) -> None:
+    """Skip a test of what is compiled where make ``said`` that it cannot be, but not in CI."""
+    if "Plain Python" in said:
+        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(said)
 
 
 def clone_into(folder: Path) -> None:

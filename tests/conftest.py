@@ -4,13 +4,17 @@ Without that they skip on a user's machine, and fail in CI.
 """
 
 import asyncio
+import itertools
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Final
 
 import pytest
 import uvloop
+
+from gateway.log import HOLD_S
 
 _WHEELHOUSE: Final = Path(__file__).parents[1] / "build/wheelhouse/complete"
 
@@ -46,3 +50,9 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
         if os.environ.get("CI") == "true":
             pytest.fail(f"CI must not skip this: {reason}", pytrace=False)
         pytest.skip(reason)
+
+
+@pytest.fixture
+def no_hold(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Have a failure be over with the first success: HOLD_S pass between any two looks at the log's clock."""
+    monkeypatch.setattr("gateway.log.time", SimpleNamespace(monotonic=itertools.count(0.0, HOLD_S).__next__))

@@ -104,7 +104,7 @@ class StreamWatch:
     def _learn(self, _xml: bytes, parsed: ParsedParameters) -> None:
         self.parsed = parsed
 
-    def _take(self, frames: list[Frame], utime: int) -> None:
+    def _take(self, frames: list[Frame], utime: int, _now_s: float) -> None:
         self.status.frames_in += len(frames)
         for frame in frames:
             for component in frame.components:

@@ -8,7 +8,7 @@ import logging
 import threading
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import zenoh
 
@@ -95,9 +95,10 @@ class ZenohPublisher:
 
     def look(self) -> None:
         """See again whether anybody listens: a notification may have been missed."""
-        if self._publisher is not None:
-            # Zenoh's type stub says bool here; it is the same MatchingStatus that listeners get.
-            self.wanted = cast(zenoh.MatchingStatus, self._publisher.matching_status).matching
+        # Zenoh's type stub says that matching_status is a bool; it is the MatchingStatus that listeners get.
+        publisher: Any = self._publisher
+        if publisher is not None:
+            self.wanted = publisher.matching_status.matching
 
     def _on_matching(self, status: zenoh.MatchingStatus) -> None:
         # From Zenoh's thread; setting a flag is all it does.

@@ -18,7 +18,7 @@ from gateway.errors import (
     ReplyTimeoutError,
     ServerError,
 )
-from gateway.message import PREFIX, Stamp, splice
+from gateway.message import FINGERPRINT_BYTES, STAMP, Stamp, splice
 from gateway.queries.answers import (
     JSON,
     XML,
@@ -326,5 +326,5 @@ class Desk:
 
 
 def _session_of(message: bytes) -> int:
-    session: int = PREFIX.unpack_from(message)[4]
+    session: int = STAMP.unpack_from(message, FINGERPRINT_BYTES)[3]
     return session

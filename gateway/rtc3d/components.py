@@ -2,13 +2,13 @@
 
 import struct
 from enum import IntEnum
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 ByteOrder = Literal["big", "little"]
-Items = npt.NDArray[Any]
+Items: TypeAlias = npt.NDArray[Any]
 
 
 class ComponentType(IntEnum):

@@ -191,10 +191,10 @@ async def test_components_that_were_not_asked_for_are_not_published() -> None:
         assert running.messages("3d") == []
 
 
+@pytest.mark.usefixtures("no_hold")
 async def test_bad_frames_are_counted_and_the_next_good_one_is_published(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr("gateway.session.HOLD_S", 0.0)
     caplog.set_level(logging.DEBUG, "gateway.session")
 
     async def script(client: Client) -> None:

@@ -2,36 +2,69 @@
 
 import subprocess
 import sys
+import sysconfig
 import zipfile
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
-from tests.clones import ROOT, SYSTEM_PYTHON, clone_into, files_in, pip_environment
+from gateway import __version__
+from tests.clones import (
+    COMPILED_MODULES,
+    ROOT,
+    SYSTEM_PYTHON,
+    WHEELHOUSE_PYTHON,
+    clone_into,
+    files_in,
+    pip_environment,
+    skip_if_plain,
+)
 
 pytestmark = [pytest.mark.wheelhouse]
 
 _PATH = "/usr/local/bin:/usr/bin:/bin"
 
 
-@pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    clone = tmp_path_factory.mktemp("clone")
+class Made(NamedTuple):
+    """A wheel, and what make said of it."""
+
+    wheel: Path
+    said: str
+
+    @property
+    def names(self) -> set[str]:
+        return set(zipfile.ZipFile(self.wheel).namelist())
+
+
+def make_wheel(clone: Path, **environment: str) -> Made:
     clone_into(clone)
     before = files_in(clone)
-    make = ["make", "-C", str(clone), "wheel", f"PYTHON={sys.executable}"]
-    subprocess.run(make, env={"PATH": _PATH, **pip_environment()}, check=True, stdout=subprocess.DEVNULL)
+    make = ["make", "-C", str(clone), "wheel", f"PYTHON={WHEELHOUSE_PYTHON}"]
+    said = subprocess.check_output(make, env={"PATH": _PATH, **pip_environment(), **environment}, text=True)
     [built] = clone.glob("dist/*.whl")
     assert files_in(clone) == before | {f"dist/{built.name}"}
-    return built
+    return Made(built, said)
 
 
 @pytest.fixture(scope="module")
-def program(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """The wheel as this machine makes it: compiled, if it has a compiler."""
+    return make_wheel(tmp_path_factory.mktemp("clone"))
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> Made:
+    """The wheel as a machine without a compiler makes it."""
+    return make_wheel(tmp_path_factory.mktemp("clone"), CC="no-such-compiler")
+
+
+@pytest.fixture(scope="module")
+def program(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
     home = tmp_path_factory.mktemp("home")
     folders = {f"PIPX_{name}": str(home / name) for name in ("HOME", "BIN_DIR", "MAN_DIR")}
     environment = {"PATH": _PATH, "HOME": str(home), **folders, **pip_environment()}
-    pipx = [sys.executable, "-m", "pipx", "install", "--quiet", f"--python={SYSTEM_PYTHON}", str(wheel)]
+    pipx = [sys.executable, "-m", "pipx", "install", "--quiet", f"--python={SYSTEM_PYTHON}", str(made.wheel)]
     subprocess.run(pipx, env=environment, check=True)
     return home / "BIN_DIR" / "rtc3d-gateway"
 
@@ -42,16 +75,34 @@ def run(program: Path, folder: Path, *arguments: str) -> str:
     return subprocess.check_output(command, cwd=folder, env={"PATH": _PATH, "LANG": "C.UTF-8"}, text=True)
 
 
-def test_the_wheel_has_message_types_and_configurations(wheel: Path) -> None:
-    names = set(zipfile.ZipFile(wheel).namelist())
+@pytest.mark.parametrize("kind", ["made", "plain"])
+def test_the_wheel_has_message_types_and_configurations(kind: str, request: pytest.FixtureRequest) -> None:
+    names = request.getfixturevalue(kind).names
     message_types = {f"rtc3d/{path.name}" for path in (ROOT / "lcm_types/rtc3d").glob("*.lcm")}
     configurations = {f"gateway/_config/{name}" for name in files_in(ROOT / "config")}
-    assert message_types | configurations | {"gateway/py.typed"} <= names
+    assert message_types | configurations | {"gateway/py.typed"} | set(COMPILED_MODULES) <= names
     assert not any(name.startswith(("tests/", "benchmarks/")) for name in names)
 
 
-def test_the_program_says_its_version(program: Path, tmp_path: Path) -> None:
-    assert run(program, tmp_path, "--version").startswith("rtc3d-gateway ")
+def test_with_a_compiler_the_straight_path_is_compiled_for_this_platform(made: Made) -> None:
+    skip_if_plain(made.said)
+    compiled = {name.partition(".")[0] + ".py" for name in made.names if name.endswith(".so") and "/" in name}
+    assert compiled == set(COMPILED_MODULES)
+    assert made.wheel.name.endswith(f"{sysconfig.get_platform().replace('-', '_')}.whl")
+
+
+def test_without_a_compiler_the_wheel_is_for_any_platform_and_make_says_what_is_missing(plain: Made) -> None:
+    assert not any(name.endswith(".so") for name in plain.names)
+    assert plain.wheel.name.endswith("-py3-none-any.whl")
+    [line] = [line for line in plain.said.splitlines() if "Plain Python" in line]
+    assert "for want of no-such-compiler (Debian: apt-get install gcc python3-dev)" in line
+
+
+def test_the_program_says_its_version_and_that_it_is_compiled(
+    made: Made, program: Path, tmp_path: Path
+) -> None:
+    skip_if_plain(made.said)
+    assert run(program, tmp_path, "--version") == f"rtc3d-gateway {__version__} (compiled)\n"
 
 
 @pytest.mark.parametrize("name", ["gateway.yaml", "demo.yaml", "two-servers.yaml"])

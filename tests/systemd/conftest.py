@@ -25,7 +25,7 @@ def machine() -> Iterator[Machine]:
         booted = Machine(int(process.stdout.readline()))
         clone_into(booted.path(CLONE))
         before = files_in(booted.path(CLONE))
-        uvloop.run(booted.type(typed("Install", 1)))
+        booted.said_installing = uvloop.run(booted.type(typed("Install", 1))).text
         booted.left_in_clone = files_in(booted.path(CLONE)) - before
         yield booted
 

@@ -35,6 +35,7 @@ class Machine:
         self._files = Path(f"/proc/{process_1}/root")
         self.left_in_clone: set[str] = set()
         """What installing made in the clone."""
+        self.said_installing = ""
 
     def path(self, path: str) -> Path:
         """Return where a file of the machine is, seen from here."""

@@ -5,6 +5,7 @@ import shutil
 
 import pytest
 
+from tests.clones import skip_if_plain
 from tests.networks import free_port, zenoh_keys
 from tests.systemd.machine import CONFIG, UNIT, Machine, Service
 from tests.systemd.page import exposure, typed
@@ -18,6 +19,7 @@ UNITS = "/usr/local/lib/systemd/system"
 SCHEMA = "/etc/rtc3d-gateway/gateway.schema.json"
 SECRETS = "/etc/rtc3d-gateway/gateway.env"
 INSTANCE = "rtc3d-gateway@hall-2.service"
+WITHOUT_COMPILER = "export CC=no-such-compiler\n"
 
 
 async def test_the_program_runs_from_its_own_environment(machine: Machine) -> None:
@@ -27,6 +29,11 @@ async def test_the_program_runs_from_its_own_environment(machine: Machine) -> No
     where = "import gateway, os; print(os.path.realpath(gateway.__file__))"
     location = await machine.run(f"{VENV}/bin/python", "-c", where)
     assert location.text.startswith(f"{VENV}/lib")
+
+
+async def test_the_program_is_compiled_where_there_is_a_compiler(machine: Machine) -> None:
+    skip_if_plain(machine.said_installing)
+    assert (await machine.run(PROGRAM, "--version")).text.endswith(" (compiled)\n")
 
 
 def test_installing_leaves_nothing_in_the_clone(machine: Machine) -> None:
@@ -113,10 +120,11 @@ async def test_a_secret_reaches_the_gateway_and_nobody_else(service: Service) ->
 async def test_upgrading_and_removing_leave_the_configuration(machine: Machine) -> None:
     mine = "sources: [{name: mine, host: 192.0.2.20}]\n"
     machine.path(CONFIG).write_text(mine)
-    await machine.type(typed("Upgrade"))
+    await machine.run("cp", "--archive", "--link", VENV, "/opt/kept")  # so that installing again is short
+    await machine.type(WITHOUT_COMPILER + typed("Upgrade"))
+    assert "compiled" not in (await machine.run(PROGRAM, "--version")).text
     assert machine.path(CONFIG).read_text() == mine
     await machine.run("systemctl", "enable", UNIT, INSTANCE)
-    await machine.run("cp", "--archive", "--link", VENV, "/opt/kept")  # so that installing again is short
     await machine.type(typed("Remove"))
     try:
         for path in (
@@ -132,6 +140,8 @@ async def test_upgrading_and_removing_leave_the_configuration(machine: Machine) 
         assert machine.path(CONFIG).read_text() == mine
     finally:
         await machine.run("mkdir", "--parents", PREFIX)
+        await machine.run("cp", "--archive", "--link", "/opt/kept", VENV)
+        await machine.type(WITHOUT_COMPILER + typed("Install", 1))
+        await machine.run("rm", "-r", VENV)
         await machine.run("mv", "/opt/kept", VENV)
-        await machine.type(typed("Install", 1))
     assert machine.path(CONFIG).read_text() == mine

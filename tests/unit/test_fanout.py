@@ -4,7 +4,6 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from gateway import ways
 from gateway.decode import decode
 from gateway.errors import OutputError
 from gateway.fanout import FanOut
@@ -63,7 +62,7 @@ def test_each_component_counts_for_itself_and_across_sessions(memory: MemoryOutp
     fan_out = FanOut("lab", [memory])
     fan_out.publish(FULL, STAMP, ALL)
     fan_out.publish(FULL, STAMP, MARKERS)
-    fan_out.publish(FULL, STAMP._replace(session=2), ALL)
+    fan_out.publish(FULL, Stamp(STAMP.utime, STAMP.capture_utime, 2), ALL)
     messages = [(topic.parts, decode(message)) for topic, message in memory.messages]
     counted = {
         key: [(message.sequence, message.session) for parts, message in messages if parts == (key,)]
@@ -145,10 +144,10 @@ def test_a_message_refused_still_counts_so_that_the_gap_shows() -> None:
     assert [decode(message).sequence for _, message in output.messages] == [0, 2]
 
 
+@pytest.mark.usefixtures("no_hold")
 def test_a_failing_output_is_told_once_loudly_then_quietly_and_when_it_is_over(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    monkeypatch.setattr(ways, "HOLD_S", 0.0)
     caplog.set_level(logging.DEBUG, "gateway.ways")
     output = ToyOutput()
     fan_out = FanOut("lab", [output])

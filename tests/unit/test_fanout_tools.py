@@ -101,7 +101,7 @@ def test_the_same_tools_again_keep_their_topics() -> None:
     fan_out = FanOut("lab", [output], ["toy"])
     for session in (1, 2):
         fan_out.set_parameters(parameters("Probe"))
-        fan_out.publish(tools_frame(IN_VIEW), STAMP._replace(session=session), ALL)
+        fan_out.publish(tools_frame(IN_VIEW), Stamp(STAMP.utime, STAMP.capture_utime, session), ALL)
     counted = [(pose.sequence, pose.session) for pose in output.poses("Probe")]
     assert counted == [(0, 1), (1, 2)]
     assert output.given_up == []

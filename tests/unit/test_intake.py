@@ -1,5 +1,7 @@
 """Batches of frames with their times, against a clock that has learnt for three seconds."""
 
+from time import monotonic
+
 import numpy as np
 import pytest
 
@@ -49,7 +51,7 @@ class Lab:
 
     def take(self, *frames: Frame, late_us: int = 0) -> None:
         newest = frames[-1].components[0].timestamp_us
-        self.intake.take(list(frames), BOOT_UTIME + newest + late_us)
+        self.intake.take(list(frames), BOOT_UTIME + newest + late_us, monotonic())
 
 
 @pytest.fixture(params=["latest", "all"])
@@ -89,7 +91,7 @@ async def test_while_behind_the_newest_is_published_and_no_event_is_skipped(lab:
 
 
 async def test_a_restart_is_told_and_is_no_lateness(lab: Lab) -> None:
-    lab.intake.take([frame(3)], BOOT_UTIME + 600 * PERIOD_US)
+    lab.intake.take([frame(3)], BOOT_UTIME + 600 * PERIOD_US, monotonic())
     assert (lab.restarts, lab.status.restarts) == (1, 1)
     assert [number for number, _ in lab.published] == [3]
     assert lab.halvings == []
@@ -97,6 +99,6 @@ async def test_a_restart_is_told_and_is_no_lateness(lab: Lab) -> None:
 
 async def test_frames_without_components_are_counted_and_no_more(lab: Lab) -> None:
     before = lab.status.frames_in
-    lab.intake.take([split_frame(build_frame([]), "big")], BOOT_UTIME)
+    lab.intake.take([split_frame(build_frame([]), "big")], BOOT_UTIME, monotonic())
     assert lab.status.frames_in == before + 1
     assert not lab.published

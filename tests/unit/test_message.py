@@ -132,7 +132,9 @@ def test_a_component_without_items_is_a_message_without_items(kind: ComponentTyp
     )
     (component,) = split_frame((1).to_bytes(4, order) + wire, order).components
     fingerprint = LCM_TYPES[kind]._get_packed_fingerprint()
-    expected = struct.pack(">8sqqqiiqi", fingerprint, *STAMP[:2], SEQUENCE, STAMP.session, 7, 9, 0)
+    expected = struct.pack(
+        ">8sqqqiiqi", fingerprint, STAMP.utime, STAMP.capture_utime, SEQUENCE, STAMP.session, 7, 9, 0
+    )
     assert splice(component, STAMP, SEQUENCE) == expected
 
 

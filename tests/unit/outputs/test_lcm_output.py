@@ -8,7 +8,6 @@ import pytest
 from gateway.config import LcmSettings
 from gateway.errors import OutputError
 from gateway.names import Topic
-from gateway.outputs import lcm_output
 from gateway.outputs.lcm_output import LcmOutput, multicast_problem, open_lcm
 from tests.networks import add_multicast_route, lcm_url, remove_multicast_route
 from tests.waiting import wait_until
@@ -167,10 +166,8 @@ def test_with_a_multicast_route_there_is_no_problem() -> None:
 
 
 @pytest.mark.netns
-def test_a_route_lost_and_found_is_told_once_each(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(lcm_output, "HOLD_S", 0.0)
+@pytest.mark.usefixtures("no_hold")
+def test_a_route_lost_and_found_is_told_once_each(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "gateway.outputs")
     url = lcm_url()
     output = LcmOutput(LcmSettings(url=url))

@@ -223,20 +223,9 @@ def test_after_the_error_nothing_more_is_returned_or_kept(first: bytes) -> None:
 
 
 def test_a_packet_of_4_gib_cannot_be_encoded() -> None:
-    class Body(bytes):  # says a length that a test should not allocate
-        def __new__(cls, length: int) -> "Body":
-            body = super().__new__(cls)
-            body.length = length
-            return body
-
-        length: int
-
-        def __len__(self) -> int:
-            return self.length
-
-    assert encode_packet(2, Body(0xFFFFFFFF - 8)) == b"\xff\xff\xff\xff\0\0\0\x02"
+    body = bytes(0xFFFFFFFF - 7)  # of zeros that nobody looks at: it takes no memory
     with pytest.raises(PacketError, match="4294967296") as caught:
-        encode_packet(2, Body(0xFFFFFFFF - 7))
+        encode_packet(2, body)
     assert (caught.value.size, caught.value.packet_type) == (4294967296, 2)
 
 
