@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 
 from benchmarks.processes import ROOT, router_kind
-from gateway import fanout
+from gateway import version_text
 
 DOCUMENT: Final = ROOT / "docs" / "performance.md"
 RESULTS: Final = ROOT / "benchmarks" / "results.json"
@@ -112,7 +112,7 @@ def machine() -> dict[str, str]:
         "eclipse-zenoh": version("eclipse-zenoh"),
         "lcm": version("lcm"),
         "router": router_kind(),
-        "straight path": "plain Python" if fanout.__file__.endswith(".py") else "compiled",
+        "gateway": version_text(),
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
         "commit": commit.stdout.strip() or "unknown",
     }
@@ -132,11 +132,10 @@ def merge(file: Path, part: str, result: dict[str, Any]) -> None:
 
 def machines_table(results: dict[str, Any]) -> Table:
     """Return on what the parts were measured, a column for those that were measured alike."""
+    names = list(dict.fromkeys(name for result in results.values() for name in result["machine"]))
     parts: dict[tuple[str, ...], list[str]] = {}
-    names: list[str] = []
     for part, result in results.items():
-        names = list(result["machine"])
-        parts.setdefault(tuple(result["machine"].values()), []).append(part)
+        parts.setdefault(tuple(result["machine"].get(name, "") for name in names), []).append(part)
     rows = [[name, *(values[at] for values in parts)] for at, name in enumerate(names)]
     return Table("Machine", ["parts", *(", ".join(each) for each in parts.values())], rows)
 

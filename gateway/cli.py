@@ -15,7 +15,7 @@ import typer
 import uvloop
 from rich.console import Console
 
-from gateway import __version__, cli_configuration, fanout
+from gateway import cli_configuration, version_text
 from gateway.cli_configuration import INSTALLED_CONFIG, ConfigOption, ServerOption, configuration
 from gateway.config import effective_lcm_url
 from gateway.config_file import load
@@ -77,8 +77,7 @@ def _exit(text: str, status: int) -> NoReturn:
 
 def _show_version(wanted: bool) -> None:
     if wanted:
-        compiled = "" if fanout.__file__.endswith(".py") else " (compiled)"
-        print(f"rtc3d-gateway {__version__}{compiled}")
+        print(f"rtc3d-gateway {version_text()}")
         raise typer.Exit
 
 

@@ -24,7 +24,7 @@ from typing import Any, Final
 import uvloop
 from rich.console import Console
 
-from gateway import __version__
+from gateway import version_text
 from gateway.decode import decode
 from gateway.listening import ZenohListener, key_pattern, open_zenoh
 from gateway.simulator.faults.control import Faults
@@ -62,7 +62,8 @@ class Heard:
             except Exception:  # noqa: BLE001 - counted: a malformed message is what is looked for
                 self.malformed += 1
                 return
-            expected = self._sequence.get(component, -1) + 1
+            # The first may have any number: the gateway does not wait for this subscriber.
+            expected = self._sequence.get(component, decoded.sequence - 1) + 1
             if decoded.sequence < expected:
                 self.repeated += 1
             self.gaps[component] += max(0, decoded.sequence - expected)
@@ -152,7 +153,7 @@ class Soak:
         start_kib, end_kib = self.memory_kib[0], self.memory_kib[-1]
         lines = [
             f"Random faults for {self.minutes:g} minutes at {RATE_HZ:g} Hz (`make soak SOAK_MINUTES="
-            f"{self.minutes:g}`, seed {self.seed}), {datetime.now(UTC):%Y-%m-%d}, version {__version__}, "
+            f"{self.minutes:g}`, seed {self.seed}), {datetime.now(UTC):%Y-%m-%d}, version {version_text()}, "
             f"Python {platform.python_version()}, uvloop {version('uvloop')}, {platform.machine()}. "
             "Each round begins one fault of the simulator (see `rtc3d-gateway simulate --list-faults`), "
             "ends it 0.3 to 3 s later, and waits for data. "

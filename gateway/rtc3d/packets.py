@@ -98,7 +98,8 @@ class PacketReader:
         Never raises: look at ``error`` after handling what was returned. Once it is set, further
         bytes are thrown away.
         """
-        if self.error is not None:
+        error = self.error  # of before; what follows may set it
+        if error is not None:
             return []
         if not self._partial:
             packets, used = self._cut(data)
