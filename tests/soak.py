@@ -62,7 +62,8 @@ class Heard:
             except Exception:  # noqa: BLE001 - counted: a malformed message is what is looked for
                 self.malformed += 1
                 return
-            expected = self._sequence.get(component, -1) + 1
+            # The first may have any number: the gateway does not wait for this subscriber.
+            expected = self._sequence.get(component, decoded.sequence - 1) + 1
             if decoded.sequence < expected:
                 self.repeated += 1
             self.gaps[component] += max(0, decoded.sequence - expected)
