@@ -9,6 +9,7 @@ import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
+from functools import cache
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -94,8 +95,9 @@ class Progress:
         )
 
 
+@cache
 def machine() -> dict[str, str]:
-    """Return on what the figures were measured, and with what."""
+    """Return on what the figures were measured, and with what; the same for all of a run, which writes results."""
     model = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     commit = subprocess.run(
         ["git", "describe", "--always", "--dirty"],  # noqa: S607 - wherever git is
