@@ -97,7 +97,7 @@ class Progress:
 
 @cache
 def machine() -> dict[str, str]:
-    """Return on what the figures were measured, and with what; the same for all of a run, which writes results."""
+    """Return on what and with what the figures are measured; found out once, for results change the tree."""
     model = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     commit = subprocess.run(
         ["git", "describe", "--always", "--dirty"],  # noqa: S607 - wherever git is
