@@ -174,7 +174,7 @@ def run_measured(command: Sequence[str], environment: Mapping[str, str] | None =
 def gateway(file: Path, settings: dict[str, Any]) -> Program:
     """Return the gateway as users run it, with ``settings`` in the configuration ``file``."""
     file.write_text(yaml.safe_dump(settings))
-    command = [sys.executable, "-m", "gateway", "run", "--config", str(file), "--log-level", "warning"]
+    command = [sys.executable, "-m", "gateway", "run", "--config", str(file), "--log-level", "error"]
     return Program(command, measured=True)
 
 
