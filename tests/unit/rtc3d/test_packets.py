@@ -229,6 +229,23 @@ def test_a_packet_of_4_gib_cannot_be_encoded() -> None:
     assert (caught.value.size, caught.value.packet_type) == (4294967296, 2)
 
 
+def test_a_packet_of_a_byte_less_can_be_encoded() -> None:
+    class Body(bytes):  # says a length that a test should not allocate
+        def __new__(cls, length: int) -> "Body":
+            body = super().__new__(cls)
+            body.length = length
+            return body
+
+        length: int
+
+        def __len__(self) -> int:
+            return self.length
+
+    assert encode_packet(2, Body(0xFFFFFFFF - 8)) == b"\xff\xff\xff\xff\0\0\0\x02"
+    with pytest.raises(PacketError, match="4294967296"):
+        encode_packet(2, Body(0xFFFFFFFF - 7))
+
+
 # Memory --------------------------------------------------------------------------------------
 
 
