@@ -106,7 +106,7 @@ class _Fed:
 
     async def _feed(self, loops: int, per_read: int) -> float:
         size = self._frames.packet_bytes
-        feed = _feeder(self._session)
+        feed = self._session.data_received
         took_s = 0.0
         for first in range(0, loops, _BLOCK_FRAMES):
             self._frames.stamp(self._number, time.monotonic_ns() // 1000)
@@ -131,22 +131,6 @@ class _Fed:
         self._stop.set()
         self._loop.run_until_complete(self._running)
         self._loop.run_until_complete(self._server.close())
-
-
-def _feeder(session: Any) -> Any:
-    """Return what asyncio does with bytes that a socket gave, for either kind of its protocols."""
-    if not isinstance(session, asyncio.BufferedProtocol):
-        return session.data_received
-
-    def feed(data: bytes) -> None:
-        while data:
-            buffer = memoryview(session.get_buffer(-1))
-            count = min(len(buffer), len(data))
-            buffer[:count] = data[:count]
-            session.buffer_updated(count)
-            data = data[count:]
-
-    return feed
 
 
 def expected_s(quick: bool) -> float:

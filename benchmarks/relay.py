@@ -48,16 +48,17 @@ async def main(plan: dict[str, Any]) -> None:
     channels = lcm.LCM(plan["lcm"]) if plan["lcm"] else None
     cuts: list[tuple[int, int, list[Any]]] = []
     for first, last, component, schema in plan["cuts"]:
-        cuts.append((first, last, []))
+        sends: list[Any] = []
         if session:
             key = f"mocap/{plan['name']}/{component}"
             encoding, drop = zenoh.Encoding(LCM_ENCODING).with_schema(schema), zenoh.CongestionControl.DROP
-            cuts[-1][2].append(session.declare_publisher(key, encoding=encoding, congestion_control=drop).put)
+            sends.append(session.declare_publisher(key, encoding=encoding, congestion_control=drop).put)
         if channels:
-            cuts[-1][2].append(partial(channels.publish, f"MOCAP_{plan['name']}_{component}".upper()))
+            sends.append(partial(channels.publish, f"MOCAP_{plan['name']}_{component}".upper()))
+        cuts.append((first, last, sends))
+    loop = asyncio.get_running_loop()
     while True:
         ended = asyncio.Event()
-        loop = asyncio.get_running_loop()
         await loop.create_connection(partial(Relay, cuts, ended), "127.0.0.1", plan["port"])
         await ended.wait()
 

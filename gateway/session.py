@@ -5,7 +5,7 @@ import contextlib
 import logging
 import socket
 from collections.abc import Callable
-from time import monotonic, time_ns
+from time import monotonic
 from typing import Final, NamedTuple
 
 from gateway.config import Source, Stream
@@ -35,7 +35,7 @@ from gateway.rtc3d.connection import (
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.packets import Packet, text_of
 from gateway.rtc3d.parameters_xml import ParsedParameters
-from gateway.status import StreamStatus
+from gateway.status import StreamStatus, now_utime
 from gateway.stream_state import StreamInput
 
 _BYE_S: Final = 0.5
@@ -213,7 +213,7 @@ class Session(asyncio.Protocol):
 
     def data_received(self, data: bytes) -> None:
         """Take bytes; the straight path from here to the outputs is calls, not tasks."""
-        utime = time_ns() // 1000
+        utime = now_utime()
         self._status.bytes_in += len(data)
         frames: list[Frame] = []
         for event in self._connection.receive(data):
