@@ -10,6 +10,7 @@ import statistics
 import sys
 import tempfile
 import time
+from collections import deque
 from pathlib import Path
 from typing import Any, Final
 
@@ -32,41 +33,47 @@ from tests.waiting import wait_until_async
 TITLE: Final = "Own cost of one frame of five components, from TCP's bytes to messages"
 GATEWAY: Final = "frame_per_read"
 BATCH: Final = "frames_in_one_read"
+SEGMENTS: Final = "frame_in_two_reads"
 PLAIN: Final = "plain_python"
 LCM_GEN: Final = "lcm_gen"
 GOAL_US: Final = 5.0
 GOAL_TIMES: Final = 50.0
 _BATCH_FRAMES: Final = 64
+_SEGMENT_BYTES: Final = 1448
+"""What a TCP segment carries on Ethernet; the frames have 2252 bytes."""
+
 _BLOCK_FRAMES: Final = 64 * 16
 _LOOPS: Final = {
     GATEWAY: _BLOCK_FRAMES * 16,
     BATCH: _BLOCK_FRAMES * 16,
+    SEGMENTS: _BLOCK_FRAMES * 16,
     PLAIN: _BLOCK_FRAMES * 16,
     LCM_GEN: 1000,
 }
 _TEXTS: Final = {
     GATEWAY: "gateway, a frame in each read",
     BATCH: f"gateway, {_BATCH_FRAMES} frames in each read",
+    SEGMENTS: "gateway, each frame in two reads, cut as TCP does on Ethernet",
     PLAIN: "gateway not compiled, a frame in each read",
     LCM_GEN: "lcm-gen: decode and encode the same five messages",
 }
 
 
 class _Kept:
-    """A publisher that keeps the newest message, and no more."""
+    """A publisher that keeps the newest message, and no more: it costs as little as one can."""
 
     wanted = True
-    message = b""
 
-    def publish(self, message: bytes) -> None:
-        self.message = message
+    def __init__(self) -> None:
+        self.messages: deque[bytes] = deque(maxlen=1)
+        self.publish = self.messages.append
 
     def close(self) -> None:
         pass
 
 
 class _KeepingOutput(MemoryOutput):
-    """An output that costs as little as one can; all else is the gateway's own."""
+    """An output that only keeps; all else is the gateway's own."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -100,11 +107,11 @@ class _Fed:
         assert session is not None  # noqa: S101 - it has just told of its state
         return session
 
-    def run(self, loops: int, per_read: int) -> float:
-        """Feed ``loops`` frames, so many in each read; return how long it took, s."""
-        return self._loop.run_until_complete(self._feed(loops, per_read))
+    def run(self, loops: int, per_read: int, *, segments: bool = False) -> float:
+        """Feed ``loops`` frames, so many in each read, or each in ``segments``; return how long it took, s."""
+        return self._loop.run_until_complete(self._feed(loops, per_read, segments=segments))
 
-    async def _feed(self, loops: int, per_read: int) -> float:
+    async def _feed(self, loops: int, per_read: int, *, segments: bool) -> float:
         size = self._frames.packet_bytes
         feed = self._session.data_received
         took_s = 0.0
@@ -113,6 +120,9 @@ class _Fed:
             self._number += _BLOCK_FRAMES
             data = bytes(self._frames.data[: min(_BLOCK_FRAMES, loops - first) * size])
             reads = [data[at : at + per_read * size] for at in range(0, len(data), per_read * size)]
+            if segments:
+                cuts = (slice(_SEGMENT_BYTES), slice(_SEGMENT_BYTES, None))
+                reads = [read[cut] for read in reads for cut in cuts]
             began_s = time.process_time()
             for read in reads:
                 feed(read)
@@ -123,7 +133,9 @@ class _Fed:
         """Return the newest message of every component."""
         self.run(1, 1)
         return [
-            kept.message for parts, kept in self._output.kept.items() if parts[0] not in {"status", "clock"}
+            kept.messages[0]
+            for parts, kept in self._output.kept.items()
+            if parts[0] not in {"status", "clock"}
         ]
 
     def close(self) -> None:
@@ -202,7 +214,7 @@ def main() -> None:
     decoded = functools.cache(lambda: [(message, type(decode(message))) for message in fed().messages()])
 
     def feed(loops: int) -> float:
-        return fed().run(loops, _BATCH_FRAMES if name == BATCH else 1)
+        return fed().run(loops, _BATCH_FRAMES if name == BATCH else 1, segments=name == SEGMENTS)
 
     def decode_and_encode(loops: int) -> float:
         messages = decoded()

@@ -92,7 +92,7 @@ class ServerClock:
         # The window under way, and the frame with the least delay in it.
         self._window_end_utime = 0
         self._least_lag_us: float = math.inf
-        self._least = Sample(0, 0)
+        self._least_timestamp_us = self._least_offset_us = 0
 
     @property
     def offset_us(self) -> int:
@@ -154,7 +154,7 @@ class ServerClock:
                 capture_utime = arrival_utime
                 lag_us = 0
             self._least_lag_us = float(lag_us)
-            self._least = Sample(server_us, arrival_utime - server_us)
+            self._least_timestamp_us, self._least_offset_us = server_us, arrival_utime - server_us
 
         if not self.has_clock:
             self._capture_utime = arrival_utime
@@ -209,12 +209,13 @@ class ServerClock:
     def _close_window(self, arrival_utime: int) -> None:
         """Judge the least delay of the window before this frame, and draw the line anew."""
         lag_us = self._least_lag_us
+        least = Sample(self._least_timestamp_us, self._least_offset_us)
         self._begin_window(arrival_utime)
         doubt_us = _STEP_US + 4 * self._scatter_us
         if lag_us < doubt_us:
-            self._samples.append(self._least)
+            self._samples.append(least)
         else:
-            self._late_samples.append(self._least)
+            self._late_samples.append(least)
             if not self._is_late_for_good(min(lag_us / 4, doubt_us)):
                 return
             self._samples = self._late_samples.copy()

@@ -41,13 +41,17 @@ class ProtocolError(GatewayError):
 
 
 class PacketError(ProtocolError):
-    """A packet's size is out of bounds (§4.1): the next packet's start is unknown, the connection ends."""
+    """A packet's size is out of bounds (§4.1): the next packet's start is unknown, the connection ends.
 
-    def __init__(self, message: str, *, size: int, packet_type: int, offset: int) -> None:
+    ``begin`` is how the packet begins, up to 60 bytes of it: it may show what talks there instead.
+    """
+
+    def __init__(self, message: str, *, size: int, packet_type: int, offset: int, begin: bytes = b"") -> None:
         super().__init__(message)
         self.size = size
         self.packet_type = packet_type
         self.offset = offset
+        self.begin = begin
 
 
 class FrameError(ProtocolError):

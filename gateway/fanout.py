@@ -48,6 +48,7 @@ class _Plan:
         *,
         with_tools: bool,
     ) -> None:
+        self.layout, self.wanted = layout, wanted
         parts = [(part.type, index) for index, part in enumerate(layout.parts) if part.type in wanted]
         self.fans = [(fans[kind], index) for kind, index in parts]
         """Of each component that is wanted, with its index in the frame."""
@@ -74,6 +75,7 @@ class FanOut:
         self._last_ways: dict[str, Way] = {}  # by the output's name, those given up too
         self._fans = {kind: _Fan(kind) for kind in MESSAGE_TYPES}
         self._plans: dict[tuple[Layout, frozenset[ComponentType]], _Plan] = {}
+        self._plan: _Plan | None = None  # of the frame before
         self._num_items: dict[ComponentType, int] = {}
         self.on_layout = on_layout
         self._flowing = False
@@ -102,6 +104,7 @@ class FanOut:
             fan.lanes = [way.lanes[kind] for way in self._ways]
         self._tools.use([way for way in self._ways if way.output.name in tool_outputs])
         self._plans.clear()
+        self._plan = None
         for way in before.values():
             way.close()
 
@@ -132,10 +135,9 @@ class FanOut:
         An output that paces a component leaves frames out; its messages are numbered by themselves.
         """
         # The inner loop of the gateway: attributes instead of dictionaries, and calls only to what sends.
-        plan = self._plans.get((frame.layout, wanted)) or self._plan(frame.layout, wanted)
-        contents = frame.contents if plan.is_canonical else tuple(map(canonical_content, frame.components))
+        plan = self._plan_of(frame.layout, wanted)
         for fan, index in plan.fans:
-            content = contents[index]
+            content = frame.content(index) if plan.is_canonical else canonical_content(frame.component(index))
             fan.frames += 1
             message = b""
             spliced = -1  # the number in it, if any
@@ -147,7 +149,7 @@ class FanOut:
                 sequence = lane.sequence
                 if spliced != sequence:
                     spliced = sequence
-                    message = fan.fingerprint + stamp.packed(sequence) + content
+                    message = b"%b%b%b" % (fan.fingerprint, stamp.packed(sequence), content)
                 lane.sequence = sequence + 1
                 try:
                     lane.publish(message)
@@ -163,14 +165,22 @@ class FanOut:
         for index in plan.tools:
             self._tools.publish(frame, index, stamp)
 
-    def _plan(self, layout: Layout, wanted: frozenset[ComponentType]) -> _Plan:
+    def _plan_of(self, layout: Layout, wanted: frozenset[ComponentType]) -> _Plan:
+        """Return what is done with frames of a layout, most often the same as with the frame before."""
+        plan = self._plan
+        if plan is None or plan.layout is not layout or plan.wanted is not wanted:
+            self._plan = plan = self._plans.get((layout, wanted)) or self._new_plan(layout, wanted)
+        return plan
+
+    def _new_plan(self, layout: Layout, wanted: frozenset[ComponentType]) -> _Plan:
         """Return what is done with frames of a layout that is new, and tell if counts have changed."""
         for part in layout.parts:
             if part.type in wanted and part.type is not ComponentType.EVENT:
                 self._note_count(part)
         if len(self._plans) >= _MAX_PLANS:
             self._plans.clear()
-        plan = self._plans[layout, wanted] = _Plan(layout, wanted, self._fans, with_tools=self._tools.is_used)
+        plan = _Plan(layout, wanted, self._fans, with_tools=self._tools.is_used)
+        self._plans[layout, wanted] = plan
         return plan
 
     def _note_count(self, part: Part) -> None:

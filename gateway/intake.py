@@ -61,7 +61,7 @@ class Intake:
         for frame in frames:
             if frame.layout.unknown_types:
                 self._note_unknown(frame.layout.unknown_types)
-            if not frame.contents:
+            if not frame.layout.parts:
                 continue
             stamp = self._stamp(frame, utime, now_s)
             if self._lag.behind and self.skips and frame is not last:
@@ -72,7 +72,7 @@ class Intake:
 
     def _stamp(self, frame: Frame, utime: int, now_s: float) -> Stamp:
         layout = frame.layout
-        frame_number, timestamp_us = layout.number_and_time(frame.contents[0])
+        frame_number, timestamp_us = frame.number_and_time
         first = layout.first_type
         # Servers may count component types apart: one of them is followed, events only where nothing else is.
         if first is self._counted:

@@ -6,7 +6,7 @@ import logging
 import socket
 from collections.abc import Callable
 from time import monotonic
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from gateway.config import Source, Stream
 from gateway.errors import (
@@ -62,7 +62,7 @@ class Handlers(NamedTuple):
     """A complete C3D file."""
 
 
-class Session(asyncio.Protocol):
+class Session:
     """One connection of one stream: ``connect``, ``ask``, ``ended``, ``close``, in this order.
 
     It keeps ``status`` up to date. Every method that waits raises LinkError once the connection is of
@@ -74,6 +74,7 @@ class Session(asyncio.Protocol):
         self._stream = stream
         self._status = status
         self.handlers = handlers
+        self._take_frames = handlers.frames  # called for every read
         self._connection = Connection(source.max_packet_bytes, source.max_c3d_bytes)
         self._seen = State.IDLE  # of the connection
         self._loop = asyncio.get_running_loop()
@@ -100,8 +101,9 @@ class Session(asyncio.Protocol):
                 # create_connection will look it up again, but uvloop cannot end a lookup there: what comes
                 # of one given up is logged as an error, and the next waits behind it.
                 await asyncio.to_thread(socket.getaddrinfo, self._source.host, self._source.port)
+                protocol: Any = self  # by its methods: what is compiled has no base class in Python
                 self._transport, _ = await self._loop.create_connection(
-                    lambda: self, self._source.host, self._source.port
+                    lambda: protocol, self._source.host, self._source.port
                 )
         except TimeoutError:
             raise ConnectError(
@@ -225,7 +227,7 @@ class Session(asyncio.Protocol):
             self._on_state()
         if frames:
             self._last_frame_s = now_s = monotonic()
-            self.handlers.frames(frames, utime, now_s)
+            self._take_frames(frames, utime, now_s)
             if self._rejected.failing:
                 self._rejected.recovered("frames are good again")
 
@@ -260,7 +262,9 @@ class Session(asyncio.Protocol):
             case OtherByteOrder(byte_order):
                 self._on_other_byte_order(byte_order)
             case Broken(packet_error):
-                self._fail(ClosedError(f"{self.server}: {packet_error}"))
+                closed = ClosedError(f"{self.server}: {packet_error}")
+                closed.__cause__ = packet_error
+                self._fail(closed)
             case Stray(packet):
                 logger.debug(
                     "%s: nobody waits for packet type %d: %.200s",

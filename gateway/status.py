@@ -30,7 +30,7 @@ def now_utime() -> int:
     return time.time_ns() // 1000
 
 
-@dataclass(slots=True)
+@dataclass
 class StreamStatus:
     """How one stream is; the session and the intake keep it up to date, the status reads it.
 
@@ -103,7 +103,7 @@ class StreamStatus:
         self.last_error_utime = now_utime()
 
 
-@dataclass(slots=True)
+@dataclass
 class OutputStatus:
     """What one output did for one source: messages and their bytes by component, and drops by cause."""
 
@@ -113,7 +113,7 @@ class OutputStatus:
     message_bytes: Counter[str] = field(default_factory=Counter)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class OutputHealth:
     """Whether an output can send, and if not, what is wrong and what to do."""
 

@@ -1,7 +1,5 @@
 """What is seen of one stream while the doctor watches it: rates, sizes, markers in view."""
 
-from typing import Final
-
 import numpy as np
 import numpy.typing as npt
 
@@ -13,8 +11,6 @@ from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.session import Handlers, Session
 from gateway.status import StreamStatus
-
-_FIRST_BYTES: Final = 60
 
 
 class ComponentSeen:
@@ -78,16 +74,6 @@ class ComponentSeen:
         return [int(index) for index in np.flatnonzero(~self._visible)]
 
 
-class _Session(Session):
-    """Keeps the first bytes that came, to show what talks there if it is no RT server."""
-
-    first_bytes = b""
-
-    def data_received(self, data: bytes) -> None:
-        self.first_bytes += data[: _FIRST_BYTES - len(self.first_bytes)]
-        super().data_received(data)
-
-
 class StreamWatch:
     """One stream of a source, in a connection of its own; make it in a running event loop."""
 
@@ -98,7 +84,7 @@ class StreamWatch:
         self.parsed: ParsedParameters | None = None
         self.seen: dict[ComponentType, ComponentSeen] = {}
         handlers = Handlers(self._take, self._learn, lambda _content: None)
-        self.session = _Session(source, stream, self.status, handlers)
+        self.session = Session(source, stream, self.status, handlers)
         self.negotiation = Negotiation(source, stream, self.status, self.session)
 
     def _learn(self, _xml: bytes, parsed: ParsedParameters) -> None:

@@ -10,7 +10,7 @@ from gateway.config import Source
 from gateway.doctor.finding import Finding, Patient
 from gateway.doctor.frames import VISIBLE, frames_finding, rate_finding, visibility_finding
 from gateway.doctor.observation import StreamWatch
-from gateway.errors import ConnectError, LinkError
+from gateway.errors import ConnectError, LinkError, PacketError
 from gateway.rtc3d.parameters import Parameters
 from gateway.stream_state import StreamInput
 
@@ -95,7 +95,7 @@ class SourceExamination:
             try:
                 await watch.negotiation.start()
             except LinkError as error:
-                return self._no_protocol(watch, error)
+                return self._no_protocol(error)
             watch.status.move(StreamInput.READY, self._server)
             if not watch.status.bytes_in:
                 return self._patient.bad(
@@ -110,10 +110,10 @@ class SourceExamination:
             "protocol", f"the server is an RT server; the gateway does without this: {'; '.join(refused)}"
         )
 
-    def _no_protocol(self, watch: StreamWatch, error: LinkError) -> Finding:
+    def _no_protocol(self, error: LinkError) -> Finding:
         text = str(error)
-        if "no RTC3D server" in text:
-            begin = watch.session.first_bytes.decode("latin-1")
+        if isinstance(error.__cause__, PacketError):
+            begin = error.__cause__.begin.decode("latin-1")
             words = "".join(letter if letter.isprintable() else "·" for letter in begin)
             return self._patient.bad(
                 "protocol",

@@ -94,6 +94,7 @@ class LcmOutput:
         self._retry_at_s = 0.0
         self._opening = FailureLog(logger, self.name)
         self._sending = FailureLog(logger, self.name, HOLD_S)
+        self._is_failing = False
 
     def start(self) -> None:
         """Open LCM; what fails is tried again by ``maintain``."""
@@ -141,10 +142,12 @@ class LcmOutput:
             url = self.settings.effective_url
             self._problem = multicast_problem(url) or f"LCM did not send to {url}: {error}; check lcm.url"
             self._sending.failed(self._problem)
+            self._is_failing = True
             raise OutputError(self._problem, cause="send failed") from error
-        self._problem = ""
-        if self._sending.failing:
+        if self._is_failing:
+            self._problem = ""
             self._sending.recovered(f"sending to {self.settings.effective_url}")
+            self._is_failing = self._sending.failing
 
     def announce(self, source: str) -> None:
         """LCM has nothing of the kind; the status messages show who serves ``source``."""

@@ -232,12 +232,11 @@ class Connection:
         events: list[Event] = []
         reader = self._reader
         start = 0
-        if not (is_between := reader.is_between_packets):
+        if not reader.is_between_packets:
             start = min(reader.missing_bytes, len(data))
-            self._take(data[:start], events)
-            is_between = reader.is_between_packets
-        # Most of what comes is frames laid out like those before; what they answer: _answer_with_frame.
-        if is_between and self.state is _STREAMING and not isinstance(self.under_way, SendCurrentFrame):
+            if not (self._takes_known_frames and self._complete_known(data[:start], events)):
+                self._take(data[:start], events)
+        if reader.is_between_packets and self._takes_known_frames:
             end = self._layouts.cut(data, start, events)
             reader.offset += end - start
             start = end
@@ -247,6 +246,27 @@ class Connection:
             self.end()
             events.append(Broken(reader.error))
         return events
+
+    @property
+    def _takes_known_frames(self) -> bool:
+        """Whether frames are nothing but frames; most of them are laid out like those before.
+
+        Else they answer something: ``_on_frame``, ``_answer_with_frame``.
+        """
+        return self.state is _STREAMING and not isinstance(self.under_way, SendCurrentFrame)
+
+    def _complete_known(self, data: bytes, events: list[Event]) -> bool:
+        """Take the unfinished packet if ``data`` makes it a frame like the one before; else do nothing.
+
+        On a network a frame of more than 1448 bytes comes in pieces, often in reads of their own.
+        """
+        reader = self._reader
+        if reader.buffered_bytes + len(data) != self._layouts.newest_bytes:
+            return False
+        if not self._layouts.cut(reader.unfinished + data, 0, events):
+            return False
+        reader.skip_unfinished(len(data))
+        return True
 
     def _take(self, data: bytes, events: list[Event]) -> None:
         for packet in self._reader.feed(data):

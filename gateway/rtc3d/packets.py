@@ -10,6 +10,7 @@ HEADER = struct.Struct(">II")
 DEFAULT_MAX_PACKET_BYTES = 16 * 1024 * 1024
 DEFAULT_MAX_C3D_BYTES = 256 * 1024 * 1024
 _MAX_SIZE = 0xFFFFFFFF
+_SHOWN_BYTES = 60  # of what is no packet
 
 
 class PacketType(IntEnum):
@@ -83,6 +84,11 @@ class PacketReader:
         return len(self._partial)
 
     @property
+    def unfinished(self) -> bytes:
+        """What has come of an unfinished packet."""
+        return bytes(self._partial)
+
+    @property
     def missing_bytes(self) -> int:
         """How many bytes complete the unfinished packet, or its header; 0 between two packets."""
         if not self._partial:
@@ -112,6 +118,12 @@ class PacketReader:
         self.is_between_packets = not self._partial and self.error is None
         return packets
 
+    def skip_unfinished(self, num_bytes: int) -> None:
+        """Drop the unfinished packet: the caller has taken it, with the ``num_bytes`` that completed it."""
+        self.offset += len(self._partial) + num_bytes
+        self._partial.clear()
+        self.is_between_packets = True
+
     def _cut(self, source: bytes | memoryview) -> tuple[list[Packet], int]:
         """Return the complete packets at the start of ``source`` and how many bytes they take."""
         packets: list[Packet] = []
@@ -121,7 +133,8 @@ class PacketReader:
             size, packet_type = HEADER.unpack_from(source, start)
             limit = self._max_c3d_bytes if packet_type == PacketType.C3D else self._max_packet_bytes
             if not HEADER.size <= size <= limit:
-                self.error = _size_error(size, packet_type, self.offset + start, limit)
+                begin = bytes(source[start : start + _SHOWN_BYTES])
+                self.error = _size_error(size, packet_type, self.offset + start, limit, begin)
                 start = available
                 break
             end = start + size
@@ -133,7 +146,7 @@ class PacketReader:
         return packets, start
 
 
-def _size_error(size: int, packet_type: int, offset: int, limit: int) -> PacketError:
+def _size_error(size: int, packet_type: int, offset: int, limit: int, begin: bytes) -> PacketError:
     bound = f"less than the header's {HEADER.size}" if size < HEADER.size else f"limit {limit}"
     return PacketError(
         f"packet size {size} ({bound}), type {packet_type}, at byte {offset} of the stream: "
@@ -141,4 +154,5 @@ def _size_error(size: int, packet_type: int, offset: int, limit: int) -> PacketE
         size=size,
         packet_type=packet_type,
         offset=offset,
+        begin=begin,
     )

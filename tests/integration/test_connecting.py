@@ -5,7 +5,9 @@ import socket
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 import yaml
@@ -26,22 +28,34 @@ exec "$@"
 """Runs a command with another resolv.conf and nsswitch.conf."""
 
 
-class Watched(Session):
-    """A session that shows its transport; ``connecting`` is cancelled as soon as the connection is made."""
+def session_to(port: int) -> Session:
+    source = Source(name="lab", host="127.0.0.1", port=port)
+    handlers = Handlers(lambda *_: None, lambda *_: None, lambda _: None)
+    return Session(source, Stream(), StreamStatus("3d"), handlers)
 
-    connecting: asyncio.Task[None] | None = None
-    transport: asyncio.BaseTransport
 
-    def __init__(self, port: int) -> None:
-        source = Source(name="lab", host="127.0.0.1", port=port)
-        handlers = Handlers(lambda *_: None, lambda *_: None, lambda _: None)
-        super().__init__(source, Stream(), StreamStatus("3d"), handlers)
+class HastyLoop:
+    """A loop that calls back as soon as a connection is made, which is before anybody has it."""
+
+    def __init__(self, made: Callable[[], object]) -> None:
+        self._loop = asyncio.get_running_loop()
+        self._made = made
+
+    async def create_connection(self, factory: Callable[[], Any], host: str, port: int) -> Any:
+        return await self._loop.create_connection(lambda: HastyProtocol(factory(), self._made), host, port)
+
+
+class HastyProtocol(asyncio.Protocol):
+    def __init__(self, session: Any, made: Callable[[], object]) -> None:
+        self._session = session
+        self._made = made
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        super().connection_made(transport)
-        self.transport = transport
-        if self.connecting is not None:
-            self.connecting.cancel()
+        self._session.connection_made(transport)
+        self._made()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._session.connection_lost(exc)
 
 
 async def silent(client: Client) -> None:
@@ -50,9 +64,10 @@ async def silent(client: Client) -> None:
 
 async def test_commands_leave_at_once_and_a_vanished_server_is_noticed() -> None:
     async with ScriptedServer(silent) as server:
-        session = Watched(server.port)
+        session = session_to(server.port)
         await session.connect()
-        tcp = session.transport.get_extra_info("socket")
+        assert session._transport is not None
+        tcp = session._transport.get_extra_info("socket")
         assert tcp.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
         assert tcp.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
         await session.close()
@@ -60,10 +75,11 @@ async def test_commands_leave_at_once_and_a_vanished_server_is_noticed() -> None
 
 async def test_a_connection_given_up_in_the_moment_it_is_made_can_be_closed() -> None:
     async with ScriptedServer(silent) as server:
-        session = Watched(server.port)
-        session.connecting = asyncio.create_task(session.connect())
+        session = session_to(server.port)
+        connecting = asyncio.create_task(session.connect())
+        session._loop = cast(asyncio.AbstractEventLoop, HastyLoop(connecting.cancel))
         with pytest.raises(asyncio.CancelledError):
-            await session.connecting
+            await connecting
         assert not session.is_open
         await session.close()
 

@@ -411,3 +411,34 @@ def test_a_broken_stream_is_told_by_its_place_after_known_frames() -> None:
     assert [type(event) for event in frames] == [Frame, Frame]
     assert isinstance(broken, Broken)
     assert broken.error.offset == 3 * len(FRAME)
+
+
+@pytest.mark.parametrize("first", [1, 7, 8, 12, len(FRAME) - 1])
+def test_a_known_frame_in_pieces_is_the_same_frame_and_the_stream_goes_on_behind_it(first: int) -> None:
+    connection = after(STREAM)
+    connection.receive(FRAME)
+    assert connection.receive(FRAME[:first]) == []
+    completed, next_one, broken = connection.receive(FRAME[first:] + FRAME + bytes(8))
+    [expected, _] = after(STREAM).receive(FRAME + FRAME)[-2:]
+    assert isinstance(expected, Frame)
+    for frame in (completed, next_one):
+        assert isinstance(frame, Frame)
+        assert frame.components == expected.components
+    assert isinstance(broken, Broken)
+    assert broken.error.offset == 3 * len(FRAME)
+
+
+def test_a_packet_in_pieces_as_long_as_the_frame_before_is_read_for_what_it_is() -> None:
+    connection = after(STREAM)
+    connection.receive(FRAME)
+    text = packet(1, b"x" * (len(FRAME) - 8))
+    assert connection.receive(text[:20]) == []
+    assert [type(event) for event in connection.receive(text[20:] + FRAME)] == [Stray, Frame]
+
+
+def test_a_frame_in_pieces_that_is_asked_for_is_the_answer() -> None:
+    connection = after(STREAM)
+    connection.receive(FRAME + ok("OK-StreamFrames"))
+    connection.send(SendCurrentFrame())
+    connection.receive(FRAME[:20])
+    assert answers(connection.receive(FRAME[20:])) == [SendCurrentFrame()]

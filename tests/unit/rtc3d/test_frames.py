@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from gateway.rtc3d.components import LONG_EVENT, SHORT_EVENT, ComponentType, build_component
+from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, SHORT_EVENT, ComponentType, build_component
 from gateway.rtc3d.frames import Frame, KnownLayouts, Layout, build_frame, byte_order_of, split_frame
 from tests.servers import packet
 from tests.unit.rtc3d.wire import frame, only_component
@@ -144,7 +144,7 @@ def test_numbers_times_and_items_may_differ() -> None:
     wire[24:] = bytes(len(wire) - 24)
     found = cut(layout, frame("big", bytes(wire)))
     assert found is not None
-    assert layout.number_and_time(found.contents[0]) == (-7, 2**40)
+    assert found.number_and_time == (-7, 2**40)
     assert found.contents == (bytes(wire[8:]),)
 
 
@@ -178,6 +178,24 @@ def test_known_layouts_cut_up_to_the_first_packet_that_is_not_whole_or_not_known
             ComponentType.ANALOG,
             ComponentType.MARKERS,
         ]
+
+
+def test_the_newest_layout_tells_how_long_the_next_packet_will_be() -> None:
+    assert KnownLayouts().newest_bytes == 0
+    markers, analog = (frame("big", vector.wire["big"]) for vector in (MARKERS, ANALOG))
+    layouts = known(markers, analog)
+    assert layouts.newest_bytes == 8 + len(analog)
+    layouts.learn(split_frame(markers, "big").layout)
+    assert layouts.newest_bytes == 8 + len(markers)
+
+
+def test_of_two_layouts_that_begin_alike_the_newest_is_known() -> None:
+    bodies = [
+        frame("big", build_component(kind, 1, 1, np.zeros(count, ITEM_DTYPES[kind])))
+        for kind, count in ((ComponentType.MARKERS, 2), (ComponentType.TOOLS, 1))
+    ]
+    layouts = known(*bodies)
+    assert [layouts.cut(packet(3, body), 0, []) for body in bodies] == [0, 8 + len(bodies[1])]
 
 
 def test_layouts_without_number_are_forgotten() -> None:

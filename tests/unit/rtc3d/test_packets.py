@@ -105,6 +105,16 @@ def test_a_body_stays_as_it_was_when_more_is_fed() -> None:
     assert packet.body == b"abcd"
 
 
+def test_an_unfinished_packet_can_be_taken_by_others() -> None:
+    reader = PacketReader()
+    reader.feed(PACKETS[1].packet + header(12, 3) + b"ab")
+    assert (reader.unfinished, reader.missing_bytes) == (header(12, 3) + b"ab", 2)
+    reader.skip_unfinished(2)
+    assert (reader.unfinished, reader.missing_bytes, reader.is_between_packets) == (b"", 0, True)
+    assert reader.offset == 20 + 12
+    assert reader.feed(PACKETS[1].packet) == [Packet(PACKETS[1].type, PACKETS[1].body)]
+
+
 # Bounds of the size field --------------------------------------------------------------------
 
 
@@ -177,6 +187,14 @@ def test_the_error_of_a_large_size_says_size_limit_type_and_offset(packet_type: 
     assert f"type {packet_type}" in text
     assert "byte 0 " in text
     assert "check host and port" in text
+
+
+@pytest.mark.parametrize("piece", [8, 100])
+def test_the_error_shows_how_what_is_no_packet_begins(piece: int) -> None:
+    reader = limited_reader()
+    greeting = b"SSH-2.0-" + bytes(range(92))
+    reader.feed(PACKETS[1].packet + greeting[:piece])
+    assert error_of(reader).begin == greeting[: min(piece, 60)]
 
 
 # Of 20, 8 and 15 bytes: the next packet starts at byte 43 of the stream.
