@@ -108,7 +108,7 @@ class _Fed:
         return session
 
     def run(self, loops: int, per_read: int, *, segments: bool = False) -> float:
-        """Feed ``loops`` frames, so many in each read, or each in ``segments``; return how long it took, s."""
+        """Feed ``loops`` frames, so many in each read or each in ``segments``; return how long it took, s."""
         return self._loop.run_until_complete(self._feed(loops, per_read, segments=segments))
 
     async def _feed(self, loops: int, per_read: int, *, segments: bool) -> float:
