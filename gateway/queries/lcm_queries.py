@@ -147,11 +147,7 @@ class LcmQueries:
         with log_fields(source=desk.source.name):
             task = asyncio.create_task(self._answer(desk, request))
         self._tasks.add(task)
-        task.add_done_callback(self._done)
-
-    def _done(self, task: asyncio.Task[None]) -> None:
-        self._free.release()
-        self._tasks.discard(task)
+        task.add_done_callback(self._tasks.discard)
 
     async def _answer(self, desk: Desk, request: Any) -> None:
         reply = rtc3d.parameters_reply_t()
@@ -165,6 +161,8 @@ class LcmQueries:
             reply.error, reply.error_code = f"a defect in the gateway: {error!r}", "defect"
         else:
             reply.xml, reply.age_s = _text(known.xml), known.age_s
+        finally:
+            self._free.release()  # before the reply goes out: who has it may ask again at once
         self.results[reply.error_code or "ok"] += 1
         self._publish(self._asked, desk.source.name, "PARAMETERS_REPLY", reply)
 

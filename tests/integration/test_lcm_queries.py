@@ -14,7 +14,7 @@ from gateway.daemon import Gateway
 from gateway.decode import decode
 from gateway.listening import LcmListener
 from gateway.outputs.lcm_output import open_lcm
-from gateway.queries.lcm_queries import MAX_PENDING, MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES
+from gateway.queries.lcm_queries import MAX_PENDING, MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES, LcmQueries
 from gateway.rtc3d.commands import SECTIONS
 from tests.networks import free_port, lcm_url
 from tests.querying import LabServer, gateway_at, is_filled
@@ -265,8 +265,32 @@ async def test_the_queue_is_bounded_and_what_is_beyond_it_is_counted() -> None:
         await wait_until_async(lambda: len(peer.replies) == MAX_PENDING)
         assert {reply.error for reply in peer.replies} == {""}
         assert server.count("SendParameters") == before
-        assert (await peer.ask(2000)).error == ""
+
+        def answered() -> object:
+            peer.send(request(2000))  # again and again: so many replies at once can cost LCM a message
+            return peer.answers(2000)
+
+        await wait_until_async(answered)
+        assert peer.answers(2000)[0].error == ""
         assert not peer.answers(1000)
+
+
+async def test_who_has_a_reply_may_ask_again_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gateway.queries.lcm_queries.MAX_PENDING", 1)
+    async with lab() as (_, gateway, peer):
+        [queries] = gateway._queries.values()
+        assert isinstance(queries, LcmQueries)
+        publish, free, could_ask = queries._publish, queries._free, []
+
+        def publish_and_look(connection: Any, source: str, name: str, message: Any) -> None:
+            publish(connection, source, name, message)
+            if name == "PARAMETERS_REPLY":
+                could_ask.append(free.acquire(blocking=False))
+                free.release()
+
+        monkeypatch.setattr(queries, "_publish", publish_and_look)
+        assert (await peer.ask(1)).error == ""
+        assert could_ask == [True]
 
 
 async def test_replies_of_others_are_no_requests() -> None:
