@@ -160,7 +160,7 @@ class FanOut:
                     lane.message_bytes += len(message)
                     if lane.way.is_failing:
                         lane.way.sent()
-            if message:
+            if spliced >= 0:
                 fan.newest = message
         for index in plan.tools:
             self._tools.publish(frame, index, stamp)

@@ -69,7 +69,7 @@ class Stamp:
         self.capture_utime = capture_utime
         self.session = session
         self.has_clock = has_clock
-        self._sequence = 0  # the one in _packed
+        self._sequence = -1  # the one in _packed
         self._packed = b""
 
     def packed(self, sequence: int) -> bytes:
@@ -77,7 +77,7 @@ class Stamp:
 
         Of one frame most messages have the same number: the bytes are kept.
         """
-        if sequence != self._sequence or not self._packed:
+        if sequence != self._sequence:
             self._sequence = sequence
             self._packed = STAMP.pack(self.utime, self.capture_utime, sequence, self.session)
         return self._packed

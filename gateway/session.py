@@ -4,8 +4,8 @@ import asyncio
 import contextlib
 import logging
 import socket
+import time
 from collections.abc import Callable
-from time import monotonic
 from typing import Any, Final, NamedTuple
 
 from gateway.config import Source, Stream
@@ -48,6 +48,8 @@ _INPUTS: Final = {
 }
 """What a change of the connection's state means to the stream."""
 
+_monotonic: Final = time.monotonic  # compiled, a Final is not looked up by its name at every call
+
 logger = logging.getLogger(__name__)
 
 
@@ -86,6 +88,7 @@ class Session:
         self._asking = asyncio.Lock()
         self._last_frame_s = 0.0
         self._rejected = FailureLog(logger, source.name, HOLD_S)
+        self._is_rejecting = False  # as it says; asked at every read
         self.server = f"{source.host}:{source.port}"
 
     @property
@@ -116,7 +119,7 @@ class Session:
             ) from error
         except OSError as error:
             raise ConnectError(_connect_text(self.server, error)) from error
-        self._last_frame_s = monotonic()
+        self._last_frame_s = _monotonic()
         self._status.move(StreamInput.CONNECTED, self.server)
 
     async def ask(self, command: Command) -> Packet:
@@ -156,7 +159,7 @@ class Session:
     async def ended(self) -> None:
         """Wait for the end, and for silence; raises LinkError with the reason."""
         while True:
-            quiet_s = monotonic() - self._last_frame_s
+            quiet_s = _monotonic() - self._last_frame_s
             wait_s = self._source.stall_timeout_s - quiet_s
             if wait_s <= 0:
                 await self._on_silence()
@@ -184,7 +187,7 @@ class Session:
             pass
         except ReplyTimeoutError as error:
             raise SilenceError(f"{error}, and sends no frames; connecting again") from None
-        self._last_frame_s = monotonic()
+        self._last_frame_s = _monotonic()
 
     async def close(self) -> None:
         """Say Bye, and end the connection at the latest half a second later."""
@@ -226,10 +229,11 @@ class Session:
         if self._connection.state is not self._seen:
             self._on_state()
         if frames:
-            self._last_frame_s = now_s = monotonic()
+            self._last_frame_s = now_s = _monotonic()
             self._take_frames(frames, utime, now_s)
-            if self._rejected.failing:
+            if self._is_rejecting:
                 self._rejected.recovered("frames are good again")
+                self._is_rejecting = self._rejected.failing
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Note the end, whoever caused it."""
@@ -240,7 +244,7 @@ class Session:
 
     def _on_state(self) -> None:
         self._seen = self._connection.state
-        self._last_frame_s = monotonic()
+        self._last_frame_s = _monotonic()
         self._status.byte_order = self._connection.byte_order or ""
         if self._seen in _INPUTS:
             self._status.move(_INPUTS[self._seen], self.server)
@@ -257,6 +261,7 @@ class Session:
                 self._status.drops["frame rejected"] += 1
                 self._status.note_error(f"frame rejected: {frame_error}")
                 self._rejected.failed(f"frame rejected: {frame_error}")
+                self._is_rejecting = True
             case FileReceived(content):
                 self.handlers.file(content)
             case OtherByteOrder(byte_order):

@@ -253,7 +253,8 @@ class Connection:
 
         Else they answer something: ``_on_frame``, ``_answer_with_frame``.
         """
-        return self.state is _STREAMING and not isinstance(self.under_way, SendCurrentFrame)
+        asked = self.under_way
+        return self.state is _STREAMING and (asked is None or not isinstance(asked, SendCurrentFrame))
 
     def _complete_known(self, data: bytes, events: list[Event]) -> bool:
         """Take the unfinished packet if ``data`` makes it a frame like the one before; else do nothing.
