@@ -29,12 +29,12 @@ def _cases(quick: bool) -> list[tuple[str, int, bool]]:
 
 def expected_s(quick: bool) -> float:
     """Return about how long it takes."""
-    return len(_cases(quick)) * (3 if quick else 15)
+    return len(_cases(quick)) * (3 if quick else 24)
 
 
 def measure(quick: bool, progress: Progress) -> dict[str, Any]:
     """Return, of every case, the figures of each pair of runs."""
-    lasting_s, pairs = (0.1, 2) if quick else (0.5, 7)
+    lasting_s, pairs = (0.1, 2) if quick else (0.4, 15)
     cases = _cases(quick)
     rows = []
     for number, (side, count, routed) in enumerate(cases):

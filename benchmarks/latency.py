@@ -23,7 +23,7 @@ _NAMES: Final = (GATEWAY, RELAY, PLAIN)
 
 def _plan(quick: bool) -> tuple[int, dict[int, float]]:
     """Return how many rounds there are, and how long one run lasts at each rate, s."""
-    return (2, {200: 0.5, 1000: 0.5}) if quick else (11, {100: 2.0, 200: 1.5, 1000: 1.0})
+    return (2, {200: 0.5, 1000: 0.5}) if quick else (20, {100: 2.0, 200: 1.5, 1000: 1.0})
 
 
 def expected_s(quick: bool) -> float:
