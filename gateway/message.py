@@ -38,6 +38,8 @@ FINGERPRINT_BYTES: Final = 8
 STAMP: Final = struct.Struct(">qqqi")
 """What follows the fingerprint: utime, capture_utime, sequence, session."""
 
+_pack_stamp: Final = STAMP.pack
+
 PREFIX_BYTES: Final = FINGERPRINT_BYTES + STAMP.size
 """36: what of a message is ours; the component's own bytes follow."""
 
@@ -79,7 +81,7 @@ class Stamp:
         """
         if sequence != self._sequence:
             self._sequence = sequence
-            self._packed = STAMP.pack(self.utime, self.capture_utime, sequence, self.session)
+            self._packed = _pack_stamp(self.utime, self.capture_utime, sequence, self.session)
         return self._packed
 
 
