@@ -57,5 +57,6 @@ def test_after_any_nonsense_the_rate_is_right_at_once(
     for timestamp_us, arrival_utime in before:
         pacer.due(timestamp_us, arrival_utime)
     indices = picked(pacer, stamps(rate_hz, frames, 2**63))
-    # It begins anew with the first; the spacing is known with the third.
-    assert frames * share - 2 <= len(indices) <= frames * share + 2
+    # It begins anew with the first, and the spacing is known with the third. Besides, a frame that is more
+    # than a quarter of the spacing ahead of its time may be left out: at the end three quarters are missing.
+    assert frames * share - 2.75 <= len(indices) <= frames * share + 2
