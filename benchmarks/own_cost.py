@@ -147,7 +147,7 @@ class _Fed:
 
 def expected_s(quick: bool) -> float:
     """Return about how long it takes."""
-    return 20 if quick else 110
+    return 20 if quick else 230
 
 
 def measure(quick: bool, progress: Progress) -> dict[str, Any]:
@@ -155,7 +155,7 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
     import pyperf  # noqa: PLC0415 - the tests of the benchmarks do without
 
     values: dict[str, list[float]] = {name: [] for name in _LOOPS}
-    rounds = 2 if quick else 7
+    rounds = 2 if quick else 15
     sizes = ["--processes=1", "--warmups=1", "--values=2" if quick else "--values=5"]
     sizes.append("--inherit-environ=PYTHONPATH,PYTHONSAFEPATH")
     with tempfile.TemporaryDirectory() as folder:
