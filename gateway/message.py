@@ -39,6 +39,7 @@ STAMP: Final = struct.Struct(">qqqi")
 """What follows the fingerprint: utime, capture_utime, sequence, session."""
 
 _pack_stamp: Final = STAMP.pack
+_NO_SEQUENCE: Final = 1 << 63  # none is as great: they are signed and have 64 bits
 
 PREFIX_BYTES: Final = FINGERPRINT_BYTES + STAMP.size
 """36: what of a message is ours; the component's own bytes follow."""
@@ -71,7 +72,7 @@ class Stamp:
         self.capture_utime = capture_utime
         self.session = session
         self.has_clock = has_clock
-        self._sequence = -1  # the one in _packed
+        self._sequence = _NO_SEQUENCE  # the one in _packed
         self._packed = b""
 
     def packed(self, sequence: int) -> bytes:

@@ -135,3 +135,12 @@ def test_a_pose_is_whole_or_missing(tools: list[tuple[float, ...]], stamp: Stamp
             assert pose.orientation_xyzw == (*tool[1:4], tool[0])
         else:
             assert all(map(math.isnan, numbers))
+
+
+@given(int64s, int64s, int32s, st.lists(int64s, min_size=1))
+def test_a_stamp_has_the_number_that_is_asked_for_each_time(
+    utime: int, capture_utime: int, session: int, sequences: list[int]
+) -> None:
+    stamp = Stamp(utime, capture_utime, session)
+    for sequence in sequences:
+        assert stamp.packed(sequence) == struct.pack(">qqqi", utime, capture_utime, sequence, session)
