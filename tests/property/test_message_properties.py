@@ -137,7 +137,7 @@ def test_a_pose_is_whole_or_missing(tools: list[tuple[float, ...]], stamp: Stamp
             assert all(map(math.isnan, numbers))
 
 
-@given(int64s, int64s, int32s, st.lists(int64s, min_size=1))
+@given(int64s, int64s, int32s, st.lists(st.integers(-2, 2) | int64s, min_size=1))
 def test_a_stamp_has_the_number_that_is_asked_for_each_time(
     utime: int, capture_utime: int, session: int, sequences: list[int]
 ) -> None:
