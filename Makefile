@@ -25,7 +25,7 @@ test: .venv/installed
 
 # The tests of what is compiled, and of what stands on it, with the compiled modules in place of the sources.
 # What rate.py waits cannot be shortened there, and takes 14 s; nor can bytes say another length than theirs.
-COMPILED_TESTS := tests/packaging/test_compiled.py tests/contract tests/unit/rtc3d tests/unit/outputs \
+COMPILED_TESTS := tests/packaging/test_compiled.py tests/contract tests/unit/rtc3d tests/unit/outputs tests/unit/queries \
     tests/integration/test_faults.py::test_several_faults_at_once \
     $(foreach name,clock components connection fanout gateway intake message pacing packets rate streams, \
         $(wildcard tests/*/test_$(name)*.py)) \
