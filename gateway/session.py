@@ -88,7 +88,7 @@ class Session:
         self._asking = asyncio.Lock()
         self._last_frame_s = 0.0
         self._rejected = FailureLog(logger, source.name, HOLD_S)
-        self._is_rejecting = False  # as it says; asked at every read
+        self._is_rejecting = False  # as it says; to ask it would be 1 % of the instructions of a read
         self.server = f"{source.host}:{source.port}"
 
     @property
