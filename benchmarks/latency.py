@@ -9,7 +9,7 @@ from benchmarks.report import Goal, Progress, Table
 from benchmarks.stage import GATEWAY, PLAIN, RELAY, Stage
 from benchmarks.subscribers import subscribe_tcp
 from benchmarks.workloads import DENSE, cuts
-from gateway.message import PREFIX_BYTES
+from gateway.messages.splice import PREFIX_BYTES
 
 TITLE: Final = "Latency: from the server's send to the subscriber's callback"
 GOAL_P50: Final = 1.10

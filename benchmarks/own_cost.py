@@ -20,14 +20,14 @@ from benchmarks.comparing import Pair, table_cell
 from benchmarks.processes import PLAIN_PYTHON, run_measured
 from benchmarks.report import Goal, Progress, Table
 from benchmarks.workloads import DENSE, Frames
-from gateway.config import MetricsSettings, Settings, Source
-from gateway.daemon import Gateway
-from gateway.decode import decode
-from gateway.names import Topic
-from gateway.outputs.memory_output import MemoryOutput
-from gateway.session import Session
-from gateway.simulator.server import Simulator
-from gateway.stream_state import StreamState
+from gateway.config.settings import MetricsSettings, Settings, SourceSettings
+from gateway.gateway import Gateway
+from gateway.messages.decode import decode
+from gateway.messages.topics import Topic
+from gateway.outputs.memory import MemoryOutput
+from gateway.rtc3d_server.server import Simulator
+from gateway.stream.session import Session
+from gateway.stream.state import StreamState
 from tests.waiting import wait_until_async
 
 TITLE: Final = "Own cost of one frame of five components, from TCP's bytes to messages"
@@ -97,7 +97,7 @@ class _Fed:
         self._server = Simulator(DENSE.scene())
         await self._server.start()
         self._server.stop_measurement()
-        source = Source(name="lab", host="127.0.0.1", port=self._server.port, max_lag_ms=60_000.0)
+        source = SourceSettings(name="lab", host="127.0.0.1", port=self._server.port, max_lag_ms=60_000.0)
         self._stop = asyncio.Event()
         gateway = Gateway(Settings(sources=(source,), metrics=MetricsSettings(enabled=False)), [self._output])
         self._running = self._loop.create_task(gateway.run(self._stop))

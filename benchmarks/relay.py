@@ -13,7 +13,7 @@ import lcm
 import uvloop
 import zenoh
 
-from gateway.outputs.zenoh_output import LCM_ENCODING, zenoh_config
+from gateway.outputs.zenoh.output import LCM_ENCODING, zenoh_config
 
 
 class Relay(asyncio.Protocol):

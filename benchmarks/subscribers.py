@@ -13,7 +13,7 @@ from typing import Any, Final
 import lcm
 import zenoh
 
-from gateway.message import PREFIX_BYTES
+from gateway.messages.splice import PREFIX_BYTES
 from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import BY_KEY
 from gateway.rtc3d.packets import HEADER, PacketType, encode_packet

@@ -6,10 +6,10 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from gateway.message import PREFIX_BYTES
+from gateway.messages.splice import PREFIX_BYTES
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import HEADER
-from gateway.simulator.frames import FrameBuilder
+from gateway.rtc3d_server.frame_builder import FrameBuilder
 from gateway.simulator.synthetic import SyntheticScene
 
 _EVENT_US: Final = 500_000

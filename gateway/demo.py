@@ -18,16 +18,23 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from gateway.config import LcmSettings, MetricsSettings, Settings, Source, Stream, ZenohSettings
-from gateway.daemon import Gateway
-from gateway.decode import decode, one_line
+from gateway.cli.subscribers import LcmListener, ZenohListener, channel_pattern, key_pattern, open_zenoh
+from gateway.config.settings import (
+    LcmSettings,
+    MetricsSettings,
+    Settings,
+    SourceSettings,
+    StreamSettings,
+    ZenohSettings,
+)
 from gateway.errors import OutputError
-from gateway.listening import LcmListener, ZenohListener, channel_pattern, key_pattern, open_zenoh
-from gateway.outputs.lcm_output import LcmOutput, open_lcm
-from gateway.outputs.zenoh_output import ZenohOutput
+from gateway.gateway import Gateway
+from gateway.messages.decode import decode, one_line
+from gateway.outputs.lcm.output import LcmOutput, open_lcm
+from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
-from gateway.simulator.scene import Scene
-from gateway.simulator.server import Simulator
+from gateway.rtc3d_server.scene import Scene
+from gateway.rtc3d_server.server import Simulator
 
 SOURCE: Final = "demo"
 _SIDES: Final = ("zenoh", "lcm")
@@ -103,12 +110,12 @@ def _settings(port: int, endpoint: str, lcm_settings: LcmSettings) -> Settings:
     slow = tuple(component for component in WIRE_ORDER if component is not ComponentType.ANALOG)
     return Settings(
         sources=(
-            Source(
+            SourceSettings(
                 name=SOURCE,
                 host="127.0.0.1",
                 port=port,
                 # Analog runs at its own, higher rate on a stream of its own (§5.3.5).
-                streams=(Stream(components=slow), Stream(components=(ComponentType.ANALOG,))),
+                streams=(StreamSettings(components=slow), StreamSettings(components=(ComponentType.ANALOG,))),
             ),
         ),
         zenoh=ZenohSettings(

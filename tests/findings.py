@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from gateway.config import LcmSettings, Settings, Source, Stream, ZenohSettings
+from gateway.config.settings import LcmSettings, Settings, SourceSettings, StreamSettings, ZenohSettings
 from gateway.doctor.examination import examine
 from gateway.doctor.finding import Finding, Result
 
@@ -30,7 +30,7 @@ class Findings:
 
 
 async def found(
-    *sources: Source,
+    *sources: SourceSettings,
     zenoh_settings: ZenohSettings | None = None,
     lcm: LcmSettings | None = None,
     seconds: float = SECONDS,
@@ -43,6 +43,6 @@ async def found(
     return Findings([finding async for finding in examine(settings, "lab.yaml", seconds)])
 
 
-def lab(port: int, *streams: Stream, **keys: Any) -> Source:
+def lab(port: int, *streams: StreamSettings, **keys: Any) -> SourceSettings:
     source: dict[str, Any] = {"host": "127.0.0.1", "reply_timeout_s": 0.1, "connect_timeout_s": 5.0}
-    return Source(name="lab", port=port, streams=streams or (Stream(),), **(source | keys))
+    return SourceSettings(name="lab", port=port, streams=streams or (StreamSettings(),), **(source | keys))

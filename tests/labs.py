@@ -5,10 +5,10 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
-from gateway.config import MetricsSettings, Reconnect, Settings, Source
-from gateway.daemon import Gateway
-from gateway.decode import decode
-from gateway.outputs.memory_output import MemoryOutput
+from gateway.config.settings import MetricsSettings, ReconnectSettings, Settings, SourceSettings
+from gateway.gateway import Gateway
+from gateway.messages.decode import decode
+from gateway.outputs.memory import MemoryOutput
 from tests.waiting import wait_until_async
 
 
@@ -42,13 +42,13 @@ async def gateway_to(port: int, **settings: Any) -> AsyncIterator[Running]:
         "name": "lab",
         "host": "127.0.0.1",
         "port": port,
-        "reconnect": Reconnect(first_delay_s=0.01, max_delay_s=0.05),
+        "reconnect": ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05),
         "reply_timeout_s": 0.3,
         "stall_timeout_s": 1.0,
     }
     output = MemoryOutput()
     unwatched = MetricsSettings(enabled=False)
-    gateway = Gateway(Settings(sources=(Source(**(source | settings)),), metrics=unwatched), [output])
+    gateway = Gateway(Settings(sources=(SourceSettings(**(source | settings)),), metrics=unwatched), [output])
     stop = asyncio.Event()
     task = asyncio.create_task(gateway.run(stop))
     try:

@@ -10,16 +10,16 @@ from typing import Any, NamedTuple
 
 import zenoh
 
-from gateway.config import (
+from gateway.config.settings import (
     LcmSettings,
     MetricsSettings,
-    Reconnect,
+    ReconnectSettings,
     Settings,
-    Source,
+    SourceSettings,
     SpoolSettings,
     ZenohSettings,
 )
-from gateway.daemon import Gateway
+from gateway.gateway import Gateway
 from gateway.rtc3d.commands import SECTIONS, SendParameters, parse_command
 from tests.networks import free_endpoint, free_port, open_zenoh, zenoh_keys
 from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
@@ -122,13 +122,13 @@ async def gateway_at(
         "name": "lab",
         "host": "127.0.0.1",
         "port": port,
-        "reconnect": Reconnect(first_delay_s=0.01, max_delay_s=0.05),
+        "reconnect": ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05),
         "reply_timeout_s": 5.0,
         "query_timeout_s": 10.0,
         "stall_timeout_s": 60.0,
     }
     # An interval of 0 cannot be configured: here every fresh question is one.
-    lab = Source(**(defaults | source)).model_copy(
+    lab = SourceSettings(**(defaults | source)).model_copy(
         update={} if "fresh_interval_s" in source else {"fresh_interval_s": 0.0}
     )
     keys = zenoh_keys("client", connect=router) if router else zenoh_keys("peer", listen=listen)

@@ -3,7 +3,7 @@
 import pytest
 from pydantic import ValidationError
 
-from gateway.config_section import Section
+from gateway.config.section import Section
 
 
 def mistakes(model: type[Section], value: object) -> list[tuple[str, str]]:

@@ -17,11 +17,11 @@ import typer.core
 import yaml
 import zenoh
 
-from gateway import config_file
-from gateway.cli import app
-from gateway.config import Settings
-from gateway.decode import MESSAGE_TYPES_BY_NAME
-from gateway.message import MESSAGE_HEADER_BYTES, MESSAGE_TYPES
+from gateway.cli.main import app
+from gateway.config import loading
+from gateway.config.settings import Settings
+from gateway.messages.decode import MESSAGE_TYPES_BY_NAME
+from gateway.messages.splice import MESSAGE_HEADER_BYTES, MESSAGE_TYPES
 from gateway.rtc3d.components import ITEM_DTYPES
 from gateway.simulator.scenario import load_scenario
 from tests.documents import ROOT, Block, all_blocks, blocks, documents
@@ -32,7 +32,7 @@ PROGRAM = "rtc3d-gateway"
 WRAPPERS = {"sudo", "tests/with-netns"}
 FOLDERS = ("benchmarks", "config", "docs", "examples", "lcm_types", "systemd", "tests")
 OTHERS = {"scrape_configs", "groups"}
-"""First keys of YAML that is Prometheus'; tests/integration/test_watching.py looks at it."""
+"""First keys of YAML that is Prometheus'; tests/integration/test_monitoring.py looks at it."""
 
 
 def commands() -> list[tuple[str, tuple[str, ...]]]:
@@ -96,7 +96,7 @@ def test_yaml_is_what_a_program_takes(block: Block, tmp_path: Path, monkeypatch:
     elif content.keys() <= Settings.model_fields.keys():
         for other in ROOT.glob("config/*.json5"):
             shutil.copy(other, tmp_path)
-        assert config_file.load(file).sources
+        assert loading.load(file).sources
     else:
         assert content.keys() <= OTHERS
 

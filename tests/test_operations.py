@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from tests.told import told_patterns
+from tests.log_messages import told_patterns
 
 ROOT = Path(__file__).parents[1]
 OPERATIONS = (ROOT / "docs/operations.md").read_text()

@@ -2,10 +2,10 @@
 
 from typing import Any
 
-from gateway.decode import decode
-from gateway.names import Topic
+from gateway.messages.decode import decode
+from gateway.messages.topics import Topic
 from gateway.rtc3d.components import ComponentType
-from gateway.status import OutputHealth
+from gateway.stream.status import OutputHealth
 
 
 class ToyOutput:

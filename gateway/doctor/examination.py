@@ -3,7 +3,7 @@
 import asyncio
 from collections.abc import AsyncIterator, Iterator
 
-from gateway.config import Settings
+from gateway.config.settings import Settings
 from gateway.doctor import host, server, zenoh_link
 from gateway.doctor.finding import Finding, Patient
 from gateway.doctor.observation import ComponentSeen

@@ -3,14 +3,14 @@
 import numpy as np
 import numpy.typing as npt
 
-from gateway.config import Source, Stream
-from gateway.message import MESSAGE_HEADER_BYTES
-from gateway.negotiation import Negotiation
+from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.messages.splice import MESSAGE_HEADER_BYTES
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters_xml import ParsedParameters
-from gateway.session import Handlers, Session
-from gateway.status import StreamStatus
+from gateway.stream.session import Handlers, Session
+from gateway.stream.status import StreamStatus
+from gateway.stream.stream_control import StreamControl
 
 
 class ComponentSeen:
@@ -77,7 +77,7 @@ class ComponentSeen:
 class StreamWatch:
     """One stream of a source, in a connection of its own; make it in a running event loop."""
 
-    def __init__(self, source: Source, stream: Stream) -> None:
+    def __init__(self, source: SourceSettings, stream: StreamSettings) -> None:
         self.stream = stream
         self.components = " ".join(component.key for component in stream.components)
         self.status = StreamStatus(self.components, name=f"{source.name} ({self.components})")
@@ -85,7 +85,7 @@ class StreamWatch:
         self.seen: dict[ComponentType, ComponentSeen] = {}
         handlers = Handlers(self._take, self._learn, lambda _content: None)
         self.session = Session(source, stream, self.status, handlers)
-        self.negotiation = Negotiation(source, stream, self.status, self.session)
+        self.negotiation = StreamControl(source, stream, self.status, self.session)
 
     def _learn(self, _xml: bytes, parsed: ParsedParameters) -> None:
         self.parsed = parsed

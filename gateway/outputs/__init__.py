@@ -1,1 +1,1 @@
-"""Where messages go: one contract (``contract.Output``), one module per kind of output."""
+"""The outputs: one contract, one module or package each."""

@@ -3,9 +3,9 @@
 from collections.abc import Mapping
 from typing import Protocol
 
-from gateway.names import Topic
+from gateway.messages.topics import Topic
 from gateway.rtc3d.components import ComponentType
-from gateway.status import OutputHealth
+from gateway.stream.status import OutputHealth
 
 
 class Publisher(Protocol):

@@ -1,1 +1,1 @@
-"""The reverse path: remote peers ask about a source, on Zenoh and on LCM."""
+"""Remote questions about a source, answered from caches."""

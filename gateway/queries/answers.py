@@ -7,8 +7,8 @@ from typing import Any, Final, Literal, NamedTuple
 
 import rtc3d
 
-from gateway.decode import decode, message_type, to_json
 from gateway.errors import QueryError
+from gateway.messages.decode import decode, message_type, to_json
 from gateway.rtc3d.commands import SECTIONS
 from gateway.rtc3d.components import BY_KEY, WIRE_ORDER, ComponentType
 from gateway.rtc3d.parameters import Parameters

@@ -1,1 +1,1 @@
-"""RTC3D, the protocol of NDI First Principles and WaveFront: bytes in, events and bytes out, no I/O."""
+"""The RTC3D protocol, both sides, without I/O."""

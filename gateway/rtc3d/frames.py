@@ -32,7 +32,7 @@ _KEY_BYTES: Final = 12  # a packet's size and type, and the frame's component co
 _MAX_LAYOUTS: Final = 32
 
 
-class Part(NamedTuple):
+class ComponentLayout(NamedTuple):
     """What a layout says of a known component; ``item_bytes`` is 16 or 24 for events, else the item's own."""
 
     type: ComponentType
@@ -45,7 +45,7 @@ class _Header(NamedTuple):
 
     size: int
     type: int
-    part: Part | None
+    part: ComponentLayout | None
 
 
 class Layout:
@@ -247,17 +247,17 @@ def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
     return Frame(layout_of(byte_order, tuple(headers)), body, -HEADER.size)
 
 
-def _part(kind: int, size: int, count: int) -> Part | None:
+def _part(kind: int, size: int, count: int) -> ComponentLayout | None:
     """Return what the component is; None for an unknown type. Raises FrameError if size and count differ."""
     known = _ITEM_BYTES.get(kind)
     if known is None:
         return None
     component, item_bytes = known
     if size == HEADER_BYTES + count * item_bytes:
-        return Part(component, count, item_bytes)
+        return ComponentLayout(component, count, item_bytes)
     # Events in the specification's form (field note 6).
     if component is ComponentType.EVENT and size == HEADER_BYTES + count * SHORT_EVENT.itemsize:
-        return Part(component, count, SHORT_EVENT.itemsize)
+        return ComponentLayout(component, count, SHORT_EVENT.itemsize)
     raise FrameError(f"{component.key} component of {size} bytes announces {count} items")
 
 

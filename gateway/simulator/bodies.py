@@ -6,8 +6,8 @@ import numpy as np
 import numpy.typing as npt
 
 from gateway.rtc3d.components import ITEM_DTYPES, MISSING, MISSING_RELIABILITY, ComponentType, Items
+from gateway.rtc3d_server.scene import Samples
 from gateway.simulator.noise import Floats, Noise
-from gateway.simulator.scene import Samples
 
 _MARKERS_PER_BODY: Final = 4
 _BODY_RADIUS_MM: Final = 80.0

@@ -6,8 +6,8 @@ import numpy as np
 
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, Items
 from gateway.rtc3d.parameters import ForceChannel, ParametersForce, Plate, Point
+from gateway.rtc3d_server.scene import Samples
 from gateway.simulator.noise import Noise
-from gateway.simulator.scene import Samples
 
 _WIDTH_MM: Final = 400.0
 _LENGTH_MM: Final = 600.0

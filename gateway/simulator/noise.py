@@ -5,7 +5,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from gateway.simulator.scene import Samples
+from gateway.rtc3d_server.scene import Samples
 
 Floats = npt.NDArray[np.floating[Any]]
 

@@ -6,8 +6,8 @@ from typing import Annotated, Final, Self
 
 from pydantic import PlainValidator, SerializeAsAny
 
-from gateway.config_file import load_as
-from gateway.config_section import Section, accepts
+from gateway.config.loading import load_as
+from gateway.config.section import Section, accepts
 from gateway.simulator.faults.base import Fault
 from gateway.simulator.faults.kinds import fault_of
 from gateway.simulator.scene_settings import SceneSettings, Seed

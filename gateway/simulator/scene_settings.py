@@ -5,8 +5,8 @@ from typing import Annotated, Self
 
 from pydantic import Field
 
-from gateway.config_section import Section, accepts
-from gateway.simulator.scene import Scene
+from gateway.config.section import Section, accepts
+from gateway.rtc3d_server.scene import Scene
 from gateway.simulator.synthetic import SyntheticScene
 
 Size = Annotated[int, Field(strict=True, ge=0, le=10_000), accepts("a whole number from 0 to 10000")]

@@ -19,10 +19,10 @@ from gateway.rtc3d.parameters import (
     ParametersEvents,
     Tool,
 )
+from gateway.rtc3d_server.scene import NO_EVENTS, Samples
 from gateway.simulator.bodies import RigidBodies
 from gateway.simulator.gait import ForcePlates
 from gateway.simulator.noise import Noise
-from gateway.simulator.scene import NO_EVENTS, Samples
 
 BUTTON_EVENT: Final = 0x123456
 """The id of the only event, that of §6.6: param1 is the button's number, param2 1 pressed or 0 released."""

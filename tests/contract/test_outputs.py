@@ -8,14 +8,14 @@ import lcm
 import pytest
 import zenoh
 
-from gateway.config import LcmSettings, ZenohSettings
+from gateway.cli.subscribers import LcmListener, ZenohListener
+from gateway.config.settings import LcmSettings, ZenohSettings
 from gateway.errors import OutputError
-from gateway.listening import LcmListener, ZenohListener
-from gateway.names import Topic
+from gateway.messages.topics import Topic
 from gateway.outputs.contract import Output, Publisher
-from gateway.outputs.lcm_output import LcmOutput
-from gateway.outputs.memory_output import MemoryOutput
-from gateway.outputs.zenoh_output import ZenohOutput
+from gateway.outputs.lcm.output import LcmOutput
+from gateway.outputs.memory import MemoryOutput
+from gateway.outputs.zenoh.output import ZenohOutput
 from tests.networks import (
     add_multicast_route,
     free_endpoint,

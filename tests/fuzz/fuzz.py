@@ -17,12 +17,12 @@ from pathlib import Path
 import atheris
 
 with atheris.instrument_imports(include=["gateway"]):
-    from gateway.config_file import load
-    from gateway.decode import decode, one_line, to_json
+    from gateway.config.loading import load
     from gateway.errors import CommandError, ConfigError, FrameError, ParametersError, ProtocolError
-    from gateway.message import Stamp, splice
+    from gateway.messages.decode import decode, one_line, to_json
+    from gateway.messages.splice import Stamp, splice
+    from gateway.rtc3d.client_protocol import ClientProtocol, State
     from gateway.rtc3d.commands import SendParameters, StreamFrames, Version, parse_command
-    from gateway.rtc3d.connection import Connection, State
     from gateway.rtc3d.frames import byte_order_of, split_frame
     from gateway.rtc3d.packets import PacketReader
     from gateway.rtc3d.parameters_xml import build_parameters, parse_parameters
@@ -62,7 +62,7 @@ def frames(data: bytes) -> None:
 def connection(data: bytes) -> None:
     """A client survives whatever a server sends, between commands of its own."""
     provider = atheris.FuzzedDataProvider(data)
-    client = Connection(max_packet_bytes=4096)
+    client = ClientProtocol(max_packet_bytes=4096)
     commands = (Version(), SendParameters(), StreamFrames())
     while provider.remaining_bytes():
         if client.under_way is None and client.state is not State.CLOSED:

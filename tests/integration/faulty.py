@@ -3,11 +3,11 @@
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
-from gateway.simulator.connection import Connection
-from gateway.simulator.server import Simulator
+from gateway.rtc3d_server.client_connection import ClientConnection
+from gateway.rtc3d_server.server import Simulator
 from tests.integration.raw_client import RawClient, connected, consecutive, until
-from tests.unit.simulator.counting_scene import CountingScene
-from tests.unit.simulator.wire import (
+from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.unit.rtc3d_server.wire import (
     COMMAND,
     command,
 )
@@ -24,7 +24,7 @@ async def playing(rate_hz: float = FAST_HZ) -> AsyncIterator[tuple[Simulator, Ra
         yield simulator, client
 
 
-def only(simulator: Simulator) -> Connection:
+def only(simulator: Simulator) -> ClientConnection:
     [connection] = simulator.connections
     return connection
 

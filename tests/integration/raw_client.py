@@ -8,7 +8,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Protocol
 
-from tests.unit.simulator.wire import (
+from tests.unit.rtc3d_server.wire import (
     DATA,
     ByteOrder,
     Part,

@@ -12,9 +12,9 @@ from typing import Any, cast
 import pytest
 import yaml
 
-from gateway.config import Source, Stream
-from gateway.session import Handlers, Session
-from gateway.status import StreamStatus
+from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.stream.session import Handlers, Session
+from gateway.stream.status import StreamStatus
 from tests.networks import zenoh_keys
 from tests.servers import Client, ScriptedServer
 from tests.waiting import wait_until
@@ -29,9 +29,9 @@ exec "$@"
 
 
 def session_to(port: int) -> Session:
-    source = Source(name="lab", host="127.0.0.1", port=port)
+    source = SourceSettings(name="lab", host="127.0.0.1", port=port)
     handlers = Handlers(lambda *_: None, lambda *_: None, lambda _: None)
-    return Session(source, Stream(), StreamStatus("3d"), handlers)
+    return Session(source, StreamSettings(), StreamStatus("3d"), handlers)
 
 
 class HastyLoop:

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from gateway.config import Source, Stream
+from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.doctor.finding import Result
 from gateway.rtc3d.commands import Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import ComponentType
-from gateway.simulator.server import Simulator
+from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests import networks, servers
 from tests.findings import Findings, found, lab
@@ -37,7 +37,7 @@ def parameters(*sections: str) -> bytes:
     return packet(2, f"<RT_Parameters Ver='1.00'>{''.join(sections)}</RT_Parameters>")
 
 
-async def examined(script: servers.Script, *streams: Stream, **keys: Any) -> Findings:
+async def examined(script: servers.Script, *streams: StreamSettings, **keys: Any) -> Findings:
     """Return what is found of a scripted server."""
     async with ScriptedServer(script) as server:
         return await found(lab(server.port, *streams, **keys))
@@ -83,7 +83,7 @@ def tools_frame(number: int, *xs: float) -> bytes:
 
 async def test_a_healthy_server_is_green_in_every_layer() -> None:
     scene = SyntheticScene(markers=3, tools=1, analog=4, plates=1, rate_hz=200, analog_rate_hz=1000)
-    streams = (Stream(components=(MARKERS, TOOLS, EVENT)), Stream(components=(ANALOG, FORCE)))
+    streams = (StreamSettings(components=(MARKERS, TOOLS, EVENT)), StreamSettings(components=(ANALOG, FORCE)))
     async with Simulator(scene) as simulator:
         findings = await found(lab(simulator.port, *streams))
     assert {each.result for each in findings.all if each.subject == "lab"} == {Result.GREEN}
@@ -114,7 +114,7 @@ async def test_a_name_is_resolved() -> None:
 async def test_an_unknown_name_is_red_and_ends_the_examination_of_its_source() -> None:
     scene = SyntheticScene(markers=1, tools=0, analog=0, plates=0)
     async with Simulator(scene) as simulator:
-        other = Source(name="other", host="127.0.0.1", port=simulator.port)
+        other = SourceSettings(name="other", host="127.0.0.1", port=simulator.port)
         findings = await found(lab(3020, host="no-such-host.invalid"), other)
     finding = findings.of("name")
     assert finding.found.startswith("the host name 'no-such-host.invalid' is not known: ")
@@ -253,13 +253,13 @@ async def test_no_measurement_is_red() -> None:
 
 
 async def test_no_frames_without_a_reason_are_red() -> None:
-    findings = await examined(answering(parameters()), Stream(components=(MARKERS, TOOLS)))
+    findings = await examined(answering(parameters()), StreamSettings(components=(MARKERS, TOOLS)))
     assert findings.of("frames").found == ("no frame of 3d 6d came, and no word that no measurement runs")
     assert findings.of("frames").remedy.startswith("Look whether the server shows live data")
 
 
 async def test_no_event_is_no_fault() -> None:
-    findings = await examined(answering(parameters()), Stream(components=(EVENT,)))
+    findings = await examined(answering(parameters()), StreamSettings(components=(EVENT,)))
     assert findings.reasons("frames") == {"events come when they come, and none came meanwhile"}
     assert findings.red() == []
 
@@ -325,7 +325,7 @@ async def test_a_server_that_does_not_keep_up_is_red() -> None:
 async def test_a_lower_rate_on_purpose_is_no_fault(rate: Rate, text: str) -> None:
     scene = SyntheticScene(markers=1, tools=0, analog=0, plates=0, rate_hz=200)
     async with Simulator(scene) as simulator:
-        findings = await found(lab(simulator.port, Stream(components=(MARKERS,), rate=rate)))
+        findings = await found(lab(simulator.port, StreamSettings(components=(MARKERS,), rate=rate)))
     assert (findings.of("rate").result, findings.of("rate").found) == (Result.GREEN, text)
 
 

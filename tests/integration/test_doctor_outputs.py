@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 
-from gateway.config import LcmSettings, ZenohSettings
+from gateway.config.settings import LcmSettings, ZenohSettings
 from gateway.doctor import host
 from gateway.doctor.finding import Finding, Result
 from gateway.doctor.observation import ComponentSeen
-from gateway.simulator.server import Simulator
+from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests import networks
 from tests.findings import Findings, found, lab

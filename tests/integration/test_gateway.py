@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import rtc3d
 
-from gateway.config import Stream
+from gateway.config.settings import StreamSettings
 from gateway.rtc3d.commands import FrequencyDivisor
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
-from gateway.simulator.server import Simulator
+from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.stream_state import StreamState
+from gateway.stream.state import StreamState
 from tests.labs import gateway_to
 from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
 
@@ -53,7 +53,10 @@ async def test_every_component_of_the_simulator_is_published() -> None:
 
 async def test_streams_have_connections_of_their_own() -> None:
     scene = SyntheticScene(markers=2, tools=0, analog=2, plates=0, rate_hz=100, analog_rate_hz=1000)
-    streams = (Stream(components=(ComponentType.MARKERS,)), Stream(components=(ComponentType.ANALOG,)))
+    streams = (
+        StreamSettings(components=(ComponentType.MARKERS,)),
+        StreamSettings(components=(ComponentType.ANALOG,)),
+    )
     async with Simulator(scene) as simulator, gateway_to(simulator.port, streams=streams) as running:
         analog = await running.heard("analog", 100)
         numbers = [message.frame_number for message in analog]
@@ -64,7 +67,7 @@ async def test_streams_have_connections_of_their_own() -> None:
 
 async def test_the_rate_asked_for_reaches_the_server() -> None:
     scene = SyntheticScene(markers=1, rate_hz=200)
-    stream = Stream(components=(ComponentType.MARKERS,), rate=FrequencyDivisor(4))
+    stream = StreamSettings(components=(ComponentType.MARKERS,), rate=FrequencyDivisor(4))
     async with Simulator(scene) as simulator, gateway_to(simulator.port, streams=(stream,)) as running:
         numbers = [message.frame_number for message in await running.heard("3d", 10)]
         assert {after - before for before, after in pairwise(numbers)} == {4}
@@ -109,7 +112,7 @@ async def test_a_server_that_knows_stream_frames_alone_streams() -> None:
 
         await client.commands(answer)
 
-    stream = Stream(components=(ComponentType.MARKERS,))
+    stream = StreamSettings(components=(ComponentType.MARKERS,))
     async with ScriptedServer(script) as server, gateway_to(server.port, streams=(stream,)) as running:
         await running.heard("3d")
         assert commands[:5] == [
@@ -126,7 +129,7 @@ async def test_a_server_that_knows_stream_frames_alone_streams() -> None:
 async def test_what_a_server_lacks_is_told_loudly_once_over_all_connections(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    caplog.set_level(logging.DEBUG, "gateway.negotiation")
+    caplog.set_level(logging.DEBUG, "gateway.stream.stream_control")
 
     async def script(client: Client) -> None:
         def answer(command: str) -> bytes:
@@ -175,7 +178,7 @@ async def test_an_acknowledged_and_ignored_byte_order_is_noticed(caplog: pytest.
 
 
 async def test_components_that_were_not_asked_for_are_not_published() -> None:
-    stream = Stream(components=(ComponentType.TOOLS,))
+    stream = StreamSettings(components=(ComponentType.TOOLS,))
     served = asyncio.Event()
 
     async def script(client: Client) -> None:
@@ -195,7 +198,7 @@ async def test_components_that_were_not_asked_for_are_not_published() -> None:
 async def test_bad_frames_are_counted_and_the_next_good_one_is_published(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    caplog.set_level(logging.DEBUG, "gateway.session")
+    caplog.set_level(logging.DEBUG, "gateway.stream.session")
 
     async def script(client: Client) -> None:
         def answer(command: str) -> bytes:
@@ -211,7 +214,7 @@ async def test_bad_frames_are_counted_and_the_next_good_one_is_published(
         told = [
             record
             for record in caplog.records
-            if "frame" in record.message and record.name == "gateway.session"
+            if "frame" in record.message and record.name == "gateway.stream.session"
         ]
         assert [record.levelname for record in told] == ["WARNING", "DEBUG", "DEBUG", "INFO"]
         assert "frame rejected" in running.status.last_error

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import pytest
 import rtc3d
 
-from gateway.config import lcm_queries_url
-from gateway.daemon import Gateway
-from gateway.decode import decode
-from gateway.listening import LcmListener
-from gateway.outputs.lcm_output import open_lcm
-from gateway.queries.lcm_queries import MAX_PENDING, MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES, LcmQueries
+from gateway.cli.subscribers import LcmListener
+from gateway.config.settings import lcm_queries_url
+from gateway.gateway import Gateway
+from gateway.messages.decode import decode
+from gateway.outputs.lcm.output import open_lcm
+from gateway.outputs.lcm.queries import MAX_PENDING, MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES, LcmQueries
 from gateway.rtc3d.commands import SECTIONS
 from tests.networks import free_port, lcm_url
 from tests.querying import LabServer, gateway_at, is_filled
@@ -276,7 +276,7 @@ async def test_the_queue_is_bounded_and_what_is_beyond_it_is_counted() -> None:
 
 
 async def test_who_has_a_reply_may_ask_again_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("gateway.queries.lcm_queries.MAX_PENDING", 1)
+    monkeypatch.setattr("gateway.outputs.lcm.queries.MAX_PENDING", 1)
     async with lab() as (_, gateway, peer):
         [queries] = gateway._queries.values()
         assert isinstance(queries, LcmQueries)

@@ -6,12 +6,12 @@ from contextlib import asynccontextmanager
 
 import pytest
 
-from gateway.simulator.connection import MAX_UNREAD_BYTES
-from gateway.simulator.server import Simulator
+from gateway.rtc3d_server.client_connection import MAX_UNREAD_BYTES
+from gateway.rtc3d_server.server import Simulator
 from tests.integration.raw_client import RawClient, connected, consecutive, until
 from tests.proxy import FuzzingProxy
-from tests.unit.simulator.counting_scene import CountingScene
-from tests.unit.simulator.wire import COMMAND, command, cut, packet
+from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.unit.rtc3d_server.wire import COMMAND, command, cut, packet
 
 FAST_HZ = 1000.0
 VERSION = (COMMAND, b"OK-Version 1.0")

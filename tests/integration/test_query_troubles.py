@@ -8,13 +8,13 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from gateway.config import Source
+from gateway.c3d_spool import Spool
+from gateway.config.settings import SourceSettings
 from gateway.errors import QueryError
+from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.queries import zenoh_queries
 from gateway.queries.answers import Answer
-from gateway.queries.desk import Desk
-from gateway.queries.zenoh_queries import ZenohQueries
-from gateway.spool import Spool
+from gateway.queries.source_queries import SourceQueries
 from tests.networks import free_endpoint, open_zenoh
 from tests.querying import ask, asker_at, gateway_at, lab
 from tests.servers import packet
@@ -24,11 +24,11 @@ from tests.waiting import wait_until_async
 async def test_a_defect_is_told_to_the_asker_and_logged(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def fail(_desk: Desk, _question: object) -> None:
+    def fail(_desk: SourceQueries, _question: object) -> None:
         raise ZeroDivisionError("of all things")
 
     async with lab() as (server, _, _, asker):
-        monkeypatch.setattr(Desk, "_recording", fail)
+        monkeypatch.setattr(SourceQueries, "_recording", fail)
         reply = await ask(asker, "mocap/lab/recording")
         assert reply.code == "defect"
         assert "ZeroDivisionError('of all things')" in reply.error
@@ -98,13 +98,13 @@ async def test_without_time_stamps_late_subscribers_must_ask_and_the_log_says_ho
     assert set(heard) == {b"<RT_Parameters/>"}
 
 
-class SlowDesk(Desk):
+class SlowDesk(SourceQueries):
     """Is asked, and never answers."""
 
     def __init__(self) -> None:
         self.asked = asyncio.Event()
         self.components = frozenset()
-        self.source = Source(name="lab", host="192.0.2.1")
+        self.source = SourceSettings(name="lab", host="192.0.2.1")
 
     async def answer(self, _question: object) -> Answer:
         self.asked.set()

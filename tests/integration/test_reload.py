@@ -10,21 +10,21 @@ from typing import Any
 
 import pytest
 
-from gateway.config import (
+from gateway.cli.subscribers import LcmListener, ZenohListener, open_zenoh
+from gateway.config.settings import (
     LcmSettings,
     MetricsSettings,
-    Reconnect,
+    ReconnectSettings,
     Settings,
-    Source,
+    SourceSettings,
     SpoolSettings,
     ZenohSettings,
 )
-from gateway.daemon import Gateway
-from gateway.decode import decode
 from gateway.errors import ConfigError
-from gateway.listening import LcmListener, ZenohListener, open_zenoh
-from gateway.outputs.lcm_output import open_lcm
-from gateway.simulator.server import Simulator
+from gateway.gateway import Gateway
+from gateway.messages.decode import decode
+from gateway.outputs.lcm.output import open_lcm
+from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
 from tests.querying import LabServer, ask, ask_all, asker_at
@@ -47,10 +47,10 @@ class Site:
 
     def settings(self, sources: Mapping[str, int], **sections: Any) -> Settings:
         """Return settings with sources by name and port; other sections stand over those here."""
-        reconnect = Reconnect(first_delay_s=0.01, max_delay_s=0.05)
+        reconnect = ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05)
         return Settings(
             sources=tuple(
-                Source(name=name, host="127.0.0.1", port=port, reconnect=reconnect)
+                SourceSettings(name=name, host="127.0.0.1", port=port, reconnect=reconnect)
                 for name, port in sources.items()
             ),
             **{

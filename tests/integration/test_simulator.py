@@ -9,12 +9,12 @@ import pytest
 
 from gateway.errors import GatewayError
 from gateway.rtc3d.parameters_xml import parse_parameters
-from gateway.simulator.connection import MAX_UNREAD_BYTES
-from gateway.simulator.server import Simulator
+from gateway.rtc3d_server.client_connection import MAX_UNREAD_BYTES
+from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.integration.raw_client import TIMEOUT_S, connected, consecutive, until
-from tests.unit.simulator.counting_scene import CountingScene
-from tests.unit.simulator.wire import (
+from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.unit.rtc3d_server.wire import (
     ANALOG,
     COMMAND,
     DATA,

@@ -9,25 +9,25 @@ import struct
 import pytest
 
 from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.faults.base import Fault
 from gateway.simulator.faults.kinds import KINDS
-from gateway.simulator.faults.replies import (
+from gateway.simulator.faults.reply_faults import (
     MissingAcknowledgements,
     ReplyText,
 )
-from gateway.simulator.faults.server import ChangeScene, NoMeasurement, Restart
-from gateway.simulator.faults.stream import (
+from gateway.simulator.faults.server_faults import ChangeScene, NoMeasurement, Restart
+from gateway.simulator.faults.stream_faults import (
     Delay,
     Garbage,
     HalfOpen,
     Undersize,
 )
 from gateway.simulator.scene_settings import SceneSettings
-from gateway.simulator.server import Simulator
 from tests.integration.faulty import FAST_HZ, NEVER_MS, VERSION, only, playing, well
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
-from tests.unit.simulator.counting_scene import CountingScene
-from tests.unit.simulator.wire import (
+from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.unit.rtc3d_server.wire import (
     COMMAND,
     DATA,
     MARKERS,

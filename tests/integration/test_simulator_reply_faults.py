@@ -8,8 +8,9 @@ import pytest
 
 from gateway.errors import FrameError
 from gateway.rtc3d.frames import split_frame
+from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.faults.base import Fault
-from gateway.simulator.faults.frames import (
+from gateway.simulator.faults.frame_faults import (
     ConstantFrameNumbers,
     FrozenTimestamps,
     JumpingTimestamps,
@@ -19,7 +20,7 @@ from gateway.simulator.faults.frames import (
     WrongByteOrder,
     WrongCounts,
 )
-from gateway.simulator.faults.replies import (
+from gateway.simulator.faults.reply_faults import (
     DoubledAcknowledgements,
     FramesFirst,
     LateAcknowledgements,
@@ -28,10 +29,9 @@ from gateway.simulator.faults.replies import (
     RefusedCommands,
     ReplyText,
 )
-from gateway.simulator.server import Simulator
 from tests.integration.faulty import NEVER_MS, VERSION, only, playing, well
 from tests.integration.raw_client import RawClient, consecutive, numbers
-from tests.unit.simulator.wire import (
+from tests.unit.rtc3d_server.wire import (
     COMMAND,
     DATA,
     ERROR,

@@ -5,13 +5,14 @@ import struct
 import numpy as np
 import pytest
 
-from gateway.simulator.connection import Connection
+from gateway.rtc3d_server.client_connection import ClientConnection
+from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.faults.base import Fault
 from gateway.simulator.faults.line import MAX_WAITING_BYTES
-from gateway.simulator.faults.replies import (
+from gateway.simulator.faults.reply_faults import (
     LateAcknowledgements,
 )
-from gateway.simulator.faults.stream import (
+from gateway.simulator.faults.stream_faults import (
     Cut,
     Delay,
     Garbage,
@@ -23,11 +24,10 @@ from gateway.simulator.faults.stream import (
     Split,
     Undersize,
 )
-from gateway.simulator.server import Simulator
 from tests.integration.faulty import FAST_HZ, NEVER_MS, VERSION, only, playing, waiting_bytes, well
 from tests.integration.raw_client import connected, consecutive, numbers, until
-from tests.unit.simulator.counting_scene import CountingScene
-from tests.unit.simulator.wire import (
+from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.unit.rtc3d_server.wire import (
     COMMAND,
     DATA,
     ERROR,
@@ -141,7 +141,7 @@ async def test_a_half_open_server_says_and_hears_nothing_and_lets_clients_connec
         await well(simulator, client)
 
 
-def only_of(simulator: Simulator, number: int) -> Connection:
+def only_of(simulator: Simulator, number: int) -> ClientConnection:
     [connection] = [c for c in simulator.connections if c.number == number]
     return connection
 

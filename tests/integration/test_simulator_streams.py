@@ -9,12 +9,12 @@ import ezc3d
 import numpy as np
 import pytest
 
-from gateway.simulator.scene import Scene
-from gateway.simulator.server import Simulator
-from gateway.simulator.take import Take
+from gateway.rtc3d_server.scene import Scene
+from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.c3d_scene import C3dScene
 from tests.integration.raw_client import connected, numbers
-from tests.unit.simulator.counting_scene import CountingScene
-from tests.unit.simulator.wire import (
+from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.unit.rtc3d_server.wire import (
     ANALOG,
     COMMAND,
     DATA,
@@ -191,7 +191,7 @@ async def test_a_real_recording_arrives_as_ezc3d_reads_it(name: str) -> None:
     path = Path(folder) / name
     read = ezc3d.c3d(str(path), extract_forceplat_data=True)["data"]
     takes: list[Awaitable[dict[int, list[Part]]]] = [
-        played_once(Take(path), components) for components in ("3D", "Analog Force")
+        played_once(C3dScene(path), components) for components in ("3D", "Analog Force")
     ]
     points, fast = await asyncio.gather(*takes)
 

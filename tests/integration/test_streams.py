@@ -6,10 +6,10 @@ from functools import partial
 
 import pytest
 
-from gateway.config import Stream
-from gateway.simulator.server import Simulator
+from gateway.config.settings import StreamSettings
+from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.stream_state import StreamState
+from gateway.stream.state import StreamState
 from tests.labs import gateway_to
 from tests.servers import Client, ScriptedServer, markers_frame, ok, packet
 
@@ -51,7 +51,7 @@ START, STOP = "StreamFrames AllFrames", "StreamFrames Stop"
 
 async def test_a_stream_on_demand_runs_while_somebody_listens() -> None:
     server = Recorder()
-    stream = Stream(on_demand=True, idle_after_s=0.1)
+    stream = StreamSettings(on_demand=True, idle_after_s=0.1)
     async with (
         ScriptedServer(server.script) as listening,
         gateway_to(listening.port, streams=(stream,)) as lab,
@@ -130,8 +130,8 @@ async def test_late_frames_make_the_gateway_ask_for_less_until_they_are_in_time(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The server's frames come in time for 3 s, and then 0.3 s late: its time stamps stay behind."""
-    monkeypatch.setattr("gateway.rate.FIRST_WAIT_S", 0.3)
-    caplog.set_level("INFO", "gateway.supervisor")
+    monkeypatch.setattr("gateway.stream.rate_control.FIRST_WAIT_S", 0.3)
+    caplog.set_level("INFO", "gateway.stream.supervisor")
     server = Recorder()
     async with ScriptedServer(server.script) as listening, gateway_to(listening.port) as lab:
         await lab.until(lambda: server.count(START) == 1)

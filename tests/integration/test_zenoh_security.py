@@ -13,8 +13,8 @@ import pytest
 import zenoh
 import zenoh.ext
 
-from gateway.config_environment import variable_name
-from gateway.config_file import load
+from gateway.config.environment import variable_name
+from gateway.config.loading import load
 from tests.networks import free_port
 from tests.waiting import wait_until
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.config import Stream
+from gateway.config.settings import StreamSettings
 from gateway.queries.answers import SCHEMA_TYPES
 from gateway.rtc3d.commands import SECTIONS
 from gateway.rtc3d.components import ComponentType
@@ -36,7 +36,7 @@ from tests.waiting import wait_until_async
     ],
 )  # fmt: skip
 async def test_a_bad_question_is_answered_with_what_is_accepted(selector: str, accepted: list[str]) -> None:
-    streams = (Stream(components=(ComponentType.MARKERS, ComponentType.EVENT)),)
+    streams = (StreamSettings(components=(ComponentType.MARKERS, ComponentType.EVENT)),)
     async with lab_without_server(streams=streams) as (_, asker):
         reply = await ask(asker, f"mocap/lab/{selector}")
         assert reply.encoding == "text/plain;bad-request"

@@ -3,7 +3,7 @@ from itertools import combinations, pairwise
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from gateway.clock import Sample, ServerClock, envelope_slope
+from gateway.stream.clock import Sample, ServerClock, envelope_slope
 from tests.clock_simulation import EPOCH_UTIME, observe, percentile_95_us, simulate
 
 timestamps_us = st.integers(-(2**63), 2**63 - 1)

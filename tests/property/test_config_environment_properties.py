@@ -8,10 +8,10 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.config import Settings
-from gateway.config_environment import PREFIX, variable_name
-from gateway.config_file import load
-from gateway.config_yaml import Location
+from gateway.config.environment import PREFIX, variable_name
+from gateway.config.loading import load
+from gateway.config.settings import Settings
+from gateway.config.yaml_document import Location
 from gateway.errors import ConfigError
 from tests.property.test_config_properties import PIECES, SETTINGS
 

@@ -8,9 +8,16 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
 from gateway import names
-from gateway.config import LcmSettings, Reconnect, Settings, Source, Stream, ZenohSettings
-from gateway.config_file import load
-from gateway.config_values import LCM_PROVIDERS, KeyPrefix
+from gateway.config.loading import load
+from gateway.config.settings import (
+    LcmSettings,
+    ReconnectSettings,
+    Settings,
+    SourceSettings,
+    StreamSettings,
+    ZenohSettings,
+)
+from gateway.config.values import LCM_PROVIDERS, KeyPrefix
 from gateway.errors import ConfigError
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
@@ -68,7 +75,7 @@ RATES = st.one_of(
 
 
 @st.composite
-def streams(draw: st.DrawFn) -> tuple[Stream, ...]:
+def streams(draw: st.DrawFn) -> tuple[StreamSettings, ...]:
     """Return streams that share no component."""
     owners = draw(st.lists(st.integers(0, 4), min_size=5, max_size=5))
     parts = [
@@ -76,17 +83,17 @@ def streams(draw: st.DrawFn) -> tuple[Stream, ...]:
         for stream in range(4)
     ]
     named: list[tuple[ComponentType, ...]] = [part for part in parts if part] or [WIRE_ORDER]
-    return tuple(Stream(components=part, rate=draw(RATES)) for part in named)
+    return tuple(StreamSettings(components=part, rate=draw(RATES)) for part in named)
 
 
 @st.composite
-def reconnects(draw: st.DrawFn) -> Reconnect:
+def reconnects(draw: st.DrawFn) -> ReconnectSettings:
     first, longest = sorted([draw(SECONDS), draw(SECONDS)])
-    return Reconnect(first_delay_s=first, max_delay_s=longest)
+    return ReconnectSettings(first_delay_s=first, max_delay_s=longest)
 
 
 SOURCES = st.builds(
-    Source,
+    SourceSettings,
     name=st.from_regex(r"\A[A-Za-z0-9_-]{1,24}\Z"),
     host=st.sampled_from(["lab", "192.0.2.20", "::1", "ndi.example.org", "5a", "on", "2026-06-01"]),
     port=st.integers(1, 65535),
@@ -152,7 +159,7 @@ def test_any_file_gives_settings_or_lines_with_its_path(file: Path, content: byt
 
 @given(first=st.from_regex(r"\A[ABab_-]{1,4}\Z"), second=st.from_regex(r"\A[ABab_-]{1,4}\Z"))
 def test_names_are_refused_together_exactly_if_they_share_channels(first: str, second: str) -> None:
-    sources = tuple(Source(name=name, host="lab") for name in (first, second))
+    sources = tuple(SourceSettings(name=name, host="lab") for name in (first, second))
     if names.lcm_channel("MOCAP", first) == names.lcm_channel("MOCAP", second):
         with pytest.raises(ValidationError, match="shares its LCM channels"):
             Settings(sources=sources)

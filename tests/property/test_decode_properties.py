@@ -4,12 +4,12 @@ import json
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.decode import decode, one_line, to_json
 from gateway.errors import ProtocolError
-from gateway.message import Stamp, splice, tool_poses
+from gateway.messages.decode import decode, one_line, to_json
+from gateway.messages.splice import Stamp, splice, tool_poses
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
-from gateway.status import OutputHealth, OutputStatus, StreamStatus, clock_message, status_message
+from gateway.stream.status import OutputHealth, OutputStatus, StreamStatus, clock_message, status_message
 from tests.strategies import damaged
 from tests.vectors import FULL_FRAME
 

@@ -11,9 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from gateway.decode import decode
-from gateway.listening import ZenohListener, key_pattern, open_zenoh
-from gateway.simulator.server import Simulator
+from gateway.cli.subscribers import ZenohListener, key_pattern, open_zenoh
+from gateway.messages.decode import decode
+from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.clones import ROOT
 from tests.networks import free_endpoint, free_port, zenoh_keys

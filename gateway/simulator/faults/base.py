@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple, S
 import numpy as np
 from pydantic import Field, model_validator
 
-from gateway.config_section import Section, accepts, mistake
+from gateway.config.section import Section, accepts, mistake
 from gateway.rtc3d.packets import Packet, PacketType
 
 if TYPE_CHECKING:
-    from gateway.simulator.connection import Connection
+    from gateway.rtc3d_server.client_connection import ClientConnection
+    from gateway.rtc3d_server.server import Simulator
     from gateway.simulator.faults.line import Line
-    from gateway.simulator.server import Simulator
 
 MAX_SECONDS: Final = 86400
 
@@ -157,7 +157,7 @@ class ConnectionFault(Fault):
     connection: Count | None = None
     """Only the n-th connection since the server's start; without it, all."""
 
-    def covers(self, connection: Connection) -> bool:
+    def covers(self, connection: ClientConnection) -> bool:
         """Return whether this connection is meant."""
         return self.connection in {None, connection.number}
 
@@ -171,7 +171,7 @@ class StrikeFault(ConnectionFault):
             if self.covers(connection):
                 self.strike(connection, run)
 
-    def strike(self, connection: Connection, run: Run) -> None:
+    def strike(self, connection: ClientConnection, run: Run) -> None:
         """Do it to one connection."""
         raise NotImplementedError
 

@@ -13,12 +13,12 @@ from gateway.errors import GatewayError
 from gateway.simulator.faults.base import Fault, LineFault, Run, StrikeFault
 from gateway.simulator.faults.kinds import KINDS
 from gateway.simulator.faults.line import Line
-from gateway.simulator.faults.server import NoMeasurement, Restart
+from gateway.simulator.faults.server_faults import NoMeasurement, Restart
 from gateway.simulator.scene_settings import SceneSettings
 
 if TYPE_CHECKING:
-    from gateway.simulator.connection import Connection
-    from gateway.simulator.server import Simulator
+    from gateway.rtc3d_server.client_connection import ClientConnection
+    from gateway.rtc3d_server.server import Simulator
 
 _RETRY_S: Final = 1.0  # until the port is free again, if something else took it meanwhile
 _ORDER: Final = {kind: place for place, kind in enumerate(KINDS.values())}
@@ -99,12 +99,12 @@ class Faults:
 
     # What connections and lines call --------------------------------------------------------
 
-    def connected(self, connection: Connection) -> None:
+    def connected(self, connection: ClientConnection) -> None:
         """Put a line into a connection if a fault that is on needs it."""
         if connection.line is None and self.on_line(connection):
             connection.line = Line(connection, self)
 
-    def on_line(self, connection: Connection) -> list[tuple[Run, LineFault]]:
+    def on_line(self, connection: ClientConnection) -> list[tuple[Run, LineFault]]:
         """Return the faults that are on for what passes through a connection, in their order."""
         return [
             (run, run.fault)

@@ -7,13 +7,13 @@ from typing import Any, Final
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from gateway.config_section import did_you_mean, mistake, shown
+from gateway.config.section import did_you_mean, mistake, shown
 from gateway.errors import ConfigError
 from gateway.simulator.faults.base import Fault, as_given
-from gateway.simulator.faults.frames import FRAME_FAULTS
-from gateway.simulator.faults.replies import REPLY_FAULTS
-from gateway.simulator.faults.server import SERVER_FAULTS
-from gateway.simulator.faults.stream import STREAM_FAULTS
+from gateway.simulator.faults.frame_faults import FRAME_FAULTS
+from gateway.simulator.faults.reply_faults import REPLY_FAULTS
+from gateway.simulator.faults.server_faults import SERVER_FAULTS
+from gateway.simulator.faults.stream_faults import STREAM_FAULTS
 
 KINDS: Final[dict[str, type[Fault]]] = {
     fault.kind: fault for fault in (*SERVER_FAULTS, *REPLY_FAULTS, *FRAME_FAULTS, *STREAM_FAULTS)

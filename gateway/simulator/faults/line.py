@@ -11,11 +11,11 @@ from collections import deque
 from typing import TYPE_CHECKING, Final
 
 from gateway.rtc3d.packets import Packet, PacketType
-from gateway.simulator.client import error_packet
+from gateway.rtc3d_server.client_session import error_packet
 from gateway.simulator.faults.base import Chunk, LineFault, Run, type_of
 
 if TYPE_CHECKING:
-    from gateway.simulator.connection import Connection
+    from gateway.rtc3d_server.client_connection import ClientConnection
     from gateway.simulator.faults.control import Faults
 
 MAX_WAITING_BYTES: Final = 4 * 1024 * 1024
@@ -31,7 +31,7 @@ class Line:
     fault of its connection is on or anything waits in it.
     """
 
-    def __init__(self, connection: Connection, faults: Faults) -> None:
+    def __init__(self, connection: ClientConnection, faults: Faults) -> None:
         self._connection = connection
         self._faults = faults
         self._loop = asyncio.get_running_loop()

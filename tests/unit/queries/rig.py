@@ -6,16 +6,16 @@ from typing import Any
 
 import pytest
 
-from gateway.config import Source
+from gateway.config.settings import SourceSettings
 from gateway.errors import QueryError
 from gateway.queries.answers import Answer, Question
-from gateway.queries.desk import Desk, StreamAccess
-from gateway.queries.known import Known
+from gateway.queries.parameter_cache import Known
+from gateway.queries.source_queries import SourceQueries, StreamAccess
 from gateway.rtc3d.commands import Command
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters_xml import parse_parameters
-from gateway.status import StreamStatus
+from gateway.stream.status import StreamStatus
 from tests.spec_parameters import in_root
 from tests.waiting import wait_until_async
 
@@ -65,8 +65,10 @@ class Rig:
         self.files: list[str] = []
         self.recorded: list[bool] = []
         # An interval of 0 cannot be configured: here every fresh question is one.
-        settings = Source(name="lab", host="192.0.2.1").model_copy(update={"fresh_interval_s": 0.0} | source)
-        self.desk = Desk(
+        settings = SourceSettings(name="lab", host="192.0.2.1").model_copy(
+            update={"fresh_interval_s": 0.0} | source
+        )
+        self.desk = SourceQueries(
             settings,
             [
                 StreamAccess(

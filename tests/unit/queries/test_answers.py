@@ -5,7 +5,7 @@ import pytest
 import rtc3d
 
 from gateway.errors import QueryError
-from gateway.message import Stamp, splice
+from gateway.messages.splice import Stamp, splice
 from gateway.queries.answers import (
     JSON,
     SCHEMA_TYPES,

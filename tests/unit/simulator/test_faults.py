@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from gateway.errors import ConfigError, FrameError
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet
+from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.faults.base import Chunk, Fault, LineFault, Run
-from gateway.simulator.faults.frames import (
+from gateway.simulator.faults.frame_faults import (
     ConstantFrameNumbers,
     FrozenTimestamps,
     JumpingTimestamps,
@@ -23,13 +24,12 @@ from gateway.simulator.faults.frames import (
     WrongCounts,
 )
 from gateway.simulator.faults.kinds import KINDS, list_of_kinds, meaning_of, parse_fault
-from gateway.simulator.faults.replies import MinimalServer, RefusedCommands
-from gateway.simulator.faults.server import Restart
-from gateway.simulator.faults.stream import Delay, HalfOpen, Jitter, Merge, SlowReader, Split
+from gateway.simulator.faults.reply_faults import MinimalServer, RefusedCommands
+from gateway.simulator.faults.server_faults import Restart
+from gateway.simulator.faults.stream_faults import Delay, HalfOpen, Jitter, Merge, SlowReader, Split
 from gateway.simulator.scene_settings import SceneSettings
-from gateway.simulator.server import Simulator
-from tests.unit.simulator.counting_scene import CountingScene
-from tests.unit.simulator.wire import COMMAND, DATA, MARKERS, TOOLS, ByteOrder, Part, cut, frame_of, packet
+from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, MARKERS, TOOLS, ByteOrder, Part, cut, frame_of, packet
 
 MISSING = b"\xff" * 4
 

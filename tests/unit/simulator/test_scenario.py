@@ -7,12 +7,12 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
-from gateway.cli import app
+from gateway.cli.main import app
 from gateway.errors import ConfigError
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.faults.kinds import COMMON, KINDS, list_of_kinds, parameters_of
-from gateway.simulator.faults.server import Restart
-from gateway.simulator.faults.stream import Cut, Delay
+from gateway.simulator.faults.server_faults import Restart
+from gateway.simulator.faults.stream_faults import Cut, Delay
 from gateway.simulator.scenario import Scenario, load_scenario
 from gateway.simulator.scene_settings import SceneSettings
 

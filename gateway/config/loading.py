@@ -1,0 +1,172 @@
+"""Reads settings: YAML files and environment variables to sections, and each mistake with its place."""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, NamedTuple, TypeVar
+
+from pydantic import ValidationError
+
+from gateway.config.environment import PREFIX, override, variable_name
+from gateway.config.secrets import MASK, is_secret_key, key_of_file, secrets_in, without_secrets
+from gateway.config.section import UNKNOWN_KEY, Section
+from gateway.config.settings import Settings
+from gateway.config.yaml_document import Document, Location, Place, line_and_column_after, read_yaml
+from gateway.errors import ConfigError
+
+MAX_FILE_BYTES: Final = 1024 * 1024
+
+AnySection = TypeVar("AnySection", bound=Section)
+
+_ZENOH_CONFIG: Final = ("zenoh", "config")
+
+
+class Configuration(NamedTuple):
+    """The gateway's settings, and the place of each value that is not a default."""
+
+    settings: Settings
+    places: Mapping[Location, Place]
+
+
+def load(path: Path | None, environ: Mapping[str, str] = os.environ) -> Settings:
+    """Return the gateway's settings; see ``read``."""
+    return read(path, environ).settings
+
+
+def read(path: Path | None, environ: Mapping[str, str] = os.environ) -> Configuration:
+    """Return what ``environ`` says (``config_environment``), over the YAML file at ``path`` if there is one.
+
+    Relative paths count from the file's folder, else from the current one. Raises ConfigError with one
+    line per mistake, ``PLACE: KEY: what was found; what is accepted``; the place is FILE:LINE:COLUMN or
+    the variable. Of mistakes in the YAML itself only the first is told: the rest cannot be read.
+    """
+    if path is None:
+        document = read_yaml("{}", "environment", has_lines=False)
+        return _configuration(document, Path.cwd(), environ)
+    document = _read_file(path, Settings, "config/gateway.yaml")
+    return _configuration(document, path.parent.absolute(), environ)
+
+
+def read_server(host: str, port: int, environ: Mapping[str, str] = os.environ) -> Configuration:
+    """Return the configuration of one server as source "lab", all else as by default or in ``environ``.
+
+    Raises ConfigError as ``read`` does, with the place ``--server``.
+    """
+    sources = json.dumps({"sources": [{"name": "lab", "host": host, "port": port}]})
+    return _configuration(read_yaml(sources, "--server", has_lines=False), Path.cwd(), environ)
+
+
+def load_as(section: type[AnySection], path: Path, *, example: str) -> AnySection:
+    """Return what the YAML file at ``path`` holds; relative paths in it count from its folder.
+
+    Raises ConfigError as ``read`` does. ``example`` is a file that could have been meant.
+    """
+    document = _read_file(path, section, example)
+    try:
+        return section.model_validate(document.values, context={"folder": path.parent.absolute()})
+    except ValidationError as error:
+        raise _in_order(_explained(document, error)) from None
+
+
+def _configuration(document: Document, folder: Path, environ: Mapping[str, str]) -> Configuration:
+    override(document, environ)
+    mistakes = _take_out_secrets(document)
+    try:
+        settings = Settings.model_validate(document.values, context={"folder": folder})
+    except ValidationError as error:
+        raise _in_order([*mistakes, *_explained(document, error)]) from None
+    if mistakes:
+        raise _in_order(mistakes)
+    return Configuration(settings, document.places)
+
+
+def _read_file(path: Path, section: type[Section], example: str) -> Document:
+    document = read_yaml(_text_of(path, example), str(path))
+    if not document.places:
+        needed = next(name for name, field in section.model_fields.items() if field.is_required())
+        raise ConfigError(f"{path}: empty; accepted is a mapping, with the key {needed} at least")
+    return document
+
+
+def _text_of(path: Path, example: str) -> str:
+    try:
+        with path.open("rb") as file:
+            data = file.read(MAX_FILE_BYTES + 1)
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: cannot be read: {error.strerror}; name a YAML file such as {example}"
+        ) from error
+    if len(data) > MAX_FILE_BYTES:
+        raise ConfigError(f"{path}: too large; accepted is a file of at most {MAX_FILE_BYTES} bytes")
+    try:
+        return data.decode("utf-8-sig")  # some editors begin a file with a byte order mark
+    except UnicodeDecodeError as error:
+        place = Place(str(path), *line_and_column_after(error.object[: error.start].decode()))
+        found = f"0x{error.object[error.start]:02X}"
+        raise place.error((), f"found the byte {found}; accepted is text in UTF-8") from None
+
+
+_Mistake = tuple[Place, ConfigError]
+
+
+def _in_order(mistakes: list[_Mistake]) -> ConfigError:
+    """Return all mistakes as one error: those in the file in its order, then those in variables."""
+    ordered = sorted(mistakes, key=lambda mistake: (mistake[0].line == 0, *mistake[0], str(mistake[1])))
+    return ConfigError("\n".join(str(error) for _, error in ordered))
+
+
+def _explained(document: Document, error: ValidationError) -> list[_Mistake]:
+    """Return the mistakes that the models found, each with its place."""
+    mistakes = []
+    for details in error.errors(include_url=False):
+        location, text = details["loc"], details["msg"]
+        place = document.key_places.get(location) if details["type"] == UNKNOWN_KEY else None
+        place = place or document.nearest_place(location)
+        if place.line:
+            text += _variables_in(document, location)
+        mistakes.append((place, place.error(location, text)))
+    return mistakes
+
+
+def _variables_in(document: Document, location: Location) -> str:
+    """Return which variables set a part of the value: the mistake may be theirs."""
+    names = {
+        place.origin
+        for other, place in document.places.items()
+        if other[: len(location)] == location and place.origin.startswith(PREFIX)
+    }
+    return f" (a part of it is from {', '.join(sorted(names))})" if names else ""
+
+
+def _take_out_secrets(document: Document) -> list[_Mistake]:
+    """Take secrets that stand in the file itself out of the values, and return a mistake for each.
+
+    Files like this one are shown around and kept under version control. Taken out, no error quotes them.
+    """
+    config = document.values
+    for key in _ZENOH_CONFIG:
+        config = config.get(key) if isinstance(config, dict) else None
+    mistakes = []
+    for steps, secret in list(secrets_in(config)):
+        location = (*_ZENOH_CONFIG, *steps)
+        place = document.nearest_place(location)
+        if not place.line:
+            continue
+        _replace(config, steps, MASK if is_secret_key(steps[-1]) else without_secrets(secret))
+        path_key = key_of_file(steps[-1])
+        others = f"{path_key} with the path of the key's file, " if path_key else ""
+        text = (
+            f"found a secret, which does not belong in this file; accepted is {others}"
+            f"the environment variable {variable_name(location)}, or zenoh.config as the path "
+            "of a JSON5 file that only the gateway may read"
+        )
+        mistakes.append((place, place.error(location, text)))
+    return mistakes
+
+
+def _replace(config: Any, steps: Location, value: object) -> None:
+    *way, last = steps
+    for step in way:
+        config = config[step]
+    config[last] = value

@@ -1,0 +1,107 @@
+"""What every part of the configuration shares: it is frozen, and tells mistakes in words of ours."""
+
+import difflib
+from collections.abc import Iterable, Mapping
+from typing import Any, Final, Self
+
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    ModelWrapValidatorHandler,
+    ValidationError,
+    ValidatorFunctionWrapHandler,
+    WrapValidator,
+    model_validator,
+)
+from pydantic_core import InitErrorDetails, PydanticCustomError
+
+from gateway.config.secrets import without_secrets
+
+UNKNOWN_KEY: Final = "unknown_key"
+"""The type of the error that is in a key itself; all others are in a value, or in its absence."""
+
+_MISTAKE: Final = "mistake"
+
+
+class Section(BaseModel):
+    """A mapping of the configuration: no other keys than its own, and nothing changes later."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _tell_mistakes_in_our_words(cls, value: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
+        known = ", ".join(cls.model_fields)
+        if not isinstance(value, Mapping | cls):
+            raise mistake(f"found {shown(value)}; accepted is a mapping with any of the keys {known}")
+        try:
+            return validate(value)
+        except ValidationError as error:
+            mistakes = []
+            for details in error.errors(include_url=False):
+                location, kind, text = details["loc"], details["type"], details["msg"]
+                if kind == "extra_forbidden":
+                    kind = UNKNOWN_KEY
+                    text = f"unknown key{did_you_mean(location[-1], cls.model_fields)}; known: {known}"
+                elif kind == "missing":
+                    text = "missing; this key has no default"
+                mistakes.append(_line_error(text, location, kind))
+            raise ValidationError.from_exception_data(cls.__name__, mistakes) from None
+
+
+def mistake(text: str, *location: str | int) -> ValidationError:
+    """Return the error for a validator to raise; ``location`` counts from the value it was given."""
+    return ValidationError.from_exception_data("configuration", [_line_error(text, location, _MISTAKE)])
+
+
+def accepts(what: str) -> WrapValidator:
+    """Return an annotation: a value refused by the type beside it was found, and ``what`` is accepted."""
+
+    def check(value: object, validate: ValidatorFunctionWrapHandler) -> object:
+        try:
+            return validate(value)
+        except ValidationError as error:
+            first = error.errors(include_url=False)[0]
+            if first["loc"]:
+                raise  # of an item inside the value, told in words of its own
+            unquoted = first["type"] == "string_type" and isinstance(value, bool | int | float)
+            hint = " (quotes make it text)" if unquoted else ""
+            raise mistake(f"found {shown(value)}{hint}; accepted is {what}") from None
+
+    return WrapValidator(check)
+
+
+def shown(value: object) -> str:
+    """Return what was found, fit for a sentence: printable, on one line, bounded, without passwords."""
+    match value:
+        case None:
+            return "nothing"
+        case bool():
+            return "true" if value else "false"
+        case Mapping():
+            return "a mapping" if value else "an empty mapping"
+        case list() | tuple():
+            return "a list" if value else "an empty list"
+        case str():
+            text = without_secrets(value)
+            return repr(text if len(text) <= 60 else text[:60] + "…")
+    return str(value)
+
+
+def one_of(words: Iterable[str]) -> str:
+    """Return "a, b or c"."""
+    *others, last = words
+    return f"{', '.join(others)} or {last}" if others else last
+
+
+def did_you_mean(word: object, known: Iterable[str]) -> str:
+    """Return " (did you mean 'x'?)" if ``word`` is nearly ``x``, one of ``known``; else nothing."""
+    near = difflib.get_close_matches(str(word).lower()[:60], known, n=1)
+    return f" (did you mean {near[0]!r}?)" if near else ""
+
+
+def _line_error(text: str, location: tuple[str | int, ...], kind: str) -> InitErrorDetails:
+    # The text is an argument, not the template: braces in it are to stay.
+    return InitErrorDetails(
+        type=PydanticCustomError(kind, "{text}", {"text": text}), loc=location, input=None
+    )

@@ -1,0 +1,332 @@
+"""The gateway's configuration as frozen, validated settings.
+
+The docstring under each key says what it is; ``config/gateway.yaml`` says why one would change it.
+Mistakes raise pydantic's ValidationError, each with its location and a sentence: what was found and
+what is accepted. ``gateway.config.loading`` adds file, line and column.
+"""
+
+import os
+import re
+from pathlib import Path
+from typing import Annotated, Final, Self
+from urllib.parse import urlsplit, urlunsplit
+
+from pydantic import AfterValidator, Field, field_validator, model_validator
+
+from gateway.config.section import Section, accepts, mistake
+from gateway.config.values import (
+    Backlog,
+    ByteLimit,
+    ChannelPrefix,
+    Components,
+    FileLimit,
+    Host,
+    KeyPrefix,
+    LcmUrl,
+    MaxRates,
+    Milliseconds,
+    Port,
+    Seconds,
+    ServerByteOrder,
+    SourceName,
+    SpoolDirectory,
+    StreamRate,
+    Switch,
+    ZenohConfig,
+    not_empty,
+)
+from gateway.rtc3d.commands import AllFrames, Frequency
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.rtc3d.packets import DEFAULT_MAX_C3D_BYTES, DEFAULT_MAX_PACKET_BYTES
+
+DEFAULT_LCM_URL: Final = "udpm://239.255.76.67:7667?ttl=0"
+"""LCM's own default, which stays on this host."""
+
+
+class StreamSettings(Section):
+    """One TCP session with a source's server: these components at this rate."""
+
+    components: Components = WIRE_ORDER
+    """What to ask for: [all], or a list of 3d, 6d, analog, force, event in any order."""
+
+    rate: StreamRate = AllFrames()
+    """How often: all, {frequency_hz: NUMBER} or {divisor: WHOLE NUMBER}."""
+
+    backlog: Backlog = "latest"
+    """While frames come late: publish the newest only, or all of them. Events are never skipped."""
+
+    on_demand: Switch = False
+    """Whether the stream runs only while somebody listens; with LCM on, somebody always may."""
+
+    idle_after_s: Seconds = 5.0
+    """How long nobody must have listened before an on-demand stream is stopped."""
+
+
+class ReconnectSettings(Section):
+    """The waits between tries to connect: each about twice the one before, up to a maximum."""
+
+    first_delay_s: Seconds = 0.2
+    """The first wait."""
+
+    max_delay_s: Seconds = 10.0
+    """The longest wait."""
+
+    @model_validator(mode="after")
+    def _max_is_not_below_first(self) -> Self:
+        if self.max_delay_s < self.first_delay_s:
+            raise mistake(
+                f"found {self.max_delay_s:g}; accepted is first_delay_s ({self.first_delay_s:g}) or more",
+                "max_delay_s",
+            )
+        return self
+
+
+class SourceSettings(Section):
+    """One RTC3D server, and how to read it."""
+
+    name: SourceName
+    """What keys and channels call this source; channels in upper case, with '_' for '-'."""
+
+    host: Host
+    """The server's name or address."""
+
+    port: Port = 3020
+    """The server's TCP port: 3020 for First Principles, 3030 for WaveFront."""
+
+    byte_order: ServerByteOrder = "big"
+    """The byte order to ask for. What is published is the same in both."""
+
+    streams: Annotated[
+        tuple[StreamSettings, ...],
+        AfterValidator(not_empty),
+        accepts("a list of streams, one or more"),
+        Field(json_schema_extra={"minItems": 1}),
+    ] = (StreamSettings(),)
+    """The TCP sessions with the server, each with its components and its rate."""
+
+    reconnect: ReconnectSettings = ReconnectSettings()
+    """The waits between tries to connect."""
+
+    connect_timeout_s: Seconds = 5.0
+    """How long a try to connect may take."""
+
+    reply_timeout_s: Seconds = 2.0
+    """How long the server may take to answer a command."""
+
+    stall_timeout_s: Seconds = 3.0
+    """How long a stream may be silent while a measurement runs."""
+
+    max_lag_ms: Milliseconds = 50.0
+    """How late frames may come before less is asked of the server."""
+
+    max_packet_bytes: ByteLimit = DEFAULT_MAX_PACKET_BYTES
+    """The largest packet that is believed; C3D files have a limit of their own."""
+
+    max_c3d_bytes: ByteLimit = DEFAULT_MAX_C3D_BYTES
+    """The largest C3D file that is taken."""
+
+    query_timeout_s: Seconds = 4.0
+    """How long a peer's question may wait for the server, the questions before it included."""
+
+    fresh_interval_s: Seconds = 1.0
+    """How long an answer of the server counts as fresh: no peer makes it answer more often."""
+
+    remote_control: Switch = False
+    """Whether peers may start and stop the server's recording."""
+
+    @field_validator("streams")
+    @classmethod
+    def _each_component_is_in_one_stream(
+        cls, streams: tuple[StreamSettings, ...]
+    ) -> tuple[StreamSettings, ...]:
+        owners: dict[ComponentType, int] = {}
+        for index, stream in enumerate(streams):
+            for component in stream.components:
+                if component in owners:
+                    raise mistake(
+                        f"found {component.key!r}, which streams[{owners[component]}] has too; "
+                        "accepted is each component in one stream, for it has one key and one channel",
+                        *(index, "components"),
+                    )
+                owners[component] = index
+        return streams
+
+    @model_validator(mode="after")
+    def _frames_come_before_the_stall(self) -> Self:
+        for index, stream in enumerate(self.streams):
+            if isinstance(stream.rate, Frequency) and stream.rate.hz * self.stall_timeout_s <= 1:
+                raise mistake(
+                    f"found {stream.rate.hz:g}, one frame in {1 / stream.rate.hz:g} s, which stall_timeout_s "
+                    f"({self.stall_timeout_s:g}) takes for silence; accepted is more than "
+                    f"{1 / self.stall_timeout_s:g}, or a longer stall_timeout_s",
+                    *("streams", index, "rate", "frequency_hz"),
+                )
+        return self
+
+
+class ZenohSettings(Section):
+    """How data and answers go to Zenoh."""
+
+    enabled: Switch = True
+    """Whether anything is published, and answered, on Zenoh."""
+
+    prefix: KeyPrefix = "mocap"
+    """What all keys begin with."""
+
+    config: ZenohConfig = Field(default_factory=dict, repr=False)  # it may hold a password
+    """Zenoh's own configuration: the path of a JSON5 file, or its keys inline; without secrets."""
+
+    express: Switch = False
+    """Whether each message is sent at once instead of in batches."""
+
+    max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
+    """The highest rate of each component named; frames beyond it are left out, evenly."""
+
+    tool_poses: Switch = False
+    """Whether each tool's pose is published on a key of its own, while someone listens."""
+
+
+def effective_lcm_url(url: str | None) -> str:
+    """Return ``url``, else the environment's LCM_DEFAULT_URL, else DEFAULT_LCM_URL.
+
+    The environment's is not checked here: LCM itself says what it cannot use.
+    """
+    return url or os.environ.get("LCM_DEFAULT_URL") or DEFAULT_LCM_URL
+
+
+def lcm_queries_url(url: str) -> str:
+    """Return where requests go unless told otherwise: to the next port, where a URL is multicast's.
+
+    Whoever listens on a multicast URL is sent all that anybody sends there, the gateway its own messages
+    too: that would double what LCM costs it, and more. Others pass on only what is subscribed to.
+    """
+    parts = urlsplit(url)
+    try:
+        port = parts.port or 7667
+    except ValueError:  # LCM itself refuses it
+        return url
+    if parts.scheme != "udpm":
+        return url
+    host = parts.hostname or "239.255.76.67"
+    other = port + 1 if port < 65535 else port - 1
+    return urlunsplit(parts._replace(netloc=f"{host}:{other}"))
+
+
+class LcmSettings(Section):
+    """How data and answers go to LCM."""
+
+    enabled: Switch = True
+    """Whether anything is published, and answered, on LCM."""
+
+    prefix: ChannelPrefix = "MOCAP"
+    """What all channels begin with."""
+
+    url: LcmUrl | None = None
+    """Where to publish; null is the environment's LCM_DEFAULT_URL, else LCM's own, on this host only."""
+
+    queries_url: LcmUrl | None = None
+    """Where requests are awaited and answered; null is the port after that of url."""
+
+    max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
+    """The highest rate of each component named; frames beyond it are left out, evenly."""
+
+    tool_poses: Switch = False
+    """Whether each tool's pose is published on a channel of its own."""
+
+    @property
+    def effective_url(self) -> str:
+        """What ``effective_lcm_url`` makes of ``url``."""
+        return effective_lcm_url(self.url)
+
+    @property
+    def effective_queries_url(self) -> str:
+        """``queries_url``, else what belongs to ``effective_url``."""
+        return self.queries_url or lcm_queries_url(self.effective_url)
+
+
+class SpoolSettings(Section):
+    """Where complete C3D files that servers send are kept."""
+
+    directory: SpoolDirectory | None = None
+    """A folder; null is c3d in the service's state directory under systemd, else in the user's."""
+
+    max_files: FileLimit = 100
+    """How many files are kept; the oldest goes first."""
+
+    max_bytes: ByteLimit = 1024 * 1024 * 1024
+    """How many bytes they may take together; the oldest goes first."""
+
+    @property
+    def effective_directory(self) -> Path:
+        """The folder in use."""
+        if self.directory is not None:
+            return Path(self.directory)
+        state = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+        if state:
+            return Path(state) / "c3d"
+        home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+        return Path(home) / "rtc3d-gateway" / "c3d"
+
+
+class MetricsSettings(Section):
+    """How the gateway is watched over HTTP: Prometheus' metrics on /metrics, and /healthz."""
+
+    enabled: Switch = True
+    """Whether HTTP is served at all."""
+
+    address: Host = "127.0.0.1"
+    """Where to listen: an address of this host, 0.0.0.0 or "::" for all."""
+
+    port: Port = 9464
+    """The TCP port."""
+
+
+class Settings(Section):
+    """The whole configuration."""
+
+    sources: Annotated[
+        tuple[SourceSettings, ...],
+        AfterValidator(not_empty),
+        accepts("a list of sources, one or more, each with name and host"),
+        Field(json_schema_extra={"minItems": 1}),
+    ]
+    """The servers."""
+
+    spool: SpoolSettings = SpoolSettings()
+    """Where the servers' C3D files are kept."""
+
+    zenoh: ZenohSettings = ZenohSettings()
+    """The Zenoh side."""
+
+    lcm: LcmSettings = LcmSettings()
+    """The LCM side."""
+
+    metrics: MetricsSettings = MetricsSettings()
+    """How the gateway is watched."""
+
+    @field_validator("sources")
+    @classmethod
+    def _names_make_different_channels(
+        cls, sources: tuple[SourceSettings, ...]
+    ) -> tuple[SourceSettings, ...]:
+        owners: dict[str, int] = {}
+        for index, source in enumerate(sources):
+            # As gateway.messages.topics makes channels: upper case, and everything else a single '_'.
+            channel = "_".join(re.findall("[A-Z0-9]+", source.name.upper()))
+            if channel in owners:
+                other = owners[channel]
+                raise mistake(
+                    f"found {source.name!r}, which shares its LCM channels with {sources[other].name!r}, "
+                    f"sources[{other}]; accepted is a name of other letters or digits, case aside",
+                    *(index, "name"),
+                )
+            owners[channel] = index
+        return sources
+
+    @model_validator(mode="after")
+    def _something_is_published(self) -> Self:
+        if not (self.zenoh.enabled or self.lcm.enabled):
+            raise mistake(
+                "found false here and in zenoh; accepted is true in one of them at least", "lcm", "enabled"
+            )
+        return self

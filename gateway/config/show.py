@@ -1,0 +1,103 @@
+"""The configuration in effect as YAML, each value with where it is from: a file, a variable, a default."""
+
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping
+from typing import Any, Final, NamedTuple
+
+import yaml
+
+from gateway.config.loading import Configuration
+from gateway.config.secrets import masked
+from gateway.config.settings import Settings
+from gateway.config.yaml_document import Location
+
+_DEFAULT: Final = "default"
+_MAX_COLUMN: Final = 48
+"""Where the comments begin at the latest; those of longer lines follow their line at once."""
+
+
+class _Line(NamedTuple):
+    text: str
+    origin: str = ""
+
+
+def shown_configuration(configuration: Configuration) -> str:
+    """Return the configuration in effect as YAML, with a comment per value, and MASK for each secret.
+
+    What depends on the environment is shown as it is here: ``lcm.url`` and ``spool.directory``.
+    """
+    values = masked(configuration.settings.model_dump(mode="json"))
+    origins = _Origins(configuration)
+    origins.resolve(configuration.settings, values)
+    lines = [line for key, value in values.items() for line in _lines(key, value, (key,), "", origins)]
+    column = min(max(len(line.text) for line in lines), _MAX_COLUMN)
+    return "".join(
+        (f"{line.text:{column}}  # {line.origin}" if line.origin else line.text) + "\n" for line in lines
+    )
+
+
+class _Origins:
+    """Says where each value is from."""
+
+    def __init__(self, configuration: Configuration) -> None:
+        self._places = configuration.places
+        self._resolved: dict[Location, str] = {}
+
+    def resolve(self, settings: Settings, values: dict[str, Any]) -> None:
+        """Put in what the program takes where nothing is configured."""
+        if settings.lcm.url is None:
+            values["lcm"]["url"] = settings.lcm.effective_url
+            self._resolved["lcm", "url"] = _variable("LCM_DEFAULT_URL")
+        values["lcm"]["queries_url"] = settings.lcm.effective_queries_url
+        if settings.spool.directory is None:
+            values["spool"]["directory"] = str(settings.spool.effective_directory)
+            self._resolved["spool", "directory"] = _variable("STATE_DIRECTORY", "XDG_STATE_HOME")
+
+    def of(self, location: Location) -> str:
+        if location in self._resolved:
+            return self._resolved[location]
+        # The items of a list on one line may be from several places.
+        places = [place for other, place in self._places.items() if other[: len(location)] == location]
+        return ", ".join(dict.fromkeys(place.without_column for place in places)) or _DEFAULT
+
+
+def _variable(*names: str) -> str:
+    return next((name for name in names if os.environ.get(name)), _DEFAULT)
+
+
+def _lines(key: str, value: Any, location: Location, indent: str, origins: _Origins) -> Iterator[_Line]:
+    """Yield the lines of one key: mappings and lists of them in lines of their own, all else in one."""
+    start = f"{indent}{_flow(key)}:"
+    match value:
+        case Mapping() if value:
+            yield _Line(start)
+            for inner, item in value.items():
+                yield from _lines(inner, item, (*location, inner), indent + "  ", origins)
+        case [*items] if any(isinstance(item, Mapping) and item for item in items):
+            yield _Line(start)
+            for index, item in enumerate(items):
+                yield from _item_lines(item, (*location, index), indent + "  ", origins)
+        case _:
+            yield _Line(f"{start} {_flow(value)}", origins.of(location))
+
+
+def _item_lines(item: Any, location: Location, indent: str, origins: _Origins) -> Iterator[_Line]:
+    """Yield the lines of one item of a list that holds mappings."""
+    if not isinstance(item, Mapping) or not item:
+        yield _Line(f"{indent}- {_flow(item)}", origins.of(location))
+        return
+    begin = f"{indent}- "
+    for inner, value in item.items():
+        for line in _lines(inner, value, (*location, inner), indent + "  ", origins):
+            yield line._replace(text=begin + line.text[len(begin) :])
+            begin = indent + "  "
+
+
+def _flow(value: Any) -> str:
+    """Return ``value`` as YAML on one line."""
+    if isinstance(value, str) and not value.isprintable():
+        return json.dumps(value)
+    text: str = yaml.safe_dump(value, default_flow_style=True, allow_unicode=True, width=math.inf)
+    return text.removesuffix("...\n").strip()

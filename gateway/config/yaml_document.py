@@ -1,0 +1,212 @@
+"""YAML text to plain values, and the place of each: for errors, and to tell where a value came from."""
+
+import re
+from dataclasses import dataclass
+from typing import Any, Final, NamedTuple
+
+import yaml
+
+from gateway.config.section import shown
+from gateway.errors import ConfigError
+
+MAX_VALUES: Final = 10_000
+"""How many values a text may hold; what an alias repeats counts again."""
+
+MAX_DEPTH: Final = 32
+"""How many levels of values may be nested."""
+
+MAX_NUMBER_LENGTH: Final = 40
+"""How many characters a number may have."""
+
+Location = tuple[str | int, ...]
+"""The keys and indices that lead to a value: ("sources", 0, "port")."""
+
+_YAML: Final = "tag:yaml.org,2002:"
+
+
+class Place(NamedTuple):
+    """Where a key or value stands: in a file, or in what has no lines, such as an environment variable.
+
+    ``origin`` is the file's path or the variable's name. ``line`` and ``column`` count from 1; both are
+    0 where there are none.
+    """
+
+    origin: str
+    line: int = 0
+    column: int = 0
+
+    def __str__(self) -> str:
+        return f"{self.origin}:{self.line}:{self.column}" if self.line else self.origin
+
+    @property
+    def without_column(self) -> str:
+        """FILE:LINE, or the variable's name."""
+        return f"{self.origin}:{self.line}" if self.line else self.origin
+
+    def error(self, location: Location, text: str) -> ConfigError:
+        """Return the error with this place, the key that ``location`` leads to, and ``text``."""
+        key = key_path(location)
+        return ConfigError(f"{self}: {key}{': ' if key else ''}{text}")
+
+
+class _Loader(yaml.SafeLoader):
+    """Makes nodes as SafeLoader does, nested to MAX_DEPTH only: it recurses, and Python's stack ends."""
+
+    _depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        self._depth += 1
+        if self._depth > MAX_DEPTH:
+            mark = parent.start_mark if parent else None
+            raise yaml.composer.ComposerError(None, None, f"found more than {MAX_DEPTH} levels", mark)
+        node = super().compose_node(parent, index)
+        self._depth -= 1
+        return node
+
+
+@dataclass(frozen=True, slots=True)
+class Document:
+    """The values of one YAML document, mappings with keys of text, and the place of each value and key."""
+
+    values: Any
+    places: dict[Location, Place]
+    key_places: dict[Location, Place]
+
+    def nearest_place(self, location: Location) -> Place:
+        """Return where the value is; where it would belong if it is missing or a default."""
+        while location not in self.places:
+            location = location[:-1]
+        return self.places[location]
+
+
+def read_yaml(text: str, origin: str, *, has_lines: bool = True) -> Document:
+    """Return the document in ``text``; one that holds nothing at all has the value None and no places.
+
+    Raises ConfigError with the place of the first mistake. ``origin`` begins every place; without
+    ``has_lines`` it is all of it.
+    """
+    return _Reader(origin, has_lines).read(text)
+
+
+class _Reader:
+    """Reads one document: mappings, lists, texts, numbers, truth values and None."""
+
+    def __init__(self, origin: str, has_lines: bool) -> None:
+        self._origin = origin
+        self._has_lines = has_lines
+        self._places: dict[Location, Place] = {}
+        self._key_places: dict[Location, Place] = {}
+        self._values_left = MAX_VALUES
+
+    def read(self, text: str) -> Document:
+        try:
+            loader = _Loader(text)
+        except yaml.reader.ReaderError as error:
+            place = self._place(*line_and_column_after(text[: error.position]))
+            found = f"the character U+{ord(text[error.position]):04X}"
+            raise place.error((), f"found {found}, which YAML does not allow") from None
+        try:
+            root = loader.get_single_node()
+        except yaml.MarkedYAMLError as error:
+            raise self._not_yaml(error, loader.get_mark()) from None
+        except (ValueError, OverflowError):  # from chr() and int() within PyYAML
+            place = self._place_of(loader.get_mark())
+            raise place.error((), "not YAML: a number here is out of range") from None
+        values = None if root is None else self._value(root, ())
+        return Document(values, self._places, self._key_places)
+
+    def _value(self, node: yaml.Node, location: Location) -> object:
+        place = self._place_of(node.start_mark)
+        self._values_left -= 1
+        if self._values_left < 0 or len(location) >= MAX_DEPTH:  # only aliases reach this depth
+            limits = f"at most {MAX_VALUES} values in {MAX_DEPTH} levels, those of aliases included"
+            raise place.error((), f"found too much; accepted are {limits}")
+        self._places[location] = place
+        match node, node.tag.removeprefix(_YAML):
+            case yaml.MappingNode(), "map":
+                return self._mapping(node, location)
+            case yaml.SequenceNode(), "seq":
+                return [self._value(item, (*location, index)) for index, item in enumerate(node.value)]
+            case (
+                yaml.ScalarNode(),
+                "str" | "timestamp" | "value" | "merge",
+            ):  # a source may be named 2026-06-01
+                return self._text(node, location)
+            case yaml.ScalarNode(), "bool" | "int" | "float":
+                return self._number(node, location)
+            case yaml.ScalarNode(), "null":
+                return None
+        raise place.error(location, f"found the tag {shown(node.tag)}; accepted are values without a tag")
+
+    def _mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, object]:
+        values: dict[str, object] = {}
+        for key_node, value_node in node.value:
+            place = self._place_of(key_node.start_mark)
+            if not isinstance(key_node, yaml.ScalarNode):
+                raise place.error(location, "found a list or mapping as a key")
+            key = self._text(key_node, location)
+            here = (*location, key)
+            if key in values:
+                raise place.error(here, f"the same key as in line {self._key_places[here].line}")
+            if key_node.tag == f"{_YAML}merge":
+                raise place.error(here, "mappings are not merged; accepted is an alias as a key's value")
+            self._key_places[here] = place
+            values[key] = self._value(value_node, here)
+        return values
+
+    def _number(self, node: yaml.ScalarNode, location: Location) -> object:
+        if len(node.value) <= MAX_NUMBER_LENGTH:
+            try:
+                return yaml.constructor.SafeConstructor().construct_object(node)
+            except (ValueError, LookupError):  # such as 0x_, or a text that is tagged !!int or !!bool
+                pass
+        text = f"found {shown(node.value)}; accepted is a number of at most {MAX_NUMBER_LENGTH} characters"
+        raise self._place_of(node.start_mark).error(location, text)
+
+    def _text(self, node: yaml.ScalarNode, location: Location) -> str:
+        """Return a key or a text; half a surrogate pair, which an escape can write, is none."""
+        text: str = node.value
+        if not is_whole(text):
+            found = f"found {shown(text)}; accepted is text of whole characters"
+            raise self._place_of(node.start_mark).error(location, found)
+        return text
+
+    def _not_yaml(self, error: yaml.MarkedYAMLError, end: yaml.Mark) -> ConfigError:
+        text = f"not YAML: {error.problem}"
+        if error.context and error.context_mark:
+            text = f"not YAML: {error.context} from line {error.context_mark.line + 1}: {error.problem}"
+        if isinstance(error, yaml.scanner.ScannerError | yaml.parser.ParserError):
+            text += "; check indentation, colons, quotes and brackets here"
+        return self._place_of(error.problem_mark or end).error((), text)
+
+    def _place_of(self, mark: yaml.Mark) -> Place:
+        return self._place(mark.line + 1, mark.column + 1)
+
+    def _place(self, line: int, column: int) -> Place:
+        return Place(self._origin, line, column) if self._has_lines else Place(self._origin)
+
+
+def is_whole(text: str) -> bool:
+    """Return whether ``text`` has no half of a surrogate pair, which cannot be printed or encoded."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def key_path(location: Location) -> str:
+    """Return sources[0].port for ("sources", 0, "port")."""
+    path = ""
+    for step in location:
+        if isinstance(step, int):
+            path += f"[{step}]"
+        else:
+            path += ("." if path else "") + (step if re.fullmatch(r"[\w/-]{1,60}", step) else shown(step))
+    return path
+
+
+def line_and_column_after(text: str) -> tuple[int, int]:
+    """Return line and column, both from 1, of what follows ``text``."""
+    lines = text.split("\n")
+    return len(lines), len(lines[-1]) + 1

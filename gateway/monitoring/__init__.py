@@ -1,0 +1,1 @@
+"""What a running gateway shows: metrics, health, HTTP pages, a status line."""

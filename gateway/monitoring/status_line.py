@@ -1,0 +1,42 @@
+"""How the gateway is, in one line for people: what ``systemctl status`` shows."""
+
+from collections.abc import Iterable, Sequence
+
+from gateway.config.settings import SourceSettings
+from gateway.stream.state import StreamState
+from gateway.stream.status import OutputHealth, StreamStatus
+
+
+def source_line(source: SourceSettings, streams: Sequence[tuple[StreamStatus, float]]) -> str:
+    """Return "lab: streaming 200.0 Hz"; ``streams`` come with their rates in Hz.
+
+    Streams that are in different states are told apart by their components.
+    """
+    server = f"{source.host}:{source.port}"
+    texts = [_stream_text(server, status, rate_hz) for status, rate_hz in streams]
+    if len(set(texts)) == 1:
+        return f"{source.name}: {texts[0]}"
+    parts = (f"{status.components} {text}" for (status, _), text in zip(streams, texts, strict=True))
+    return f"{source.name}: {', '.join(parts)}"
+
+
+def output_lines(outputs: Iterable[tuple[str, OutputHealth]]) -> list[str]:
+    """Return a line for each output that cannot send; ``outputs`` come with their names."""
+    return [f"{name}: {health.problem}" for name, health in outputs if not health.connected]
+
+
+def _stream_text(server: str, status: StreamStatus, rate_hz: float) -> str:
+    match status.state:
+        case StreamState.STREAMING:
+            return f"streaming {rate_hz:.1f} Hz"
+        case StreamState.IDLE:
+            return f"connected to {server}, no frames asked for"
+        case StreamState.NO_MEASUREMENT:
+            return f"connected to {server}, no measurement runs"
+        case StreamState.HANDSHAKING:
+            return f"connected to {server}, shaking hands"
+        case StreamState.STALLED:
+            return f"nothing comes from {server}"
+        case StreamState.CONNECTING | StreamState.WAITING:
+            tries = f", {status.tries} {'try' if status.tries == 1 else 'tries'}" if status.tries else ""
+            return f"waiting for {server}{tries}"

@@ -1,0 +1,1 @@
+"""From one source to all outputs: numbering, pacing, per-tool poses."""

@@ -1,0 +1,1 @@
+"""The daemon: signals, reload, systemd, log formats."""

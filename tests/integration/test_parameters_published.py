@@ -1,0 +1,259 @@
+"""Parameters that are told unasked: to those who listen already, and to those who come late."""
+
+import asyncio
+from collections.abc import Iterator
+
+import pytest
+import rtc3d
+import zenoh
+import zenoh.ext
+
+from gateway.cli.subscribers import LcmListener
+from gateway.messages.decode import decode
+from gateway.outputs.lcm.output import open_lcm
+from gateway.queries import lcm_queries
+from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.synthetic import SyntheticScene
+from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
+from tests.querying import LabServer, ask, asker_at, gateway_at, is_filled, parameters_of
+from tests.servers import ScriptedServer, markers_frame
+from tests.spec_parameters import in_root
+from tests.waiting import wait_until_async
+
+pytestmark = pytest.mark.netns
+KEY = "mocap/lab/parameters"
+
+
+class Ears:
+    """Whoever can listen: a plain subscriber, one with a history, and a program on LCM."""
+
+    def __init__(self, session: zenoh.Session, url: str) -> None:
+        self._session = session
+        self.plain: list[bytes] = []
+        self.with_history: list[bytes] = []
+        self.lcm: list[rtc3d.parameters_t] = []
+        self._subscribers = [
+            session.declare_subscriber(KEY, lambda sample: self.plain.append(sample.payload.to_bytes()))
+        ]
+        self._advanced = listen_with_history(session, self.with_history)
+        self._listener = LcmListener(
+            open_lcm(url), "MOCAP_LAB_PARAMETERS", lambda _channel, data: self.lcm.append(decode(data))
+        )
+
+    async def hear(self, xml: bytes) -> None:
+        """Wait until the newest that everyone heard is this."""
+        await wait_until_async(lambda: self.plain and self.plain[-1] == xml)
+        await wait_until_async(lambda: self.with_history and self.with_history[-1] == xml)
+        await wait_until_async(lambda: self.lcm and self.lcm[-1].xml.encode() == xml)
+
+    def close(self) -> None:
+        self._listener.close()
+
+
+def listen_with_history(session: zenoh.Session, heard: list[bytes]) -> zenoh.ext.AdvancedSubscriber[None]:
+    return zenoh.ext.declare_advanced_subscriber(
+        session,
+        KEY,
+        lambda sample: heard.append(sample.payload.to_bytes()),
+        history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
+    )
+
+
+@pytest.fixture
+def url() -> str:
+    return lcm_url()
+
+
+@pytest.fixture
+def router() -> Iterator[str]:
+    endpoint = free_endpoint()
+    session = open_zenoh("router", listen=endpoint)
+    yield endpoint
+    session.close()
+
+
+@pytest.fixture
+def ears(router: str, url: str) -> Iterator[Ears]:
+    session = open_zenoh("client", connect=router)
+    ears = Ears(session, url)
+    yield ears
+    ears.close()
+    session.close()
+
+
+async def test_everyone_hears_of_a_connection_and_of_a_server_that_comes_back_with_other_parameters(
+    router: str, url: str, ears: Ears
+) -> None:
+    port = free_port()
+    async with gateway_at(port, router=router, lcm_url=url):
+        first, second = LabServer("Marker of the morning"), LabServer("Marker of the evening")
+        async with ScriptedServer(first.script, port):
+            await ears.hear(first.xml)
+            [message, *_] = ears.lcm
+            assert (message.sequence, message.session) == (0, 1)
+            assert message.capture_utime <= message.utime
+        async with ScriptedServer(second.script, port):
+            await ears.hear(second.xml)
+            assert ears.lcm[-1].session == 2
+            with asker_at(router) as asker:
+                assert (await ask(asker, KEY)).payload == second.xml
+
+
+async def test_everyone_hears_again_when_the_gateway_restarts(router: str, url: str, ears: Ears) -> None:
+    server = LabServer()
+    async with ScriptedServer(server.script) as listening:
+        async with gateway_at(listening.port, router=router, lcm_url=url):
+            await ears.hear(server.xml)
+        server.xml = parameters_of("Changed meanwhile")
+        async with gateway_at(listening.port, router=router, lcm_url=url):
+            await ears.hear(server.xml)
+            assert ears.lcm[-1].session == 1
+
+
+async def test_the_first_to_come_late_hear_what_was_told(
+    router: str, url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(lcm_queries, "REPEAT_S", 0.05)
+    server = LabServer()
+    async with (
+        ScriptedServer(server.script) as listening,
+        gateway_at(listening.port, router=router, lcm_url=url) as gateway,
+    ):
+        await is_filled(gateway, server)
+        asked = list(server.commands)
+        session = open_zenoh("client", connect=router)
+        ears = Ears(session, url)
+        try:
+            await ears.hear(server.xml)
+            sequences = [message.sequence for message in ears.lcm]
+            assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
+            assert server.commands == asked
+        finally:
+            ears.close()
+            session.close()
+
+
+async def test_a_late_subscriber_with_a_history_hears_what_was_told_and_nobody_hears_it_again(
+    router: str, url: str, ears: Ears
+) -> None:
+    server = LabServer()
+    async with (
+        ScriptedServer(server.script) as listening,
+        gateway_at(listening.port, router=router, lcm_url=url),
+    ):
+        await ears.hear(server.xml)
+        late: list[bytes] = []
+        session = open_zenoh("client", connect=router)
+        try:
+            with asker_at(router) as asker:
+                await ask(asker, KEY)  # what was told before has arrived everywhere
+                told = len(ears.plain)
+                subscriber = listen_with_history(session, late)
+                await wait_until_async(lambda: late)
+                await ask(asker, KEY)
+            assert late == [server.xml]
+            assert len(ears.plain) == told
+            subscriber.undeclare()
+        finally:
+            session.close()
+
+
+async def test_everyone_hears_of_parameters_that_a_fresh_question_finds_changed(
+    router: str, url: str, ears: Ears
+) -> None:
+    server = LabServer()
+    async with (
+        ScriptedServer(server.script) as listening,
+        gateway_at(listening.port, router=router, lcm_url=url) as gateway,
+    ):
+        await is_filled(gateway, server)
+        await ears.hear(server.xml)
+        server.xml = parameters_of("One more", "Marker 1")
+        with asker_at(router) as asker:
+            assert (await ask(asker, f"{KEY}?fresh=true")).payload == server.xml
+            await ears.hear(server.xml)
+
+            await wait_until_async(lambda: not gateway.sources[0]._tasks)  # each section is known anew
+            server.xml = parameters_of("Another")
+            server.sections["3d"] = in_root("<The_3D><Unit>cm</Unit></The_3D>")
+            assert (await ask(asker, f"{KEY}/3d?fresh=true")).payload == server.sections["3d"]
+            await ears.hear(server.xml)  # all, though only a section was asked for
+            assert (await ask(asker, f"{KEY}/3d")).payload == server.sections["3d"]
+
+
+async def test_statistics_of_the_server_that_change_are_told_to_nobody(
+    router: str, url: str, ears: Ears
+) -> None:
+    server = LabServer()
+    async with (
+        ScriptedServer(server.script) as listening,
+        gateway_at(listening.port, router=router, lcm_url=url) as gateway,
+    ):
+        await is_filled(gateway, server)
+        await ears.hear(server.xml)
+        told = len(ears.lcm), len(ears.plain)
+        server.xml = server.xml.replace(b"<FramesSent>1<", b"<FramesSent>22<")
+        with asker_at(router) as asker:
+            assert b">22<" in (await ask(asker, f"{KEY}?fresh=true")).payload
+        server.xml = parameters_of("Other")
+        with asker_at(router) as asker:
+            await ask(asker, f"{KEY}?fresh=true")
+        await ears.hear(server.xml)
+        between = [message.xml.encode() for message in ears.lcm[told[0] :]] + ears.plain[told[1] :]
+        assert not any(b">22<" in xml for xml in between)
+
+
+async def test_nothing_is_lost_while_two_hundred_questions_are_answered(router: str) -> None:
+    scene = SyntheticScene(markers=10, tools=2, analog=4, plates=1, rate_hz=200, analog_rate_hz=200)
+    sequences: list[int] = []
+    async with Simulator(scene) as simulator:
+        simulator.stop_measurement()
+        async with gateway_at(simulator.port, router=router) as gateway:
+            [source] = gateway.sources
+            await wait_until_async(lambda: source.statuses[0].state.value == "no measurement")
+            with asker_at(router) as asker:
+                asker.declare_subscriber(
+                    "mocap/lab/3d",
+                    lambda sample: sequences.append(decode(sample.payload.to_bytes()).sequence),
+                )
+                await wait_until_async(lambda: source.fan_out.listened(source.desk.components))
+                simulator.start_measurement()
+                keys = ("parameters?fresh=true", "parameters/3d", "6d", "*?format=json")
+                for start in range(0, 200, 20):
+                    selectors = [f"mocap/lab/{keys[number % 4]}" for number in range(start, start + 20)]
+                    await asyncio.gather(*(ask_or_more(asker, selector) for selector in selectors))
+                await wait_until_async(lambda: len(sequences) > 50)
+                simulator.stop_measurement()
+                await wait_until_async(lambda: len(sequences) >= simulator.sent["3d"])
+    assert sequences == list(range(simulator.sent["3d"]))
+
+
+async def ask_or_more(asker: zenoh.Session, selector: str) -> None:
+    replies = await asyncio.to_thread(lambda: list(asker.get(selector, timeout=20)))
+    assert replies
+    assert all(reply.ok is not None for reply in replies)
+
+
+async def test_frames_between_a_command_and_its_reply_flow_on() -> None:
+    server, endpoint = LabServer(), free_endpoint()
+    async with (
+        ScriptedServer(server.script) as listening,
+        gateway_at(listening.port, listen=endpoint) as gateway,
+    ):
+        await is_filled(gateway, server)
+        published = gateway.sources[0].fan_out
+        with asker_at(endpoint) as asker:
+            server.open.clear()
+            before = server.count("SendParameters")
+            asked = asyncio.create_task(ask(asker, f"{KEY}?fresh=true"))
+            await wait_until_async(lambda: server.count("SendParameters") > before)
+            for number in range(8, 108):
+                server.send(markers_frame(number, (1.0, 2.0, 3.0)))
+            await wait_until_async(
+                lambda: {decode(message).frame_number for message in published.newest.values()} == {107}
+            )
+            assert not asked.done()
+            server.open.set()
+            assert (await asked).payload == server.xml
+            [newest] = published.newest.values()
+            assert decode(newest).sequence == 100  # the first frame, and one hundred

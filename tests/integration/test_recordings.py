@@ -1,0 +1,167 @@
+"""Real recordings, from the file through simulator, TCP and gateway to subscribers on both sides."""
+
+import asyncio
+import os
+import socket
+from collections import defaultdict
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import ezc3d
+import lcm
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from gateway.cli.subscribers import LcmListener, ZenohListener, channel_pattern, key_pattern, open_zenoh
+from gateway.config.settings import LcmSettings, Settings, SourceSettings, StreamSettings, ZenohSettings
+from gateway.gateway import Gateway
+from gateway.messages.splice import message_items
+from gateway.outputs.contract import Output
+from gateway.outputs.lcm.output import LcmOutput
+from gateway.outputs.zenoh.output import ZenohOutput
+from gateway.rtc3d.components import BY_KEY, ComponentType
+from gateway.rtc3d_server.scene import Scene
+from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.c3d_scene import C3dScene
+from gateway.simulator.synthetic import SyntheticScene
+from tests.waiting import wait_until_async
+
+pytestmark = pytest.mark.netns
+
+LCM_URL = "udpm://239.255.76.67:7711?ttl=0&recv_buf_size=2000000"
+ANALOG = StreamSettings(components=(ComponentType.ANALOG,))
+OTHERS = StreamSettings(
+    components=(ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.FORCE, ComponentType.EVENT)
+)
+
+Bits = npt.NDArray[np.uint32]
+Received = dict[str, list[bytes]]
+
+
+class Lab:
+    """A simulator, a gateway, and what a subscriber on each side received, by component."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        self.simulator = simulator
+        self.zenoh: Received = defaultdict(list)
+        self.lcm: Received = defaultdict(list)
+
+    async def until(self, condition: Callable[[], bool], timeout_s: float = 30) -> None:
+        await wait_until_async(condition, timeout_s)
+
+
+@asynccontextmanager
+async def lab(scene: Scene, *streams: StreamSettings) -> AsyncIterator[Lab]:
+    """Run all of it; the measurement begins once both subscribers hear the gateway."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    async with Simulator(scene) as simulator:
+        simulator.stop_measurement()
+        settings = Settings(
+            sources=(SourceSettings(name="lab", host="127.0.0.1", port=simulator.port, streams=streams),),
+            zenoh=ZenohSettings(
+                config={"listen": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
+            ),
+            lcm=LcmSettings(url=LCM_URL),
+        )
+        stop = asyncio.Event()
+        zenoh_output = ZenohOutput(settings.zenoh)
+        outputs: list[Output] = [zenoh_output, LcmOutput(settings.lcm)]
+        gateway = asyncio.create_task(Gateway(settings, outputs).run(stop))
+        running = Lab(simulator)
+        await running.until(lambda: zenoh_output.session is not None)
+        session = open_zenoh(endpoint)
+        listener = LcmListener(
+            lcm.LCM(LCM_URL),
+            channel_pattern("MOCAP", "lab", None),
+            lambda channel, message: running.lcm[channel.rsplit("_", 1)[-1].lower()].append(message),
+        )
+        try:
+            ZenohListener(
+                session,
+                key_pattern("mocap", "lab", None),
+                lambda key, message: running.zenoh[key.rsplit("/", 1)[-1]].append(message),
+            )
+            await running.until(lambda: bool(running.zenoh["status"] and running.lcm["status"]))
+            simulator.start_measurement()
+            yield running
+        finally:
+            stop.set()
+            await gateway
+            session.close()
+            listener.close()
+
+
+def take_path(name: str) -> Path:
+    return Path(os.environ["RTC3D_TAKES"]) / name
+
+
+def expected_bits(path: Path) -> dict[str, Bits]:
+    """Return what ezc3d reads of a file, as float32 bits, shape (samples, items, values)."""
+    content = ezc3d.c3d(str(path), extract_forceplat_data=True)
+    points = content["data"]["points"][:3].transpose(2, 1, 0).astype(np.float32)
+    bits = points.view(np.uint32).reshape(points.shape).copy()
+    bits[np.isnan(points).any(axis=2)] = 0xFFFFFFFF
+    expected = {"3d": bits}
+    analogs = content["data"]["analogs"][0].T.astype(np.float32)
+    expected["analog"] = np.ascontiguousarray(analogs).view(np.uint32)[:, :, np.newaxis]
+    plates = [np.concatenate([plate["force"], plate["moment"]]).T for plate in content["data"]["platform"]]
+    if plates:
+        loads = np.ascontiguousarray(np.stack(plates, axis=1).astype(np.float32))
+        expected["force"] = loads.view(np.uint32)
+    return expected
+
+
+def assert_equal_to_file(messages: list[bytes], component: str, expected: Bits) -> None:
+    """Every value of every message is the file's; frames are numbered from 1 and the take loops."""
+    seen = set()
+    for message in messages:
+        number = int.from_bytes(message[36:40], "big", signed=True) - 1
+        items = np.ascontiguousarray(message_items(message, BY_KEY[component]))
+        bits = items.view(">u4").reshape(len(items), -1)[:, : expected.shape[2]]
+        np.testing.assert_array_equal(bits, expected[number % len(expected)])
+        seen.add(number % len(expected))
+    assert len(seen) >= 0.1 * len(expected)
+
+
+@pytest.mark.takes
+@pytest.mark.parametrize(
+    ("name", "frames", "components"),
+    [("qualisys.c3d", 340, ["3d", "analog", "force"]), ("optotrak.c3d", 29, ["3d"])],
+)
+async def test_every_value_that_arrives_is_the_files(name: str, frames: int, components: list[str]) -> None:
+    path = take_path(name)
+    expected = expected_bits(path)
+    async with lab(C3dScene(path), OTHERS, ANALOG) as running:
+        await running.until(lambda: min(len(side["3d"]) for side in (running.zenoh, running.lcm)) > frames)
+        running.simulator.stop_measurement()
+    for side in (running.zenoh, running.lcm):
+        assert set(side) - {"status", "clock", "parameters"} == set(components)
+        for component in components:
+            assert_equal_to_file(side[component], component, expected[component])
+    if name == "optotrak.c3d":
+        assert (expected["3d"] == 0xFFFFFFFF).any()
+
+
+async def test_nothing_is_lost_in_ten_seconds_with_analog_at_2000_hz() -> None:
+    scene = SyntheticScene(markers=55, tools=6, analog=69, plates=2, rate_hz=200, analog_rate_hz=2000)
+    async with lab(scene, OTHERS, ANALOG) as running:
+        await running.until(lambda: running.simulator.sent["analog"] >= 20_000)
+        running.simulator.stop_measurement()
+        sent = running.simulator.sent
+        assert sent["3d"] >= 1990
+
+        def all_there() -> bool:
+            return all(
+                len(side[key]) >= count
+                for side in (running.zenoh, running.lcm)
+                for key, count in sent.items()
+            )
+
+        await running.until(all_there)
+    for side in (running.zenoh, running.lcm):
+        for component, count in sent.items():
+            sequences = [int.from_bytes(message[24:32], "big") for message in side[component]]
+            assert sequences == list(range(count)), component

@@ -1,0 +1,146 @@
+import math
+import struct
+
+import rtc3d
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.messages.splice import MESSAGE_TYPES, Stamp, message_items, splice, tool_poses
+from gateway.rtc3d.components import Component, ComponentType
+from gateway.rtc3d.frames import split_frame
+from tests.vectors import ByteOrder
+
+ORDERS: tuple[ByteOrder, ...] = ("big", "little")
+# Words of 4 bytes per item, by §7.3 to §7.7.
+WORDS = {
+    ComponentType.MARKERS: 4,
+    ComponentType.ANALOG: 1,
+    ComponentType.FORCE: 6,
+    ComponentType.TOOLS: 8,
+    ComponentType.EVENT: 4,
+}
+# Missing, a quiet and a signalling NaN, one with a payload, infinity, -0.0, the smallest denormal.
+ODD_FLOATS = [
+    0xFFFFFFFF, 0x7FC00000, 0x7F800001, 0xFFA5A5A5, 0x7F800000, 0x80000000, 0x00000001,
+]  # fmt: skip
+
+int32s = st.integers(-(2**31), 2**31 - 1)
+int64s = st.integers(-(2**63), 2**63 - 1)
+stamps = st.builds(Stamp, int64s, int64s, int32s)
+words = st.integers(0, 2**32 - 1) | st.sampled_from(ODD_FLOATS)
+kinds = st.sampled_from(ComponentType)
+
+
+def is_kept_by_python(word: int) -> bool:
+    """Whether the float of these bits is a Python float and back; CPython makes signalling NaNs quiet."""
+    bits = struct.pack(">I", word)
+    return struct.pack(">f", *struct.unpack(">f", bits)) == bits
+
+
+@st.composite
+def word_lists(draw: st.DrawFn, kind: ComponentType, words: st.SearchStrategy[int] = words) -> list[int]:
+    size = WORDS[kind] * draw(st.integers(0, 5))
+    return draw(st.lists(words, min_size=size, max_size=size))
+
+
+def component(
+    kind: ComponentType, frame_number: int, timestamp_us: int, values: list[int], order: ByteOrder
+) -> Component:
+    mark = ">" if order == "big" else "<"
+    count = len(values) // WORDS[kind]
+    size = 24 + 4 * len(values)
+    header = struct.pack(f"{mark}IIIiqI", 1, size, kind, frame_number, timestamp_us, count)
+    (built,) = split_frame(header + struct.pack(f"{mark}{len(values)}I", *values), order).components
+    return built
+
+
+@given(st.data(), kinds, int32s, int64s, stamps, int64s)
+def test_both_byte_orders_make_the_same_message_bit_by_bit(
+    data: st.DataObject,
+    kind: ComponentType,
+    frame_number: int,
+    timestamp_us: int,
+    stamp: Stamp,
+    sequence: int,
+) -> None:
+    values = data.draw(word_lists(kind))
+    big, little = (
+        splice(component(kind, frame_number, timestamp_us, values, order), stamp, sequence)
+        for order in ORDERS
+    )
+    assert big == little
+    count = len(values) // WORDS[kind]
+    items = struct.pack(f">{len(values)}I", *values)
+    if kind is ComponentType.EVENT:
+        time = struct.pack(">q", timestamp_us)
+        events = [items[at : at + 16] for at in range(0, len(items), 16)]
+        items = b"".join(event[:4] + time + event[4:] for event in events)
+    ours = struct.pack(">qqqi", stamp.utime, stamp.capture_utime, sequence, stamp.session)
+    assert big[8:] == ours + struct.pack(">iqi", frame_number, timestamp_us, count) + items
+
+
+@given(st.data(), kinds, int32s, int64s, stamps, int64s)
+def test_a_message_is_what_lcm_gen_writes(
+    data: st.DataObject,
+    kind: ComponentType,
+    frame_number: int,
+    timestamp_us: int,
+    stamp: Stamp,
+    sequence: int,
+) -> None:
+    values = data.draw(word_lists(kind, words.filter(is_kept_by_python)))
+    message = splice(component(kind, frame_number, timestamp_us, values, "big"), stamp, sequence)
+    decoded = MESSAGE_TYPES[kind].decode(message)
+    assert (decoded.utime, decoded.capture_utime, decoded.session) == (
+        stamp.utime,
+        stamp.capture_utime,
+        stamp.session,
+    )
+    assert (decoded.sequence, decoded.frame_number, decoded.timestamp) == (
+        sequence,
+        frame_number,
+        timestamp_us,
+    )
+    assert decoded.encode() == message
+
+
+@given(st.data(), kinds)
+def test_message_items_are_the_components_items(data: st.DataObject, kind: ComponentType) -> None:
+    values = data.draw(word_lists(kind))
+    received = component(kind, 1, 2, values, "little")
+    items = message_items(splice(received, Stamp(0, 0, 0), 0), kind)
+    assert items.shape == (received.num_items,)
+    for name in received.items().dtype.names or ():
+        expected = received.items()[name].astype(items[name].dtype)
+        assert items[name].tobytes() == expected.tobytes()
+
+
+floats = st.floats(width=32) | st.sampled_from([math.nan, 0.0, -0.0])
+tool_values = st.lists(st.tuples(*8 * [floats]), max_size=4)
+units = st.sampled_from([1.0, 1e-2, 1e-3, 1e-6, 0.0254])
+
+
+@given(tool_values, stamps, units)
+def test_a_pose_is_whole_or_missing(tools: list[tuple[float, ...]], stamp: Stamp, metres: float) -> None:
+    bits = [word for tool in tools for word in struct.unpack("=8I", struct.pack("=8f", *tool))]
+    sequences = range(10, 10 + len(tools))
+    messages = tool_poses(component(ComponentType.TOOLS, 1, 2, bits, "big"), stamp, sequences, metres)
+    for tool, sequence, message in zip(tools, sequences, messages, strict=True):
+        pose = rtc3d.tool_pose_t.decode(message)
+        assert pose.sequence == sequence
+        numbers = (*pose.position_m, *pose.orientation_xyzw, pose.error_m)
+        assert pose.visible == (not any(map(math.isnan, tool)))
+        if pose.visible:
+            assert not any(map(math.isnan, numbers))
+            assert pose.orientation_xyzw == (*tool[1:4], tool[0])
+        else:
+            assert all(map(math.isnan, numbers))
+
+
+@given(int64s, int64s, int32s, st.lists(st.integers(-2, 2) | int64s, min_size=1))
+def test_a_stamp_has_the_number_that_is_asked_for_each_time(
+    utime: int, capture_utime: int, session: int, sequences: list[int]
+) -> None:
+    stamp = Stamp(utime, capture_utime, session)
+    for sequence in sequences:
+        assert stamp.packed(sequence) == struct.pack(">qqqi", utime, capture_utime, sequence, session)

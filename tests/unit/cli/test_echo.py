@@ -1,0 +1,114 @@
+"""What ``echo`` prints of a message; the listening itself is tested with the command."""
+
+import io
+import json
+import queue
+
+import pytest
+import rtc3d
+
+from gateway.cli.echo import Messages, echo
+from tests.spec_parameters import in_root, spec_xml
+
+MARKERS_BYTES = len(spec_xml("3d"))
+
+
+def printed(name: str, message: bytes, *, as_json: bool = False) -> str:
+    messages: Messages = queue.Queue()
+    messages.put((name, message))
+    out = io.StringIO()
+    assert echo(messages, out, count=1, as_json=as_json, timeout_s=10) == 1
+    return out.getvalue().removesuffix("\n")
+
+
+def parameters() -> bytes:
+    message = rtc3d.parameters_t()
+    message.sequence, message.session, message.xml = 4, 2, spec_xml("3d").decode()
+    return bytes(message.encode())
+
+
+def request() -> bytes:
+    message = rtc3d.parameters_request_t()
+    message.request_id, message.requester, message.fresh = 7, "viewer", True
+    message.sections, message.num_sections = ["3d", "6d"], 2
+    return bytes(message.encode())
+
+
+def reply(error: str = "") -> bytes:
+    message = rtc3d.parameters_reply_t()
+    message.request_id, message.requester, message.age_s, message.error = 7, "viewer", 1.25, error
+    message.xml = "" if error else in_root("<General/>").decode()
+    return bytes(message.encode())
+
+
+@pytest.mark.parametrize(
+    ("name", "message", "line"),
+    [
+        (
+            "mocap/lab/parameters",
+            spec_xml("3d"),
+            f"mocap/lab/parameters {MARKERS_BYTES} bytes of XML: 1 marker",
+        ),
+        (
+            "mocap/lab/parameters",
+            in_root("<The_6D/>", "<Analog/>", "<Force/>", "<Events/>"),
+            "mocap/lab/parameters 82 bytes of XML: 0 tools, 0 analog channels, 0 force plates, 0 events",
+        ),
+        (
+            "mocap/lab/parameters",
+            b"<!-- -->",
+            "mocap/lab/parameters 8 bytes of XML that cannot be read as parameters",
+        ),
+        (
+            "mocap/lab/c3d",
+            b'{"name":"lab-20260102T030405.678901Z.c3d","bytes":123}',
+            "mocap/lab/c3d name lab-20260102T030405.678901Z.c3d, bytes 123",
+        ),
+        (
+            "MOCAP_LAB_PARAMETERS",
+            parameters(),
+            f"MOCAP_LAB_PARAMETERS #4 session 2: {MARKERS_BYTES} bytes of XML: 1 marker",
+        ),
+        (
+            "MOCAP_LAB_PARAMETERS_REQUEST",
+            request(),
+            "MOCAP_LAB_PARAMETERS_REQUEST request 7 of 'viewer': 3d 6d, fresh",
+        ),
+        (
+            "MOCAP_LAB_PARAMETERS_REPLY",
+            reply(),
+            "MOCAP_LAB_PARAMETERS_REPLY reply 7 to 'viewer': 54 bytes of XML: "
+            "no markers, tools, channels, plates or events, 1.2 s old",
+        ),
+        (
+            "MOCAP_LAB_PARAMETERS_REPLY",
+            reply("the server is \x1b[31maway"),
+            "MOCAP_LAB_PARAMETERS_REPLY reply 7 to 'viewer': the server is \N{REPLACEMENT CHARACTER}[31maway",
+        ),
+    ],
+)
+def test_a_line_says_what_came(name: str, message: bytes, line: str) -> None:
+    assert printed(name, message) == line
+
+
+@pytest.mark.parametrize(
+    "message", [b"", b"12345678 of something else", b"[1]", b"[" * 100_000, b"{", b"\xff{"]
+)
+def test_what_is_no_message_of_the_gateway_is_said_to_be_none(message: bytes) -> None:
+    assert "are no message of this gateway" in printed("mocap/lab/parameters", message)
+    assert "are no message" in json.loads(printed("mocap/lab/parameters", message, as_json=True))["error"]
+
+
+def test_json_has_the_xml_as_a_text() -> None:
+    value = json.loads(printed("mocap/lab/parameters", spec_xml("force"), as_json=True))
+    assert value == {"key": "mocap/lab/parameters", "xml": spec_xml("force").decode()}
+
+
+def test_json_has_the_fields_of_an_announcement() -> None:
+    value = json.loads(printed("mocap/lab/c3d", b'{"name":"a.c3d","bytes":1}', as_json=True))
+    assert value == {"key": "mocap/lab/c3d", "name": "a.c3d", "bytes": 1}
+
+
+def test_json_has_the_fields_of_a_request() -> None:
+    value = json.loads(printed("MOCAP_LAB_PARAMETERS_REQUEST", request(), as_json=True))
+    assert (value["request_id"], value["requester"], value["sections"]) == (7, "viewer", ["3d", "6d"])

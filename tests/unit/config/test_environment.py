@@ -1,0 +1,234 @@
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.config.environment import variable_name
+from gateway.config.loading import load, read, read_server
+from gateway.config.settings import LcmSettings, Settings, SourceSettings, StreamSettings
+from gateway.errors import ConfigError
+from gateway.rtc3d.commands import FrequencyDivisor
+from gateway.rtc3d.components import ComponentType
+
+FILE = """\
+sources:
+  - name: lab
+    host: 192.0.2.20
+    streams:
+      - {components: [3d], rate: all}
+      - {components: [analog], rate: {divisor: 2}}
+zenoh: {config: {mode: client, connect: {endpoints: [tcp/192.0.2.10:7447]}}}
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    path = tmp_path / "lab.yaml"
+    path.write_text(FILE, encoding="utf-8")
+    return path
+
+
+def with_prefix(variables: dict[str, str]) -> dict[str, str]:
+    return {f"RTC3D_GATEWAY__{name}": value for name, value in variables.items()}
+
+
+def refused(path: Path | None, **variables: str) -> list[str]:
+    """Return the lines of the error, the file as its last part only and the variables without prefix."""
+    with pytest.raises(ConfigError) as caught:
+        load(path, with_prefix(variables))
+    text = str(caught.value).replace("RTC3D_GATEWAY__", "")
+    return (text if path is None else text.replace(f"{path}:", f"{path.name}:")).splitlines()
+
+
+def test_a_variable_stands_over_the_file(file: Path) -> None:
+    variables = {"LCM__URL": "memq://", "SOURCES__0__HOST": "lab-pc", "SOURCES__0__PORT": "3030"}
+    settings = load(file, with_prefix(variables))
+    assert settings.lcm == LcmSettings(url="memq://")
+    assert (settings.sources[0].host, settings.sources[0].port) == ("lab-pc", 3030)
+    assert settings.sources[0].streams == load(file, {}).sources[0].streams
+
+
+def test_the_processes_own_environment_counts(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RTC3D_GATEWAY__LCM__PREFIX", "HALL2")
+    assert load(file).lcm.prefix == "HALL2"
+    assert read_server("lab-pc", 3020).settings.lcm.prefix == "HALL2"
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "location", "expected"),
+    [
+        ("LCM__ENABLED", "false", ("lcm", "enabled"), False),
+        ("LCM__URL", "", ("lcm", "url"), None),
+        ("LCM__URL", "null", ("lcm", "url"), None),
+        ("LCM__MAX_RATE_HZ", "{3d: 60}", ("lcm", "max_rate_hz"), {"3d": 60}),
+        ("LCM__MAX_RATE_HZ__6D", "60", ("lcm", "max_rate_hz"), {"6d": 60}),
+        ("SOURCES__0__NAME", "2026-06-01", ("sources", 0, "name"), "2026-06-01"),
+        ("SOURCES__0__NAME", "'7'", ("sources", 0, "name"), "7"),
+        ("SOURCES__0__RECONNECT__MAX_DELAY_S", "60", ("sources", 0, "reconnect", "max_delay_s"), 60),
+        ("SOURCES__0__STREAMS__1__RATE__DIVISOR", "5", ("sources", 0, "streams", 1, "rate"), {"divisor": 5}),
+        ("SOURCES__0__STREAMS__1__RATE", "all", ("sources", 0, "streams", 1, "rate"), "all"),
+        (
+            "SOURCES__0__STREAMS__0__COMPONENTS__1",
+            "6d",
+            ("sources", 0, "streams", 0, "components"),
+            ["3d", "6d"],
+        ),
+        ("ZENOH__CONFIG__MODE", "peer", ("zenoh", "config", "mode"), "peer"),
+        ("ZENOH__CONFIG", "{mode: peer}", ("zenoh", "config"), {"mode": "peer"}),
+    ],
+)
+def test_values_are_yaml(
+    file: Path, name: str, value: str, location: tuple[str | int, ...], expected: object
+) -> None:
+    found: Any = load(file, with_prefix({name: value})).model_dump(mode="json")
+    for step in location:
+        found = found[step]
+    assert found == expected
+
+
+def test_variables_alone_are_a_configuration() -> None:
+    variables = {
+        "SOURCES__0__NAME": "a",
+        "SOURCES__0__HOST": "lab-a",
+        "SOURCES__1__HOST": "lab-b",
+        "SOURCES__1__NAME": "b",
+        "SOURCES__1__STREAMS__0__COMPONENTS": "[6d]",
+        "SOURCES__1__STREAMS__0__RATE__DIVISOR": "2",
+    }
+    stream = StreamSettings(components=(ComponentType.TOOLS,), rate=FrequencyDivisor(2))
+    sources = (
+        SourceSettings(name="a", host="lab-a"),
+        SourceSettings(name="b", host="lab-b", streams=(stream,)),
+    )
+    assert load(None, with_prefix(variables)) == Settings(sources=sources)
+
+
+def test_more_than_ten_items_keep_their_order() -> None:
+    variables = {f"SOURCES__{n}__NAME": f"s{n}" for n in range(12)}
+    variables |= {f"SOURCES__{n}__HOST": "lab" for n in range(12)}
+    settings = load(None, with_prefix(variables))
+    assert [source.name for source in settings.sources] == [f"s{n}" for n in range(12)]
+
+
+def test_a_mapping_comes_before_its_keys(file: Path) -> None:
+    variables = {"LCM__PREFIX": "A", "LCM": "{prefix: B, url: memq://}"}
+    assert load(file, with_prefix(variables)).lcm == LcmSettings(prefix="A", url="memq://")
+
+
+def test_relative_paths_count_from_the_files_folder(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    zenoh_file = file.parent / "zenoh.json5"
+    zenoh_file.write_text("{mode: 'client'}", encoding="utf-8")
+    assert load(file, with_prefix({"ZENOH__CONFIG": "zenoh.json5"})).zenoh.config == zenoh_file
+    monkeypatch.chdir(file.parent)
+    variables = {"SOURCES": "[{name: lab, host: lab}]", "ZENOH__CONFIG": "zenoh.json5"}
+    assert load(None, with_prefix(variables)).zenoh.config == zenoh_file
+
+
+@pytest.mark.parametrize(
+    "name", ["RTC3D_GATEWAY_SERVICE_HOST", "RTC3D_GATEWAY_PORT", "rtc3d_gateway__lcm__url", "LCM__URL"]
+)
+def test_other_names_are_not_ours(file: Path, name: str) -> None:
+    assert load(file, {name: "tcp://10.0.0.1:9464"}) == load(file, {})
+
+
+MISTAKES: list[tuple[str, str, str]] = [
+    (
+        "LCM__ULR",
+        "memq://",
+        "LCM__ULR: lcm.ulr: unknown key (did you mean 'url'?); known: enabled, prefix, url, queries_url, "
+        "max_rate_hz, tool_poses",
+    ),
+    ("LMC__URL", "memq://", "LMC__URL: lmc: unknown key (did you mean 'lcm'?); known: sources, "),
+    ("SOURCES__0__PORT", "abc", "SOURCES__0__PORT: sources[0].port: found 'abc'; accepted is a whole number"),
+    ("SOURCES__0__PORT", "", "SOURCES__0__PORT: sources[0].port: found nothing; accepted is a whole number"),
+    ("SOURCES__0__NAME", "7", "SOURCES__0__NAME: sources[0].name: found 7 (quotes make it text); accepted"),
+    ("SOURCES__1__NAME", "b", "SOURCES__1__NAME: sources[1].host: missing; this key has no default"),
+    (
+        "SOURCES__2__NAME",
+        "c",
+        "SOURCES__2__NAME: sources: found the index '2'; accepted is a number from 0 to 1",
+    ),
+    (
+        "SOURCES__HOST",
+        "c",
+        "SOURCES__HOST: sources: found the index 'host'; accepted is a number from 0 to 1",
+    ),
+    (
+        "SOURCES__0__STREAMS__0__RATE__DIVISOR",
+        "2",
+        "SOURCES__0__STREAMS__0__RATE__DIVISOR: sources[0].streams[0].rate: has no keys to set, it is 'all' "
+        "(lab.yaml:5:34); accepted is all of it in SOURCES__0__STREAMS__0__RATE",
+    ),
+    (
+        "LCM",
+        "{url: [",
+        "LCM: not YAML: while parsing a flow node from line 1: expected the node content, but found "
+        "'<stream end>'; check indentation, colons, quotes and brackets here",
+    ),
+    ("LCM__URL", "\udcff", "LCM__URL: found the character U+DCFF, which YAML does not allow"),
+    ("", "1", ": names no key; accepted is a name such as LCM__URL"),
+    ("LCM__", "1", "LCM__: names no key; accepted is a name such as LCM__URL"),
+    (
+        "ZENOH__CONFIG__MODES",
+        "peer",
+        "lab.yaml:7:17: zenoh.config: Zenoh refuses these keys: unknown field `modes`, expected one of ",
+    ),
+]
+
+
+@pytest.mark.parametrize(("name", "value", "error"), MISTAKES, ids=[name for name, _, _ in MISTAKES])
+def test_a_mistake_is_told_with_the_variable(file: Path, name: str, value: str, error: str) -> None:
+    [line] = refused(file, **{name: value})
+    assert line.startswith(error)
+
+
+def test_a_mistake_in_a_value_of_both_names_file_and_variables(file: Path) -> None:
+    [line] = refused(file, ZENOH__CONFIG__MODES="peer")
+    assert line.endswith("(a part of it is from ZENOH__CONFIG__MODES)")
+
+
+def test_mistakes_of_the_file_come_first(file: Path) -> None:
+    file.write_text(FILE + "spool: {max_files: 0}\n", encoding="utf-8")
+    lines = refused(file, SPOOL__MAX_BYTES="0", LCM__PREFIX="Ä")
+    assert [line.partition(": ")[0] for line in lines] == ["lab.yaml:8:20", "LCM__PREFIX", "SPOOL__MAX_BYTES"]
+
+
+def test_a_file_that_is_no_mapping_is_told_first(file: Path) -> None:
+    file.write_text("[1]", encoding="utf-8")
+    [line] = refused(file, LCM__URL="memq://")
+    assert line.startswith("lab.yaml:1:1: found a list; accepted is a mapping")
+
+
+def test_no_sources_in_the_environment_are_told() -> None:
+    assert refused(None, LCM__URL="memq://") == [
+        "environment: sources: missing; this key has no default",
+    ]
+
+
+def test_one_server_has_the_defaults() -> None:
+    settings = read_server("::1", 3030, {}).settings
+    assert settings == Settings(sources=(SourceSettings(name="lab", host="::1", port=3030),))
+
+
+def test_one_servers_mistakes_are_told() -> None:
+    with pytest.raises(ConfigError) as caught:
+        read_server("two words", 0, {})
+    assert str(caught.value).splitlines() == [
+        "--server: sources[0].host: found 'two words'; accepted is a host name or an IP address; "
+        "the port has a key of its own",
+        "--server: sources[0].port: found 0; accepted is a whole number from 1 to 65535",
+    ]
+
+
+def test_places_tell_where_each_value_is_from(file: Path) -> None:
+    places = read(file, with_prefix({"ZENOH__CONFIG": "{mode: client}"})).places
+    assert str(places["sources", 0, "host"]) == f"{file}:3:11"
+    assert str(places["zenoh", "config", "mode"]) == "RTC3D_GATEWAY__ZENOH__CONFIG"
+    assert ("zenoh", "config", "connect", "endpoints") not in places
+    assert ("lcm",) not in places
+
+
+def test_a_variables_name_is_its_keys_path() -> None:
+    assert (
+        variable_name(("sources", 0, "connect_timeout_s")) == "RTC3D_GATEWAY__SOURCES__0__CONNECT_TIMEOUT_S"
+    )

@@ -1,0 +1,361 @@
+from pathlib import Path
+
+import pytest
+
+from gateway.config.loading import MAX_FILE_BYTES, load
+from gateway.config.section import Section
+from gateway.config.settings import LcmSettings, Settings, SourceSettings, StreamSettings, ZenohSettings
+from gateway.errors import ConfigError
+from gateway.rtc3d.commands import Frequency
+from gateway.rtc3d.components import ComponentType
+
+SHIPPED = Path(__file__).parents[3] / "config"
+
+SERVER = """\
+sources:
+  - name: lab
+    host: 192.0.2.20
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "lab.yaml"
+
+
+def lines_of(error: ConfigError, file: Path) -> list[str]:
+    """Return the lines of the error's text, the path in each as its last part only."""
+    return [line.replace(str(file), file.name) for line in str(error).splitlines()]
+
+
+def refused(file: Path, content: str | bytes) -> list[str]:
+    """Return the lines of the error that a file with ``content`` raises."""
+    file.write_bytes(content.encode() if isinstance(content, str) else content)
+    with pytest.raises(ConfigError) as caught:
+        load(file)
+    return lines_of(caught.value, file)
+
+
+def test_the_issues_example(file: Path) -> None:
+    file.write_text(
+        """\
+sources:
+  - name: lab
+    host: 192.0.2.20
+    port: 3020
+    byte_order: big              # or little
+    streams:
+      - components: [3d, 6d, event]   # of 3d, 6d, analog, force, event; or [all]
+        rate: {frequency_hz: 60}
+    reconnect: {first_delay_s: 0.2, max_delay_s: 10}
+zenoh: {enabled: true, prefix: mocap, config: {}}
+lcm: {enabled: true, prefix: MOCAP, url: "udpm://239.255.76.67:7667?ttl=0"}
+""",
+        encoding="utf-8",
+    )
+    components = (ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.EVENT)
+    assert load(file) == Settings(
+        sources=(
+            SourceSettings(
+                name="lab",
+                host="192.0.2.20",
+                streams=(StreamSettings(components=components, rate=Frequency(60.0)),),
+            ),
+        ),
+        lcm=LcmSettings(url="udpm://239.255.76.67:7667?ttl=0"),
+    )
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.yaml")), ids=lambda path: path.name)
+def test_every_shipped_configuration_loads(path: Path) -> None:
+    assert load(path).sources
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.json5")), ids=lambda path: path.name)
+def test_every_shipped_zenoh_configuration_can_be_named(path: Path, file: Path) -> None:
+    file.write_text(f"{SERVER}zenoh: {{config: {path}}}\n", encoding="utf-8")
+    assert load(file).zenoh.config == path
+
+
+def test_gateway_yaml_has_every_key_with_its_default() -> None:
+    settings = load(SHIPPED / "gateway.yaml")
+    [source] = settings.sources
+    [stream] = source.streams
+    sections: list[Section] = [settings, source, stream, source.reconnect]
+    sections += [settings.spool, settings.zenoh, settings.lcm, settings.metrics]
+    for section in sections:
+        fields = type(section).model_fields
+        assert section.model_fields_set == set(fields), (
+            f"{type(section).__name__} has keys that are not there"
+        )
+        for key, field in fields.items():
+            if not field.is_required():
+                default = field.get_default(call_default_factory=True)
+                assert getattr(section, key) == default, f"{type(section).__name__}.{key} is not the default"
+
+
+def test_demo_yaml_stays_on_this_machine() -> None:
+    settings = load(SHIPPED / "demo.yaml")
+    assert [(source.name, source.host, source.port) for source in settings.sources] == [
+        ("lab", "127.0.0.1", 3020)
+    ]
+    assert settings.zenoh.config == {
+        "mode": "peer",
+        "scouting": {"multicast": {"enabled": False}},
+        "listen": {"endpoints": ["tcp/127.0.0.1:7447"]},
+    }
+    assert settings.lcm == LcmSettings()
+
+
+MISTAKES: list[tuple[str, str]] = [
+    # One line of YAML after SERVER, and the error's one line.
+    (
+        "    port: abc",
+        "lab.yaml:4:11: sources[0].port: found 'abc'; accepted is a whole number from 1 to 65535",
+    ),
+    (
+        "    prot: 3030",
+        "lab.yaml:4:5: sources[0].prot: unknown key (did you mean 'port'?); known: name, host, port, "
+        "byte_order, streams, reconnect, connect_timeout_s, reply_timeout_s, stall_timeout_s, "
+        "max_lag_ms, "
+        "max_packet_bytes, max_c3d_bytes, query_timeout_s, fresh_interval_s, remote_control",
+    ),
+    (
+        "sorces: 1",
+        "lab.yaml:4:1: sorces: unknown key (did you mean 'sources'?); "
+        "known: sources, spool, zenoh, lcm, metrics",
+    ),
+    ("on: 1", "lab.yaml:4:1: on: unknown key; known: sources, spool, zenoh, lcm, metrics"),
+    ("a b: 1", "lab.yaml:4:1: 'a b': unknown key; known: sources, spool, zenoh, lcm, metrics"),
+    (
+        "    byte_order: bigendian",
+        "lab.yaml:4:17: sources[0].byte_order: found 'bigendian'; accepted is big or little",
+    ),
+    (
+        "    streams: [{rate: {frequency_hz: fast}}]",
+        "lab.yaml:4:37: sources[0].streams[0].rate.frequency_hz: found 'fast'; accepted is a number of "
+        "frames per second above 0, up to 1000000",
+    ),
+    (
+        "    streams: [{components: [6d, 3D]}]",
+        "lab.yaml:4:33: sources[0].streams[0].components[1]: found '3D' (did you mean '3d'?); "
+        "accepted is 3d, 6d, analog, force or event",
+    ),
+    (
+        "    reconnect: {first_delay_s: 20}",
+        "lab.yaml:4:16: sources[0].reconnect.max_delay_s: found 10; accepted is first_delay_s (20) or more",
+    ),
+    (
+        "zenoh:",
+        "lab.yaml:4:7: zenoh: found nothing; accepted is a mapping with any of the keys enabled, prefix, "
+        "config, express, max_rate_hz, tool_poses",
+    ),
+    ("lcm: {enabled: 1}", "lab.yaml:4:16: lcm.enabled: found 1; accepted is true or false"),
+    ("  - host: lab-2", "lab.yaml:4:5: sources[1].name: missing; this key has no default"),
+    (
+        "  - {name: LAB, host: lab-2}",
+        "lab.yaml:4:12: sources[1].name: found 'LAB', which shares its LCM channels with 'lab', sources[0]; "
+        "accepted is a name of other letters or digits, case aside",
+    ),
+    (
+        "    name: lab-2",
+        "lab.yaml:4:5: sources[0].name: the same key as in line 2",
+    ),
+    ("? [a]\n: 1", "lab.yaml:4:3: found a list or mapping as a key"),
+    ("<<: {lcm: {}}", "lab.yaml:4:1: '<<': mappings are not merged; accepted is an alias as a key's value"),
+    ("lcm: !url memq", "lab.yaml:4:6: lcm: found the tag '!url'; accepted are values without a tag"),
+    (
+        "lcm: !!set {a}",
+        "lab.yaml:4:6: lcm: found the tag 'tag:yaml.org,2002:set'; accepted are values without a tag",
+    ),
+    ("lcm: !!int a", "lab.yaml:4:6: lcm: found 'a'; accepted is a number of at most 40 characters"),
+    ("lcm: !!bool a", "lab.yaml:4:6: lcm: found 'a'; accepted is a number of at most 40 characters"),
+    ('lcm: !!int ""', "lab.yaml:4:6: lcm: found ''; accepted is a number of at most 40 characters"),
+    ("lcm: 0x_", "lab.yaml:4:6: lcm: found '0x_'; accepted is a number of at most 40 characters"),
+    (
+        f"lcm: {'9' * 41}",
+        f"lab.yaml:4:6: lcm: found '{'9' * 41}'; accepted is a number of at most 40 characters",
+    ),
+    (r'lcm: "\ud800"', r"lab.yaml:4:6: lcm: found '\ud800'; accepted is text of whole characters"),
+    (r'lcm: "\Uffffffff"', "lab.yaml:4:9: not YAML: a number here is out of range"),
+    ("lcm: *other", "lab.yaml:4:6: not YAML: found undefined alias 'other'"),
+    (
+        "lcm: &it [*it]",
+        "lab.yaml:4:6: found too much; accepted are at most 10000 values in 32 levels, "
+        "those of aliases included",
+    ),
+    ("lcm: " + "[" * 2000, "lab.yaml:4:36: not YAML: found more than 32 levels"),
+    (
+        "lcm: [1",
+        "lab.yaml:5:1: not YAML: while parsing a flow sequence from line 4: expected ',' or ']', but got "
+        "'<stream end>'; check indentation, colons, quotes and brackets here",
+    ),
+    (
+        "\tlcm: {}",
+        r"lab.yaml:4:1: not YAML: found character '\t' that cannot start any token; "
+        "check indentation, colons, quotes and brackets here",
+    ),
+    (
+        "---\n{}",
+        "lab.yaml:4:1: not YAML: expected a single document in the stream from line 1: "
+        "but found another document",
+    ),
+    ("lcm: \x07", "lab.yaml:4:6: found the character U+0007, which YAML does not allow"),
+]
+
+
+@pytest.mark.parametrize(("line", "error"), MISTAKES, ids=[line[:30] for line, _ in MISTAKES])
+def test_a_mistake_is_told_with_its_place(file: Path, line: str, error: str) -> None:
+    assert refused(file, f"{SERVER}{line}\n") == [error]
+
+
+def test_all_mistakes_are_told_in_the_files_order(file: Path) -> None:
+    text = """\
+lcm: {enable: true}
+zenoh: {prefix: /mocap}
+sources:
+  - host: two words
+    port: 70000
+"""
+    assert refused(file, text) == [
+        "lab.yaml:1:7: lcm.enable: unknown key (did you mean 'enabled'?); "
+        "known: enabled, prefix, url, queries_url, max_rate_hz, tool_poses",
+        "lab.yaml:2:17: zenoh.prefix: found '/mocap'; accepted is a Zenoh key of at most 128 characters, "
+        "such as mocap or site/mocap, without space, * $ # ? and without / at an end or doubled",
+        "lab.yaml:4:5: sources[0].name: missing; this key has no default",
+        "lab.yaml:4:11: sources[0].host: found 'two words'; accepted is a host name or an IP address; "
+        "the port has a key of its own",
+        "lab.yaml:5:11: sources[0].port: found 70000; accepted is a whole number from 1 to 65535",
+    ]
+
+
+def test_a_wrong_value_in_what_an_alias_repeats_is_told_where_it_stands(file: Path) -> None:
+    text = """\
+sources:
+  - {name: a, host: lab-a, reconnect: &patient {first_delay_s: 0}}
+  - {name: b, host: lab-b, reconnect: *patient}
+"""
+    accepted = "found 0; accepted is a number of seconds from 0.001 to 86400"
+    assert refused(file, text) == [
+        f"lab.yaml:2:64: sources[0].reconnect.first_delay_s: {accepted}",
+        f"lab.yaml:2:64: sources[1].reconnect.first_delay_s: {accepted}",
+    ]
+
+
+def test_aliases_repeat_values(file: Path) -> None:
+    file.write_text(
+        """\
+sources:
+  - {name: a, host: lab-a, reconnect: &patient {max_delay_s: 60}}
+  - {name: b, host: lab-b, reconnect: *patient}
+""",
+        encoding="utf-8",
+    )
+    assert [source.reconnect.max_delay_s for source in load(file).sources] == [60.0, 60.0]
+
+
+def test_aliases_that_grow_without_bound_are_refused(file: Path) -> None:
+    rows = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
+    rows += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 20)]
+    [line] = refused(file, "\n".join(rows))
+    assert line.endswith(
+        ": found too much; accepted are at most 10000 values in 32 levels, those of aliases included"
+    )
+
+
+def test_a_date_is_a_name_like_any_other(file: Path) -> None:
+    file.write_text("sources: [{name: 2026-06-01, host: lab}]", encoding="utf-8")
+    assert load(file).sources[0].name == "2026-06-01"
+
+
+def test_a_byte_order_mark_is_no_mistake(file: Path) -> None:
+    file.write_bytes(b"\xef\xbb\xbf" + SERVER.encode())
+    assert load(file).sources[0].name == "lab"
+
+
+@pytest.mark.parametrize("content", ["", "# nothing yet\n"])
+def test_an_empty_file_is_refused(file: Path, content: str) -> None:
+    assert refused(file, content) == ["lab.yaml: empty; accepted is a mapping, with the key sources at least"]
+
+
+@pytest.mark.parametrize(("content", "found"), [("[1]", "a list"), ("text", "'text'"), ("~", "nothing")])
+def test_a_file_that_is_no_mapping_is_refused(file: Path, content: str, found: str) -> None:
+    assert refused(file, content) == [
+        f"lab.yaml:1:1: found {found}; accepted is a mapping with any of the keys "
+        "sources, spool, zenoh, lcm, metrics"
+    ]
+
+
+def test_no_sources_are_a_mistake(file: Path) -> None:
+    assert refused(file, "lcm: {}") == ["lab.yaml:1:1: sources: missing; this key has no default"]
+
+
+@pytest.mark.parametrize(
+    ("content", "place"),
+    [
+        (b"# M\xfcnster", "1:4"),
+        (b"\xef\xbb\xbf# M\xfcnster", "1:4"),
+        (SERVER.encode() + "# Männer, Münster\n".encode() + b"# M\xfcnster", "5:4"),
+    ],
+)
+def test_a_file_that_is_not_utf8_is_refused(file: Path, content: bytes, place: str) -> None:
+    assert refused(file, content) == [f"lab.yaml:{place}: found the byte 0xFC; accepted is text in UTF-8"]
+
+
+def test_a_file_too_large_is_refused(file: Path) -> None:
+    padding = "#" * (MAX_FILE_BYTES - len(SERVER))
+    file.write_text(SERVER + padding, encoding="utf-8")
+    assert load(file)
+    assert refused(file, SERVER + padding + "#") == [
+        "lab.yaml: too large; accepted is a file of at most 1048576 bytes"
+    ]
+
+
+def test_a_missing_file_and_a_folder_are_refused(file: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(file)
+    assert lines_of(caught.value, file) == [
+        "lab.yaml: cannot be read: No such file or directory; name a YAML file such as config/gateway.yaml"
+    ]
+    file.mkdir()
+    with pytest.raises(ConfigError) as caught:
+        load(file)
+    assert lines_of(caught.value, file) == [
+        "lab.yaml: cannot be read: Is a directory; name a YAML file such as config/gateway.yaml"
+    ]
+
+
+def test_zenohs_file_is_looked_for_beside_this_one(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file.write_text(f"{SERVER}zenoh: {{config: net/zenoh.json5}}\n", encoding="utf-8")
+    zenoh_file = file.parent / "net" / "zenoh.json5"
+    zenoh_file.parent.mkdir()
+    zenoh_file.write_text("{mode: 'client'} // JSON5", encoding="utf-8")
+    assert load(file).zenoh == ZenohSettings(config=zenoh_file)
+
+    monkeypatch.chdir(file.parent)
+    assert load(Path(file.name)).zenoh.config == zenoh_file
+
+    zenoh_file.write_text("{mode: 'clint'}", encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load(file)
+    [line] = lines_of(caught.value, file)
+    assert line.startswith(f"lab.yaml:4:17: zenoh.config: Zenoh refuses the file {zenoh_file}: ")
+    assert "unknown variant `clint`, expected one of `router`, `peer`, `client`" in line
+
+    zenoh_file.unlink()
+    with pytest.raises(ConfigError) as caught:
+        load(file)
+    assert lines_of(caught.value, file) == [
+        f"lab.yaml:4:17: zenoh.config: Zenoh refuses the file {zenoh_file}: "
+        "No such file or directory (os error 2)"
+    ]
+
+
+def test_a_drawing_of_zenoh_is_put_on_one_line(file: Path) -> None:
+    zenoh_file = file.parent / "zenoh.json5"
+    zenoh_file.write_text("{mode: 'peer',,\n}", encoding="utf-8")
+    [line] = refused(file, f"{SERVER}zenoh: {{config: zenoh.json5}}\n")
+    assert line == (
+        f"lab.yaml:4:17: zenoh.config: Zenoh refuses the file {zenoh_file}: "
+        "line 1, column 15: expected identifier or string"
+    )

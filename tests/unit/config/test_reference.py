@@ -1,0 +1,96 @@
+"""docs/reference/configuration.md says of every key what the program says of it."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+from pydantic import ValidationError
+
+from gateway.config.section import Section
+from gateway.config.settings import (
+    LcmSettings,
+    MetricsSettings,
+    ReconnectSettings,
+    Settings,
+    SourceSettings,
+    SpoolSettings,
+    StreamSettings,
+    ZenohSettings,
+)
+
+REFERENCE = (Path(__file__).parents[3] / "docs/reference/configuration.md").read_text(encoding="utf-8")
+
+SECTIONS: dict[str, type[Section]] = {
+    "sources[]": SourceSettings,
+    "sources[].streams[]": StreamSettings,
+    "sources[].reconnect": ReconnectSettings,
+    "zenoh": ZenohSettings,
+    "lcm": LcmSettings,
+    "spool": SpoolSettings,
+    "metrics": MetricsSettings,
+}
+
+
+def default_of(section: type[Section], key: str) -> str:
+    field = section.model_fields[key]
+    if field.is_required():
+        return "none"
+    default = field.get_default(call_default_factory=True)
+    if isinstance(default, Section) or (isinstance(default, tuple) and isinstance(default[0], Section)):
+        return "below"
+    value = section.model_construct(**{key: default}).model_dump(mode="json", include={key})[key]
+    if key == "components":
+        value = ["all"]
+    text: str = yaml.safe_dump(value, default_flow_style=True, width=1000)
+    text = text.removesuffix("...\n").strip()
+    return f"`{text}`"
+
+
+def accepted_by(section: type[Section], key: str) -> str:
+    """Return what the program says is accepted, when it finds something else."""
+    try:
+        section.model_validate({key: object()})
+    except ValidationError as error:
+        for details in error.errors():
+            if details["loc"][0] == key:
+                text = str(details["msg"]).partition("accepted is ")[2]
+                return re.sub(r"a mapping with any of the keys .*", "a mapping", text)
+    raise AssertionError(f"{key} accepts anything")
+
+
+def table(section: type[Section]) -> str:
+    lines = ["| key | default | accepted | what |", "|---|---|---|---|"]
+    for key, field in section.model_fields.items():
+        description = " ".join(str(field.description).split())
+        lines.append(
+            f"| `{key}` | {default_of(section, key)} | {accepted_by(section, key)} | {description} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+@pytest.mark.parametrize("name", SECTIONS)
+def test_the_table_of_a_section_is_what_the_program_says(name: str) -> None:
+    heading = f"## {name}\n"
+    assert heading in REFERENCE
+    part = REFERENCE.partition(heading)[2].partition("\n## ")[0]
+    assert table(SECTIONS[name]) in part, f"put this below {heading}{table(SECTIONS[name])}"
+
+
+def test_every_section_is_there() -> None:
+    def sections_in(model: Any) -> set[type[Section]]:
+        found = {model}
+        for field in model.model_fields.values():
+            default = field.get_default(call_default_factory=True)
+            for value in default if isinstance(default, tuple) else (default,):
+                if isinstance(value, Section):
+                    found |= sections_in(type(value))
+        return found
+
+    assert sections_in(Settings) | sections_in(SourceSettings) == {Settings, *SECTIONS.values()}
+
+
+@pytest.mark.parametrize("block", re.findall(r"```yaml\n(.*?)```", REFERENCE, re.DOTALL))
+def test_its_examples_are_configurations(block: str) -> None:
+    assert Settings.model_validate(yaml.safe_load(block)).sources

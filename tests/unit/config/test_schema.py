@@ -1,0 +1,57 @@
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given
+from jsonschema import Draft202012Validator
+
+from gateway.config.schema import schema_text
+from gateway.config.settings import Settings
+from tests.property.test_config_properties import SETTINGS
+
+SHIPPED = Path(__file__).parents[3] / "config"
+VALIDATOR = Draft202012Validator(json.loads(schema_text()))
+
+
+def test_the_shipped_schema_is_current() -> None:
+    shipped = (SHIPPED / "gateway.schema.json").read_text(encoding="utf-8")
+    assert shipped == schema_text(), "rtc3d-gateway config schema > config/gateway.schema.json"
+
+
+def test_it_is_a_schema() -> None:
+    Draft202012Validator.check_schema(json.loads(schema_text()))
+
+
+@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.yaml")), ids=lambda path: path.name)
+def test_shipped_configurations_name_the_schema_and_fit_it(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    assert text.startswith("# yaml-language-server: $schema=gateway.schema.json\n")
+    VALIDATOR.validate(yaml.safe_load(text))
+
+
+@given(SETTINGS)
+def test_what_the_gateway_accepts_fits_the_schema(settings: Settings) -> None:
+    VALIDATOR.validate(settings.model_dump(mode="json"))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"sources": []},
+        {"sources": [{"name": "lab"}]},
+        {"sources": [{"name": "lab", "host": "lab", "prot": 3020}]},
+        {"sources": [{"name": "lab", "host": "lab", "port": 0}]},
+        {"sources": [{"name": "l b", "host": "lab"}]},
+        {"sources": [{"name": "lab", "host": "lab", "streams": []}]},
+        {"sources": [{"name": "lab", "host": "lab", "streams": [{"components": ["7d"]}]}]},
+        {"sources": [{"name": "lab", "host": "lab", "streams": [{"rate": "fast"}]}]},
+        {"sources": [{"name": "lab", "host": "lab", "streams": [{"rate": {"divisor": 1.5}}]}]},
+        {"sources": [{"name": "lab", "host": "lab"}], "lcm": {"max_rate_hz": {"3d": 0}}},
+        {"sources": [{"name": "lab", "host": "lab"}], "lcm": None},
+        {"sources": [{"name": "lab", "host": "lab"}], "zenoh": {"config": 1}},
+    ],
+)
+def test_an_editor_sees_mistakes(values: object) -> None:
+    assert list(VALIDATOR.iter_errors(values))

@@ -1,0 +1,214 @@
+import logging
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.config.environment import variable_name
+from gateway.config.loading import load, read
+from gateway.config.secrets import masked, secrets_in, without_secrets
+from gateway.config.show import shown_configuration
+from gateway.config.values import zenoh_reason
+from gateway.errors import ConfigError
+from gateway.outputs.zenoh.output import ZenohOutput
+from tests.networks import free_port
+from tests.waiting import wait_until
+
+SERVER = "sources: [{name: lab, host: 192.0.2.20}]\n"
+PASSWORD = variable_name(("zenoh", "config", "transport", "auth", "usrpwd", "password"))
+PEM = "-----BEGIN EC PRIVATE KEY-----\ngeheim\n-----END EC PRIVATE KEY-----\n"
+JSON5 = (
+    "the environment variable {}, or zenoh.config as the path of a JSON5 file that only the gateway may read"
+)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "lab.yaml"
+
+
+SECRETS: list[tuple[dict[str, Any], dict[str, Any]]] = [
+    # Zenoh's keys, and what may be seen of them.
+    (
+        {"transport": {"auth": {"usrpwd": {"user": "me", "password": "geheim"}}}},
+        {"transport": {"auth": {"usrpwd": {"user": "me", "password": "***"}}}},
+    ),
+    (
+        {"transport": {"auth": {"pubkey": {"public_key_pem": "P", "private_key_pem": PEM}}}},
+        {"transport": {"auth": {"pubkey": {"public_key_pem": "P", "private_key_pem": "***"}}}},
+    ),
+    (
+        {
+            "transport": {
+                "link": {"tls": {"listen_private_key_base64": "geheim", "connect_private_key": "/k"}}
+            }
+        },
+        {"transport": {"link": {"tls": {"listen_private_key_base64": "***", "connect_private_key": "/k"}}}},
+    ),
+    (
+        {"connect": {"endpoints": ["tcp/a:1", "tls/a:1#connect_private_key_raw=geheim;so_sndbuf=1"]}},
+        {"connect": {"endpoints": ["tcp/a:1", "tls/a:1#connect_private_key_raw=***;so_sndbuf=1"]}},
+    ),
+    (
+        {"plugins": {"storage_manager": {"volumes": {"influx": {"private": {"username": "geheim"}}}}}},
+        {"plugins": {"storage_manager": {"volumes": {"influx": {"private": "***"}}}}},
+    ),
+    (
+        {"plugins": {"x": {"url": "https://me:geheim@lab:1/geheim.txt", "token_secret": "geheim"}}},
+        {"plugins": {"x": {"url": "https://me:***@lab:1/geheim.txt", "token_secret": "***"}}},
+    ),
+    ({"plugins": {"x": {"pem": PEM}}}, {"plugins": {"x": {"pem": "***\n"}}}),
+]
+
+
+@pytest.mark.parametrize(("config", "seen"), SECRETS)
+def test_secrets_are_masked(config: dict[str, Any], seen: dict[str, Any]) -> None:
+    assert masked(config) == seen
+    assert list(secrets_in(config))
+    assert masked(seen) == seen
+
+
+@pytest.mark.parametrize(
+    "config",
+    [
+        {},
+        {
+            "transport": {
+                "auth": {"usrpwd": {"user": "me", "password": None, "dictionary_file": "/etc/users"}}
+            }
+        },
+        {"transport": {"link": {"tls": {"listen_private_key": "/k", "root_ca_certificate_base64": "x"}}}},
+        {
+            "connect": {"endpoints": ["tcp/lab:7447", "tcp/[::1]:7447#so_sndbuf=1"]},
+            "metadata": {"name": "a:b@c"},
+        },
+    ],
+)
+def test_what_is_no_secret_stays(config: dict[str, Any]) -> None:
+    assert masked(config) == config
+    assert list(secrets_in(config)) == []
+
+
+@pytest.mark.parametrize(
+    ("config", "place", "accepted"),
+    [
+        (
+            "{transport: {auth: {usrpwd: {user: me, password: geheim}}}}",
+            "2:66: zenoh.config.transport.auth.usrpwd.password",
+            JSON5.format(PASSWORD),
+        ),
+        (
+            "{transport: {auth: {usrpwd: {user: me, password: 1234567}}}}",
+            "2:66: zenoh.config.transport.auth.usrpwd.password",
+            JSON5.format(PASSWORD),
+        ),
+        (
+            "{transport: {link: {tls: {connect_private_key_base64: geheim}}}}",
+            "2:71: zenoh.config.transport.link.tls.connect_private_key_base64",
+            "connect_private_key with the path of the key's file, "
+            + JSON5.format("RTC3D_GATEWAY__ZENOH__CONFIG__TRANSPORT__LINK__TLS__CONNECT_PRIVATE_KEY_BASE64"),
+        ),
+        (
+            "{transport: {auth: {pubkey: {private_key_pem: geheim}}}}",
+            "2:63: zenoh.config.transport.auth.pubkey.private_key_pem",
+            "private_key_file with the path of the key's file, "
+            + JSON5.format("RTC3D_GATEWAY__ZENOH__CONFIG__TRANSPORT__AUTH__PUBKEY__PRIVATE_KEY_PEM"),
+        ),
+        (
+            "{connect: {endpoints: ['tls/lab:7447#connect_private_key_raw=geheim']}}",
+            "2:40: zenoh.config.connect.endpoints[0]",
+            JSON5.format("RTC3D_GATEWAY__ZENOH__CONFIG__CONNECT__ENDPOINTS__0"),
+        ),
+    ],
+)
+def test_a_secret_in_the_file_is_refused(file: Path, config: str, place: str, accepted: str) -> None:
+    file.write_text(f"{SERVER}zenoh: {{config: {config}}}\n", encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load(file, {})
+    text = "found a secret, which does not belong in this file; accepted is"
+    assert str(caught.value) == f"{file}:{place}: {text} {accepted}"
+
+
+def test_a_secret_is_told_with_the_other_mistakes(file: Path) -> None:
+    config = "{mode: clint, transport: {auth: {usrpwd: {password: geheim}}}}"
+    file.write_text(f"lcm: 1\n{SERVER}zenoh: {{config: {config}}}\n", encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load(file, {})
+    lines = str(caught.value).splitlines()
+    assert [line.split(": ")[1] for line in lines] == [
+        "lcm",
+        "zenoh.config",
+        "zenoh.config.transport.auth.usrpwd.password",
+    ]
+    assert "geheim" not in str(caught.value)
+
+
+@pytest.mark.parametrize("password", ["geheim", "12345678", "null", "a: {b", "#x", " ", "*a", "'"])
+def test_a_password_from_the_environment_is_text_as_it_stands(file: Path, password: str) -> None:
+    file.write_text(f"{SERVER}zenoh: {{config: {{transport: {{auth: {{usrpwd: {{user: me}}}}}}}}}}\n")
+    configuration = read(file, {PASSWORD: password})
+    assert configuration.settings.model_dump()["zenoh"]["config"]["transport"]["auth"]["usrpwd"] == {
+        "user": "me",
+        "password": password,
+    }
+    shown = [" ".join(line.split()) for line in shown_configuration(configuration).splitlines()]
+    assert f"password: '***' # {PASSWORD}" in shown
+
+
+def test_settings_in_a_log_line_show_no_password(file: Path) -> None:
+    file.write_text(f"{SERVER}zenoh: {{config: {{transport: {{auth: {{usrpwd: {{user: me}}}}}}}}}}\n")
+    assert "geheim" not in repr(load(file, {PASSWORD: "geheim"}))
+
+
+def test_half_a_character_in_a_password_is_refused(file: Path) -> None:
+    file.write_text(SERVER, encoding="utf-8")
+    with pytest.raises(ConfigError, match="found bytes that are not UTF-8; accepted is text"):
+        load(file, {PASSWORD: "\udcff"})
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "{transport: {auth: {usrpwd: {user: 'u', password: 'geheim' xx}}}}",  # the line is drawn
+        "{transport: {auth: {usrpwd: {user: 'u', password: 4711}}}}",  # the value is told
+        "{transport: {auth: {usrpwd: 'geheim'}}}",
+        "{connect: {endpoints: ['tls lab#connect_private_key_raw=geheim']}}",
+    ],
+)
+def test_zenohs_errors_quote_no_secrets(file: Path, content: str) -> None:
+    (file.parent / "zenoh.json5").write_text(content, encoding="utf-8")
+    file.write_text(f"{SERVER}zenoh: {{config: zenoh.json5}}\n", encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        load(file, {})
+    assert "Zenoh refuses the file" in str(caught.value)
+    assert "geheim" not in str(caught.value)
+    assert "4711" not in str(caught.value)
+
+
+def test_zenohs_reasons_keep_what_helps() -> None:
+    drawing = (
+        " --> 2:7\n  |\n2 |  mode: 'geheim',,\n  |       ^---\n  |\n  = expected identifier\n at src/a.rs:1."
+    )
+    assert zenoh_reason(ValueError(drawing)) == "line 2, column 7: expected identifier"
+    text = 'invalid type: string "ge\\"heim", expected a boolean at /x/y.rs:615.'
+    assert zenoh_reason(ValueError(text)) == "invalid type: string, expected a boolean"
+
+
+def test_a_link_that_fails_is_told_without_its_key(caplog: pytest.LogCaptureFixture, file: Path) -> None:
+    endpoint = f"tls/127.0.0.1:{free_port()}#connect_private_key_base64=geheim"
+    file.write_text(SERVER + "zenoh: {config: {mode: client, scouting: {multicast: {enabled: false}}}}\n")
+    settings = load(file, {"RTC3D_GATEWAY__ZENOH__CONFIG__CONNECT__ENDPOINTS": f"['{endpoint}']"})
+    caplog.set_level(logging.DEBUG)
+    output = ZenohOutput(settings.zenoh)
+    output.start()
+    try:
+        wait_until(lambda: "does not open" in output.health().problem)
+        assert "connect_private_key_base64=***" in output.health().problem
+        assert "geheim" not in output.health().problem + caplog.text
+    finally:
+        output.close()
+
+
+def test_texts_without_secrets_stay() -> None:
+    text = "tls/lab:7447#so_sndbuf=1, https://lab/a@b and a:b@c, password"
+    assert without_secrets(text) == text

@@ -1,0 +1,178 @@
+import warnings
+from typing import Any
+
+import pytest
+from pydantic import TypeAdapter, ValidationError
+
+from gateway import names
+from gateway.config.section import shown
+from gateway.config.settings import (
+    LcmSettings,
+    ReconnectSettings,
+    Settings,
+    SourceSettings,
+    StreamSettings,
+    ZenohSettings,
+    lcm_queries_url,
+)
+from gateway.config.values import ChannelPrefix, SourceName
+from gateway.rtc3d.commands import AllFrames
+from gateway.rtc3d.components import ComponentType
+from tests.settings import mistakes, source
+
+MARKERS, ANALOG, FORCE = ComponentType.MARKERS, ComponentType.ANALOG, ComponentType.FORCE
+TOOLS, EVENT = ComponentType.TOOLS, ComponentType.EVENT
+
+
+def test_one_server_is_enough() -> None:
+    settings = Settings.model_validate({"sources": [source()]})
+    assert settings == Settings(sources=(SourceSettings(name="lab", host="192.0.2.20"),))
+    assert settings.sources[0] == SourceSettings(
+        name="lab",
+        host="192.0.2.20",
+        port=3020,
+        byte_order="big",
+        streams=(StreamSettings(components=(MARKERS, TOOLS, ANALOG, FORCE, EVENT), rate=AllFrames()),),
+        reconnect=ReconnectSettings(first_delay_s=0.2, max_delay_s=10.0),
+        connect_timeout_s=5.0,
+        reply_timeout_s=2.0,
+        stall_timeout_s=3.0,
+        max_packet_bytes=16 * 1024 * 1024,
+        max_c3d_bytes=256 * 1024 * 1024,
+    )
+    assert settings.zenoh == ZenohSettings(
+        enabled=True, prefix="mocap", config={}, express=False, tool_poses=False
+    )
+    assert settings.lcm == LcmSettings(enabled=True, prefix="MOCAP", url=None, tool_poses=False)
+
+
+def test_settings_do_not_change() -> None:
+    settings = Settings.model_validate({"sources": [source()]})
+    with pytest.raises(ValidationError):
+        settings.sources[0].port = 1
+
+
+def test_the_longest_name_and_prefix_fit_a_channel() -> None:
+    TypeAdapter(SourceName).validate_python("S" * 24)
+    TypeAdapter(ChannelPrefix).validate_python("P" * 16)
+    channel = f"{'P' * 16}_{'S' * 24}_PARAMETERS_REQUEST"
+    assert len(channel) <= names.MAX_CHANNEL_LENGTH
+    assert names.lcm_channel("P" * 16, "S" * 24, "PARAMETERS_REQUEST") == channel
+
+
+def test_names_that_share_channels_are_both_named() -> None:
+    value = {"sources": [source(name="hall"), source(name="lab-1"), source(name="LAB_1")]}
+    assert mistakes(Settings, value) == [
+        (
+            "sources.2.name",
+            "found 'LAB_1', which shares its LCM channels with 'lab-1', sources[1]; "
+            "accepted is a name of other letters or digits, case aside",
+        )
+    ]
+
+
+def test_a_component_is_in_one_stream_only() -> None:
+    streams = [{"components": ["3d"]}, {"components": ["analog"]}, {"components": ["6d", "3d"]}]
+    assert mistakes(SourceSettings, source(streams=streams)) == [
+        (
+            "streams.2.components",
+            "found '3d', which streams[0] has too; accepted is each component in one stream, "
+            "for it has one key and one channel",
+        )
+    ]
+
+
+def test_frames_of_a_slow_rate_are_no_stall() -> None:
+    streams = [{"components": ["3d"]}, {"components": ["6d"], "rate": {"frequency_hz": 0.25}}]
+    assert mistakes(SourceSettings, source(streams=streams)) == [
+        (
+            "streams.1.rate.frequency_hz",
+            "found 0.25, one frame in 4 s, which stall_timeout_s (3) takes for silence; "
+            "accepted is more than 0.333333, or a longer stall_timeout_s",
+        )
+    ]
+    assert SourceSettings.model_validate(source(streams=streams, stall_timeout_s=4.1))
+
+
+@pytest.mark.parametrize(
+    ("value", "found"), [([], "an empty list"), ({}, "an empty mapping"), ("x", "'x'"), (None, "nothing")]
+)
+def test_sources_and_streams_are_lists_of_at_least_one(value: object, found: str) -> None:
+    assert mistakes(Settings, {"sources": value}) == [
+        ("sources", f"found {found}; accepted is a list of sources, one or more, each with name and host")
+    ]
+    assert mistakes(SourceSettings, source(streams=value)) == [
+        ("streams", f"found {found}; accepted is a list of streams, one or more")
+    ]
+
+
+def test_the_longest_wait_is_not_below_the_first() -> None:
+    assert mistakes(ReconnectSettings, {"first_delay_s": 20}) == [
+        ("max_delay_s", "found 10; accepted is first_delay_s (20) or more")
+    ]
+    assert ReconnectSettings.model_validate({"first_delay_s": 10})
+
+
+def test_no_lcm_url_is_that_of_the_environment_else_this_host(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("LCM_DEFAULT_URL", raising=False)
+    assert LcmSettings().effective_url == "udpm://239.255.76.67:7667?ttl=0"
+    monkeypatch.setenv("LCM_DEFAULT_URL", "udpm://239.255.76.67:7667?ttl=1")
+    assert LcmSettings().effective_url == "udpm://239.255.76.67:7667?ttl=1"
+    assert LcmSettings(url="memq://").effective_url == "memq://"
+
+
+@pytest.mark.parametrize(
+    ("url", "queries_url"),
+    [
+        ("udpm://239.255.76.67:7667?ttl=1", "udpm://239.255.76.67:7668?ttl=1"),
+        ("udpm://239.1.2.3:65535", "udpm://239.1.2.3:65534"),
+        ("udpm://?ttl=1&recv_buf_size=2000000", "udpm://239.255.76.67:7668?ttl=1&recv_buf_size=2000000"),
+        *((url, url) for url in ("mpudpm://", "memq://", "tcpq://lab:7700", "udpm://239.1.2.3:lcm")),
+    ],
+)
+def test_requests_go_to_the_next_port_where_whoever_listens_gets_all(url: str, queries_url: str) -> None:
+    assert lcm_queries_url(url) == queries_url
+    assert LcmSettings.model_construct(url=url).effective_queries_url == queries_url
+    assert LcmSettings(url="memq://", queries_url="tcpq://lab:1").effective_queries_url == "tcpq://lab:1"
+
+
+def test_one_side_must_be_on() -> None:
+    off = {"enabled": False}
+    assert mistakes(Settings, {"sources": [source()], "zenoh": off, "lcm": off}) == [
+        ("lcm.enabled", "found false here and in zenoh; accepted is true in one of them at least")
+    ]
+    assert Settings.model_validate({"sources": [source()], "zenoh": off}).lcm.enabled
+    assert Settings.model_validate({"sources": [source()], "lcm": off}).zenoh.enabled
+
+
+def test_every_mistake_is_told_at_once() -> None:
+    sources = [source(prt=1), {"name": "b"}]
+    assert dict(mistakes(Settings, {"sources": sources, "lcm": None, "zenho": {}})) == {
+        "sources.0.prt": "unknown key (did you mean 'port'?); known: name, host, port, byte_order, streams, "
+        "reconnect, connect_timeout_s, reply_timeout_s, stall_timeout_s, max_lag_ms, "
+        "max_packet_bytes, max_c3d_bytes, "
+        "query_timeout_s, fresh_interval_s, remote_control",
+        "sources.1.host": "missing; this key has no default",
+        "lcm": "found nothing; accepted is a mapping with any of the keys enabled, prefix, url, queries_url, "
+        "max_rate_hz, tool_poses",
+        "zenho": "unknown key (did you mean 'zenoh'?); known: sources, spool, zenoh, lcm, metrics",
+    }
+
+
+def test_what_is_shown_is_one_bounded_line() -> None:
+    assert shown("a\nb\x1b" + "x" * 1000) == repr("a\nb\x1b" + "x" * 56 + "…")
+
+
+def test_what_is_shown_has_no_password() -> None:
+    assert shown("tcpq://me:geheim@lab:7700") == "'tcpq://me:***@lab:7700'"
+    assert shown("x" * 50 + "tls/lab#connect_private_key_base64=geheim").count("geheim") == 0
+
+
+def test_every_key_has_a_description_in_the_schema() -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        schema: dict[str, Any] = Settings.model_json_schema()
+    sections = [schema, *schema["$defs"].values()]
+    keys = [key for section in sections for key in section["properties"].values()]
+    assert len(keys) > 20
+    assert all(key["description"] for key in keys)

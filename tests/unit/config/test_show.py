@@ -1,0 +1,99 @@
+import json
+from pathlib import Path
+
+import pytest
+import yaml
+
+from gateway.config.loading import load, read
+from gateway.config.show import shown_configuration
+
+FILE = """\
+sources:
+  - name: lab
+    host: 192.0.2.20
+    streams: [{components: [6d], rate: {frequency_hz: 60}}]
+zenoh:
+  config: {mode: client, connect: {endpoints: [tcp/192.0.2.10:7447, tcp/192.0.2.11:7447]}}
+lcm: {url: memq://}
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    for name in ("LCM_DEFAULT_URL", "STATE_DIRECTORY", "XDG_STATE_HOME"):
+        monkeypatch.delenv(name, raising=False)
+    path = tmp_path / "lab.yaml"
+    path.write_text(FILE, encoding="utf-8")
+    return path
+
+
+def shown(path: Path, **variables: str) -> list[str]:
+    """Return the lines, blanks made one, files as their last part, and variables without prefix."""
+    environ = {f"RTC3D_GATEWAY__{name}": value for name, value in variables.items()}
+    text = shown_configuration(read(path, environ)).replace(str(path), path.name)
+    return [" ".join(line.split()) for line in text.replace("RTC3D_GATEWAY__", "").splitlines()]
+
+
+def test_every_value_has_its_origin(file: Path) -> None:
+    lines = shown(file, LCM__PREFIX="HALL2", ZENOH__CONFIG__CONNECT__ENDPOINTS__1="tcp/192.0.2.12:7447")
+    for line in (
+        "- name: lab # lab.yaml:2",
+        "port: 3020 # default",
+        "- components: [6d] # lab.yaml:4",
+        "frequency_hz: 60.0 # lab.yaml:4",
+        "backlog: latest # default",
+        "mode: client # lab.yaml:6",
+        "endpoints: ['tcp/192.0.2.10:7447', 'tcp/192.0.2.12:7447'] "
+        "# lab.yaml:6, ZENOH__CONFIG__CONNECT__ENDPOINTS__1",
+        "prefix: HALL2 # LCM__PREFIX",
+        "prefix: mocap # default",
+        "url: memq:// # lab.yaml:7",
+    ):
+        assert line in lines
+    is_section = [line.endswith(":") for line in lines]
+    assert [" # " in line for line in lines] == [not section for section in is_section]
+
+
+def test_what_a_variable_sets_as_a_whole_is_from_it(file: Path) -> None:
+    lines = shown(file, SOURCES__0__STREAMS="[{rate: all}]")
+    assert "rate: all # SOURCES__0__STREAMS" in lines
+    assert "- components: [3d, 6d, analog, force, event] # default" in lines
+
+
+def test_what_depends_on_the_environment_is_shown_as_it_is(
+    file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file.write_text(FILE.replace("lcm: {url: memq://}", ""), encoding="utf-8")
+    assert "url: udpm://239.255.76.67:7667?ttl=0 # default" in shown(file)
+    monkeypatch.setenv("LCM_DEFAULT_URL", "udpm://239.255.76.68:7667?ttl=1")
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/lab")
+    lines = shown(file)
+    assert "url: udpm://239.255.76.68:7667?ttl=1 # LCM_DEFAULT_URL" in lines
+    assert "directory: /var/lib/lab/c3d # STATE_DIRECTORY" in lines
+
+
+def test_what_is_shown_is_a_configuration_of_the_same_effect(file: Path) -> None:
+    configuration = read(file, {})
+    again = file.with_name("again.yaml")
+    again.write_text(shown_configuration(configuration), encoding="utf-8")
+    directory = configuration.settings.spool.effective_directory
+    spool = configuration.settings.spool.model_copy(update={"directory": str(directory)})
+    before = configuration.settings.lcm
+    lcm = before.model_copy(update={"queries_url": before.effective_queries_url})
+    assert load(again, {}) == configuration.settings.model_copy(update={"spool": spool, "lcm": lcm})
+
+
+def test_odd_keys_and_values_stay_what_they_are(file: Path) -> None:
+    metadata = {"on": "off", "12": "1e3", "a: b": "x # y", "lines": "a\nb", "list": [{}, {"a": []}, "x"]}
+    inline = f"mode: client, metadata: {json.dumps(metadata)}"
+    file.write_text(FILE.replace("mode: client", inline), encoding="utf-8")
+    values = yaml.safe_load(shown_configuration(read(file, {})))
+    assert values["zenoh"]["config"]["metadata"] == metadata
+
+
+def test_comments_stand_in_a_column_except_behind_long_lines(file: Path) -> None:
+    lines = shown_configuration(read(file, {})).splitlines()
+    parts = [line.partition("  # ")[0].rstrip() for line in lines if "  # " in line]
+    columns = [line.index("# ") for line in lines if "  # " in line]
+    assert {column for column, part in zip(columns, parts, strict=True) if len(part) <= 48} == {50}
+    assert all(column == len(part) + 2 for column, part in zip(columns, parts, strict=True) if len(part) > 48)

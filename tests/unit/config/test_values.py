@@ -1,0 +1,278 @@
+import pytest
+
+from gateway.config.section import shown
+from gateway.config.settings import (
+    DEFAULT_LCM_URL,
+    LcmSettings,
+    SourceSettings,
+    StreamSettings,
+    ZenohSettings,
+)
+from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from tests.settings import mistakes, source
+
+MARKERS, TOOLS, ANALOG = ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.ANALOG
+
+
+@pytest.mark.parametrize(
+    ("port", "found"),
+    [
+        ("abc", "'abc'"),
+        ("3020", "'3020'"),
+        (0, "0"),
+        (-1, "-1"),
+        (65536, "65536"),
+        (True, "true"),
+        (3020.0, "3020.0"),
+        (None, "nothing"),
+        ([], "an empty list"),
+        ({"a": 1}, "a mapping"),
+    ],
+)
+def test_a_port_is_a_whole_number_of_16_bits(port: object, found: str) -> None:
+    assert mistakes(SourceSettings, source(port=port)) == [
+        ("port", f"found {found}; accepted is a whole number from 1 to 65535")
+    ]
+
+
+@pytest.mark.parametrize("value", [0, -1, True, "2", float("nan"), float("inf"), 10**400, 86401, None])
+@pytest.mark.parametrize("key", ["connect_timeout_s", "reply_timeout_s", "stall_timeout_s"])
+def test_a_time_is_a_bounded_number_of_seconds(key: str, value: object) -> None:
+    [(location, text)] = mistakes(SourceSettings, source(**{key: value}))
+    assert location == key
+    assert text.endswith("; accepted is a number of seconds from 0.001 to 86400")
+
+
+def test_a_whole_number_of_seconds_is_a_number() -> None:
+    assert SourceSettings.model_validate(source(stall_timeout_s=5)).stall_timeout_s == 5.0
+
+
+@pytest.mark.parametrize("value", [1023, 2**32, 1e6, True, "16 MiB"])
+def test_a_limit_fits_the_size_field(value: object) -> None:
+    [(_, text)] = mistakes(SourceSettings, source(max_c3d_bytes=value))
+    assert text.endswith("; accepted is a whole number of bytes from 1024 to 4294967295")
+
+
+@pytest.mark.parametrize("value", [1, 0, "yes", None])
+def test_a_switch_is_true_or_false(value: object) -> None:
+    assert mistakes(ZenohSettings, {"express": value}) == [
+        ("express", f"found {shown(value)}; accepted is true or false")
+    ]
+
+
+@pytest.mark.parametrize(
+    "host",
+    ["lab", "ndi-3.example.org.", "192.0.2.20", "2001:db8::1", "fe80::1%eth0", "rt_server", "bücher.example"],
+)
+def test_a_host_is_a_name_or_an_address(host: str) -> None:
+    assert SourceSettings.model_validate(source(host=host)).host == host
+
+
+@pytest.mark.parametrize(
+    "host",
+    [
+        "",
+        "192.0.2.300",
+        "192.0.2",
+        "192.0.2.20:3020",
+        "tcp://lab",
+        "a b",
+        "a..b",
+        "a" * 64,
+        "lab\n",
+        "a." * 127,
+    ],
+)
+def test_what_is_no_host_is_refused(host: str) -> None:
+    [(location, text)] = mistakes(SourceSettings, source(host=host))
+    assert location == "host"
+    assert text.endswith("; accepted is a host name or an IP address; the port has a key of its own")
+
+
+def test_a_number_as_a_name_wants_quotes() -> None:
+    assert mistakes(SourceSettings, source(name=5)) == [
+        (
+            "name",
+            "found 5 (quotes make it text); accepted is 1 to 24 of the letters A to Z and a to z, digits, "
+            "'_' and '-'",
+        )
+    ]
+
+
+@pytest.mark.parametrize("name", ["", "a b", "a/b", "a.b", "é", "lab\n", "a" * 25])
+def test_a_name_is_fit_for_keys_and_channels(name: str) -> None:
+    assert [location for location, _ in mistakes(SourceSettings, source(name=name))] == ["name"]
+
+
+@pytest.mark.parametrize(
+    ("value", "rate"),
+    [
+        ("all", AllFrames()),
+        ({"frequency_hz": 60}, Frequency(60.0)),
+        ({"frequency_hz": 0.5}, Frequency(0.5)),
+        ({"divisor": 4}, FrequencyDivisor(4)),
+        (Frequency(60.0), Frequency(60.0)),
+    ],
+)
+def test_a_rate_has_three_forms(value: object, rate: Rate) -> None:
+    assert StreamSettings.model_validate({"rate": value}).rate == rate
+
+
+@pytest.mark.parametrize(
+    ("value", "location", "text"),
+    [
+        ("fast", "rate", "found 'fast'; accepted is all, {frequency_hz: 60} or {divisor: 4}"),
+        (60, "rate", "found 60; accepted is all, {frequency_hz: 60} or {divisor: 4}"),
+        (None, "rate", "found nothing; accepted is all, {frequency_hz: 60} or {divisor: 4}"),
+        ({"hz": 60}, "rate", "found a mapping; accepted is all, {frequency_hz: 60} or {divisor: 4}"),
+        (
+            {"frequency_hz": 0},
+            "rate.frequency_hz",
+            "found 0; accepted is a number of frames per second above 0, up to 1000000",
+        ),
+        (
+            {"frequency_hz": "60"},
+            "rate.frequency_hz",
+            "found '60'; accepted is a number of frames per second above 0, up to 1000000",
+        ),
+        (
+            {"frequency_hz": float("inf")},
+            "rate.frequency_hz",
+            "found inf; accepted is a number of frames per second above 0, up to 1000000",
+        ),
+        ({"divisor": 0}, "rate.divisor", "found 0; accepted is a whole number from 1 to 1000000"),
+        ({"divisor": 1.5}, "rate.divisor", "found 1.5; accepted is a whole number from 1 to 1000000"),
+        ({"divisor": True}, "rate.divisor", "found true; accepted is a whole number from 1 to 1000000"),
+        (
+            {"divisor": 2, "divisors": 2},
+            "rate.divisors",
+            "unknown key (did you mean 'divisor'?); known: divisor",
+        ),
+        (
+            {"divisor": 2, "frequency_hz": 2},
+            "rate",
+            "found frequency_hz and divisor together; accepted is one of them",
+        ),
+    ],
+)
+def test_other_rates_are_refused(value: object, location: str, text: str) -> None:
+    assert mistakes(StreamSettings, {"rate": value}) == [(location, text)]
+
+
+@pytest.mark.parametrize(
+    ("value", "components"),
+    [
+        (["all"], WIRE_ORDER),
+        (["3d"], (MARKERS,)),
+        (["event", "force", "analog", "6d", "3d"], WIRE_ORDER),
+        (["analog", "3d"], (MARKERS, ANALOG)),
+        ((TOOLS, MARKERS), (MARKERS, TOOLS)),
+    ],
+)
+def test_components_are_kept_in_wire_order(value: object, components: tuple[ComponentType, ...]) -> None:
+    assert StreamSettings.model_validate({"components": value}).components == components
+
+
+@pytest.mark.parametrize(
+    ("value", "location", "text"),
+    [
+        (
+            [],
+            "components",
+            "found an empty list; accepted is a list of 3d, 6d, analog, force or event, or [all]",
+        ),
+        ("all", "components", "found 'all'; accepted is a list of 3d, 6d, analog, force or event, or [all]"),
+        (None, "components", "found nothing; accepted is a list of 3d, 6d, analog, force or event, or [all]"),
+        (["all", "3d"], "components.0", "found 'all' beside others; accepted is [all] alone"),
+        (["3d", "6d", "3d"], "components.2", "found '3d' again; accepted is each component once"),
+        (
+            ["3d", "Events"],
+            "components.1",
+            "found 'Events' (did you mean 'event'?); accepted is 3d, 6d, analog, force or event",
+        ),
+        (["markers"], "components.0", "found 'markers'; accepted is 3d, 6d, analog, force or event"),
+        ([1], "components.0", "found 1; accepted is 3d, 6d, analog, force or event"),
+    ],
+)
+def test_other_components_are_refused(value: object, location: str, text: str) -> None:
+    assert mistakes(StreamSettings, {"components": value}) == [(location, text)]
+
+
+@pytest.mark.parametrize("prefix", ["mocap", "a/b", "hall-2/mocap.x", "überlab"])
+def test_a_key_prefix_is_one_or_more_chunks(prefix: str) -> None:
+    assert ZenohSettings.model_validate({"prefix": prefix}).prefix == prefix
+
+
+@pytest.mark.parametrize(
+    "prefix", ["", "/a", "a/", "a//b", "*", "a/**", "a$*", "a#", "a?b", "a b", "a\tb", "a\x07b", "a" * 129]
+)
+def test_a_key_prefix_without_wildcards_and_empty_chunks(prefix: str) -> None:
+    [(location, text)] = mistakes(ZenohSettings, {"prefix": prefix})
+    assert location == "prefix"
+    assert text.startswith(f"found {shown(prefix)}; accepted is a Zenoh key")
+
+
+def test_zenoh_reads_its_own_keys() -> None:
+    config = {"mode": "client", "connect": {"endpoints": ["tcp/127.0.0.1:7447"]}}
+    assert ZenohSettings.model_validate({"config": config}).config == config
+
+
+@pytest.mark.parametrize(
+    ("config", "text"),
+    [
+        (
+            {"mode": "per"},
+            "Zenoh refuses these keys: unknown variant `per`, expected one of `router`, `peer`, `client`",
+        ),
+        ({"connect": {"endpoints": ["nowhere"]}}, "Zenoh refuses these keys: Endpoints must be of the form"),
+        ({"mode": float("nan")}, "Zenoh refuses these keys: Out of range float"),
+        ({"mode": b"peer"}, "Zenoh refuses these keys: Object of type bytes"),
+        ([], "found an empty list; accepted is a JSON5 file's path or a mapping with Zenoh's own keys"),
+        ("a\nb", "found 'a\\nb'; accepted is a JSON5 file's path or a mapping with Zenoh's own keys"),
+        ("", "found ''; accepted is a JSON5 file's path or a mapping with Zenoh's own keys"),
+        (True, "found true; accepted is a JSON5 file's path or a mapping with Zenoh's own keys"),
+    ],
+)
+def test_what_zenoh_refuses_is_refused(config: object, text: str) -> None:
+    [(location, found)] = mistakes(ZenohSettings, {"config": config})
+    assert location == "config"
+    assert found.startswith(text)
+    assert ".rs" not in found
+
+
+@pytest.mark.parametrize(
+    "url",
+    [DEFAULT_LCM_URL, "udpm://?ttl=1", "mpudpm://", "memq://", "tcpq://lab:7700", "file:///tmp/x?mode=w"],
+)
+def test_lcm_urls_have_a_provider_of_lcm(url: str) -> None:
+    assert LcmSettings(url=url).effective_url == url
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "",
+        "udpm",
+        "udpm:",
+        "239.255.76.67:7667",
+        "UDPM://",
+        "zmq://x",
+        "udpm://a b",
+        "udpm://\n",
+        "tcpq://me@lab",
+    ],
+)
+def test_other_lcm_urls_are_refused(url: str) -> None:
+    assert mistakes(LcmSettings, {"url": url}) == [
+        (
+            "url",
+            f"found {shown(url)}; accepted is a URL that begins with udpm://, mpudpm://, memq://, tcpq:// "
+            "or file://, and has no user",
+        )
+    ]
+
+
+@pytest.mark.parametrize("prefix", ["", "A-B", "Ä", "A" * 17])
+def test_a_channel_prefix_is_fit_for_channels(prefix: str) -> None:
+    assert [location for location, _ in mistakes(LcmSettings, {"prefix": prefix})] == ["prefix"]

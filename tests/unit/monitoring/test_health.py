@@ -1,0 +1,139 @@
+"""What /healthz says of streams and outputs in every state."""
+
+import json
+from typing import Any
+
+import pytest
+
+from gateway.config.settings import MetricsSettings, Settings, SourceSettings, StreamSettings
+from gateway.gateway import Gateway
+from gateway.monitoring.health import health_page
+from gateway.outputs.memory import MemoryOutput
+from gateway.rtc3d.components import ComponentType
+from gateway.stream.state import StreamState
+from gateway.stream.status import StreamStatus, now_utime
+
+MARKERS, ANALOG, EVENT = (
+    (ComponentType.MARKERS,),
+    (ComponentType.ANALOG,),
+    (ComponentType.EVENT,),
+)
+LIMIT_S = 3.0
+
+
+class Lab:
+    """A gateway that does not run; its states are set by hand."""
+
+    def __init__(self, *streams: StreamSettings) -> None:
+        self.output = MemoryOutput()
+        self.output.start()
+        source = SourceSettings(name="lab", host="192.0.2.20", streams=streams, stall_timeout_s=LIMIT_S)
+        settings = Settings(sources=(source,), metrics=MetricsSettings(enabled=False))
+        self.gateway = Gateway(settings, [self.output])
+        self.statuses = self.gateway.sources[0].statuses
+
+    def asked(self) -> tuple[int, dict[str, Any]]:
+        """Return the status and the body."""
+        page = health_page(self.gateway)
+        assert page.content_type == "application/json"
+        return page.status, json.loads(page.body)
+
+    def problem(self) -> str:
+        """Return the only stream's problem, having seen that the status goes with it."""
+        status, body = self.asked()
+        [stream] = body["streams"]
+        assert (status, body["healthy"]) == ((503, False) if stream["problem"] else (200, True))
+        return str(stream["problem"])
+
+
+def set_state(status: StreamStatus, state: StreamState, age_s: float | None) -> None:
+    status.state = state
+    status.last_frame_utime = 0 if age_s is None else now_utime() - round(age_s * 1e6)
+
+
+@pytest.mark.parametrize("state", StreamState)
+async def test_a_young_frame_is_health_in_every_state(state: StreamState) -> None:
+    lab = Lab(StreamSettings(components=MARKERS))
+    set_state(lab.statuses[0], state, LIMIT_S - 1)
+    assert lab.problem() == ""
+
+
+@pytest.mark.parametrize("state", [state for state in StreamState if state is not StreamState.NO_MEASUREMENT])
+@pytest.mark.parametrize(("age_s", "text"), [(None, "no frame so far"), (41.5, "no frame for 41.5 s")])
+async def test_without_one_a_stream_is_not_healthy(
+    state: StreamState, age_s: float | None, text: str
+) -> None:
+    lab = Lab(StreamSettings(components=MARKERS))
+    set_state(lab.statuses[0], state, age_s)
+    assert lab.problem().startswith(text)
+
+
+@pytest.mark.parametrize("age_s", [None, 41.5])
+async def test_no_measurement_is_no_fault(age_s: float | None) -> None:
+    lab = Lab(StreamSettings(components=MARKERS))
+    set_state(lab.statuses[0], StreamState.NO_MEASUREMENT, age_s)
+    assert lab.problem() == ""
+
+
+async def test_the_reason_is_told_with_what_to_look_at() -> None:
+    lab = Lab(StreamSettings(components=MARKERS))
+    set_state(lab.statuses[0], StreamState.CONNECTING, None)
+    assert lab.problem() == "no frame so far: connecting to 192.0.2.20:3020"
+    set_state(lab.statuses[0], StreamState.WAITING, 41.5)
+    lab.statuses[0].note_error("connection refused by 192.0.2.20:3020; is the RT server running?")
+    assert lab.problem() == (
+        "no frame for 41.5 s, the limit is 3 s: "
+        "connection refused by 192.0.2.20:3020; is the RT server running?"
+    )
+    lab.statuses[0].state = StreamState.IDLE  # the error is of long ago
+    assert "does a measurement run there?" in lab.problem()
+
+
+async def test_a_stream_on_demand_is_healthy_while_nobody_listens() -> None:
+    lab = Lab(StreamSettings(components=MARKERS, on_demand=True))
+    set_state(lab.statuses[0], StreamState.IDLE, None)
+    assert lab.problem() != ""
+    lab.output.listened = False
+    assert lab.problem() == ""
+    lab.statuses[0].state = StreamState.WAITING
+    assert lab.problem() != ""
+
+
+async def test_nobody_listening_is_no_excuse_for_a_stream_that_always_runs() -> None:
+    lab = Lab(StreamSettings(components=MARKERS))
+    lab.output.listened = False
+    set_state(lab.statuses[0], StreamState.IDLE, None)
+    assert lab.problem() != ""
+
+
+async def test_events_come_when_they_come() -> None:
+    lab = Lab(StreamSettings(components=EVENT))
+    for state in (StreamState.IDLE, StreamState.STREAMING):
+        set_state(lab.statuses[0], state, None)
+        assert lab.problem() == ""
+    set_state(lab.statuses[0], StreamState.WAITING, None)
+    assert lab.problem() != ""
+
+
+async def test_one_stream_of_several_is_enough_to_be_unhealthy() -> None:
+    lab = Lab(StreamSettings(components=MARKERS), StreamSettings(components=ANALOG))
+    set_state(lab.statuses[0], StreamState.STREAMING, 0.01)
+    set_state(lab.statuses[1], StreamState.STALLED, 41.5)
+    status, body = lab.asked()
+    assert status == 503
+    good, bad = body["streams"]
+    assert (good["source"], good["stream"], good["state"], good["problem"]) == ("lab", "3d", "streaming", "")
+    assert (bad["source"], bad["stream"], bad["state"]) == ("lab", "analog", "stalled")
+    assert bad["problem"]
+    assert bad["last_frame_age_s"] >= 41.5
+
+
+async def test_an_output_that_cannot_send_is_told_with_its_problem() -> None:
+    lab = Lab(StreamSettings(components=MARKERS))
+    set_state(lab.statuses[0], StreamState.STREAMING, 0.01)
+    assert lab.asked()[0] == 200
+    lab.output.close()
+    status, body = lab.asked()
+    assert status == 503
+    assert body["healthy"] is False
+    assert body["outputs"] == [{"output": "memory", "problem": lab.output.health().problem}]

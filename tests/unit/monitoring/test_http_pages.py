@@ -1,0 +1,164 @@
+"""The pages over real sockets, for those who ask as they should and for those who do not."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from http import HTTPStatus
+
+import pytest
+import pytest_asyncio
+
+from gateway import http_pages
+from gateway.monitoring.http_pages import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpPages, Page
+from tests.networks import free_port
+from tests.waiting import wait_until_async
+
+
+class Site:
+    """Pages on a port of this machine; ``served`` counts how often the page was made."""
+
+    def __init__(self) -> None:
+        self.port = free_port()
+        self.served = 0
+        self.pages = HttpPages({"/page": self._page, "/defect": self._defect})
+
+    def _page(self) -> Page:
+        self.served += 1
+        return Page(HTTPStatus.OK, "text/plain; charset=utf-8", "µ\n".encode())
+
+    def _defect(self) -> Page:
+        raise ZeroDivisionError
+
+    async def connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
+        return await asyncio.open_connection("127.0.0.1", self.port)
+
+    async def ask(self, request: bytes) -> bytes:
+        """Return all that comes for ``request`` until the other side closes."""
+        reader, writer = await self.connect()
+        try:
+            writer.write(request)
+            async with asyncio.timeout(10):
+                return await reader.read()
+        except ConnectionError:
+            return b""
+        finally:
+            writer.close()
+
+
+@pytest_asyncio.fixture
+async def site() -> AsyncIterator[Site]:
+    site = Site()
+    await site.pages.start("127.0.0.1", site.port)
+    yield site
+    await site.pages.close()
+
+
+def status_of(answer: bytes) -> int:
+    assert answer.startswith(b"HTTP/1.1 ")
+    return int(answer.split()[1])
+
+
+async def test_a_page_is_made_anew_for_each_request(site: Site) -> None:
+    await site.ask(b"GET /page HTTP/1.1\r\n\r\n")
+    answer = await site.ask(b"GET /page HTTP/1.1\r\nHost: localhost\r\n\r\n")
+    head, _, body = answer.partition(b"\r\n\r\n")
+    assert head.split(b"\r\n") == [
+        b"HTTP/1.1 200 OK",
+        b"Content-Type: text/plain; charset=utf-8",
+        b"Content-Length: 3",
+        b"Allow: GET",
+        b"Cache-Control: no-store",
+        b"Connection: close",
+    ]
+    assert body == "µ\n".encode()
+    assert site.served == 2
+
+
+async def test_a_request_may_come_in_pieces_and_with_a_query(site: Site) -> None:
+    reader, writer = await site.connect()
+    for piece in (b"GET /page?x=", b"1 HTTP/1.0\r\n", b"\r", b"\n"):
+        writer.write(piece)
+        await writer.drain()
+        await asyncio.sleep(0)
+    assert status_of(await reader.read()) == 200
+    writer.close()
+
+
+@pytest.mark.parametrize(
+    ("request_line", "status"),
+    [
+        (b"GET / HTTP/1.1", 404),
+        (b"GET /pages HTTP/1.1", 404),
+        (b"HEAD /page HTTP/1.1", 405),
+        (b"POST /page HTTP/1.1", 405),
+        (b"get /page HTTP/1.1", 405),
+        (b"GET /page", 400),
+        (b"GET /page HTTP/2", 400),
+        (b"GET  /page HTTP/1.1", 400),
+        (b"\x16\x03\x01\x02\x00", 400),  # TLS
+        (b"", 400),
+    ],
+)
+async def test_what_is_not_served_is_refused(site: Site, request_line: bytes, status: int) -> None:
+    assert status_of(await site.ask(request_line + b"\r\n\r\n")) == status
+    assert site.served == 0
+
+
+async def test_what_is_not_there_is_told_with_what_is(site: Site) -> None:
+    assert b"/page\n" in await site.ask(b"GET / HTTP/1.1\r\n\r\n")
+
+
+async def test_a_request_that_is_too_large_is_cut_off(site: Site) -> None:
+    assert await site.ask(b"GET /page HTTP/1.1\r\nX: " + b"x" * (MAX_REQUEST_BYTES + 1)) == b""
+    assert await site.ask(b"x" * 1_000_000) == b""
+
+
+async def test_a_request_that_never_ends_is_cut_off(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http_pages, "REQUEST_S", 0.05)
+    assert await site.ask(b"GET /page HTTP/1.1\r\n") == b""
+
+
+async def test_connections_are_limited_and_freed(site: Site) -> None:
+    connections = [await site.connect() for _ in range(MAX_CONNECTIONS)]
+    assert await site.ask(b"GET /page HTTP/1.1\r\n\r\n") == b""
+    for _, writer in connections:
+        writer.close()
+
+    async def answered() -> bool:
+        return bool(await site.ask(b"GET /page HTTP/1.1\r\n\r\n"))
+
+    async with asyncio.timeout(10):
+        while not await answered():
+            pass
+
+
+async def test_who_hangs_up_early_is_no_error(site: Site, caplog: pytest.LogCaptureFixture) -> None:
+    _, writer = await site.connect()
+    writer.write(b"GET /pa")
+    writer.transport.abort()
+    assert status_of(await site.ask(b"GET /page HTTP/1.1\r\n\r\n")) == 200
+    assert not caplog.records
+
+
+async def test_a_defect_in_a_page_is_logged_and_ends_only_that_request(
+    site: Site, caplog: pytest.LogCaptureFixture
+) -> None:
+    assert await site.ask(b"GET /defect HTTP/1.1\r\n\r\n") == b""
+    await wait_until_async(lambda: caplog.records)
+    assert status_of(await site.ask(b"GET /page HTTP/1.1\r\n\r\n")) == 200
+
+
+async def test_closing_cuts_off_who_is_connected_and_frees_the_port(site: Site) -> None:
+    reader, writer = await site.connect()
+    await wait_until_async(lambda: site.pages._connections)
+    await site.pages.close()
+    async with asyncio.timeout(10):
+        assert await reader.read() == b""
+    writer.close()
+    again = HttpPages({})
+    await again.start("127.0.0.1", site.port)
+    await again.close()
+
+
+async def test_a_port_in_use_raises(site: Site) -> None:
+    with pytest.raises(OSError, match="address already in use"):
+        await HttpPages({}).start("127.0.0.1", site.port)

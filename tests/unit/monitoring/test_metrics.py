@@ -1,0 +1,185 @@
+"""The metrics of counters set by hand, read back as Prometheus would."""
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from prometheus_client import Metric
+from prometheus_client.parser import text_string_to_metric_families
+
+from gateway import __version__
+from gateway.config.settings import MetricsSettings, Settings, SourceSettings, StreamSettings
+from gateway.gateway import Gateway
+from gateway.messages.splice import Stamp
+from gateway.monitoring.loop_delay import LoopDelay
+from gateway.monitoring.metrics import metrics_page, metrics_registry
+from gateway.rtc3d.components import ComponentType, build_component
+from gateway.rtc3d.frames import build_frame, split_frame
+from gateway.stream.state import StreamInput, StreamState
+from tests.toy_output import ToyOutput
+
+STREAMS = (
+    StreamSettings(components=(ComponentType.MARKERS, ComponentType.TOOLS)),
+    StreamSettings(components=(ComponentType.ANALOG,)),
+)
+
+
+class Lab:
+    """A gateway of two streams and two outputs that does not run."""
+
+    def __init__(self) -> None:
+        settings = Settings(
+            sources=(SourceSettings(name="lab", host="192.0.2.20", streams=STREAMS),),
+            metrics=MetricsSettings(enabled=False),
+        )
+        self.gateway = Gateway(settings, [ToyOutput("zenoh"), ToyOutput("toy")])
+        self.source = self.gateway.sources[0]
+        self.markers, self.analog = self.source.statuses
+        self.loop_delay = LoopDelay()
+        self._registry = metrics_registry(self.gateway, self.loop_delay)
+
+    def families(self) -> list[Metric]:
+        page = metrics_page(self._registry)
+        assert page.status == 200
+        return list(text_string_to_metric_families(page.body.decode()))
+
+    def samples(self, name: str) -> Iterator[tuple[dict[str, str], float]]:
+        for family in self.families():
+            for sample in family.samples:
+                if sample.name == f"rtc3d_gateway_{name}":
+                    yield dict(sample.labels), sample.value
+
+    def value(self, name: str, **labels: str) -> float:
+        [value] = [value for found, value in self.samples(name) if found == labels]
+        return value
+
+
+@pytest.fixture
+async def lab() -> Lab:
+    return Lab()
+
+
+MARKERS = {"source": "lab", "stream": "3d 6d"}
+ANALOG = {"source": "lab", "stream": "analog"}
+
+
+async def test_what_streams_count_is_there_for_each(lab: Lab) -> None:
+    lab.markers.frames_in, lab.analog.frames_in = 7, 70
+    lab.markers.bytes_in = 1000
+    lab.markers.session, lab.markers.reconnects, lab.markers.restarts = 3, 5, 2
+    lab.markers.last_frame_utime = 1_700_000_000_250_000
+    lab.markers.lag_s = 0.125
+    assert lab.value("frames_received_total", **MARKERS) == 7
+    assert lab.value("frames_received_total", **ANALOG) == 70
+    assert lab.value("received_bytes_total", **MARKERS) == 1000
+    assert lab.value("sessions_total", **MARKERS) == 3
+    assert lab.value("reconnects_total", **MARKERS) == 5
+    assert lab.value("server_restarts_total", **MARKERS) == 2
+    assert lab.value("lag_seconds", **MARKERS) == 0.125
+    assert list(lab.samples("last_frame_timestamp_seconds")) == [(MARKERS, 1_700_000_000.25)]
+
+
+async def test_a_stream_is_in_one_state(lab: Lab) -> None:
+    for happened in (StreamInput.DIAL, StreamInput.CONNECTED, StreamInput.FRAME):
+        lab.markers.move(happened, "test")
+    states = {
+        labels["state"]: value
+        for labels, value in lab.samples("stream_state")
+        if MARKERS.items() <= labels.items()
+    }
+    assert states == {state.value: float(state is StreamState.STREAMING) for state in StreamState}
+
+
+async def test_drops_are_told_by_cause_the_usual_ones_from_0_on(lab: Lab) -> None:
+    lab.markers.drops["frame rejected"] = 2
+    lab.markers.drops["quite unusual"] = 1
+    [(zenoh, zenoh_status), (toy, toy_status)] = lab.source.fan_out.outputs
+    zenoh_status.drops["no router"] = 9
+    toy_status.drops["ValueError"] = 1
+    told = {
+        labels["cause"]: value
+        for labels, value in lab.samples("stream_drops_total")
+        if MARKERS.items() <= labels.items()
+    }
+    assert told == {
+        "frame rejected": 2,
+        "unknown component": 0,
+        "skipped while behind": 0,
+        "quite unusual": 1,
+    }
+    drops = {
+        (labels["output"], labels["cause"]): value for labels, value in lab.samples("output_drops_total")
+    }
+    assert drops == {
+        (zenoh.name, "not open"): 0,
+        (zenoh.name, "no router"): 9,
+        (zenoh.name, "put failed"): 0,
+        (toy.name, "ValueError"): 1,
+    }
+
+
+async def test_messages_and_bytes_are_told_by_component_and_output(lab: Lab) -> None:
+    _, (toy, status) = lab.source.fan_out.outputs
+    status.messages.update({"3d": 4, "status": 1})
+    status.message_bytes.update({"3d": 400, "status": 50})
+    for name, counted in (
+        ("messages_total", {"3d": 4, "status": 1}),
+        ("message_bytes_total", {"3d": 400, "status": 50}),
+    ):
+        told = {
+            labels["component"]: value for labels, value in lab.samples(name) if labels["output"] == toy.name
+        }
+        assert told == {"3d": 0, "6d": 0, "analog": 0} | counted
+
+
+async def test_frames_are_told_by_the_components_that_are_configured(lab: Lab) -> None:
+    analog = build_component(ComponentType.ANALOG, 1, 1, np.zeros(3, ">f4"))
+    frame = split_frame(build_frame([analog]), "big")
+    for _ in range(12):
+        lab.source.fan_out.publish(frame, Stamp(2, 1, 1), frozenset({ComponentType.ANALOG}))
+    told = {labels["component"]: value for labels, value in lab.samples("component_frames_total")}
+    assert told == {"3d": 0, "6d": 0, "analog": 12}
+
+
+async def test_the_clock_is_told_once_there_is_one(lab: Lab) -> None:
+    boot_utime = 1_700_000_000_000_000
+    assert lab.value("clock_valid", **MARKERS) == 0
+    for name in ("clock_offset_seconds", "clock_drift_ratio", "clock_uncertainty_seconds"):
+        assert not list(lab.samples(name))
+    for number in range(400):  # 4 s at 100 Hz, without jitter
+        lab.markers.clock.observe(10_000 * number, number, boot_utime + 10_000 * number)
+    assert lab.value("clock_valid", **MARKERS) == 1
+    assert lab.value("clock_offset_seconds", **MARKERS) == boot_utime / 1e6
+    assert lab.value("clock_drift_ratio", **MARKERS) == lab.markers.clock.drift_ppm / 1e6
+    assert lab.value("clock_uncertainty_seconds", **MARKERS) == lab.markers.clock.uncertainty_us / 1e6
+    assert math.isfinite(lab.value("clock_uncertainty_seconds", **MARKERS))
+
+
+async def test_outputs_delay_and_versions_are_told(lab: Lab) -> None:
+    lab.loop_delay.note(0.0, 0.5)
+    lab.loop_delay.note(0.1, 0.25)
+    assert lab.value("output_connected", output="zenoh") == 1
+    assert lab.value("loop_delay_seconds") == 0.25
+    assert lab.value("loop_delay_max_seconds") == 0.5
+    [(versions, one)] = lab.samples("build_info")
+    assert (versions["version"], one) == (__version__, 1)
+    assert versions.keys() == {"version", "python", "zenoh", "lcm"}
+
+
+async def test_the_process_is_told_under_the_usual_names(lab: Lab) -> None:
+    told = {sample.name: sample.value for family in lab.families() for sample in family.samples}
+    assert told["process_cpu_seconds_total"] > 0
+    assert told["process_resident_memory_bytes"] > 1_000_000
+
+
+async def test_what_strangers_send_makes_no_series(lab: Lab) -> None:
+    def names() -> set[tuple[str, ...]]:
+        return {
+            (sample.name, *sample.labels.values()) for family in lab.families() for sample in family.samples
+        }
+
+    before = names()
+    lab.markers.note_error("whatever a server says")
+    lab.markers.limit("the server refused something")
+    assert names() == before

@@ -1,0 +1,381 @@
+import json
+import logging
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import zenoh
+
+from gateway.config.settings import ZenohSettings
+from gateway.errors import ConfigError
+from gateway.messages.topics import Topic
+from gateway.outputs.zenoh.output import ZenohOutput, zenoh_config
+from tests.networks import free_endpoint, open_zenoh, zenoh_keys
+from tests.waiting import wait_until
+
+MARKERS = Topic("lab", ("3d",), "rtc3d.markers_t")
+
+
+class Lab:
+    """A gateway's output, a peer that listens on ``endpoint``, and somebody connected to it."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.endpoint = free_endpoint()
+        self.output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer", listen=self.endpoint), **settings))
+        self._somebody: zenoh.Session | None = None
+        self.samples: list[zenoh.Sample] = []
+
+    def open(self) -> None:
+        self.output.start()
+        wait_until(lambda: self.output.health().connected)
+
+    @property
+    def somebody(self) -> zenoh.Session:
+        if self._somebody is None:
+            self._somebody = open_zenoh("client", connect=self.endpoint)
+        return self._somebody
+
+    def hear(self, keys: str) -> zenoh.Subscriber[None]:
+        return self.somebody.declare_subscriber(keys, self.samples.append)
+
+    def sample_of(self, topic: Topic) -> zenoh.Sample:
+        """Return what arrives of a message published under ``topic``."""
+        publisher = self.output.publisher(topic)
+        wait_until(lambda: publisher.wanted)
+        self.samples.clear()
+        publisher.publish(b"message")
+        wait_until(lambda: self.samples)
+        [sample] = self.samples
+        assert sample.payload.to_bytes() == b"message"
+        return sample
+
+    def tokens(self, keys: str) -> list[str]:
+        replies = self.somebody.liveliness().get(keys)
+        return sorted(str(reply.ok.key_expr) for reply in replies if reply.ok is not None)
+
+    def close(self) -> None:
+        self.output.close()
+        if self._somebody is not None:
+            self._somebody.close()
+
+
+@pytest.fixture
+def lab() -> Iterator[Lab]:
+    lab = Lab()
+    yield lab
+    lab.close()
+
+
+# Keys and samples ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("parts", "type_name", "key"),
+    [
+        (("3d",), "rtc3d.markers_t", "mocap/lab/3d"),
+        (("6d",), "rtc3d.tools_t", "mocap/lab/6d"),
+        (("analog",), "rtc3d.analog_t", "mocap/lab/analog"),
+        (("force",), "rtc3d.forces_t", "mocap/lab/force"),
+        (("event",), "rtc3d.events_t", "mocap/lab/event"),
+        (("status",), "rtc3d.status_t", "mocap/lab/status"),
+        (("6d", "a/b *?"), "rtc3d.tool_pose_t", "mocap/lab/6d/a%2Fb%20%2A%3F"),
+    ],
+)
+def test_samples_have_the_topics_key_and_the_lcm_type_as_schema(
+    lab: Lab, parts: tuple[str, ...], type_name: str, key: str
+) -> None:
+    lab.open()
+    subscriber = lab.hear("mocap/**")
+    sample = lab.sample_of(Topic("lab", parts, type_name))
+    subscriber.undeclare()
+    assert str(sample.key_expr) == key
+    assert sample.encoding == zenoh.Encoding("application/x-lcm").with_schema(type_name)
+    assert str(sample.encoding) == f"application/x-lcm;{type_name}"
+
+
+@pytest.mark.parametrize("express", [False, True])
+def test_samples_are_dropped_rather_than_waited_for_and_express_as_configured(express: bool) -> None:
+    lab = Lab(express=express, prefix="site/hall")
+    try:
+        lab.open()
+        subscriber = lab.hear("**")
+        sample = lab.sample_of(MARKERS)
+        subscriber.undeclare()
+        assert sample.congestion_control == zenoh.CongestionControl.DROP
+        assert sample.express == express
+        assert str(sample.key_expr) == "site/hall/lab/3d"
+    finally:
+        lab.close()
+
+
+def test_a_topic_is_wanted_while_somebody_subscribes_to_its_key(lab: Lab) -> None:
+    early = lab.output.publisher(MARKERS)
+    other = lab.output.publisher(Topic("lab", ("analog",), "rtc3d.analog_t"))
+    assert not early.wanted
+    lab.open()
+    first, second = lab.hear("mocap/lab/3d"), lab.hear("mocap/*/3d")
+    wait_until(lambda: early.wanted)
+    late = lab.output.publisher(MARKERS)
+    wait_until(lambda: late.wanted)
+    assert not other.wanted
+    first.undeclare()
+    second.undeclare()
+    wait_until(lambda: not early.wanted and not late.wanted)
+
+
+def test_a_closed_publisher_is_not_wanted(lab: Lab) -> None:
+    lab.open()
+    subscriber = lab.hear("mocap/**")
+    publisher = lab.output.publisher(MARKERS)
+    wait_until(lambda: publisher.wanted)
+    publisher.close()
+    assert not publisher.wanted
+    subscriber.undeclare()
+
+
+# Liveliness ----------------------------------------------------------------------------------
+
+
+def test_sources_are_alive_from_announcement_to_close(lab: Lab) -> None:
+    lab.output.announce("lab")
+    lab.open()
+    seen: list[tuple[str, str]] = []
+
+    def alive() -> list[str]:
+        return lab.tokens("mocap/*/alive")
+
+    watching = lab.somebody.liveliness().declare_subscriber(
+        "mocap/*/alive",
+        lambda sample: seen.append((str(sample.key_expr), str(sample.kind))),
+        history=True,
+    )
+    wait_until(lambda: alive() == ["mocap/lab/alive"])
+    lab.output.announce("hall-2")
+    wait_until(lambda: alive() == ["mocap/hall-2/alive", "mocap/lab/alive"])
+    lab.output.close()
+    wait_until(lambda: alive() == [])
+    born = [("mocap/lab/alive", "SampleKind.PUT"), ("mocap/hall-2/alive", "SampleKind.PUT")]
+    gone = {(key, "SampleKind.DELETE") for key, _ in born}
+    wait_until(lambda: gone <= set(seen))
+    watching.undeclare()
+    # Zenoh may tell of a token twice: from history, and as it comes.
+    told = list(dict.fromkeys(seen))
+    assert (told[:2], set(told[2:])) == (born, gone)
+
+
+def test_a_source_is_alive_until_it_is_withdrawn(lab: Lab) -> None:
+    lab.output.announce("early")
+    lab.output.withdraw("early")
+    lab.output.announce("lab")
+    lab.output.announce("hall-2")
+    lab.open()
+    wait_until(lambda: lab.tokens("mocap/*/alive") == ["mocap/hall-2/alive", "mocap/lab/alive"])
+    lab.output.withdraw("lab")
+    wait_until(lambda: lab.tokens("mocap/*/alive") == ["mocap/hall-2/alive"])
+
+
+def test_a_server_is_shown_while_its_frames_flow(lab: Lab) -> None:
+    def shown() -> list[str]:
+        return lab.tokens("mocap/*/server")
+
+    lab.output.show_flowing("lab", True)
+    lab.open()
+    wait_until(lambda: shown() == ["mocap/lab/server"])
+    lab.output.show_flowing("hall-2", True)
+    lab.output.show_flowing("hall-2", True)
+    wait_until(lambda: shown() == ["mocap/hall-2/server", "mocap/lab/server"])
+    lab.output.show_flowing("lab", False)
+    lab.output.show_flowing("lab", False)
+    wait_until(lambda: shown() == ["mocap/hall-2/server"])
+    lab.output.show_flowing("lab", True)
+    wait_until(lambda: shown() == ["mocap/hall-2/server", "mocap/lab/server"])
+    lab.output.close()
+    wait_until(lambda: shown() == [])
+
+
+# Opening -------------------------------------------------------------------------------------
+
+
+def test_an_endpoint_that_is_taken_is_told_once_and_used_once_it_is_free(
+    lab: Lab, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "gateway.outputs")
+    port = int(lab.endpoint.rpartition(":")[2])
+    with socket.create_server(("127.0.0.1", port)):
+        lab.output.start()
+        wait_until(lambda: caplog.records)
+        problem = lab.output.health().problem
+        assert lab.endpoint in problem
+        assert "are zenoh.config's endpoints right and free?" in problem
+        assert ".rs:" not in problem
+    wait_until(lambda: lab.output.health().connected)
+    wait_until(lambda: len(caplog.records) >= 2)
+    assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.INFO]
+    assert caplog.messages[0] == f"zenoh: {problem}"
+    assert caplog.messages[1].startswith("zenoh: the session is open, after ")
+
+
+def test_a_router_lost_and_found_is_told_once_each(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gateway.outputs")
+    endpoint = free_endpoint()
+    router = open_zenoh("router", listen=endpoint)
+    output = ZenohOutput(ZenohSettings(config=zenoh_keys("client", connect=endpoint)))
+    try:
+        output.start()
+        wait_until(lambda: output.health().connected)
+        caplog.clear()
+        output.maintain()
+        router.close()
+        wait_until(lambda: not output.health().connected)
+        for _ in range(3):
+            output.maintain()
+        router = open_zenoh("router", listen=endpoint)
+        wait_until(lambda: output.health().connected)
+        for _ in range(3):
+            output.maintain()
+    finally:
+        output.close()
+        router.close()
+    assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.INFO]
+    assert "no Zenoh router is connected: start zenohd" in caplog.messages[0]
+    assert "connected to the router" in caplog.messages[1]
+
+
+def test_a_process_ends_although_the_router_never_answers() -> None:
+    # Zenoh's open() then blocks for ever, whatever happens to the process.
+    keys = zenoh_keys("client", connect=free_endpoint())
+    keys["connect"]["timeout_ms"] = -1
+    program = f"""
+from gateway.config.settings import ZenohSettings
+from gateway.outputs.zenoh.output import ZenohOutput
+output = ZenohOutput(ZenohSettings(config={keys!r}))
+output.start()
+print(output.health().problem)
+output.close()
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
+    )
+    assert "the Zenoh session is not open yet; is the router running" in done.stdout
+
+
+def test_a_session_that_opens_only_after_close_is_closed() -> None:
+    endpoint = free_endpoint()
+    keys = zenoh_keys("client", connect=endpoint)
+    keys["connect"]["timeout_ms"] = -1
+    output = ZenohOutput(ZenohSettings(config=keys))
+    output.start()
+    output.close()
+    router = open_zenoh("router", listen=endpoint)
+    events: list[zenoh.SampleKind] = []
+    router.info.declare_transport_events_listener(lambda event: events.append(event.kind), history=True)
+    try:
+        wait_until(lambda: zenoh.SampleKind.DELETE in events)
+        assert not output.health().connected
+    finally:
+        router.close()
+
+
+# Configuration -------------------------------------------------------------------------------
+
+
+def value_of(config: zenoh.Config, path: str) -> Any:
+    return json.loads(config.get_json(path))
+
+
+@pytest.mark.parametrize(
+    ("config", "reason"),
+    [
+        ({"mod": "client"}, "unknown field `mod`, expected one of `id`"),
+        ({"mode": "clinet"}, "unknown variant `clinet`, expected one of `router`, `peer`, `client`"),
+        ({"listen": {"endpoints": 5}}, "expected list of endpoints"),
+        ({"connect": {"endpoints": ["foo"]}}, "Endpoints must be of the form <protocol>/<address>"),
+        ({"transport": {"shared_memory": {"enable": True}}}, "unknown field `enable`"),
+    ],
+)
+def test_what_zenoh_refuses_inline_is_a_config_error_with_its_reason(
+    config: dict[str, Any], reason: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        ZenohOutput(ZenohSettings.model_construct(config=config))
+    text = str(caught.value)
+    assert text.startswith("Zenoh does not accept the inline zenoh.config: ")
+    assert reason in text
+    assert ".rs:" not in text
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        ("{ mod: 'client' }", "unknown field `mod`"),
+        ("{ mode: ", "expected"),
+        (None, "No such file"),
+    ],
+)
+def test_what_zenoh_refuses_in_a_file_is_a_config_error_with_its_reason(
+    tmp_path: Path, content: str | None, reason: str
+) -> None:
+    path = tmp_path / "zenoh.json5"
+    if content is not None:
+        path.write_text(content, encoding="utf-8")
+    with pytest.raises(ConfigError) as caught:
+        ZenohOutput(ZenohSettings(config=path))
+    text = str(caught.value)
+    assert text.startswith(f"Zenoh does not accept the file {path}: ")
+    assert reason in text
+    assert len(text.splitlines()) == 1
+
+
+def test_a_json5_file_passes_whole_and_as_it_stands(tmp_path: Path) -> None:
+    endpoint = free_endpoint()
+    path = tmp_path / "zenoh.json5"
+    path.write_text(
+        f"""// JSON5: comments, bare keys, commas at ends
+        {{
+            mode: 'peer',
+            id: 'a1b2c3',
+            listen: {{ endpoints: ['{endpoint}'], }},
+            scouting: {{ multicast: {{ enabled: false }}, gossip: {{ enabled: false }} }},
+            transport: {{ shared_memory: {{ enabled: false }}, link: {{ tx: {{ lease: 2000 }} }} }},
+        }}""",
+        encoding="utf-8",
+    )
+    config = zenoh_config(path)
+    assert value_of(config, "transport/link/tx/lease") == 2000
+    # What the gateway prefers goes to inline configurations only.
+    assert value_of(config, "connect/retry") == value_of(zenoh.Config.from_file(str(path)), "connect/retry")
+
+    output = ZenohOutput(ZenohSettings(config=path))
+    try:
+        output.start()
+        wait_until(lambda: output.health().connected)
+        somebody = open_zenoh("client", connect=endpoint)
+        [peer] = somebody.info.peers_zid() + somebody.info.routers_zid()
+        somebody.close()
+        assert str(peer) == "a1b2c3"
+    finally:
+        output.close()
+
+
+def test_inline_keys_pass_whole_over_what_the_gateway_prefers() -> None:
+    config = zenoh_config(
+        {
+            "id": "a1b2c3",
+            "connect": {"retry": {"period_max_ms": 9000}},
+            "transport": {"link": {"tx": {"lease": 2000}}},
+        }
+    )
+    assert value_of(config, "id") == "a1b2c3"
+    retry = value_of(config, "connect/retry")
+    assert (retry["period_max_ms"], retry["period_init_ms"]) == (9000, 200)
+    assert value_of(config, "transport/link/tx/lease") == 2000
+    assert value_of(config, "transport/shared_memory/enabled") is False
+
+
+def test_shared_memory_can_be_switched_on() -> None:
+    config = zenoh_config({"transport": {"shared_memory": {"enabled": True}}})
+    assert value_of(config, "transport/shared_memory/enabled") is True

@@ -1,0 +1,83 @@
+import subprocess
+import sys
+import threading
+from functools import partial
+
+import pytest
+
+from gateway.outputs.zenoh.send_thread import SendThread
+
+
+@pytest.fixture
+def blocked() -> tuple[SendThread, threading.Event]:
+    """A sender whose thread waits for the event."""
+    sender, go = SendThread("test"), threading.Event()
+    began = threading.Event()
+
+    def wait() -> None:
+        began.set()
+        go.wait(10)
+
+    sender.submit(wait)
+    assert began.wait(10)
+    return sender, go
+
+
+def test_calls_are_made_in_order_in_a_thread_of_its_own() -> None:
+    sender = SendThread("test")
+    made: list[tuple[int, str]] = []
+
+    def call(number: int) -> None:
+        made.append((number, threading.current_thread().name))
+
+    futures = [sender.submit(partial(call, number)) for number in range(100)]
+    for future in futures:
+        future.result(10)
+    assert made == [(number, "test") for number in range(100)]
+    sender.close()
+
+
+def test_what_a_call_raises_goes_to_who_waits_for_it_and_the_next_is_made() -> None:
+    def fail() -> None:
+        raise OSError("of the test")
+
+    sender = SendThread("test")
+    failed, good = sender.submit(fail), sender.submit(lambda: None)
+    with pytest.raises(OSError, match="of the test"):
+        failed.result(10)
+    good.result(10)
+    sender.close()
+
+
+def test_a_call_that_is_cancelled_before_its_turn_is_not_made(
+    blocked: tuple[SendThread, threading.Event],
+) -> None:
+    sender, go = blocked
+    made: list[str] = []
+    cancelled = sender.submit(lambda: made.append("cancelled"))
+    last = sender.submit(lambda: made.append("last"))
+    cancelled.cancel()
+    go.set()
+    last.result(10)
+    assert made == ["last"]
+    sender.close()
+
+
+def test_after_close_no_call_is_begun(blocked: tuple[SendThread, threading.Event]) -> None:
+    sender, go = blocked
+    made: list[str] = []
+    sender.submit(lambda: made.append("late"))
+    [thread] = [each for each in threading.enumerate() if each.name == "test"]
+    sender.close()
+    go.set()
+    thread.join(10)
+    assert not thread.is_alive()
+    assert made == []
+
+
+def test_the_end_of_the_program_does_not_wait_for_a_call() -> None:
+    code = (
+        "import threading; from gateway.outputs.zenoh.send_thread import Sender; began = threading.Event();"
+        "Sender('s').submit(lambda: (began.set(), threading.Event().wait())); began.wait()"
+    )
+    assert subprocess.run([sys.executable, "-c", code], timeout=30, check=False).returncode == 0

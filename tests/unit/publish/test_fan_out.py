@@ -1,0 +1,223 @@
+import logging
+from collections import Counter
+
+import numpy as np
+import pytest
+
+from gateway.errors import OutputError
+from gateway.messages.decode import decode
+from gateway.messages.splice import Stamp, splice
+from gateway.messages.topics import Topic
+from gateway.outputs.memory import MemoryOutput
+from gateway.publish.fan_out import FanOut
+from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, ComponentType, build_component
+from gateway.rtc3d.frames import Frame, build_frame, split_frame
+from tests.toy_output import ToyOutput
+from tests.vectors import EMPTY_FRAME, FULL_FRAME
+
+STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1)
+ALL = frozenset(WIRE_ORDER)
+MARKERS = frozenset({ComponentType.MARKERS})
+FULL = split_frame(FULL_FRAME["big"], "big")
+
+
+@pytest.fixture
+def memory() -> MemoryOutput:
+    output = MemoryOutput()
+    output.start()
+    return output
+
+
+# Components ----------------------------------------------------------------------------------
+
+
+def test_every_component_goes_to_every_output_under_its_topic() -> None:
+    outputs = [ToyOutput("one"), ToyOutput("two")]
+    FanOut("lab", outputs).publish(FULL, STAMP, ALL)
+    names = {1: "markers_t", 2: "analog_t", 3: "forces_t", 4: "tools_t", 5: "events_t"}
+    expected = [
+        (Topic("lab", (component.type.key,), f"rtc3d.{names[component.type]}"), splice(component, STAMP, 0))
+        for component in FULL.components
+    ]
+    assert len(expected) == 5
+    assert [output.messages for output in outputs] == [expected, expected]
+
+
+def test_all_topics_are_declared_before_the_first_frame() -> None:
+    output = ToyOutput()
+    FanOut("lab", [output])
+    assert {topic.parts for topic in output.declared} == {
+        ("3d",), ("6d",), ("analog",), ("force",), ("event",), ("status",), ("clock",),
+    }  # fmt: skip
+    assert {topic.source for topic in output.declared} == {"lab"}
+
+
+def test_the_source_is_announced_on_every_output() -> None:
+    outputs = [ToyOutput("one"), ToyOutput("two")]
+    FanOut("lab", outputs)
+    assert [output.announced for output in outputs] == [["lab"], ["lab"]]
+
+
+def test_each_component_counts_for_itself_and_across_sessions(memory: MemoryOutput) -> None:
+    fan_out = FanOut("lab", [memory])
+    fan_out.publish(FULL, STAMP, ALL)
+    fan_out.publish(FULL, STAMP, MARKERS)
+    fan_out.publish(FULL, Stamp(STAMP.utime, STAMP.capture_utime, 2), ALL)
+    messages = [(topic.parts, decode(message)) for topic, message in memory.messages]
+    counted = {
+        key: [(message.sequence, message.session) for parts, message in messages if parts == (key,)]
+        for key in ("3d", "analog")
+    }
+    assert counted == {"3d": [(0, 1), (1, 1), (2, 2)], "analog": [(0, 1), (1, 2)]}
+
+
+def test_components_that_the_stream_does_not_want_are_not_published(memory: MemoryOutput) -> None:
+    FanOut("lab", [memory]).publish(FULL, STAMP, frozenset({ComponentType.TOOLS, ComponentType.EVENT}))
+    assert [topic.parts for topic, _ in memory.messages] == [("6d",), ("event",)]
+
+
+def test_an_empty_frame_publishes_nothing(memory: MemoryOutput) -> None:
+    FanOut("lab", [memory]).publish(split_frame(EMPTY_FRAME["big"], "big"), STAMP, ALL)
+    assert not memory.messages
+
+
+def test_the_newest_message_of_each_component_is_kept(memory: MemoryOutput) -> None:
+    fan_out = FanOut("lab", [memory])
+    fan_out.publish(FULL, STAMP, ALL)
+    fan_out.publish(FULL, STAMP, MARKERS)
+    newest = {kind.key: decode(message).sequence for kind, message in fan_out.newest.items()}
+    assert newest == {"3d": 1, "6d": 0, "analog": 0, "force": 0, "event": 0}
+
+
+def test_status_and_clock_messages_have_topics_of_their_own(memory: MemoryOutput) -> None:
+    fan_out = FanOut("lab", [memory])
+    fan_out.publish(FULL, STAMP, ALL)
+    fan_out.publish_status(b"status")
+    fan_out.publish_clock(b"clock")
+    assert list(memory.messages)[-2:] == [
+        (Topic("lab", ("status",), "rtc3d.status_t"), b"status"),
+        (Topic("lab", ("clock",), "rtc3d.clock_t"), b"clock"),
+    ]
+
+
+def test_frames_messages_and_bytes_are_counted_by_component(memory: MemoryOutput) -> None:
+    fan_out = FanOut("lab", [memory])
+    fan_out.publish(FULL, STAMP, ALL)
+    fan_out.publish(FULL, STAMP, MARKERS)
+    assert fan_out.frames == dict.fromkeys(WIRE_ORDER, 1) | {ComponentType.MARKERS: 2}
+    [(_, status)] = fan_out.outputs
+    sizes: Counter[str] = Counter()
+    for topic, message in memory.messages:
+        sizes[topic.parts[0]] += len(message)
+    assert status.message_bytes == sizes
+    assert min(sizes.values()) > 0
+
+
+# Failing outputs -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("error", "cause"),
+    [(OutputError("no router", cause="no router"), "no router"), (ValueError("a defect"), "ValueError")],
+)
+def test_an_output_that_raises_is_counted_and_stops_no_other(error: Exception, cause: str) -> None:
+    broken, good = ToyOutput("broken"), ToyOutput("good")
+    broken.error = error
+    fan_out = FanOut("lab", [broken, good])
+    for _ in range(2):
+        fan_out.publish(FULL, STAMP, ALL)
+    fan_out.publish_status(b"status")
+    statuses = {output.name: status for output, status in fan_out.outputs}
+    assert statuses["broken"].drops == {cause: 11}
+    assert not statuses["broken"].messages
+    assert not statuses["good"].drops
+    each_twice = {"3d": 2, "6d": 2, "analog": 2, "force": 2, "event": 2}
+    assert statuses["good"].messages == each_twice | {"status": 1}
+    assert len(good.messages) == 11
+
+
+def test_a_message_refused_still_counts_so_that_the_gap_shows() -> None:
+    output = ToyOutput()
+    fan_out = FanOut("lab", [output])
+    for output.error in (None, OutputError("no router", cause="no router"), None):
+        fan_out.publish(FULL, STAMP, MARKERS)
+    assert [decode(message).sequence for _, message in output.messages] == [0, 2]
+
+
+@pytest.mark.usefixtures("no_hold")
+def test_a_failing_output_is_told_once_loudly_then_quietly_and_when_it_is_over(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.DEBUG, "gateway.publish.routes")
+    output = ToyOutput()
+    fan_out = FanOut("lab", [output])
+    lost = OutputError("no Zenoh router is connected: start zenohd", cause="no router")
+    for output.error in (None, lost, lost, lost, None, None):
+        fan_out.publish(FULL, STAMP, MARKERS)
+    warning, *repeats, recovery = caplog.records
+    assert (warning.levelno, warning.getMessage()) == (logging.WARNING, f"lab to toy: {lost}")
+    assert [record.levelno for record in repeats] == [logging.DEBUG, logging.DEBUG]
+    assert recovery.levelno == logging.INFO
+    assert "lab to toy: messages go out" in recovery.getMessage()
+
+
+def test_messages_that_fail_by_turns_are_one_failure(caplog: pytest.LogCaptureFixture) -> None:
+    output = ToyOutput()
+    fan_out = FanOut("lab", [output])
+    for output.error in [OutputError("too large", cause="send failed"), None] * 5:
+        fan_out.publish(FULL, STAMP, MARKERS)
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
+    assert fan_out.outputs[0][1].messages == {"3d": 5}
+
+
+# Pacing, layouts and listeners ---------------------------------------------------------------
+
+
+def test_a_paced_component_is_numbered_by_itself_on_each_output() -> None:
+    paced, whole = ToyOutput("paced"), ToyOutput("whole")
+    paced.max_rate_hz = {ComponentType.MARKERS: 50.0}
+    fan_out = FanOut("lab", [paced, whole])
+    for number in range(20):  # 100 Hz
+        frame = markers_frame(number, timestamp_us=10_000 * number, num_markers=1)
+        fan_out.publish(frame, STAMP, ALL)
+    for output, count in ((paced, 10), (whole, 20)):
+        sequences = [decode(message).sequence for _, message in output.messages]
+        assert sequences == list(range(count))
+
+
+def test_events_are_never_left_out_whatever_the_limit() -> None:
+    output = ToyOutput()
+    output.max_rate_hz = {ComponentType.EVENT: 0.001}
+    fan_out = FanOut("lab", [output])
+    for _ in range(3):
+        fan_out.publish(FULL, STAMP, frozenset({ComponentType.EVENT}))
+    assert [decode(message).sequence for _, message in output.messages] == [0, 1, 2]
+
+
+def test_a_changed_number_of_markers_is_told_once() -> None:
+    changes: list[int] = []
+    fan_out = FanOut("lab", [], on_layout=lambda: changes.append(1))
+    for num_markers, expected in ((2, 0), (2, 0), (3, 1), (3, 1), (2, 2)):
+        fan_out.publish(markers_frame(1, timestamp_us=0, num_markers=num_markers), STAMP, ALL)
+        assert len(changes) == expected
+
+
+def test_somebody_listens_if_one_output_has_a_listener_to_one_component() -> None:
+    deaf, heard = ToyOutput("deaf"), ToyOutput("heard", "6d")
+    assert not FanOut("lab", [deaf]).listened(ALL)
+    assert FanOut("lab", [deaf, heard]).listened({ComponentType.MARKERS, ComponentType.TOOLS})
+    assert not FanOut("lab", [deaf, heard]).listened({ComponentType.MARKERS})
+
+
+def test_every_output_shows_whether_frames_flow() -> None:
+    outputs = [ToyOutput("a"), ToyOutput("b")]
+    fan_out = FanOut("lab", outputs)
+    fan_out.show_flowing(True)
+    fan_out.show_flowing(False)
+    assert [output.flowing for output in outputs] == [[True, False], [True, False]]
+
+
+def markers_frame(number: int, *, timestamp_us: int, num_markers: int) -> Frame:
+    items = np.zeros(num_markers, ITEM_DTYPES[ComponentType.MARKERS])
+    component = build_component(ComponentType.MARKERS, number, timestamp_us, items)
+    return split_frame(build_frame([component]), "big")

@@ -1,0 +1,107 @@
+"""A fan-out whose outputs change while frames flow."""
+
+from gateway.messages.decode import decode
+from gateway.messages.splice import Stamp
+from gateway.publish.fan_out import FanOut
+from gateway.rtc3d.components import WIRE_ORDER
+from gateway.rtc3d.frames import split_frame
+from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool
+from tests.toy_output import ToyOutput
+from tests.vectors import FULL_FRAME
+
+STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1)
+FULL = split_frame(FULL_FRAME["big"], "big")
+PROBES = Parameters(tools=Parameters6D(tools=(Tool(id="0", label="Probe"), Tool(id="1", label="Head"))))
+
+
+def publish(fan_out: FanOut) -> None:
+    fan_out.publish(FULL, STAMP, frozenset(WIRE_ORDER))
+
+
+def sequences(output: ToyOutput, component: str) -> list[int]:
+    return [decode(message).sequence for topic, message in output.messages if topic.parts == (component,)]
+
+
+def test_an_output_that_stays_notices_nothing_of_another_that_is_replaced() -> None:
+    stays, before, after = ToyOutput("stays"), ToyOutput("side"), ToyOutput("side")
+    fan_out = FanOut("lab", [stays, before])
+    declared = list(stays.declared)
+    fan_out.use([stays, after])
+    publish(fan_out)
+    assert (stays.declared, stays.given_up) == (declared, [])
+    assert sequences(stays, "3d") == [0]
+
+
+def test_an_output_in_place_of_another_goes_on_with_its_numbers_and_counters() -> None:
+    before, after = ToyOutput("side"), ToyOutput("side")
+    fan_out = FanOut("lab", [before])
+    publish(fan_out)
+    fan_out.use([after])
+    publish(fan_out)
+    assert (sequences(before, "3d"), sequences(after, "3d")) == ([0], [1])
+    [(output, status)] = fan_out.outputs
+    assert output is after
+    assert status.messages["3d"] == 2
+
+
+def test_what_was_declared_on_an_output_is_given_up_with_it() -> None:
+    output = ToyOutput()
+    fan_out = FanOut("lab", [output])
+    declared = list(output.declared)
+    fan_out.use([])
+    publish(fan_out)
+    assert (output.declared, output.announced, output.messages) == ([], [], [])
+    assert sorted(output.given_up) == sorted(declared)
+
+
+def test_an_output_that_comes_back_goes_on_with_its_numbers() -> None:
+    fan_out = FanOut("lab", [ToyOutput("side")])
+    publish(fan_out)
+    fan_out.use([])
+    again = ToyOutput("side")
+    fan_out.use([again])
+    publish(fan_out)
+    assert sequences(again, "3d") == [1]
+
+
+def test_a_new_output_is_shown_what_the_others_were() -> None:
+    fan_out = FanOut("lab", [ToyOutput("one")])
+    fan_out.show_flowing(True)
+    new = ToyOutput("two")
+    fan_out.use([new])
+    assert (new.announced, new.flowing) == (["lab"], [True])
+
+
+def test_a_closed_fan_out_leaves_nothing_behind() -> None:
+    output = ToyOutput("toy", "Probe")
+    fan_out = FanOut("lab", [output], ["toy"])
+    fan_out.set_parameters(PROBES)
+    fan_out.show_flowing(True)
+    publish(fan_out)
+    fan_out.close()
+    assert (output.declared, output.announced, output.flowing) == ([], [], [True, False])
+
+
+def test_tools_keep_their_topics_on_an_output_that_stays() -> None:
+    stays, before, after = (ToyOutput(name, "Probe") for name in ("stays", "side", "side"))
+    fan_out = FanOut("lab", [stays, before], ["stays", "side"])
+    fan_out.set_parameters(PROBES)
+    publish(fan_out)
+    fan_out.use([stays, after], ["stays", "side"])
+    publish(fan_out)
+    assert stays.given_up == []
+    assert [len(output.poses("Probe")) for output in (stays, before, after)] == [2, 1, 1]
+    assert [pose.sequence for pose in stays.poses("Probe")] == [0, 1]
+    assert before.tool_names() == []
+
+
+def test_tools_lose_their_topics_where_they_are_switched_off() -> None:
+    output = ToyOutput("toy", "Probe")
+    fan_out = FanOut("lab", [output], ["toy"])
+    fan_out.set_parameters(PROBES)
+    publish(fan_out)
+    fan_out.use([output], [])
+    publish(fan_out)
+    assert output.tool_names() == []
+    assert len(output.poses("Probe")) == 1
+    assert sequences(output, "3d") == [0, 1]

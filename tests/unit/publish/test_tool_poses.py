@@ -1,0 +1,168 @@
+import logging
+import struct
+from collections.abc import Sequence
+from itertools import chain
+
+import pytest
+
+from gateway.messages.splice import Stamp
+from gateway.messages.topics import Topic
+from gateway.publish.fan_out import FanOut
+from gateway.rtc3d.components import WIRE_ORDER
+from gateway.rtc3d.frames import Frame, split_frame
+from gateway.rtc3d.parameters import Parameters, Parameters3D, Parameters6D, Tool
+from tests.toy_output import ToyOutput
+
+STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1)
+ALL = frozenset(WIRE_ORDER)
+IN_VIEW = (1.0, 0.0, 0.0, 0.0, 100.0, 200.0, 300.0, 0.5)
+
+
+def tools_frame(*poses: Sequence[float]) -> Frame:
+    """Return a frame with one 6D component: of each tool q0, qx, qy, qz, x, y, z, error."""
+    wire = struct.pack(">IIIiqI", 1, 24 + 32 * len(poses), 4, 7, 7000, len(poses))
+    wire += struct.pack(f">{8 * len(poses)}f", *chain.from_iterable(poses))
+    return split_frame(wire, "big")
+
+
+def parameters(*labels: str, unit: str = "mm") -> Parameters:
+    tools = tuple(Tool(id=str(number), label=label) for number, label in enumerate(labels))
+    return Parameters(markers=Parameters3D(unit=unit), tools=Parameters6D(tools=tools))
+
+
+def publish_tools(fan_out: FanOut, count: int) -> None:
+    fan_out.publish(tools_frame(*[IN_VIEW] * count), STAMP, ALL)
+
+
+def test_tools_have_topics_where_switched_on_only() -> None:
+    with_tools, without = ToyOutput("with", "Probe"), ToyOutput("without", "Probe")
+    fan_out = FanOut("lab", [with_tools, without], ["with"])
+    fan_out.set_parameters(parameters("Probe"))
+    publish_tools(fan_out, 1)
+    [(topic, _)] = [each for each in with_tools.messages if len(each[0].parts) == 2]
+    assert topic == Topic("lab", ("6d", "Probe"), "rtc3d.tool_pose_t")
+    assert without.tool_names() == []
+
+
+def test_a_pose_is_published_while_somebody_listens() -> None:
+    output = ToyOutput("toy", "Probe")
+    fan_out = FanOut("lab", [output], ["toy"])
+    fan_out.set_parameters(parameters("Probe", "Head"))
+    publish_tools(fan_out, 2)
+    assert (len(output.poses("Probe")), len(output.poses("Head"))) == (1, 0)
+    output.listened = {"Head"}
+    publish_tools(fan_out, 2)
+    assert (len(output.poses("Probe")), len(output.poses("Head"))) == (1, 1)
+    output.listened = set()
+    publish_tools(fan_out, 2)
+    assert (len(output.poses("Probe")), len(output.poses("Head"))) == (1, 1)
+    assert dict(fan_out.outputs[0][1].messages) == {"6d": 3, "6d/tool": 2}
+
+
+@pytest.mark.parametrize(
+    ("labels", "names"),
+    [
+        (["Probe", "Head"], ["Probe", "Head"]),
+        (["Probe", "Probe", "Probe"], ["Probe", "Probe_2", "Probe_3"]),
+        ([" Probe ", "  ", ""], ["Probe", "tool 2", "tool 3"]),
+        (["Probe"], ["Probe", "tool 2"]),
+        ([], ["tool 1"]),
+        ([500 * "x", 500 * "x"], [200 * "x", 198 * "x" + "_2"]),
+    ],
+)
+def test_topics_carry_the_tools_labels(labels: list[str], names: list[str]) -> None:
+    output = ToyOutput()
+    fan_out = FanOut("lab", [output], ["toy"])
+    fan_out.set_parameters(parameters(*labels))
+    publish_tools(fan_out, len(names))
+    assert output.tool_names() == names
+
+
+def test_without_parameters_tools_are_numbered() -> None:
+    output = ToyOutput()
+    fan_out = FanOut("lab", [output], ["toy"])
+    fan_out.set_parameters(Parameters())
+    publish_tools(fan_out, 2)
+    assert output.tool_names() == ["tool 1", "tool 2"]
+
+
+def test_other_tools_replace_the_topics() -> None:
+    output = ToyOutput()
+    fan_out = FanOut("lab", [output], ["toy"])
+    fan_out.set_parameters(parameters("Probe", "Head"))
+    publish_tools(fan_out, 2)
+    fan_out.set_parameters(parameters("Head", "Foot", "Hand"))
+    publish_tools(fan_out, 3)
+    assert output.tool_names() == ["Head", "Foot", "Hand"]
+
+
+def test_the_same_tools_again_keep_their_topics() -> None:
+    output = ToyOutput("toy", "Probe")
+    fan_out = FanOut("lab", [output], ["toy"])
+    for session in (1, 2):
+        fan_out.set_parameters(parameters("Probe"))
+        fan_out.publish(tools_frame(IN_VIEW), Stamp(STAMP.utime, STAMP.capture_utime, session), ALL)
+    counted = [(pose.sequence, pose.session) for pose in output.poses("Probe")]
+    assert counted == [(0, 1), (1, 2)]
+    assert output.given_up == []
+
+
+def test_a_tool_that_stays_among_others_goes_on_counting() -> None:
+    output = ToyOutput("toy", "Probe", "Head")
+    fan_out = FanOut("lab", [output], ["toy"])
+    for labels in (["Probe"], ["Head", "Probe"], ["Head", "Probe"]):
+        fan_out.set_parameters(parameters(*labels))
+        publish_tools(fan_out, len(labels))
+    assert [pose.sequence for pose in output.poses("Probe")] == [0, 1, 2]
+    assert [pose.sequence for pose in output.poses("Head")] == [0, 1]
+
+
+def test_a_count_that_goes_up_and_down_declares_no_topic_twice() -> None:
+    output = ToyOutput("toy", "A", "B", "C")
+    fan_out = FanOut("lab", [output], ["toy"])
+    fan_out.set_parameters(parameters("A", "B", "C"))
+    publish_tools(fan_out, 3)
+    for count in (1, 0, 3, 2):
+        publish_tools(fan_out, count)
+    assert (output.tool_names(), output.given_up) == (["A", "B", "C"], [])
+    counted = {name: [pose.sequence for pose in output.poses(name)] for name in "ABC"}
+    assert counted == {"A": [0, 1, 2, 3], "B": [0, 1, 2], "C": [0, 1]}
+
+
+def test_more_tools_than_any_lab_has_get_no_topics_and_are_counted(caplog: pytest.LogCaptureFixture) -> None:
+    output = ToyOutput("toy", "tool 1")
+    fan_out = FanOut("lab", [output], ["toy"])
+    for _ in range(2):
+        publish_tools(fan_out, 257)
+    assert output.tool_names() == []
+    assert fan_out.outputs[0][1].drops == {"too many tools": 2}
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
+    assert fan_out.outputs[0][1].messages == {"6d": 2}
+    publish_tools(fan_out, 256)
+    assert len(output.tool_names()) == 256
+
+
+@pytest.mark.parametrize(
+    ("unit", "position_m"), [("mm", (0.1, 0.2, 0.3)), ("m", (100.0, 200.0, 300.0)), ("", (0.1, 0.2, 0.3))]
+)
+def test_poses_are_metres_whatever_the_servers_unit(unit: str, position_m: tuple[float, ...]) -> None:
+    output = ToyOutput("toy", "Probe")
+    fan_out = FanOut("lab", [output], ["toy"])
+    fan_out.set_parameters(parameters("Probe", unit=unit))
+    publish_tools(fan_out, 1)
+    assert output.poses("Probe")[0].position_m == pytest.approx(position_m)
+
+
+def test_an_unknown_unit_is_told_and_no_robot_gets_a_guess(caplog: pytest.LogCaptureFixture) -> None:
+    output = ToyOutput("toy", "Probe")
+    fan_out = FanOut("lab", [output], ["toy"])
+    fan_out.set_parameters(parameters("Probe", unit="furlong"))
+    publish_tools(fan_out, 1)
+    assert output.poses("Probe") == []
+    assert fan_out.outputs[0][1].drops == {"unknown unit": 1}
+    assert ["furlong" in record.getMessage() for record in caplog.records] == [True]
+
+
+def test_an_unknown_unit_is_nobodys_affair_without_topics_per_tool(caplog: pytest.LogCaptureFixture) -> None:
+    FanOut("lab", [ToyOutput()]).set_parameters(parameters("Probe", unit="furlong"))
+    assert not caplog.records

@@ -1,0 +1,45 @@
+"""The protocol with one client of the simulator, at any time of the measurement."""
+
+from collections.abc import Sequence
+
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.packets import Packet
+from gateway.rtc3d.parameters import General
+from gateway.rtc3d_server.client_session import ClientSession, Server
+from gateway.rtc3d_server.frame_builder import FrameBuilder
+from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, ByteOrder, Part, cut, frame_of
+
+
+class Session:
+    """A client of the counting scene, and the measurement's time, which stands still unless set."""
+
+    def __init__(self, rate_hz: float = 100.0) -> None:
+        self.scene = CountingScene(rate_hz)
+        self.elapsed_us: int | None = 0
+        general = General(name="server under test")
+        parameters = self.scene.parameters
+        self.client = ClientSession(
+            Server(
+                frames=self._frames,
+                parameters=lambda: type(parameters)(general, parameters.markers, events=parameters.events),
+                measurement_us=lambda: self.elapsed_us,
+            )
+        )
+
+    def _frames(self, components: Sequence[ComponentType]) -> FrameBuilder:
+        return FrameBuilder(self.scene, components)
+
+    def send(self, text: bytes | str, packet_type: int = COMMAND) -> list[tuple[int, bytes]]:
+        body = text.encode() if isinstance(text, str) else text
+        return cut(b"".join(self.client.answer(Packet(packet_type, body))))
+
+    def frames_until(self, elapsed_us: int, byte_order: ByteOrder = "big") -> list[list[Part]]:
+        self.elapsed_us = elapsed_us
+        packets = cut(b"".join(data.packet for data in self.client.due(elapsed_us)))
+        assert all(packet_type == DATA for packet_type, _ in packets)
+        return [frame_of(body, byte_order) for _, body in packets]
+
+    def numbers_until(self, elapsed_us: int) -> list[int]:
+        """The frame numbers of each frame's first component."""
+        return [frame[0].frame_number for frame in self.frames_until(elapsed_us)]

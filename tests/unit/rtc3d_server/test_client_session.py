@@ -1,0 +1,153 @@
+import pytest
+
+from gateway.rtc3d.parameters_xml import parse_parameters
+from tests.unit.rtc3d_server.scripted_client import Session
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, XML
+
+
+@pytest.fixture
+def session() -> Session:
+    return Session()
+
+
+@pytest.mark.parametrize(
+    ("sent", "acknowledged"),
+    [
+        (b"Version 1.0", b"OK-Version 1.0"),
+        (b"Version 1.0\0", b"OK-Version 1.0"),
+        (b"version 1.0\n", b"OK-version 1.0"),
+        (b"SetByteOrder LittleEndian\0", b"OK-SetByteOrder LittleEndian"),
+        (b"SETBYTEORDER BIGENDIAN", b"OK-SETBYTEORDER BIGENDIAN"),
+        (b"StreamFrames", b"OK-StreamFrames"),
+        (b"StreamFrames All", b"OK-StreamFrames All"),
+        (
+            b"StreamFrames AllFrames 3D 6D Analog Force Events ",
+            b"OK-StreamFrames AllFrames 3D 6D Analog Force Events",
+        ),
+        (b"StreamFrames Frequency:30 3D Analog", b"OK-StreamFrames Frequency:30 3D Analog"),
+        (b"StreamFrames FrequencyDivisor:4", b"OK-StreamFrames FrequencyDivisor:4"),
+        (b"StreamFrames Stop", b"OK-StreamFrames Stop"),
+        (b"SendCurrentFrame", b"OK-SendCurrentFrame"),
+        (b"SendCurrentFrame 3D 6D Analog Force Events ", b"OK-SendCurrentFrame 3D 6D Analog Force Events"),
+    ],
+)
+def test_a_command_is_acknowledged_as_it_was_sent(session: Session, sent: bytes, acknowledged: bytes) -> None:
+    assert session.send(sent) == [(COMMAND, acknowledged)]
+
+
+@pytest.mark.parametrize(
+    ("sent", "told"),
+    [
+        (b"Version 2.0", b"Version 2.0 is not supported; this server speaks version 1.0"),
+        (b"Version", b"Version takes one parameter n.n, as in: Version 1.0"),
+        (b"SetByteOrder Middle", b"SetByteOrder takes one parameter, BigEndian or LittleEndian"),
+        (b"", b"Empty command"),
+        (b"Bye now", b"Bye takes no parameter"),
+    ],
+)
+def test_a_bad_command_gets_an_error_that_says_why(session: Session, sent: bytes, told: bytes) -> None:
+    [(packet_type, text)] = session.send(sent)
+
+    assert packet_type == ERROR
+    assert text.startswith(b"Error-" + told)
+
+
+@pytest.mark.parametrize(
+    "sent",
+    [b"Play", b"StreamFrames Sometimes", b"StreamFrames Frequency:0", b"SendParameters 4D", b"\xff\xfe"],
+)
+def test_what_is_no_command_gets_an_error_in_ascii(session: Session, sent: bytes) -> None:
+    [(packet_type, text)] = session.send(sent)
+
+    assert packet_type == ERROR
+    assert text.isascii()
+    assert text.startswith(b"Error-")
+
+
+def test_a_refused_command_changes_nothing(session: Session) -> None:
+    session.send("StreamFrames 3D")
+    session.send("StreamFrames FrequencyDivisor:0")
+
+    assert session.numbers_until(20_000) == [1, 2, 3]
+
+
+@pytest.mark.parametrize("packet_type", [0, 2, 4, 5, 6, 0xFFFFFFFF])
+def test_packets_that_only_servers_send_get_an_error(session: Session, packet_type: int) -> None:
+    [(reply_type, text)] = session.send(b"", packet_type)
+
+    assert (reply_type, text) == (
+        ERROR,
+        b"Error-Packets of type %d are not accepted; commands have type 1 (string)" % packet_type,
+    )
+
+
+def test_bye_is_answered_as_ndis_client_expects(session: Session) -> None:
+    assert session.send("BYE\0") == [(COMMAND, b"bye")]
+    assert session.client.said_bye
+
+
+# One event component of 48 bytes, frame number -1, time stamp 0, one event with id 1 (field note 16).
+START_BIG = bytes.fromhex(
+    "00000001 00000030 00000005 FFFFFFFF 0000000000000000 00000001"
+    "00000001 0000000000000000 FFFFFFFF FFFFFFFF FFFFFFFF"
+)
+START_LITTLE = bytes.fromhex(
+    "01000000 30000000 05000000 FFFFFFFF 0000000000000000 01000000"
+    "01000000 0000000000000000 FFFFFFFF FFFFFFFF FFFFFFFF"
+)
+
+
+@pytest.mark.parametrize(
+    ("start", "stop"),
+    [
+        (START_BIG, START_BIG[:28] + bytes(4) + START_BIG[32:]),
+        (START_LITTLE, START_LITTLE[:28] + bytes(4) + START_LITTLE[32:]),
+    ],
+    ids=["big", "little"],
+)
+def test_wavefronts_recording_control_is_taken_without_a_reply(
+    session: Session, start: bytes, stop: bytes
+) -> None:
+    assert session.send(start, DATA) == []
+    assert session.client.recording
+    assert session.send(stop, DATA) == []
+    assert not session.client.recording
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        b"",
+        START_BIG[:-1],
+        START_BIG[:12] + bytes(4) + START_BIG[16:],  # frame number 0
+        START_BIG[:12] + b"\0\0\0\1" + START_BIG[16:],  # frame number 1
+        START_BIG[:31] + b"\x02" + START_BIG[32:],  # event 2
+        bytes(4),  # no component
+    ],
+    ids=["nothing", "cut short", "frame 0", "frame 1", "event 2", "no component"],
+)
+def test_other_data_frames_from_a_client_get_an_error(session: Session, body: bytes) -> None:
+    [(packet_type, text)] = session.send(body, DATA)
+
+    assert packet_type == ERROR
+    assert b"data frame" in text
+    assert not session.client.recording
+
+
+def test_parameters_come_as_xml_with_the_sections_asked_for(session: Session) -> None:
+    [(packet_type, xml)] = session.send("SendParameters 3d General")
+
+    parameters = parse_parameters(xml).parameters
+    assert packet_type == XML
+    assert parameters.general is not None
+    assert parameters.general.name == "server under test"
+    assert parameters.markers == session.scene.parameters.markers
+    assert parameters.events is None
+
+
+@pytest.mark.parametrize("sent", ["SendParameters", "SendParameters All\0"])
+def test_parameters_are_all_sent_by_default(session: Session, sent: str) -> None:
+    [(_, xml)] = session.send(sent)
+
+    parameters = parse_parameters(xml).parameters
+    assert None not in (parameters.general, parameters.markers, parameters.events)

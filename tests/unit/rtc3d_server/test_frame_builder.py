@@ -1,0 +1,132 @@
+from fractions import Fraction
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d_server.frame_builder import FrameBuilder, exact_rate
+from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.unit.rtc3d_server.wire import (
+    ANALOG,
+    DATA,
+    EVENT,
+    MARKERS,
+    TOOLS,
+    Part,
+    cut,
+    frame_of,
+)
+
+
+def parts_of(builder: FrameBuilder, tick: int, *, with_events: bool = False) -> list[Part]:
+    events = builder.events(0, builder.time_us(tick) + 1) if with_events else builder.events(0, 0)
+    [(packet_type, body)] = cut(builder.packet("big", tick, events).packet)
+    assert packet_type == DATA
+    return frame_of(body)
+
+
+def test_a_frame_has_the_bytes_of_the_specification() -> None:
+    builder = FrameBuilder(CountingScene(), (ComponentType.MARKERS,))
+
+    assert builder.packet("big", 3).packet == bytes.fromhex(
+        "00000044 00000003"  # size 68, data frame
+        "00000001"  # one component
+        "00000038 00000001 00000004 0000000000007530"  # 56 bytes, 3D, frame 4, 30000 µs
+        "00000002"  # two markers
+        "40400000 00000000 00000000 00000000"  # 3, 0, 0; 0
+        "40400000 3FC00000 C0000000 3E800000"  # 3, 1.5, -2; 0.25
+    )
+    assert builder.packet("little", 3).packet == bytes.fromhex(
+        "00000044 00000003"  # the packet's header stays big-endian
+        "01000000"
+        "38000000 01000000 04000000 3075000000000000"
+        "02000000"
+        "00004040 00000000 00000000 00000000"
+        "00004040 0000C03F 000000C0 0000803E"
+    )
+
+
+def test_asked_for_all_a_frame_has_what_the_scene_has_in_the_servers_order() -> None:
+    builder = FrameBuilder(CountingScene(), ())
+
+    assert [part.type for part in parts_of(builder, 7, with_events=True)] == [MARKERS, TOOLS, ANALOG, EVENT]
+
+
+def test_components_the_scene_lacks_are_left_out() -> None:
+    builder = FrameBuilder(CountingScene(), (ComponentType.FORCE, ComponentType.ANALOG))
+
+    assert [part.type for part in parts_of(builder, 0)] == [ANALOG]
+
+
+def test_the_rate_is_that_of_the_slowest_component_and_each_sends_its_own_sample() -> None:
+    builder = FrameBuilder(CountingScene(rate_hz=200), (ComponentType.MARKERS, ComponentType.ANALOG))
+
+    markers, analog = parts_of(builder, 20)
+
+    assert builder.rate == 200
+    assert (markers.frame_number, analog.frame_number) == (21, 201)
+    assert markers.timestamp_us == analog.timestamp_us == 100_000
+    assert (markers.items[0][0], analog.items[0][0]) == (20, 200)
+
+
+def test_samples_are_the_same_across_blocks_of_frames() -> None:
+    builder = FrameBuilder(CountingScene(), (ComponentType.ANALOG,))
+
+    samples = [parts_of(builder, tick)[0].items[0][0] for tick in range(300)]
+
+    assert samples == list(range(300))
+
+
+def test_an_event_alone_counts_frames_of_the_measurement_rate() -> None:
+    builder = FrameBuilder(CountingScene(), (ComponentType.EVENT,))
+
+    assert parts_of(builder, 14, with_events=True) == [
+        Part(EVENT, 15, 140_000, [(1, 70_000, -1, -1, -1), (2, 140_000, -1, -1, -1)])
+    ]
+    assert parts_of(builder, 14) == []
+
+
+def test_events_can_have_the_16_bytes_of_the_specification() -> None:
+    builder = FrameBuilder(CountingScene(), (ComponentType.EVENT,), event_bytes=16)
+    data = builder.packet("little", 7, builder.events(0, 70_001))
+
+    assert frame_of(data.packet[8:], "little", event_bytes=16) == [Part(EVENT, 8, 70_000, [(1, -1, -1, -1)])]
+
+
+def test_events_not_asked_for_are_not_given() -> None:
+    builder = FrameBuilder(CountingScene(), (ComponentType.MARKERS,))
+
+    assert len(builder.events(0, 1_000_000)) == 0
+
+
+def test_frame_numbers_stay_within_a_signed_32_bit_field() -> None:
+    builder = FrameBuilder(CountingScene(), (ComponentType.MARKERS,))
+
+    assert parts_of(builder, 2**31 - 2)[0].frame_number == 2**31 - 1
+    assert parts_of(builder, 2**31 - 1)[0].frame_number == 0
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "meant"),
+    [
+        (100.0, Fraction(100)),
+        (59.94006, Fraction(60000, 1001)),
+        (29.97, Fraction(2997, 100)),
+        (0.5, Fraction(1, 2)),
+    ],
+)
+def test_rates_are_taken_as_meant(rate_hz: float, meant: Fraction) -> None:
+    assert exact_rate(rate_hz) == meant
+
+
+@given(
+    rate_hz=st.one_of(st.integers(1, 5000).map(float), st.floats(1, 5000)),
+    elapsed_us=st.integers(0, 10**13),
+)
+def test_the_tick_after_a_time_is_the_first_one_later(rate_hz: float, elapsed_us: int) -> None:
+    builder = FrameBuilder(CountingScene(rate_hz), (ComponentType.MARKERS,))
+
+    tick = builder.tick_after(elapsed_us)
+
+    assert builder.time_us(tick - 1) <= elapsed_us < builder.time_us(tick)

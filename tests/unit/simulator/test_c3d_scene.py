@@ -1,0 +1,233 @@
+import logging
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+import ezc3d
+import numpy as np
+import pytest
+
+from gateway.errors import TakeError
+from gateway.rtc3d.components import ComponentType
+from gateway.simulator.c3d_scene import C3dScene, _markers
+
+MISSING = b"\xff" * 12 + bytes.fromhex("4479C000")  # X, Y, Z all ones; 999.0
+
+
+def new_recording() -> Any:
+    """Five frames of two markers at 100 Hz, six channels of one plate and one more at 1000 Hz."""
+    content = ezc3d.c3d()
+    point, analog = content["parameters"]["POINT"], content["parameters"]["ANALOG"]
+    point["RATE"]["value"], point["LABELS"]["value"], point["UNITS"]["value"] = [100], ["heel", "toe"], ["mm"]
+    analog["RATE"]["value"] = [1000]
+    analog["LABELS"]["value"] = ["EMG", "FX", "FY", "FZ", "MX", "MY", "MZ"]
+    analog["UNITS"]["value"] = ["mV", "N", "N", "N", "Nmm", "Nmm", "Nmm"]
+    plate = content["parameters"]["FORCE_PLATFORM"]
+    plate["USED"]["value"], plate["TYPE"]["value"] = np.array([1]), np.array([2])
+    plate["CORNERS"]["value"] = np.array([(400.0, 600, 0), (400, 0, 0), (0, 0, 0), (0, 600, 0)]).T[..., None]
+    plate["ORIGIN"]["value"] = np.array([(1.0, 2.0, -30.0)]).T
+    plate["CHANNEL"]["value"] = np.array([(2, 3, 4, 5, 6, 7)]).T
+    plate["ZERO"]["value"] = np.array([0, 0])
+    rng = np.random.default_rng(7)
+    points = np.ones((4, 2, 5))
+    points[:3] = rng.uniform(-1000, 1000, (3, 2, 5))
+    points[0, 0, 1] = np.nan
+    residuals = rng.uniform(0, 2, (1, 2, 5))
+    residuals[0, 1, 3] = -1
+    content["data"]["points"] = points
+    content["data"]["meta_points"]["residuals"] = residuals
+    content["data"]["meta_points"]["camera_masks"] = np.zeros((7, 2, 5), bool)
+    content["data"]["analogs"] = rng.uniform(-500, 500, (1, 7, 50))
+    return content
+
+
+def written(content: Any, folder: Path) -> Path:
+    path = folder / "take.c3d"
+    content.write(str(path))
+    return path
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return written(new_recording(), tmp_path)
+
+
+def assert_equals_ezc3d(path: Path) -> None:
+    """Every value of the take is what ezc3d reads, as float32, in the file's order."""
+    take = C3dScene(path)
+    read = ezc3d.c3d(str(path), extract_forceplat_data=True)["data"]
+    points, residuals = read["points"][:3], read["meta_points"]["residuals"]
+    if points.size:
+        markers = take.items(ComponentType.MARKERS, np.arange(points.shape[2]))
+        missing = np.isnan(points).any(axis=0).T | (residuals[0].T == -1)
+        assert {item.tobytes() for item in markers[missing]} <= {MISSING}
+        for name, expected in zip(("x", "y", "z", "reliability"), (*points, residuals[0]), strict=True):
+            assert np.array_equal(markers[name][~missing], expected.T[~missing].astype(np.float32))
+    if read["analogs"].size:
+        analog = take.items(ComponentType.ANALOG, np.arange(read["analogs"].shape[2]))
+        assert np.array_equal(analog, read["analogs"][0].T.astype(np.float32))
+    for number, plate in enumerate(read["platform"]):
+        items = take.items(ComponentType.FORCE, np.arange(plate["force"].shape[1]))[:, [number]]
+        expected = np.concatenate([plate["force"], plate["moment"]]).T.astype(np.float32)
+        assert np.array_equal(items.view(">f4").reshape(-1, 6), expected)
+
+
+def test_values_equal_what_ezc3d_reads(path: Path) -> None:
+    assert_equals_ezc3d(path)
+
+
+def test_a_marker_of_nan_or_of_residual_minus_one_is_missing(path: Path) -> None:
+    markers = C3dScene(path).items(ComponentType.MARKERS, np.arange(5))
+
+    missing = {(f, m) for f in range(5) for m in range(2) if markers[f, m].tobytes() == MISSING}
+    assert missing == {(1, 0), (3, 1)}
+    assert np.isnan(markers["x"]).sum() == 2
+
+
+def test_a_residual_of_minus_one_is_enough_where_ezc3d_keeps_the_position() -> None:
+    markers = _markers(np.ones((4, 2, 1)), np.array([[[0.5], [-1.0]]]))
+
+    assert [item.tobytes() for item in markers[0]] == [bytes.fromhex("3F800000" * 3 + "3F000000"), MISSING]
+
+
+def test_components_have_their_own_rates(path: Path) -> None:
+    take = C3dScene(path)
+
+    assert take.rates_hz == {
+        ComponentType.MARKERS: 100.0,
+        ComponentType.ANALOG: 1000.0,
+        ComponentType.FORCE: 1000.0,
+    }
+    assert (take.measurement_rate_hz, take.num_frames) == (100.0, 5)
+    assert len(take.events(0, 10**9)) == 0
+
+
+def test_the_take_begins_again_after_its_last_sample(path: Path) -> None:
+    take = C3dScene(path)
+
+    for component, length in (
+        (ComponentType.MARKERS, 5),
+        (ComponentType.ANALOG, 50),
+        (ComponentType.FORCE, 50),
+    ):
+        once = take.items(component, np.arange(length))
+        later = take.items(component, np.arange(7 * length, 8 * length))
+        assert once.tobytes() == later.tobytes()
+
+
+def test_parameters_are_the_files(path: Path) -> None:
+    described = C3dScene(path).parameters
+
+    assert described.markers is not None
+    assert described.analog is not None
+    assert described.force is not None
+    assert described.markers.frequency_hz == 100.0
+    assert described.markers.unit == "mm"
+    assert [(marker.id, marker.label) for marker in described.markers.markers] == [
+        ("1", "heel"),
+        ("2", "toe"),
+    ]
+    assert [(c.label, c.unit, c.frequency_hz) for c in described.analog.channels[:2]] == [
+        ("EMG", "mV", 1000.0),
+        ("FX", "N", 1000.0),
+    ]
+    [plate] = described.force.plates
+    assert [(corner.x, corner.y, corner.z) for corner in plate.corners] == [
+        (400, 600, 0),
+        (400, 0, 0),
+        (0, 0, 0),
+        (0, 600, 0),
+    ]
+    assert plate.origin is not None
+    assert plate.origin.unit == "mm"
+    assert plate.analog_channel_ids == ("2", "3", "4", "5", "6", "7")
+    assert [channel.unit for channel in plate.channels] == ["N", "N", "N", "Nmm", "Nmm", "Nmm"]
+    assert plate.frequency_hz == 1000.0
+
+
+def test_markers_without_labels_are_numbered(tmp_path: Path) -> None:
+    content = new_recording()
+    content["parameters"]["POINT"]["LABELS"]["value"] = ["heel", ""]
+
+    markers = C3dScene(written(content, tmp_path)).parameters.markers
+
+    assert markers is not None
+    assert [marker.label for marker in markers.markers] == ["heel", "Marker 2"]
+
+
+def test_a_recording_without_markers_plays_at_its_analog_rate(tmp_path: Path) -> None:
+    content = new_recording()
+    del content["parameters"]["POINT"]["LABELS"]["value"][:]
+    content["data"]["points"] = np.zeros((4, 0, 5))
+    content["data"]["meta_points"]["residuals"] = np.zeros((1, 0, 5))
+    content["data"]["meta_points"]["camera_masks"] = np.zeros((7, 0, 5), bool)
+
+    take = C3dScene(written(content, tmp_path))
+
+    assert ComponentType.MARKERS not in take.rates_hz
+    assert (take.measurement_rate_hz, take.num_frames) == (1000.0, 50)
+
+
+def test_plates_of_an_unknown_kind_are_left_out_with_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    content = new_recording()
+    content["parameters"]["FORCE_PLATFORM"]["TYPE"]["value"] = [77]
+    path = written(content, tmp_path)
+
+    with caplog.at_level(logging.WARNING):
+        take = C3dScene(path)
+
+    assert set(take.rates_hz) == {ComponentType.MARKERS, ComponentType.ANALOG}
+    assert str(path) in caplog.text
+    assert "force plates" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("content", "told"),
+    [(b"", "cannot be read as a C3D file"), (b"no C3D file\n" * 999, "cannot be read as a C3D file")],
+)
+def test_what_is_no_c3d_file_is_refused_by_its_name(tmp_path: Path, content: bytes, told: str) -> None:
+    path = tmp_path / "bad.c3d"
+    path.write_bytes(content)
+
+    with pytest.raises(TakeError, match=told) as raised:
+        C3dScene(path)
+    assert str(path) in str(raised.value)
+
+
+@pytest.mark.parametrize("length", [1, 100, 511, 512, 600, 1000, 1500])
+def test_a_file_cut_short_before_its_data_is_refused(path: Path, length: int) -> None:
+    path.write_bytes(path.read_bytes()[:length])
+
+    with pytest.raises(TakeError, match=path.name):
+        C3dScene(path)
+
+
+def test_of_a_file_cut_short_in_its_data_the_rest_is_played(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-600])
+
+    assert C3dScene(path).num_frames == 4
+
+
+@pytest.mark.parametrize("name", ["nothing.c3d", "."])
+def test_a_path_that_is_no_file_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(TakeError, match="is no file"):
+        C3dScene(tmp_path / name)
+
+
+def test_without_ezc3d_the_remedy_is_told(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ezc3d", None)  # what an import of it then raises is ImportError
+
+    with pytest.raises(TakeError, match=r"pip install 'rtc3d-gateway\[c3d\]'"):
+        C3dScene(path)
+
+
+@pytest.mark.takes
+@pytest.mark.parametrize("name", ["qualisys.c3d", "optotrak.c3d"])
+def test_real_recordings_equal_what_ezc3d_reads(name: str) -> None:
+    folder = os.environ.get("RTC3D_TAKES")
+    if not folder:
+        pytest.skip("RTC3D_TAKES names no folder with recordings")
+    assert_equals_ezc3d(Path(folder) / name)

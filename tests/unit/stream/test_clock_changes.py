@@ -1,0 +1,211 @@
+"""What the clock makes of clocks that are set, of restarts and of nonsense."""
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from gateway.stream.clock import ServerClock
+from tests.clock_simulation import (
+    EPOCH_UTIME,
+    Times,
+    delayed,
+    learned,
+    observe,
+    percentile_95_us,
+    simulate,
+    whole_us,
+)
+
+RATE_HZ = 200
+SECOND = RATE_HZ  # frames
+LEARNED = 30 * SECOND
+WRAP_US = 2**32
+
+
+# --- clocks that are set
+
+
+@pytest.mark.parametrize("by_s", [3600, 10, 0.3, 0.02, -0.02, -0.3, -10, -3600])
+def test_a_host_clock_that_is_set_is_learned_again_within_three_seconds(by_s: float) -> None:
+    frames = simulate(seconds=60, rate_hz=RATE_HZ, drift_ppm=100)
+    before, after = frames.part(0, LEARNED), frames.part(LEARNED).with_host_set(round(by_s * 1e6))
+    clock = ServerClock()
+    observed = observe(clock, before + after)
+    assert not observed.restarted.any()
+    assert observed.has_clock[LEARNED:].all()
+    assert percentile_95_us(observed.errors_us[LEARNED + 3 * SECOND :]) < 200
+    assert clock.drift_ppm == pytest.approx(100, abs=3)
+
+
+def test_a_hiccup_meanwhile_does_not_hinder_that() -> None:
+    frames = delayed(simulate(seconds=60, rate_hz=RATE_HZ), RATE_HZ, [31, 31.1, 31.9, 32], [0, 0.3, 0.3, 0])
+    set_s = 30
+    after = frames.part(set_s * SECOND).with_host_set(10_000_000)
+    observed = observe(ServerClock(), frames.part(0, set_s * SECOND) + after)
+    assert percentile_95_us(observed.errors_us[(set_s + 5) * SECOND :]) < 200
+
+
+@pytest.mark.parametrize("by_us", [60_000_000, 300_000])
+def test_time_stamps_that_jump_forward_are_learned_again_at_once(by_us: int) -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ)
+    jump = by_us * (np.arange(len(frames)) >= LEARNED)
+    observed = observe(ServerClock(), frames.with_timestamps(frames.timestamps_us + jump))
+    assert not observed.restarted.any()
+    assert (observed.captures_utime <= frames.arrivals_utime).all()
+    assert percentile_95_us(observed.errors_us[LEARNED + SECOND :]) < 200
+
+
+# --- another time base
+
+
+@pytest.mark.parametrize("start_us", [0, 5_000_000])
+def test_a_restarted_server_is_recognised_on_its_first_frame(start_us: int) -> None:
+    before = simulate(seconds=40, rate_hz=RATE_HZ, drift_ppm=100)
+    after = simulate(seconds=40, rate_hz=RATE_HZ, drift_ppm=100, seed=1, start_us=start_us)
+    after = after.with_host_set(60_000_000)
+    clock = learned(before)
+    observed = observe(clock, after)
+    assert observed.restarted.tolist() == [True] + (len(after) - 1) * [False]
+    assert observed.captures_utime[0] == after.arrivals_utime[0]
+    assert observed.has_clock.all()
+    assert percentile_95_us(observed.errors_us[SECOND:]) < 100  # the drift was known
+
+
+def test_a_frame_number_that_goes_back_is_a_restart_though_time_stamps_go_on() -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ)
+    clock = ServerClock()
+    observe(clock, frames.part(0, LEARNED), first_frame_number=1000)
+    restarted = observe(clock, frames.part(LEARNED), first_frame_number=0).restarted
+    assert restarted.tolist() == [True] + (len(restarted) - 1) * [False]
+
+
+def test_frame_numbers_may_be_constant() -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ)
+    clock = ServerClock()
+    readings = [
+        clock.observe(timestamp_us, 0, arrival_utime)
+        for timestamp_us, arrival_utime in zip(
+            frames.timestamps_us.tolist(), frames.arrivals_utime.tolist(), strict=True
+        )
+    ]
+    assert not any(restarted for _, _, restarted in readings)
+    assert clock.has_clock
+
+
+@pytest.mark.parametrize("lowest", [0, -(2**31)], ids=["unsigned", "signed"])
+@pytest.mark.parametrize("seconds", [20.0, 20.1, 20.2, 20.3, 20.4])
+def test_time_stamps_of_32_bits_wrap_around_without_a_trace(seconds: float, lowest: int) -> None:
+    start_us = lowest + WRAP_US - round(seconds * 1e6)
+    frames = simulate(seconds=40, rate_hz=RATE_HZ, drift_ppm=-100, start_us=start_us)
+    wrapped = frames.with_timestamps((frames.timestamps_us - lowest) % WRAP_US + lowest)
+    assert (wrapped.timestamps_us[:-1] > wrapped.timestamps_us[1:]).sum() == 1
+    clock, same = ServerClock(), ServerClock()
+    observed = observe(clock, wrapped)
+    assert not observed.restarted.any()
+    assert observed.captures_utime.tolist() == observe(same, frames).captures_utime.tolist()
+    assert clock.offset_us == same.offset_us + WRAP_US
+
+
+def test_a_restart_after_a_wrap_around_begins_with_whole_stamps() -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ, start_us=WRAP_US - 20_000_000)
+    clock = learned(frames.with_timestamps(frames.timestamps_us % WRAP_US))
+    clock.observe(0, 0, EPOCH_UTIME + 60_000_000)
+    assert clock.offset_us == EPOCH_UTIME + 60_000_000
+
+
+def test_a_server_that_loops_a_file_restarts_each_time_and_keeps_its_clock() -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ)
+    loop = 340  # frames: 1.7 s
+    looped = frames.with_timestamps(frames.timestamps_us[np.arange(len(frames)) % loop])
+    observed = observe(ServerClock(), looped)
+    assert np.flatnonzero(observed.restarted).tolist() == list(range(loop, len(frames), loop))
+    assert observed.has_clock[loop:].all()
+    assert (observed.captures_utime <= looped.arrivals_utime).all()
+    assert percentile_95_us(observed.errors_us[loop:]) < 2_000
+
+
+# --- no clock
+
+
+def random_stamps(timestamps_us: Times) -> Times:
+    return np.random.default_rng(1).integers(-(2**63), 2**63 - 1, len(timestamps_us))
+
+
+def times(factor: float) -> Callable[[Times], Times]:
+    return lambda timestamps_us: whole_us(timestamps_us * factor)
+
+
+@pytest.mark.parametrize(
+    "stamped",
+    [
+        pytest.param(np.zeros_like, id="always 0"),
+        pytest.param(lambda timestamps_us: np.full_like(timestamps_us, 2**62), id="constant"),
+        pytest.param(random_stamps, id="random"),
+        pytest.param(times(0.001), id="milliseconds"),
+        pytest.param(times(1000), id="nanoseconds"),
+        *(pytest.param(times(factor), id=f"{factor} times as fast") for factor in (0.5, 0.9, 1.1, 2)),
+    ],
+)
+def test_time_stamps_that_make_no_sense_are_no_clock(stamped: Callable[[Times], Times]) -> None:
+    frames = simulate(seconds=60, rate_hz=RATE_HZ)
+    clock = ServerClock()
+    observed = observe(clock, frames.with_timestamps(stamped(frames.timestamps_us)))
+    assert not observed.has_clock.any()
+    assert (observed.captures_utime == frames.arrivals_utime).all()
+    assert not observed.lags_s.any()
+    assert (clock.offset_us, clock.drift_ppm, clock.uncertainty_us) == (0, 0.0, math.inf)
+
+
+@pytest.mark.parametrize("factor", [0.998, 1.002])
+def test_a_rate_that_no_crystal_has_is_found_within_ten_seconds(factor: float) -> None:
+    frames = simulate(seconds=60, rate_hz=RATE_HZ)
+    observed = observe(ServerClock(), frames.with_timestamps(times(factor)(frames.timestamps_us)))
+    assert not observed.has_clock[10 * SECOND :].any()
+
+
+def test_no_greater_drift_is_told_than_crystals_have() -> None:
+    frames = simulate(seconds=12, rate_hz=RATE_HZ)
+    clock = ServerClock()
+    # Not enough to rule out the network.
+    assert observe(clock, frames.with_timestamps(times(0.9991)(frames.timestamps_us))).has_clock[-1]
+    assert clock.drift_ppm == 500
+
+
+def test_a_time_stamp_that_freezes_ends_the_clock_until_it_moves_again() -> None:
+    frames = simulate(seconds=60, rate_hz=RATE_HZ)
+    stamps = frames.timestamps_us.copy()
+    stamps[LEARNED : LEARNED + 10 * SECOND] = stamps[LEARNED]
+    frozen = frames.with_timestamps(stamps)
+    observed = observe(ServerClock(), frozen)
+    without = slice(LEARNED + round(0.6 * SECOND), LEARNED + 10 * SECOND)
+    assert not observed.has_clock[without].any()
+    assert (observed.captures_utime == frozen.arrivals_utime)[without].all()
+    assert observed.has_clock[LEARNED + 12 * SECOND :].all()
+    assert percentile_95_us(observed.errors_us[LEARNED + 12 * SECOND :]) < 200
+
+
+@pytest.mark.parametrize("stamped", [random_stamps, times(0.9)], ids=["random", "0.9 times as fast"])
+def test_after_nonsense_there_is_a_clock_again(stamped: Callable[[Times], Times]) -> None:
+    nonsense = simulate(seconds=40, rate_hz=RATE_HZ)
+    clock = learned(nonsense.with_timestamps(stamped(nonsense.timestamps_us)))
+    frames = simulate(seconds=40, rate_hz=RATE_HZ, start_us=0).with_host_set(40_000_000)
+    observed = observe(clock, frames, first_frame_number=40 * SECOND)
+    assert observed.has_clock[2 * SECOND :].all()
+    assert percentile_95_us(observed.errors_us[2 * SECOND : 5 * SECOND]) < 500
+    assert percentile_95_us(observed.errors_us[LEARNED:]) < 100
+
+
+def test_a_server_that_restarts_into_nonsense_has_no_clock_soon() -> None:
+    clock = learned(simulate(seconds=40, rate_hz=RATE_HZ))
+    frames = simulate(seconds=20, rate_hz=RATE_HZ).with_host_set(60_000_000)
+    milliseconds = frames.with_timestamps(np.arange(len(frames)) * 5)
+    assert not observe(clock, milliseconds).has_clock[2 * SECOND :].any()
+
+
+def test_a_server_that_restarts_at_nearly_every_frame_has_no_clock() -> None:
+    clock = learned(simulate(seconds=40, rate_hz=RATE_HZ))
+    frames = simulate(seconds=1, rate_hz=RATE_HZ).with_host_set(60_000_000)
+    nonsense = frames.with_timestamps(random_stamps(frames.timestamps_us))
+    assert not observe(clock, nonsense).has_clock[10:].any()
