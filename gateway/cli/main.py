@@ -15,7 +15,8 @@ import typer
 import uvloop
 from rich.console import Console
 
-from gateway import cli_configuration, version_text
+from gateway import version_text
+from gateway.cli import config as cli_config
 from gateway.cli.config import INSTALLED_CONFIG, ConfigOption, ServerOption, configuration
 from gateway.cli.echo import echo, lcm_messages, zenoh_messages
 from gateway.cli.params import EXIT_STATUSES, ask_lcm, ask_zenoh
@@ -46,7 +47,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-app.add_typer(cli_configuration.app, name="config")
+app.add_typer(cli_config.app, name="config")
 
 LogLevelOption = Annotated[
     LogLevel, typer.Option(case_sensitive=False, help="How much to log: this and above.")

@@ -4,7 +4,7 @@ import asyncio
 from collections.abc import AsyncIterator, Iterator
 
 from gateway.config.settings import Settings
-from gateway.doctor import host, server, zenoh_link
+from gateway.doctor import host_checks, source_checks, zenoh_checks
 from gateway.doctor.finding import Finding, Patient
 from gateway.doctor.observation import ComponentSeen
 from gateway.errors import ConfigError
@@ -22,15 +22,15 @@ async def examine(settings: Settings, origin: str, seconds: float) -> AsyncItera
     yield _configuration.good("file", f"{origin}: {', '.join(names)} to {' and '.join(sides)}")
     seen: list[ComponentSeen] = []
     for source in settings.sources:
-        examination = server.SourceExamination(source, seconds)
+        examination = source_checks.SourceExamination(source, seconds)
         async for finding in examination.findings():
             yield finding
         seen += [component for watch in examination.watches for component in watch.seen.values()]
-    for finding in await asyncio.to_thread(zenoh_link.examine_zenoh, settings.zenoh, names, seconds):
+    for finding in await asyncio.to_thread(zenoh_checks.examine_zenoh, settings.zenoh, names, seconds):
         yield finding
-    for finding in host.examine_lcm(settings.lcm, seen):
+    for finding in host_checks.examine_lcm(settings.lcm, seen):
         yield finding
-    yield host.examine_clock()
+    yield host_checks.examine_clock()
 
 
 def without_settings(error: ConfigError) -> Iterator[Finding]:
@@ -39,10 +39,10 @@ def without_settings(error: ConfigError) -> Iterator[Finding]:
         "file", str(error), "Correct these lines; config/gateway.yaml explains every key."
     )
     for subject, checks in (
-        ("source", server.CHECKS),
-        ("zenoh", zenoh_link.CHECKS),
-        ("lcm", host.LCM_CHECKS),
+        ("source", source_checks.CHECKS),
+        ("zenoh", zenoh_checks.CHECKS),
+        ("lcm", host_checks.LCM_CHECKS),
     ):
         for check in checks:
             yield Patient(subject).untested(check, "it needs the configuration, which failed")
-    yield host.examine_clock()
+    yield host_checks.examine_clock()

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from gateway.config.settings import LcmSettings, ZenohSettings
-from gateway.doctor import host
+from gateway.doctor import host_checks
 from gateway.doctor.finding import Finding, Result
 from gateway.doctor.observation import ComponentSeen
 from gateway.rtc3d_server.server import Simulator
@@ -131,7 +131,7 @@ async def host_of(url: str, *sizes: int, rate_hz: float = 200.0) -> Findings:
         component = Seen()
         component.message_bytes = size
         seen.append(component)
-    return Findings(host.examine_lcm(LcmSettings(url=url), seen))
+    return Findings(host_checks.examine_lcm(LcmSettings(url=url), seen))
 
 
 async def test_lcm_switched_off_is_not_tested() -> None:
@@ -191,10 +191,10 @@ async def test_buffers_that_hold_the_messages_are_green() -> None:
 @pytest.mark.netns
 async def test_buffers_that_do_not_hold_the_messages_are_red() -> None:
     """So many large messages as fit the kernel's limit once the URL asks for enough, and more."""
-    maximum = host.receive_buffer_bytes(2**30)
+    maximum = host_checks.receive_buffer_bytes(2**30)
     url = networks.lcm_url()
     largest = 65_000  # charged twice that
-    rate_hz = 0.9 * maximum / host.PAUSE_S / host.charged_bytes(largest)
+    rate_hz = 0.9 * maximum / host_checks.PAUSE_S / host_checks.charged_bytes(largest)
     finding = (await host_of(url, largest, rate_hz=rate_hz)).of("buffers", "lcm")
     [size] = re.findall(r"^Add recv_buf_size=(\d+) to the LCM URL of every subscriber\.$", finding.remedy)
     good = await host_of(f"{url}&recv_buf_size={size}", largest, rate_hz=rate_hz)
@@ -215,7 +215,7 @@ def test_the_kernel_charges_no_more_for_a_datagram_than_is_reckoned(size: int) -
     ):
         receiver.bind(("127.0.0.1", 0))
         receiver.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 150_000)
-        count = receiver.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // host.charged_bytes(size)
+        count = receiver.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // host_checks.charged_bytes(size)
         assert count >= 1
         for _ in range(count):
             sender.sendto(bytes(size), receiver.getsockname())
@@ -224,29 +224,29 @@ def test_the_kernel_charges_no_more_for_a_datagram_than_is_reckoned(size: int) -
 
 
 def test_large_messages_are_charged_by_their_pieces() -> None:
-    assert host.charged_bytes(3 * 65_499) == 3 * host.charged_bytes(65_499)
-    assert host.charged_bytes(200) == 1280
-    assert host.charged_bytes(1500) == 2304
+    assert host_checks.charged_bytes(3 * 65_499) == 3 * host_checks.charged_bytes(65_499)
+    assert host_checks.charged_bytes(200) == 1280
+    assert host_checks.charged_bytes(1500) == 2304
 
 
 def test_the_clock_is_read() -> None:
-    synchronised, off_us = host.read_clock()
+    synchronised, off_us = host_checks.read_clock()
     assert isinstance(synchronised, bool)
     assert off_us >= 0
 
 
 def test_a_synchronised_clock_is_green(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(host, "read_clock", lambda: (True, 1234))
-    assert host.examine_clock().found == "synchronised, off by at most 1.2 ms"
-    assert host.examine_clock().result is Result.GREEN
+    monkeypatch.setattr(host_checks, "read_clock", lambda: (True, 1234))
+    assert host_checks.examine_clock().found == "synchronised, off by at most 1.2 ms"
+    assert host_checks.examine_clock().result is Result.GREEN
 
 
 def test_a_clock_of_its_own_is_red(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(host, "read_clock", lambda: (False, 16_000_000))
-    assert host.examine_clock().found == (
+    monkeypatch.setattr(host_checks, "read_clock", lambda: (False, 16_000_000))
+    assert host_checks.examine_clock().found == (
         "this computer's clock is not synchronised, so times of other computers do not compare with utime"
     )
-    assert host.examine_clock().remedy == (
+    assert host_checks.examine_clock().remedy == (
         "Set up chrony or systemd-timesyncd against the lab's time server (`chronyc tracking` or "
         "`timedatectl` shows it); in a container, on its host."
     )
@@ -256,8 +256,8 @@ def test_a_clock_that_is_not_told_is_not_tested(monkeypatch: pytest.MonkeyPatch)
     def refuse() -> tuple[bool, int]:
         raise OSError(1, "adjtimex is not allowed")
 
-    monkeypatch.setattr(host, "read_clock", refuse)
-    assert host.examine_clock() == Finding(
+    monkeypatch.setattr(host_checks, "read_clock", refuse)
+    assert host_checks.examine_clock() == Finding(
         "this computer", "clock", Result.NOT_TESTED, "the kernel does not say: adjtimex is not allowed"
     )
 

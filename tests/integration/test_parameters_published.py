@@ -10,8 +10,8 @@ import zenoh.ext
 
 from gateway.cli.subscribers import LcmListener
 from gateway.messages.decode import decode
+from gateway.outputs.lcm import queries as lcm_queries
 from gateway.outputs.lcm.output import open_lcm
-from gateway.queries import lcm_queries
 from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import pytest
 import zenoh
 
-from gateway.queries import lcm_queries
+from gateway.outputs.lcm import queries as lcm_queries
 from gateway.queries.answers import json_bytes
 from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
 from tests.querying import LabServer, gateway_at, is_filled

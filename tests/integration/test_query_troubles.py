@@ -11,8 +11,8 @@ import zenoh
 from gateway.c3d_spool import Spool
 from gateway.config.settings import SourceSettings
 from gateway.errors import QueryError
+from gateway.outputs.zenoh import queries as zenoh_queries
 from gateway.outputs.zenoh.queries import ZenohQueries
-from gateway.queries import zenoh_queries
 from gateway.queries.answers import Answer
 from gateway.queries.source_queries import SourceQueries
 from tests.networks import free_endpoint, open_zenoh

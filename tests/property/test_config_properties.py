@@ -7,7 +7,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from gateway import names
 from gateway.config.loading import load
 from gateway.config.settings import (
     LcmSettings,
@@ -19,6 +18,7 @@ from gateway.config.settings import (
 )
 from gateway.config.values import LCM_PROVIDERS, KeyPrefix
 from gateway.errors import ConfigError
+from gateway.messages import topics
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from tests.strategies import damaged
@@ -109,7 +109,7 @@ SOURCES = st.builds(
 SETTINGS = st.builds(
     Settings,
     sources=st.lists(
-        SOURCES, min_size=1, max_size=3, unique_by=lambda source: names.lcm_channel("", source.name)
+        SOURCES, min_size=1, max_size=3, unique_by=lambda source: topics.lcm_channel("", source.name)
     ).map(tuple),
     zenoh=st.builds(
         ZenohSettings,
@@ -160,7 +160,7 @@ def test_any_file_gives_settings_or_lines_with_its_path(file: Path, content: byt
 @given(first=st.from_regex(r"\A[ABab_-]{1,4}\Z"), second=st.from_regex(r"\A[ABab_-]{1,4}\Z"))
 def test_names_are_refused_together_exactly_if_they_share_channels(first: str, second: str) -> None:
     sources = tuple(SourceSettings(name=name, host="lab") for name in (first, second))
-    if names.lcm_channel("MOCAP", first) == names.lcm_channel("MOCAP", second):
+    if topics.lcm_channel("MOCAP", first) == topics.lcm_channel("MOCAP", second):
         with pytest.raises(ValidationError, match="shares its LCM channels"):
             Settings(sources=sources)
     else:

@@ -4,7 +4,6 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from gateway import names
 from gateway.config.section import shown
 from gateway.config.settings import (
     LcmSettings,
@@ -16,6 +15,7 @@ from gateway.config.settings import (
     lcm_queries_url,
 )
 from gateway.config.values import ChannelPrefix, SourceName
+from gateway.messages import topics
 from gateway.rtc3d.commands import AllFrames
 from gateway.rtc3d.components import ComponentType
 from tests.settings import mistakes, source
@@ -56,8 +56,8 @@ def test_the_longest_name_and_prefix_fit_a_channel() -> None:
     TypeAdapter(SourceName).validate_python("S" * 24)
     TypeAdapter(ChannelPrefix).validate_python("P" * 16)
     channel = f"{'P' * 16}_{'S' * 24}_PARAMETERS_REQUEST"
-    assert len(channel) <= names.MAX_CHANNEL_LENGTH
-    assert names.lcm_channel("P" * 16, "S" * 24, "PARAMETERS_REQUEST") == channel
+    assert len(channel) <= topics.MAX_CHANNEL_LENGTH
+    assert topics.lcm_channel("P" * 16, "S" * 24, "PARAMETERS_REQUEST") == channel
 
 
 def test_names_that_share_channels_are_both_named() -> None:

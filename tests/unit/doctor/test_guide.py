@@ -1,7 +1,7 @@
 import re
 from pathlib import Path
 
-from gateway.doctor import host, server, zenoh_link
+from gateway.doctor import host_checks, source_checks, zenoh_checks
 
 GUIDE = (Path(__file__).parents[3] / "docs/how-to/troubleshoot.md").read_text(encoding="utf-8")
 
@@ -9,5 +9,5 @@ GUIDE = (Path(__file__).parents[3] / "docs/how-to/troubleshoot.md").read_text(en
 def test_the_guide_has_every_check_in_its_order() -> None:
     table = GUIDE.partition("## What is looked at")[2].partition("\n## ")[0]
     checks = re.findall(r"^\| [^|]*\| (\w+) \|", table, re.MULTILINE)
-    listed = ["file", *server.CHECKS, *zenoh_link.CHECKS, *host.LCM_CHECKS, "clock"]
+    listed = ["file", *source_checks.CHECKS, *zenoh_checks.CHECKS, *host_checks.LCM_CHECKS, "clock"]
     assert [check for check in checks if check != "check"] == listed

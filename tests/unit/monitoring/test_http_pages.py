@@ -7,7 +7,7 @@ from http import HTTPStatus
 import pytest
 import pytest_asyncio
 
-from gateway import http_pages
+from gateway.monitoring import http_pages
 from gateway.monitoring.http_pages import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpPages, Page
 from tests.networks import free_port
 from tests.waiting import wait_until_async

@@ -172,7 +172,7 @@ def test_wrong_counts_make_no_frame_in_either_byte_order(field: str, byte_order:
             split_frame(body, order)
 
 
-FRAME_KINDS = [kind for kind in KINDS.values() if kind.__module__.endswith("frames")]
+FRAME_KINDS = [kind for kind in KINDS.values() if kind.__module__.endswith("frame_faults")]
 
 
 @pytest.mark.parametrize("kind", FRAME_KINDS)
