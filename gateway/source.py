@@ -12,11 +12,12 @@ from gateway.errors import LinkError, QueryError, SpoolError
 from gateway.log import log_fields
 from gateway.monitoring.status_line import source_line
 from gateway.publish.fan_out import FanOut
+from gateway.publish.status_messages import clock_message, status_message
 from gateway.queries.answers import C3D, Answer
 from gateway.queries.source_queries import Ask, SourceQueries, StreamAccess
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.stream.state import StreamState
-from gateway.stream.status import FrameRate, StreamStatus, clock_message, status_message
+from gateway.stream.status import FrameRate, StreamStatus
 from gateway.stream.supervisor import Callbacks, Supervisor
 
 _MAX_WRITING: Final = 4

@@ -4,8 +4,8 @@ from typing import Any
 
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
+from gateway.outputs.status import OutputHealth
 from gateway.rtc3d.components import ComponentType
-from gateway.stream.status import OutputHealth
 
 
 class ToyOutput:

@@ -5,12 +5,13 @@ from http import HTTPStatus
 from typing import Any, Final
 
 from gateway.config.settings import StreamSettings
+from gateway.messages.host_time import now_utime
 from gateway.monitoring.http_pages import Page
 from gateway.monitoring.monitored import Watched
 from gateway.rtc3d.components import ComponentType
 from gateway.source import Source
 from gateway.stream.state import StreamState
-from gateway.stream.status import StreamStatus, now_utime
+from gateway.stream.status import StreamStatus
 
 _ONLY_EVENTS: Final = {ComponentType.EVENT}
 

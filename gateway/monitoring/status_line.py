@@ -3,8 +3,9 @@
 from collections.abc import Iterable, Sequence
 
 from gateway.config.settings import SourceSettings
+from gateway.outputs.status import OutputHealth
 from gateway.stream.state import StreamState
-from gateway.stream.status import OutputHealth, StreamStatus
+from gateway.stream.status import StreamStatus
 
 
 def source_line(source: SourceSettings, streams: Sequence[tuple[StreamStatus, float]]) -> str:

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from typing import Protocol
 
 from gateway.messages.topics import Topic
+from gateway.outputs.status import OutputHealth
 from gateway.rtc3d.components import ComponentType
-from gateway.stream.status import OutputHealth
 
 
 class Publisher(Protocol):

@@ -13,12 +13,12 @@ from gateway.messages.splice import (
     timestamp_us_of,
 )
 from gateway.outputs.contract import Output
+from gateway.outputs.status import OutputStatus
 from gateway.publish.routes import ComponentRoute, OutputRoute
 from gateway.publish.tool_poses import ToolPoses
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import ComponentLayout, Frame, Layout
 from gateway.rtc3d.parameters import Parameters
-from gateway.stream.status import OutputStatus
 
 _MAX_PLANS: Final = 256
 

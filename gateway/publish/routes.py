@@ -7,9 +7,9 @@ from gateway.log import HOLD_S, FailureLog
 from gateway.messages.splice import MESSAGE_TYPES, type_name
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import Output, Publisher
+from gateway.outputs.status import OutputStatus
 from gateway.publish.pacing import Pacer
 from gateway.rtc3d.components import ComponentType
-from gateway.stream.status import OutputStatus
 
 logger = logging.getLogger(__name__)
 

@@ -18,6 +18,7 @@ from gateway.errors import (
     ReplyTimeoutError,
     ServerError,
 )
+from gateway.messages.host_time import now_utime
 from gateway.messages.splice import FINGERPRINT_BYTES, STAMP, Stamp, splice
 from gateway.queries.answers import (
     JSON,
@@ -35,7 +36,7 @@ from gateway.rtc3d.frames import byte_order_of, split_frame
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.stream.state import StreamState
-from gateway.stream.status import StreamStatus, now_utime
+from gateway.stream.status import StreamStatus
 
 NOT_PUBLISHED: Final = -1
 """The sequence number of a frame that was asked for and is no part of the stream."""

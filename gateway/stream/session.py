@@ -18,6 +18,7 @@ from gateway.errors import (
     SilenceError,
 )
 from gateway.log import HOLD_S, FailureLog
+from gateway.messages.host_time import now_utime
 from gateway.rtc3d.client_protocol import (
     Answered,
     Broken,
@@ -36,7 +37,7 @@ from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.packets import Packet, text_of
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.stream.state import StreamInput
-from gateway.stream.status import StreamStatus, now_utime
+from gateway.stream.status import StreamStatus
 
 _BYE_S: Final = 0.5
 """How long a server may take to close after Bye; some never do (field note 10)."""

@@ -1,15 +1,13 @@
-"""Counters of streams and outputs, and the status message made of them."""
+"""The status of one stream: its state, its counters and what went wrong."""
 
 import logging
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-import rtc3d
-
-from gateway import __version__
+from gateway.messages.host_time import now_utime
 from gateway.stream.clock import ServerClock
 from gateway.stream.state import StreamInput, StreamState, next_state
 
@@ -22,14 +20,7 @@ MAX_LIMITATIONS: Final = 20
 
 _TRYING: Final = (StreamState.CONNECTING, StreamState.HANDSHAKING, StreamState.WAITING)
 
-_time_ns: Final = time.time_ns  # compiled, a Final is not looked up by its name at every call
-
 logger = logging.getLogger(__name__)
-
-
-def now_utime() -> int:
-    """Return the host's time in µs since the Unix epoch."""
-    return _time_ns() // 1000
 
 
 @dataclass
@@ -105,24 +96,6 @@ class StreamStatus:
         self.last_error_utime = now_utime()
 
 
-@dataclass
-class OutputStatus:
-    """What one output did for one source: messages and their bytes by component, and drops by cause."""
-
-    name: str
-    messages: Counter[str] = field(default_factory=Counter)
-    drops: Counter[str] = field(default_factory=Counter)
-    message_bytes: Counter[str] = field(default_factory=Counter)
-
-
-@dataclass(frozen=True)
-class OutputHealth:
-    """Whether an output can send, and if not, what is wrong and what to do."""
-
-    connected: bool
-    problem: str = ""
-
-
 class FrameRate:
     """Frames per second between one call and the next."""
 
@@ -137,97 +110,3 @@ class FrameRate:
         rate_hz = (frames - self._frames) / elapsed_s if elapsed_s > 0 else 0.0
         self._frames, self._time_s = frames, now_s
         return rate_hz
-
-
-def status_message(
-    *,
-    source: str,
-    server: str,
-    sequence: int,
-    streams: Sequence[tuple[StreamStatus, float]],
-    outputs: Iterable[tuple[OutputStatus, OutputHealth]],
-) -> rtc3d.status_t:
-    """Return the status of one source as its LCM message; ``streams`` come with their rates in Hz."""
-    message = rtc3d.status_t()
-    message.utime = message.capture_utime = now_utime()
-    message.sequence = sequence
-    message.session = sum(stream.session for stream, _ in streams)
-    message.source = source
-    message.server = server
-    message.gateway_version = __version__
-    message.streams = [_stream_message(stream, rate_hz) for stream, rate_hz in streams]
-    message.num_streams = len(message.streams)
-    message.outputs = [_output_message(output, health) for output, health in outputs]
-    message.num_outputs = len(message.outputs)
-    return message
-
-
-def clock_message(source_session: int, sequence: int, stream: StreamStatus) -> rtc3d.clock_t:
-    """Return the clock of one stream as its LCM message."""
-    message = rtc3d.clock_t()
-    message.utime = message.capture_utime = now_utime()
-    message.sequence = sequence
-    message.session = source_session
-    message.components = stream.components
-    message.clock = clock_model(stream.clock)
-    return message
-
-
-def clock_model(clock: ServerClock) -> rtc3d.clock_model_t:
-    """Return what is known of a server's clock as its LCM type."""
-    model = rtc3d.clock_model_t()
-    model.has_clock = clock.has_clock
-    if clock.has_clock:
-        model.offset_us = round(clock.offset_us)
-        model.drift_ppm = clock.drift_ppm
-        model.uncertainty_us = clock.uncertainty_us
-    model.samples = clock.samples
-    return model
-
-
-def _stream_message(stream: StreamStatus, rate_hz: float) -> rtc3d.stream_status_t:
-    message = rtc3d.stream_status_t()
-    for name in (
-        "components",
-        "byte_order",
-        "rate",
-        "session",
-        "frames_in",
-        "bytes_in",
-        "reconnects",
-        "restarts",
-        "last_error",
-        "last_error_utime",
-    ):
-        setattr(message, name, getattr(stream, name))
-    message.state = stream.state.value
-    message.frame_rate_hz = rate_hz
-    message.lag_ms = 1000 * stream.lag_s
-    message.clock = clock_model(stream.clock)
-    message.drops = _counts(stream.drops)
-    message.num_drops = len(message.drops)
-    message.limitations = list(stream.limitations)
-    message.num_limitations = len(message.limitations)
-    return message
-
-
-def _output_message(output: OutputStatus, health: OutputHealth) -> rtc3d.output_status_t:
-    message = rtc3d.output_status_t()
-    message.name = output.name
-    message.connected = health.connected
-    message.problem = health.problem
-    message.messages = _counts(output.messages)
-    message.num_messages = len(message.messages)
-    message.drops = _counts(output.drops)
-    message.num_drops = len(message.drops)
-    return message
-
-
-def _counts(counter: Counter[str]) -> list[rtc3d.count_t]:
-    messages = []
-    for name, count in sorted(counter.items()):
-        message = rtc3d.count_t()
-        message.name = name
-        message.count = count
-        messages.append(message)
-    return messages

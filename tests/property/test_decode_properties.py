@@ -7,9 +7,11 @@ from hypothesis import strategies as st
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode, one_line, to_json
 from gateway.messages.splice import Stamp, splice, tool_poses
+from gateway.outputs.status import OutputHealth, OutputStatus
+from gateway.publish.status_messages import clock_message, status_message
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
-from gateway.stream.status import OutputHealth, OutputStatus, StreamStatus, clock_message, status_message
+from gateway.stream.status import StreamStatus
 from tests.strategies import damaged
 from tests.vectors import FULL_FRAME
 

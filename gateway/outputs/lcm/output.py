@@ -14,7 +14,7 @@ from gateway.config.settings import LcmSettings
 from gateway.errors import OutputError
 from gateway.log import HOLD_S, FailureLog
 from gateway.messages.topics import Topic, lcm_channel, unique_name
-from gateway.stream.status import OutputHealth
+from gateway.outputs.status import OutputHealth
 
 _RETRY_S: Final = 1.0
 

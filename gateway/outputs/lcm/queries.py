@@ -19,12 +19,12 @@ import rtc3d
 from gateway.config.settings import LcmSettings
 from gateway.errors import OutputError, QueryError
 from gateway.log import log_fields
+from gateway.messages.host_time import now_utime
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.output import open_lcm
 from gateway.queries.answers import unknown_section
 from gateway.queries.source_queries import SourceQueries
 from gateway.rtc3d.commands import SECTIONS
-from gateway.stream.status import now_utime
 
 MAX_PENDING: Final = 64
 """How many requests are worked on at once; more are dropped and counted."""

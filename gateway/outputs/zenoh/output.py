@@ -17,7 +17,7 @@ from gateway.config.values import zenoh_reason
 from gateway.errors import ConfigError, OutputError
 from gateway.log import FailureLog
 from gateway.messages.topics import Topic, zenoh_key
-from gateway.stream.status import OutputHealth
+from gateway.outputs.status import OutputHealth
 
 LCM_ENCODING: Final = "application/x-lcm"
 """The Zenoh encoding of every message; its schema is the LCM type: ``application/x-lcm;rtc3d.markers_t``."""

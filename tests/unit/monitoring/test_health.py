@@ -7,11 +7,12 @@ import pytest
 
 from gateway.config.settings import MetricsSettings, Settings, SourceSettings, StreamSettings
 from gateway.gateway import Gateway
+from gateway.messages.host_time import now_utime
 from gateway.monitoring.health import health_page
 from gateway.outputs.memory import MemoryOutput
 from gateway.rtc3d.components import ComponentType
 from gateway.stream.state import StreamState
-from gateway.stream.status import StreamStatus, now_utime
+from gateway.stream.status import StreamStatus
 
 MARKERS, ANALOG, EVENT = (
     (ComponentType.MARKERS,),

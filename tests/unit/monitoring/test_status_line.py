@@ -4,9 +4,10 @@ import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.monitoring.status_line import output_lines, source_line
+from gateway.outputs.status import OutputHealth
 from gateway.rtc3d.components import ComponentType
 from gateway.stream.state import StreamInput, StreamState
-from gateway.stream.status import OutputHealth, StreamStatus
+from gateway.stream.status import StreamStatus
 
 LAB = SourceSettings(name="lab", host="192.0.2.9")
 TWO = SourceSettings(

@@ -77,7 +77,8 @@ def test_after_close_no_call_is_begun(blocked: tuple[SendThread, threading.Event
 
 def test_the_end_of_the_program_does_not_wait_for_a_call() -> None:
     code = (
-        "import threading; from gateway.outputs.zenoh.send_thread import SendThread; began = threading.Event();"
+        "import threading; from gateway.outputs.zenoh.send_thread import SendThread;"
+        "began = threading.Event();"
         "SendThread('s').submit(lambda: (began.set(), threading.Event().wait())); began.wait()"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=30, check=False).returncode == 0

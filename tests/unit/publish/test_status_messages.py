@@ -1,0 +1,176 @@
+from collections import Counter
+from typing import Any
+
+import pytest
+import rtc3d
+
+from gateway import __version__
+from gateway.messages.host_time import now_utime
+from gateway.outputs.status import OutputHealth, OutputStatus
+from gateway.publish.status_messages import clock_message, clock_model, status_message
+from gateway.stream.clock import ServerClock
+from gateway.stream.state import StreamState
+from gateway.stream.status import StreamStatus
+
+NO_CLOCK = {"has_clock": False, "offset_us": 0, "drift_ppm": 0.0, "uncertainty_us": 0.0, "samples": 0}
+
+
+def fields_of(value: Any) -> Any:
+    """Return an LCM object as a dictionary of all its fields, whatever they are."""
+    if hasattr(value, "__slots__"):
+        return {name: fields_of(getattr(value, name)) for name in value.__slots__}
+    return [fields_of(item) for item in value] if isinstance(value, list) else value
+
+
+def encoded_and_decoded(message: rtc3d.status_t) -> Any:
+    return fields_of(rtc3d.status_t.decode(message.encode()))
+
+
+def test_the_status_message_has_every_field() -> None:
+    stream = StreamStatus(
+        "3d 6d",
+        state=StreamState.STREAMING,
+        byte_order="little",
+        rate="Frequency:60",
+        session=3,
+        frames_in=2**40,
+        bytes_in=2**41,
+        reconnects=2,
+        restarts=4,
+        lag_s=0.0125,
+        drops=Counter({"unknown component": 5, "frame rejected": 1}),
+        limitations=["the server refused Version 1.0: err-version", "no parameters"],
+        last_error="Verbindung weg – Kabel prüfen",
+        last_error_utime=1_700_000_000_000_000,
+    )
+    quiet = StreamStatus("analog", session=1)
+    zenoh = OutputStatus("zenoh", Counter({"6d": 8, "3d": 9}), Counter({"no router": 2}))
+    lcm = OutputStatus("lcm")
+    before = now_utime()
+    message = encoded_and_decoded(
+        status_message(
+            source="lab",
+            server="192.0.2.20:3020",
+            sequence=17,
+            streams=[(stream, 59.5), (quiet, 0.0)],
+            outputs=[(zenoh, OutputHealth(True)), (lcm, OutputHealth(False, "no multicast"))],
+        )
+    )
+    assert before <= message["utime"] <= now_utime()
+    assert message == {
+        "utime": message["utime"],
+        "capture_utime": message["utime"],
+        "sequence": 17,
+        "session": 4,
+        "source": "lab",
+        "server": "192.0.2.20:3020",
+        "gateway_version": __version__,
+        "num_streams": 2,
+        "streams": [
+            {
+                "components": "3d 6d",
+                "state": "streaming",
+                "byte_order": "little",
+                "rate": "Frequency:60",
+                "frame_rate_hz": 59.5,
+                "session": 3,
+                "frames_in": 2**40,
+                "bytes_in": 2**41,
+                "reconnects": 2,
+                "restarts": 4,
+                "lag_ms": 12.5,
+                "clock": NO_CLOCK,
+                "num_drops": 2,
+                "drops": [
+                    {"name": "frame rejected", "count": 1},
+                    {"name": "unknown component", "count": 5},
+                ],
+                "num_limitations": 2,
+                "limitations": ["the server refused Version 1.0: err-version", "no parameters"],
+                "last_error": "Verbindung weg – Kabel prüfen",
+                "last_error_utime": 1_700_000_000_000_000,
+            },
+            {
+                "components": "analog",
+                "state": "waiting to reconnect",
+                "byte_order": "",
+                "rate": "",
+                "frame_rate_hz": 0.0,
+                "session": 1,
+                "frames_in": 0,
+                "bytes_in": 0,
+                "reconnects": 0,
+                "restarts": 0,
+                "lag_ms": 0.0,
+                "clock": NO_CLOCK,
+                "num_drops": 0,
+                "drops": [],
+                "num_limitations": 0,
+                "limitations": [],
+                "last_error": "",
+                "last_error_utime": 0,
+            },
+        ],
+        "num_outputs": 2,
+        "outputs": [
+            {
+                "name": "zenoh",
+                "connected": True,
+                "problem": "",
+                "num_messages": 2,
+                "messages": [{"name": "3d", "count": 9}, {"name": "6d", "count": 8}],
+                "num_drops": 1,
+                "drops": [{"name": "no router", "count": 2}],
+            },
+            {
+                "name": "lcm",
+                "connected": False,
+                "problem": "no multicast",
+                "num_messages": 0,
+                "messages": [],
+                "num_drops": 0,
+                "drops": [],
+            },
+        ],
+    }
+
+
+def test_the_clock_message_has_every_field() -> None:
+    stream = StreamStatus("3d 6d", session=1)
+    before = now_utime()
+    message = fields_of(rtc3d.clock_t.decode(clock_message(3, 17, stream).encode()))
+    assert before <= message["utime"] <= now_utime()
+    assert message == {
+        "utime": message["utime"],
+        "capture_utime": message["utime"],
+        "sequence": 17,
+        "session": 3,
+        "components": "3d 6d",
+        "clock": NO_CLOCK,
+    }
+
+
+def test_a_clock_that_is_known_is_told() -> None:
+    clock = ServerClock()
+    for number in range(8_000):  # 20 s at 400 Hz, with a gateway's clock that is 50 ppm faster
+        timestamp_us = 2_500 * number
+        clock.observe(timestamp_us, number, 1_700_000_000_000_000 + timestamp_us + timestamp_us // 20_000)
+    assert clock.has_clock
+    assert fields_of(clock_model(clock)) == {
+        "has_clock": True,
+        "offset_us": round(clock.offset_us),
+        "drift_ppm": clock.drift_ppm,
+        "uncertainty_us": clock.uncertainty_us,
+        "samples": clock.samples,
+    }
+    assert clock.drift_ppm == pytest.approx(50, abs=1)
+
+
+@pytest.mark.parametrize("counter", ["messages", "drops"])
+def test_counts_stand_in_the_order_of_their_names(counter: str) -> None:
+    output = OutputStatus("zenoh", **{counter: Counter("cab")})
+    outputs = [(output, OutputHealth(True))]
+    message = encoded_and_decoded(
+        status_message(source="lab", server="s", sequence=0, streams=[], outputs=outputs)
+    )
+    assert [count["name"] for count in message["outputs"][0][counter]] == ["a", "b", "c"]
