@@ -6,7 +6,7 @@ from typing import Annotated, Final
 
 import typer
 
-from gateway.config.environment import PREFIX
+from gateway.config.environment import VARIABLE_PREFIX
 from gateway.config.loading import Configuration, read, read_server
 from gateway.config.schema import schema_text
 from gateway.config.show import shown_configuration
@@ -18,7 +18,7 @@ _DEFAULT_PORT: Final = 3020
 ConfigOption = Annotated[
     Path | None,
     typer.Option(
-        help=f"The configuration, YAML; see config/gateway.yaml. Variables {PREFIX}… stand over it, "
+        help=f"The configuration, YAML; see config/gateway.yaml. Variables {VARIABLE_PREFIX}… stand over it, "
         "and can do without it."
     ),
 ]
@@ -36,7 +36,9 @@ def configuration(config: Path | None, server: str | None) -> Configuration:
     """
     if server is not None and config is None:
         return read_server(*_host_and_port(server))
-    if server is None and (config is not None or any(name.startswith(PREFIX) for name in os.environ)):
+    if server is None and (
+        config is not None or any(name.startswith(VARIABLE_PREFIX) for name in os.environ)
+    ):
         return read(config)
     raise typer.BadParameter("give either --config FILE or --server HOST[:PORT]")
 

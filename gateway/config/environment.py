@@ -11,33 +11,33 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from gateway.config.secrets import is_secret_key
-from gateway.config.section import shown
-from gateway.config.yaml_document import Document, Location, Place, is_whole, read_yaml
+from gateway.config.section import describe
+from gateway.config.yaml_document import Document, Location, Position, is_encodable, read_yaml
 
-PREFIX: Final = "RTC3D_GATEWAY__"
+VARIABLE_PREFIX: Final = "RTC3D_GATEWAY__"
 
 
 def variable_name(location: Location) -> str:
     """Return the name of the variable that sets the value that ``location`` leads to."""
-    return PREFIX + "__".join(str(step).upper() for step in location)
+    return VARIABLE_PREFIX + "__".join(str(step).upper() for step in location)
 
 
-def override(document: Document, environ: Mapping[str, str]) -> None:
-    """Set in ``document`` what the variables say, each variable as the place of what it sets.
+def apply_overrides(document: Document, environ: Mapping[str, str]) -> None:
+    """Set in ``document`` what the variables say, each variable as the position of what it sets.
 
-    Raises ConfigError, the variable as its place, for a name that leads nowhere, or a value that is no
+    Raises ConfigError, the variable as its position, for a name that leads nowhere, or a value that is no
     YAML. Whether keys and values are accepted is seen later, as with those of the file.
     """
     if not isinstance(document.values, dict):
         return  # a file of something else, which will be told
-    names = [name for name in environ if name.startswith(PREFIX)]
+    names = [name for name in environ if name.startswith(VARIABLE_PREFIX)]
     # A mapping comes before its keys, and list items in order: a variable may add the next one.
     for name in sorted(names, key=lambda name: [step.zfill(9) for step in _steps(name)]):
         _Override(document, name).set(environ[name])
 
 
 def _steps(name: str) -> list[str]:
-    return name.removeprefix(PREFIX).lower().split("__")
+    return name.removeprefix(VARIABLE_PREFIX).lower().split("__")
 
 
 def _holds(container: Any, key: Any) -> bool:
@@ -49,13 +49,13 @@ class _Override:
 
     def __init__(self, document: Document, name: str) -> None:
         self._document = document
-        self._place = Place(name)
+        self._position = Position(name)
         self._steps = _steps(name)
 
     def set(self, text: str) -> None:
         if not all(self._steps):
-            raise self._place.error(
-                (), f"names no key; accepted is a name such as {variable_name(('lcm', 'url'))}"
+            raise self._position.error(
+                (), f"names no key; expected a name such as {variable_name(('lcm', 'url'))}"
             )
         container = self._document.values
         location: Location = ()
@@ -67,7 +67,7 @@ class _Override:
                 self._put(container, key, self._read(text, location), location)
             elif not _holds(container, key):
                 new: Any = [] if re.fullmatch("[0-9]+", following[0]) else {}
-                self._put(container, key, Document(new, {(): self._place}, {}), location)
+                self._put(container, key, Document(new, {(): self._position}, {}), location)
             container = container[key]
 
     def _key(self, container: object, location: Location, step: str) -> Any:
@@ -78,15 +78,15 @@ class _Override:
             case list():
                 if re.fullmatch("[0-9]{1,9}", step) and int(step) <= len(container):
                     return int(step)
-                raise self._place.error(
+                raise self._position.error(
                     location,
-                    f"found the index {shown(step)}; accepted is a number from 0 to {len(container)}",
+                    f"found the index {describe(step)}; expected a number from 0 to {len(container)}",
                 )
-        place = self._document.nearest_place(location)
-        raise self._place.error(
+        position = self._document.nearest_position(location)
+        raise self._position.error(
             location,
-            f"has no keys to set, it is {shown(container)} ({place}); "
-            f"accepted is all of it in {variable_name(location)}",
+            f"this value has no keys, it is {describe(container)} ({position}); "
+            f"set the whole value with {variable_name(location)}",
         )
 
     def _put(self, container: Any, key: Any, read: Document, location: Location) -> None:
@@ -94,19 +94,19 @@ class _Override:
             container.append(read.values)
         else:
             container[key] = read.values
-        for all_places, new_places in (
-            (self._document.places, read.places),
-            (self._document.key_places, {(): self._place, **read.key_places}),
+        for all_positions, new_positions in (
+            (self._document.positions, read.positions),
+            (self._document.key_positions, {(): self._position, **read.key_positions}),
         ):
-            for other in [other for other in all_places if other[: len(location)] == location]:
-                del all_places[other]
-            all_places.update({(*location, *inner): place for inner, place in new_places.items()})
+            for other in [other for other in all_positions if other[: len(location)] == location]:
+                del all_positions[other]
+            all_positions.update({(*location, *inner): position for inner, position in new_positions.items()})
 
     def _read(self, text: str, location: Location) -> Document:
         """Return the variable's value; a secret is text as it stands, whatever YAML would make of it."""
         if not is_secret_key(location[-1]):
-            read = read_yaml(text, self._place.origin, has_lines=False)
-            return Document(read.values, {(): self._place, **read.places}, read.key_places)
-        if not is_whole(text):
-            raise self._place.error(location, "found bytes that are not UTF-8; accepted is text")
-        return Document(text, {(): self._place}, {})
+            read = read_yaml(text, self._position.origin, has_lines=False)
+            return Document(read.values, {(): self._position, **read.positions}, read.key_positions)
+        if not is_encodable(text):
+            raise self._position.error(location, "found bytes that are not UTF-8; expected text")
+        return Document(text, {(): self._position}, {})

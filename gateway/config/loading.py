@@ -1,4 +1,4 @@
-"""Reads settings: YAML files and environment variables to sections, and each mistake with its place."""
+"""Reads settings: YAML files and environment variables to sections, and each mistake with its position."""
 
 import json
 import os
@@ -8,11 +8,11 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 from pydantic import ValidationError
 
-from gateway.config.environment import PREFIX, override, variable_name
-from gateway.config.secrets import MASK, is_secret_key, key_of_file, secrets_in, without_secrets
+from gateway.config.environment import VARIABLE_PREFIX, apply_overrides, variable_name
+from gateway.config.secrets import MASK, file_key_for, find_secrets, is_secret_key, mask_secrets_in_text
 from gateway.config.section import UNKNOWN_KEY, Section
 from gateway.config.settings import Settings
-from gateway.config.yaml_document import Document, Location, Place, line_and_column_after, read_yaml
+from gateway.config.yaml_document import Document, Location, Position, line_and_column_after, read_yaml
 from gateway.errors import ConfigError
 
 MAX_FILE_BYTES: Final = 1024 * 1024
@@ -23,10 +23,10 @@ _ZENOH_CONFIG: Final = ("zenoh", "config")
 
 
 class Configuration(NamedTuple):
-    """The gateway's settings, and the place of each value that is not a default."""
+    """The gateway's settings, and the position of each value that is not a default."""
 
     settings: Settings
-    places: Mapping[Location, Place]
+    positions: Mapping[Location, Position]
 
 
 def load(path: Path | None, environ: Mapping[str, str] = os.environ) -> Settings:
@@ -38,7 +38,7 @@ def read(path: Path | None, environ: Mapping[str, str] = os.environ) -> Configur
     """Return what ``environ`` says (``config_environment``), over the YAML file at ``path`` if there is one.
 
     Relative paths count from the file's folder, else from the current one. Raises ConfigError with one
-    line per mistake, ``PLACE: KEY: what was found; what is accepted``; the place is FILE:LINE:COLUMN or
+    line per mistake, ``POSITION: KEY: what was found; what is accepted``; the position is FILE:LINE:COLUMN or
     the variable. Of mistakes in the YAML itself only the first is told: the rest cannot be read.
     """
     if path is None:
@@ -51,7 +51,7 @@ def read(path: Path | None, environ: Mapping[str, str] = os.environ) -> Configur
 def read_server(host: str, port: int, environ: Mapping[str, str] = os.environ) -> Configuration:
     """Return the configuration of one server as source "lab", all else as by default or in ``environ``.
 
-    Raises ConfigError as ``read`` does, with the place ``--server``.
+    Raises ConfigError as ``read`` does, with the position ``--server``.
     """
     sources = json.dumps({"sources": [{"name": "lab", "host": host, "port": port}]})
     return _configuration(read_yaml(sources, "--server", has_lines=False), Path.cwd(), environ)
@@ -70,7 +70,7 @@ def load_as(section: type[AnySection], path: Path, *, example: str) -> AnySectio
 
 
 def _configuration(document: Document, folder: Path, environ: Mapping[str, str]) -> Configuration:
-    override(document, environ)
+    apply_overrides(document, environ)
     mistakes = _take_out_secrets(document)
     try:
         settings = Settings.model_validate(document.values, context={"folder": folder})
@@ -78,14 +78,14 @@ def _configuration(document: Document, folder: Path, environ: Mapping[str, str])
         raise _in_order([*mistakes, *_explained(document, error)]) from None
     if mistakes:
         raise _in_order(mistakes)
-    return Configuration(settings, document.places)
+    return Configuration(settings, document.positions)
 
 
 def _read_file(path: Path, section: type[Section], example: str) -> Document:
     document = read_yaml(_text_of(path, example), str(path))
-    if not document.places:
+    if not document.positions:
         needed = next(name for name, field in section.model_fields.items() if field.is_required())
-        raise ConfigError(f"{path}: empty; accepted is a mapping, with the key {needed} at least")
+        raise ConfigError(f"{path}: empty; expected a mapping with at least the key {needed}")
     return document
 
 
@@ -98,16 +98,16 @@ def _text_of(path: Path, example: str) -> str:
             f"{path}: cannot be read: {error.strerror}; name a YAML file such as {example}"
         ) from error
     if len(data) > MAX_FILE_BYTES:
-        raise ConfigError(f"{path}: too large; accepted is a file of at most {MAX_FILE_BYTES} bytes")
+        raise ConfigError(f"{path}: too large; the limit is {MAX_FILE_BYTES} bytes")
     try:
         return data.decode("utf-8-sig")  # some editors begin a file with a byte order mark
     except UnicodeDecodeError as error:
-        place = Place(str(path), *line_and_column_after(error.object[: error.start].decode()))
+        position = Position(str(path), *line_and_column_after(error.object[: error.start].decode()))
         found = f"0x{error.object[error.start]:02X}"
-        raise place.error((), f"found the byte {found}; accepted is text in UTF-8") from None
+        raise position.error((), f"found the byte {found}; expected text in UTF-8") from None
 
 
-_Mistake = tuple[Place, ConfigError]
+_Mistake = tuple[Position, ConfigError]
 
 
 def _in_order(mistakes: list[_Mistake]) -> ConfigError:
@@ -117,24 +117,24 @@ def _in_order(mistakes: list[_Mistake]) -> ConfigError:
 
 
 def _explained(document: Document, error: ValidationError) -> list[_Mistake]:
-    """Return the mistakes that the models found, each with its place."""
+    """Return the mistakes that the models found, each with its position."""
     mistakes = []
     for details in error.errors(include_url=False):
         location, text = details["loc"], details["msg"]
-        place = document.key_places.get(location) if details["type"] == UNKNOWN_KEY else None
-        place = place or document.nearest_place(location)
-        if place.line:
+        position = document.key_positions.get(location) if details["type"] == UNKNOWN_KEY else None
+        position = position or document.nearest_position(location)
+        if position.line:
             text += _variables_in(document, location)
-        mistakes.append((place, place.error(location, text)))
+        mistakes.append((position, position.error(location, text)))
     return mistakes
 
 
 def _variables_in(document: Document, location: Location) -> str:
     """Return which variables set a part of the value: the mistake may be theirs."""
     names = {
-        place.origin
-        for other, place in document.places.items()
-        if other[: len(location)] == location and place.origin.startswith(PREFIX)
+        position.origin
+        for other, position in document.positions.items()
+        if other[: len(location)] == location and position.origin.startswith(VARIABLE_PREFIX)
     }
     return f" (a part of it is from {', '.join(sorted(names))})" if names else ""
 
@@ -148,20 +148,20 @@ def _take_out_secrets(document: Document) -> list[_Mistake]:
     for key in _ZENOH_CONFIG:
         config = config.get(key) if isinstance(config, dict) else None
     mistakes = []
-    for steps, secret in list(secrets_in(config)):
+    for steps, secret in list(find_secrets(config)):
         location = (*_ZENOH_CONFIG, *steps)
-        place = document.nearest_place(location)
-        if not place.line:
+        position = document.nearest_position(location)
+        if not position.line:
             continue
-        _replace(config, steps, MASK if is_secret_key(steps[-1]) else without_secrets(secret))
-        path_key = key_of_file(steps[-1])
+        _replace(config, steps, MASK if is_secret_key(steps[-1]) else mask_secrets_in_text(secret))
+        path_key = file_key_for(steps[-1])
         others = f"{path_key} with the path of the key's file, " if path_key else ""
         text = (
-            f"found a secret, which does not belong in this file; accepted is {others}"
+            f"found a secret, which does not belong in this file; use {others}"
             f"the environment variable {variable_name(location)}, or zenoh.config as the path "
             "of a JSON5 file that only the gateway may read"
         )
-        mistakes.append((place, place.error(location, text)))
+        mistakes.append((position, position.error(location, text)))
     return mistakes
 
 

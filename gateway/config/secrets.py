@@ -29,7 +29,7 @@ def is_secret_key(key: object) -> bool:
     return isinstance(key, str) and (key == _PRIVATE or _SECRET_KEY.fullmatch(key.lower()) is not None)
 
 
-def secrets_in(value: Any, location: _Steps = ()) -> Iterator[tuple[_Steps, Any]]:
+def find_secrets(value: Any, location: _Steps = ()) -> Iterator[tuple[_Steps, Any]]:
     """Yield each secret in nested mappings and lists, with the keys and indices that lead to it."""
     match value:
         case Mapping():
@@ -38,15 +38,15 @@ def secrets_in(value: Any, location: _Steps = ()) -> Iterator[tuple[_Steps, Any]
                     if item is not None:
                         yield (*location, key), item
                 else:
-                    yield from secrets_in(item, (*location, key))
+                    yield from find_secrets(item, (*location, key))
         case list() | tuple():
             for index, item in enumerate(value):
-                yield from secrets_in(item, (*location, index))
-        case str() if without_secrets(value) != value:
+                yield from find_secrets(item, (*location, index))
+        case str() if mask_secrets_in_text(value) != value:
             yield location, value
 
 
-def key_of_file(key: object) -> str:
+def file_key_for(key: object) -> str:
     """Return the key that takes the path of what ``key`` takes as text: connect_private_key, …; or ""."""
     match str(key).rpartition("_"):
         case (stem, "_", "base64"):
@@ -56,22 +56,22 @@ def key_of_file(key: object) -> str:
     return ""
 
 
-def masked(value: Any) -> Any:
+def mask_secrets(value: Any) -> Any:
     """Return a copy of nested mappings and lists with MASK for every secret."""
     match value:
         case Mapping():
             return {
-                key: MASK if is_secret_key(key) and item is not None else masked(item)
+                key: MASK if is_secret_key(key) and item is not None else mask_secrets(item)
                 for key, item in value.items()
             }
         case list() | tuple():
-            return [masked(item) for item in value]
+            return [mask_secrets(item) for item in value]
         case str():
-            return without_secrets(value)
+            return mask_secrets_in_text(value)
     return value
 
 
-def without_secrets(text: str) -> str:
+def mask_secrets_in_text(text: str) -> str:
     """Return ``text`` with MASK for passwords in URLs, for keys in endpoints, and for keys as PEM."""
     text = _PEM.sub(MASK, text)
     text = _IN_ENDPOINT.sub(rf"\g<1>{MASK}", text)

@@ -15,7 +15,7 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from gateway.config.secrets import without_secrets
+from gateway.config.secrets import mask_secrets_in_text
 
 UNKNOWN_KEY: Final = "unknown_key"
 """The type of the error that is in a key itself; all others are in a value, or in its absence."""
@@ -33,7 +33,9 @@ class Section(BaseModel):
     def _tell_mistakes_in_our_words(cls, value: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
         known = ", ".join(cls.model_fields)
         if not isinstance(value, Mapping | cls):
-            raise mistake(f"found {shown(value)}; accepted is a mapping with any of the keys {known}")
+            raise validation_error(
+                f"found {describe(value)}; expected a mapping with any of the keys {known}"
+            )
         try:
             return validate(value)
         except ValidationError as error:
@@ -42,19 +44,19 @@ class Section(BaseModel):
                 location, kind, text = details["loc"], details["type"], details["msg"]
                 if kind == "extra_forbidden":
                     kind = UNKNOWN_KEY
-                    text = f"unknown key{did_you_mean(location[-1], cls.model_fields)}; known: {known}"
+                    text = f"unknown key{spelling_hint(location[-1], cls.model_fields)}; known keys: {known}"
                 elif kind == "missing":
-                    text = "missing; this key has no default"
+                    text = "missing; this key is required"
                 mistakes.append(_line_error(text, location, kind))
             raise ValidationError.from_exception_data(cls.__name__, mistakes) from None
 
 
-def mistake(text: str, *location: str | int) -> ValidationError:
+def validation_error(text: str, *location: str | int) -> ValidationError:
     """Return the error for a validator to raise; ``location`` counts from the value it was given."""
     return ValidationError.from_exception_data("configuration", [_line_error(text, location, _MISTAKE)])
 
 
-def accepts(what: str) -> WrapValidator:
+def expects(what: str) -> WrapValidator:
     """Return an annotation: a value refused by the type beside it was found, and ``what`` is accepted."""
 
     def check(value: object, validate: ValidatorFunctionWrapHandler) -> object:
@@ -65,13 +67,13 @@ def accepts(what: str) -> WrapValidator:
             if first["loc"]:
                 raise  # of an item inside the value, told in words of its own
             unquoted = first["type"] == "string_type" and isinstance(value, bool | int | float)
-            hint = " (quotes make it text)" if unquoted else ""
-            raise mistake(f"found {shown(value)}{hint}; accepted is {what}") from None
+            hint = " (use quotes to make it text)" if unquoted else ""
+            raise validation_error(f"found {describe(value)}{hint}; expected {what}") from None
 
     return WrapValidator(check)
 
 
-def shown(value: object) -> str:
+def describe(value: object) -> str:
     """Return what was found, fit for a sentence: printable, on one line, bounded, without passwords."""
     match value:
         case None:
@@ -83,18 +85,18 @@ def shown(value: object) -> str:
         case list() | tuple():
             return "a list" if value else "an empty list"
         case str():
-            text = without_secrets(value)
+            text = mask_secrets_in_text(value)
             return repr(text if len(text) <= 60 else text[:60] + "…")
     return str(value)
 
 
-def one_of(words: Iterable[str]) -> str:
+def join_or(words: Iterable[str]) -> str:
     """Return "a, b or c"."""
     *others, last = words
     return f"{', '.join(others)} or {last}" if others else last
 
 
-def did_you_mean(word: object, known: Iterable[str]) -> str:
+def spelling_hint(word: object, known: Iterable[str]) -> str:
     """Return " (did you mean 'x'?)" if ``word`` is nearly ``x``, one of ``known``; else nothing."""
     near = difflib.get_close_matches(str(word).lower()[:60], known, n=1)
     return f" (did you mean {near[0]!r}?)" if near else ""

@@ -13,7 +13,7 @@ from urllib.parse import urlsplit, urlunsplit
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from gateway.config.section import Section, accepts, mistake
+from gateway.config.section import Section, expects, validation_error
 from gateway.config.values import (
     Backlog,
     ByteLimit,
@@ -74,8 +74,8 @@ class ReconnectSettings(Section):
     @model_validator(mode="after")
     def _max_is_not_below_first(self) -> Self:
         if self.max_delay_s < self.first_delay_s:
-            raise mistake(
-                f"found {self.max_delay_s:g}; accepted is first_delay_s ({self.first_delay_s:g}) or more",
+            raise validation_error(
+                f"found {self.max_delay_s:g}; expected first_delay_s ({self.first_delay_s:g}) or more",
                 "max_delay_s",
             )
         return self
@@ -99,7 +99,7 @@ class SourceSettings(Section):
     streams: Annotated[
         tuple[StreamSettings, ...],
         AfterValidator(not_empty),
-        accepts("a list of streams, one or more"),
+        expects("a list of streams, one or more"),
         Field(json_schema_extra={"minItems": 1}),
     ] = (StreamSettings(),)
     """The TCP sessions with the server, each with its components and its rate."""
@@ -143,9 +143,9 @@ class SourceSettings(Section):
         for index, stream in enumerate(streams):
             for component in stream.components:
                 if component in owners:
-                    raise mistake(
+                    raise validation_error(
                         f"found {component.key!r}, which streams[{owners[component]}] has too; "
-                        "accepted is each component in one stream, for it has one key and one channel",
+                        "expected each component in one stream only, because it has one key and one channel",
                         *(index, "components"),
                     )
                 owners[component] = index
@@ -155,9 +155,9 @@ class SourceSettings(Section):
     def _frames_come_before_the_stall(self) -> Self:
         for index, stream in enumerate(self.streams):
             if isinstance(stream.rate, Frequency) and stream.rate.hz * self.stall_timeout_s <= 1:
-                raise mistake(
-                    f"found {stream.rate.hz:g}, one frame in {1 / stream.rate.hz:g} s, which stall_timeout_s "
-                    f"({self.stall_timeout_s:g}) takes for silence; accepted is more than "
+                raise validation_error(
+                    f"found {stream.rate.hz:g}, one frame in {1 / stream.rate.hz:g} s, which counts as "
+                    f"silence because stall_timeout_s is {self.stall_timeout_s:g}; expected more than "
                     f"{1 / self.stall_timeout_s:g}, or a longer stall_timeout_s",
                     *("streams", index, "rate", "frequency_hz"),
                 )
@@ -287,7 +287,7 @@ class Settings(Section):
     sources: Annotated[
         tuple[SourceSettings, ...],
         AfterValidator(not_empty),
-        accepts("a list of sources, one or more, each with name and host"),
+        expects("a list of sources, one or more, each with name and host"),
         Field(json_schema_extra={"minItems": 1}),
     ]
     """The servers."""
@@ -315,9 +315,9 @@ class Settings(Section):
             channel = "_".join(re.findall("[A-Z0-9]+", source.name.upper()))
             if channel in owners:
                 other = owners[channel]
-                raise mistake(
-                    f"found {source.name!r}, which shares its LCM channels with {sources[other].name!r}, "
-                    f"sources[{other}]; accepted is a name of other letters or digits, case aside",
+                raise validation_error(
+                    f"found {source.name!r}, which has the same LCM channels as {sources[other].name!r} "
+                    f"(sources[{other}]); expected a name that differs in letters or digits, ignoring case",
                     *(index, "name"),
                 )
             owners[channel] = index
@@ -326,7 +326,9 @@ class Settings(Section):
     @model_validator(mode="after")
     def _something_is_published(self) -> Self:
         if not (self.zenoh.enabled or self.lcm.enabled):
-            raise mistake(
-                "found false here and in zenoh; accepted is true in one of them at least", "lcm", "enabled"
+            raise validation_error(
+                "found false here and in zenoh.enabled; expected true in at least one of them",
+                "lcm",
+                "enabled",
             )
         return self

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 import yaml
 
 from gateway.config.loading import Configuration
-from gateway.config.secrets import masked
+from gateway.config.secrets import mask_secrets
 from gateway.config.settings import Settings
 from gateway.config.yaml_document import Location
 
@@ -28,7 +28,7 @@ def shown_configuration(configuration: Configuration) -> str:
 
     What depends on the environment is shown as it is here: ``lcm.url`` and ``spool.directory``.
     """
-    values = masked(configuration.settings.model_dump(mode="json"))
+    values = mask_secrets(configuration.settings.model_dump(mode="json"))
     origins = _Origins(configuration)
     origins.resolve(configuration.settings, values)
     lines = [line for key, value in values.items() for line in _lines(key, value, (key,), "", origins)]
@@ -42,7 +42,7 @@ class _Origins:
     """Says where each value is from."""
 
     def __init__(self, configuration: Configuration) -> None:
-        self._places = configuration.places
+        self._positions = configuration.positions
         self._resolved: dict[Location, str] = {}
 
     def resolve(self, settings: Settings, values: dict[str, Any]) -> None:
@@ -58,9 +58,11 @@ class _Origins:
     def of(self, location: Location) -> str:
         if location in self._resolved:
             return self._resolved[location]
-        # The items of a list on one line may be from several places.
-        places = [place for other, place in self._places.items() if other[: len(location)] == location]
-        return ", ".join(dict.fromkeys(place.without_column for place in places)) or _DEFAULT
+        # The items of a list on one line may be from several positions.
+        positions = [
+            position for other, position in self._positions.items() if other[: len(location)] == location
+        ]
+        return ", ".join(dict.fromkeys(position.without_column for position in positions)) or _DEFAULT
 
 
 def _variable(*names: str) -> str:

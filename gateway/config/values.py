@@ -10,8 +10,8 @@ from typing import Annotated, Any, Final, Literal, TypeVar
 import zenoh
 from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, TypeAdapter, ValidationInfo
 
-from gateway.config.secrets import without_secrets
-from gateway.config.section import Section, accepts, did_you_mean, mistake, one_of, shown
+from gateway.config.secrets import mask_secrets_in_text
+from gateway.config.section import Section, describe, expects, join_or, spelling_hint, validation_error
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import BY_KEY, WIRE_ORDER, ByteOrder, ComponentType
 
@@ -63,60 +63,61 @@ def _absolute_path(text: str) -> str:
     return text
 
 
-Switch = Annotated[bool, Field(strict=True), accepts("true or false")]
+Switch = Annotated[bool, Field(strict=True), expects("true or false")]
 Seconds = Annotated[
     float,
     Field(strict=True, ge=0.001, le=86400, allow_inf_nan=False),
-    accepts("a number of seconds from 0.001 to 86400"),
+    expects("a number of seconds from 0.001 to 86400"),
 ]
 Milliseconds = Annotated[
     float,
     Field(strict=True, ge=1, le=60_000, allow_inf_nan=False),
-    accepts("a number of milliseconds from 1 to 60000"),
+    expects("a number of milliseconds from 1 to 60000"),
 ]
 Hertz = Annotated[
     float,
     Field(strict=True, gt=0, le=1_000_000, allow_inf_nan=False),
-    accepts("a number of frames per second above 0, up to 1000000"),
+    expects("a number of frames per second above 0, up to 1000000"),
 ]
-Divisor = Annotated[int, Field(strict=True, ge=1, le=1_000_000), accepts("a whole number from 1 to 1000000")]
+Divisor = Annotated[int, Field(strict=True, ge=1, le=1_000_000), expects("a whole number from 1 to 1000000")]
 ByteLimit = Annotated[
     int,
     Field(strict=True, ge=1024, le=0xFFFFFFFF),  # a packet's size field has 32 bits (§4.1)
-    accepts("a whole number of bytes from 1024 to 4294967295"),
+    expects("a whole number of bytes from 1024 to 4294967295"),
 ]
 FileLimit = Annotated[
-    int, Field(strict=True, ge=1, le=100_000), accepts("a whole number of files from 1 to 100000")
+    int, Field(strict=True, ge=1, le=100_000), expects("a whole number of files from 1 to 100000")
 ]
-SpoolDirectory = Annotated[str, AfterValidator(_absolute_path), accepts("a folder's absolute path, or null")]
+SpoolDirectory = Annotated[str, AfterValidator(_absolute_path), expects("a folder's absolute path, or null")]
 Host = Annotated[
-    str, AfterValidator(_host), accepts("a host name or an IP address; the port has a key of its own")
+    str, AfterValidator(_host), expects("a host name or an IP address; the port has its own key")
 ]
-Port = Annotated[int, Field(strict=True, ge=1, le=65535), accepts("a whole number from 1 to 65535")]
+Port = Annotated[int, Field(strict=True, ge=1, le=65535), expects("a whole number from 1 to 65535")]
 # Their lengths are such that PREFIX_NAME_PARAMETERS_REQUEST fits LCM's 63 characters.
 SourceName = Annotated[
     str,
     Field(pattern=r"^[A-Za-z0-9_-]{1,24}$"),
-    accepts("1 to 24 of the letters A to Z and a to z, digits, '_' and '-'"),
+    expects("1 to 24 of the letters A to Z and a to z, digits, '_' and '-'"),
 ]
 ChannelPrefix = Annotated[
     str,
     Field(pattern=r"^[A-Za-z0-9_]{1,16}$"),
-    accepts("1 to 16 of the letters A to Z and a to z, digits and '_'"),
+    expects("1 to 16 of the letters A to Z and a to z, digits and '_'"),
 ]
 KeyPrefix = Annotated[
     str,
     AfterValidator(_key_prefix),
-    accepts(
+    expects(
         "a Zenoh key of at most 128 characters, such as mocap or site/mocap, "
-        "without space, * $ # ? and without / at an end or doubled"
+        "without spaces, * $ # ?, and without a leading, trailing or double /"
     ),
 ]
 LcmUrl = Annotated[
     str,
     AfterValidator(_lcm_url),
-    accepts(
-        f"a URL that begins with {one_of(f'{provider}://' for provider in LCM_PROVIDERS)}, and has no user"
+    expects(
+        f"a URL that begins with {join_or(f'{provider}://' for provider in LCM_PROVIDERS)}, "
+        "without a user name"
     ),
 ]
 
@@ -142,12 +143,12 @@ def _rate(value: object) -> Rate:
         case "all":
             return AllFrames()
         case {"frequency_hz": _, "divisor": _}:
-            raise mistake("found frequency_hz and divisor together; accepted is one of them")
+            raise validation_error("found frequency_hz and divisor together; expected one of them")
         case {"frequency_hz": _}:
             return Frequency(FrequencyRate.model_validate(value).frequency_hz)
         case {"divisor": _}:
             return FrequencyDivisor(DivisorRate.model_validate(value).divisor)
-    raise mistake(f"found {shown(value)}; accepted is all, {{frequency_hz: 60}} or {{divisor: 4}}")
+    raise validation_error(f"found {describe(value)}; expected all, {{frequency_hz: 60}} or {{divisor: 4}}")
 
 
 def _rate_as_in_yaml(rate: Rate) -> str | dict[str, float] | dict[str, int]:
@@ -161,13 +162,15 @@ def _rate_as_in_yaml(rate: Rate) -> str | dict[str, float] | dict[str, int]:
 
 def _components(value: object) -> tuple[ComponentType, ...]:
     if not isinstance(value, list | tuple) or not value:
-        raise mistake(f"found {shown(value)}; accepted is a list of {one_of(_COMPONENT_KEYS)}, or [all]")
+        raise validation_error(
+            f"found {describe(value)}; expected a list of {join_or(_COMPONENT_KEYS)}, or [all]"
+        )
     if list(value) == ["all"]:
         return WIRE_ORDER
     components = [_component(item, index) for index, item in enumerate(value)]
     for index, component in enumerate(components):
         if component in components[:index]:
-            raise mistake(f"found {component.key!r} again; accepted is each component once", index)
+            raise validation_error(f"found {component.key!r} twice; expected each component once", index)
     return tuple(component for component in WIRE_ORDER if component in components)
 
 
@@ -176,11 +179,11 @@ def _component(item: object, index: int) -> ComponentType:
         case ComponentType():
             return item
         case "all":
-            raise mistake("found 'all' beside others; accepted is [all] alone", index)
+            raise validation_error("found 'all' beside other components; expected [all] alone", index)
         case str() if item in BY_KEY:
             return BY_KEY[item]
-    meant = did_you_mean(item, _COMPONENT_KEYS)
-    raise mistake(f"found {shown(item)}{meant}; accepted is {one_of(_COMPONENT_KEYS)}", index)
+    meant = spelling_hint(item, _COMPONENT_KEYS)
+    raise validation_error(f"found {describe(item)}{meant}; expected {join_or(_COMPONENT_KEYS)}", index)
 
 
 def _component_keys(components: tuple[ComponentType, ...]) -> list[str]:
@@ -205,18 +208,20 @@ def _zenoh_config(value: object, info: ValidationInfo) -> Path | dict[str, Any]:
             path = folder / value
             _ask_zenoh(lambda: zenoh.Config.from_file(path), f"the file {path}")
             return path
-    raise mistake(f"found {shown(value)}; accepted is a JSON5 file's path or a mapping with Zenoh's own keys")
+    raise validation_error(
+        f"found {describe(value)}; expected a JSON5 file's path or a mapping with Zenoh's own keys"
+    )
 
 
 def _ask_zenoh(read: Callable[[], object], what: str) -> None:
     try:
         read()
     except (zenoh.ZError, TypeError, ValueError) as error:
-        raise mistake(f"Zenoh refuses {what}: {zenoh_reason(error)}") from None
+        raise validation_error(f"Zenoh refuses {what}: {zenoh_reason(error)}") from None
 
 
 def zenoh_reason(error: Exception) -> str:
-    """Return the text of Zenoh's error on one line, without places in its source and without secrets."""
+    """Return the text of Zenoh's error on one line, without source locations and without secrets."""
     text = str(error)
     if message := _ZENOH_MESSAGE.search(text):
         text = f"line {message[2]}, column {message[3]}: " + re.sub(r"\\(.)", r"\1", message[1])
@@ -227,7 +232,7 @@ def zenoh_reason(error: Exception) -> str:
     text = re.sub(r"^ *(\d+ )?\|.*\n|^ *= ", "", text, flags=re.MULTILINE)
     text = re.sub(r"(invalid (?:type|value): [a-z ]+) (?:`[^`]*`|\"(?:[^\"\\]|\\.)*\")", r"\1", text)
     text = re.sub(r"\bSingle\(([^()]*)\)", r"\1", text)  # Rust's word for an endpoint without alternatives
-    return " ".join(without_secrets(text).split())
+    return " ".join(mask_secrets_in_text(text).split())
 
 
 Components = Annotated[
@@ -246,9 +251,9 @@ StreamRate = Annotated[
 ]
 """YAML: all, {frequency_hz: NUMBER} or {divisor: WHOLE NUMBER}."""
 
-Backlog = Annotated[Literal["latest", "all"], accepts("latest or all")]
+Backlog = Annotated[Literal["latest", "all"], expects("latest or all")]
 
-ServerByteOrder = Annotated[ByteOrder, accepts("big or little")]
+ServerByteOrder = Annotated[ByteOrder, expects("big or little")]
 
 ZenohConfig = Annotated[
     Path | dict[str, Any], PlainValidator(_zenoh_config, json_schema_input_type=str | dict[str, Any])
@@ -260,12 +265,12 @@ _RATES: Final = TypeAdapter(dict[str, Hertz])
 
 def _max_rates(value: object) -> dict[ComponentType, float]:
     if not isinstance(value, dict):
-        raise mistake(f"found {shown(value)}; accepted is a mapping such as {{3d: 60}}, or {{}}")
+        raise validation_error(f"found {describe(value)}; expected a mapping such as {{3d: 60}}, or {{}}")
     rates = {}
     for key, rate in value.items():
         if key not in BY_KEY and not isinstance(key, ComponentType):
-            meant = did_you_mean(key, _COMPONENT_KEYS)
-            raise mistake(f"found {shown(key)}{meant}; accepted is {one_of(_COMPONENT_KEYS)}")
+            meant = spelling_hint(key, _COMPONENT_KEYS)
+            raise validation_error(f"found {describe(key)}{meant}; expected {join_or(_COMPONENT_KEYS)}")
         component = key if isinstance(key, ComponentType) else BY_KEY[key]
         rates[component] = _RATES.validate_python({component.key: rate})[component.key]
     return rates

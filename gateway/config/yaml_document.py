@@ -1,4 +1,4 @@
-"""YAML text to plain values, and the place of each: for errors, and to tell where a value came from."""
+"""YAML text to plain values, and the position of each: for errors, and to tell where a value came from."""
 
 import re
 from dataclasses import dataclass
@@ -6,7 +6,7 @@ from typing import Any, Final, NamedTuple
 
 import yaml
 
-from gateway.config.section import shown
+from gateway.config.section import describe
 from gateway.errors import ConfigError
 
 MAX_VALUES: Final = 10_000
@@ -24,7 +24,7 @@ Location = tuple[str | int, ...]
 _YAML: Final = "tag:yaml.org,2002:"
 
 
-class Place(NamedTuple):
+class Position(NamedTuple):
     """Where a key or value stands: in a file, or in what has no lines, such as an environment variable.
 
     ``origin`` is the file's path or the variable's name. ``line`` and ``column`` count from 1; both are
@@ -44,7 +44,7 @@ class Place(NamedTuple):
         return f"{self.origin}:{self.line}" if self.line else self.origin
 
     def error(self, location: Location, text: str) -> ConfigError:
-        """Return the error with this place, the key that ``location`` leads to, and ``text``."""
+        """Return the error with this position, the key that ``location`` leads to, and ``text``."""
         key = key_path(location)
         return ConfigError(f"{self}: {key}{': ' if key else ''}{text}")
 
@@ -66,23 +66,23 @@ class _Loader(yaml.SafeLoader):
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """The values of one YAML document, mappings with keys of text, and the place of each value and key."""
+    """The values of one YAML document, mappings with keys of text, and the position of each value and key."""
 
     values: Any
-    places: dict[Location, Place]
-    key_places: dict[Location, Place]
+    positions: dict[Location, Position]
+    key_positions: dict[Location, Position]
 
-    def nearest_place(self, location: Location) -> Place:
+    def nearest_position(self, location: Location) -> Position:
         """Return where the value is; where it would belong if it is missing or a default."""
-        while location not in self.places:
+        while location not in self.positions:
             location = location[:-1]
-        return self.places[location]
+        return self.positions[location]
 
 
 def read_yaml(text: str, origin: str, *, has_lines: bool = True) -> Document:
-    """Return the document in ``text``; one that holds nothing at all has the value None and no places.
+    """Return the document in ``text``; one that holds nothing at all has the value None and no positions.
 
-    Raises ConfigError with the place of the first mistake. ``origin`` begins every place; without
+    Raises ConfigError with the position of the first mistake. ``origin`` begins every position; without
     ``has_lines`` it is all of it.
     """
     return _Reader(origin, has_lines).read(text)
@@ -94,34 +94,34 @@ class _Reader:
     def __init__(self, origin: str, has_lines: bool) -> None:
         self._origin = origin
         self._has_lines = has_lines
-        self._places: dict[Location, Place] = {}
-        self._key_places: dict[Location, Place] = {}
+        self._positions: dict[Location, Position] = {}
+        self._key_positions: dict[Location, Position] = {}
         self._values_left = MAX_VALUES
 
     def read(self, text: str) -> Document:
         try:
             loader = _Loader(text)
         except yaml.reader.ReaderError as error:
-            place = self._place(*line_and_column_after(text[: error.position]))
+            position = self._position(*line_and_column_after(text[: error.position]))
             found = f"the character U+{ord(text[error.position]):04X}"
-            raise place.error((), f"found {found}, which YAML does not allow") from None
+            raise position.error((), f"found {found}, which YAML does not allow") from None
         try:
             root = loader.get_single_node()
         except yaml.MarkedYAMLError as error:
             raise self._not_yaml(error, loader.get_mark()) from None
         except (ValueError, OverflowError):  # from chr() and int() within PyYAML
-            place = self._place_of(loader.get_mark())
-            raise place.error((), "not YAML: a number here is out of range") from None
+            position = self._position_of(loader.get_mark())
+            raise position.error((), "not YAML: a number here is out of range") from None
         values = None if root is None else self._value(root, ())
-        return Document(values, self._places, self._key_places)
+        return Document(values, self._positions, self._key_positions)
 
     def _value(self, node: yaml.Node, location: Location) -> object:
-        place = self._place_of(node.start_mark)
+        position = self._position_of(node.start_mark)
         self._values_left -= 1
         if self._values_left < 0 or len(location) >= MAX_DEPTH:  # only aliases reach this depth
-            limits = f"at most {MAX_VALUES} values in {MAX_DEPTH} levels, those of aliases included"
-            raise place.error((), f"found too much; accepted are {limits}")
-        self._places[location] = place
+            limits = f"more than {MAX_VALUES} values or {MAX_DEPTH} levels"
+            raise position.error((), f"{limits}, counting those that aliases repeat")
+        self._positions[location] = position
         match node, node.tag.removeprefix(_YAML):
             case yaml.MappingNode(), "map":
                 return self._mapping(node, location)
@@ -136,21 +136,21 @@ class _Reader:
                 return self._number(node, location)
             case yaml.ScalarNode(), "null":
                 return None
-        raise place.error(location, f"found the tag {shown(node.tag)}; accepted are values without a tag")
+        raise position.error(location, f"found the tag {describe(node.tag)}; expected a value without a tag")
 
     def _mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, object]:
         values: dict[str, object] = {}
         for key_node, value_node in node.value:
-            place = self._place_of(key_node.start_mark)
+            position = self._position_of(key_node.start_mark)
             if not isinstance(key_node, yaml.ScalarNode):
-                raise place.error(location, "found a list or mapping as a key")
+                raise position.error(location, "found a list or mapping as a key")
             key = self._text(key_node, location)
             here = (*location, key)
             if key in values:
-                raise place.error(here, f"the same key as in line {self._key_places[here].line}")
+                raise position.error(here, f"the same key as in line {self._key_positions[here].line}")
             if key_node.tag == f"{_YAML}merge":
-                raise place.error(here, "mappings are not merged; accepted is an alias as a key's value")
-            self._key_places[here] = place
+                raise position.error(here, "merge keys are not supported; use an alias as the value of a key")
+            self._key_positions[here] = position
             values[key] = self._value(value_node, here)
         return values
 
@@ -160,15 +160,15 @@ class _Reader:
                 return yaml.constructor.SafeConstructor().construct_object(node)
             except (ValueError, LookupError):  # such as 0x_, or a text that is tagged !!int or !!bool
                 pass
-        text = f"found {shown(node.value)}; accepted is a number of at most {MAX_NUMBER_LENGTH} characters"
-        raise self._place_of(node.start_mark).error(location, text)
+        text = f"found {describe(node.value)}; expected a number of at most {MAX_NUMBER_LENGTH} characters"
+        raise self._position_of(node.start_mark).error(location, text)
 
     def _text(self, node: yaml.ScalarNode, location: Location) -> str:
         """Return a key or a text; half a surrogate pair, which an escape can write, is none."""
         text: str = node.value
-        if not is_whole(text):
-            found = f"found {shown(text)}; accepted is text of whole characters"
-            raise self._place_of(node.start_mark).error(location, found)
+        if not is_encodable(text):
+            found = f"found {describe(text)}; expected text that UTF-8 can encode"
+            raise self._position_of(node.start_mark).error(location, found)
         return text
 
     def _not_yaml(self, error: yaml.MarkedYAMLError, end: yaml.Mark) -> ConfigError:
@@ -177,16 +177,16 @@ class _Reader:
             text = f"not YAML: {error.context} from line {error.context_mark.line + 1}: {error.problem}"
         if isinstance(error, yaml.scanner.ScannerError | yaml.parser.ParserError):
             text += "; check indentation, colons, quotes and brackets here"
-        return self._place_of(error.problem_mark or end).error((), text)
+        return self._position_of(error.problem_mark or end).error((), text)
 
-    def _place_of(self, mark: yaml.Mark) -> Place:
-        return self._place(mark.line + 1, mark.column + 1)
+    def _position_of(self, mark: yaml.Mark) -> Position:
+        return self._position(mark.line + 1, mark.column + 1)
 
-    def _place(self, line: int, column: int) -> Place:
-        return Place(self._origin, line, column) if self._has_lines else Place(self._origin)
+    def _position(self, line: int, column: int) -> Position:
+        return Position(self._origin, line, column) if self._has_lines else Position(self._origin)
 
 
-def is_whole(text: str) -> bool:
+def is_encodable(text: str) -> bool:
     """Return whether ``text`` has no half of a surrogate pair, which cannot be printed or encoded."""
     try:
         text.encode()
@@ -202,7 +202,7 @@ def key_path(location: Location) -> str:
         if isinstance(step, int):
             path += f"[{step}]"
         else:
-            path += ("." if path else "") + (step if re.fullmatch(r"[\w/-]{1,60}", step) else shown(step))
+            path += ("." if path else "") + (step if re.fullmatch(r"[\w/-]{1,60}", step) else describe(step))
     return path
 
 

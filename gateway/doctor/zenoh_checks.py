@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import zenoh
 
-from gateway.config.secrets import without_secrets
+from gateway.config.secrets import mask_secrets_in_text
 from gateway.config.settings import ZenohSettings
 from gateway.config.values import zenoh_reason
 from gateway.doctor.finding import Finding, Patient
@@ -39,7 +39,7 @@ def examine_zenoh(settings: ZenohSettings, sources: Sequence[str], seconds: floa
     try:
         asked = zenoh_config(settings.config)
     except ConfigError as error:
-        return _no_link(without_secrets(str(error)), "Correct zenoh.config.")
+        return _no_link(mask_secrets_in_text(str(error)), "Correct zenoh.config.")
     mode = json.loads(asked.get_json("mode")) or "peer"
     connect = _endpoints(asked, "connect", mode)
     listen = [endpoint for endpoint in _endpoints(asked, "listen", mode) if not endpoint.endswith(":0")]
@@ -65,7 +65,8 @@ def examine_zenoh(settings: ZenohSettings, sources: Sequence[str], seconds: floa
         session.close()
     if mode != "client" and not any(others) and connect:
         return _no_link(
-            f"nobody is reached at {without_secrets(', '.join(connect))}, so nothing leaves", _ROUTER_REMEDY
+            f"nobody is reached at {mask_secrets_in_text(', '.join(connect))}, so nothing leaves",
+            _ROUTER_REMEDY,
         )
     if listen and not alive and (problem := _cannot_listen(asked, listen)):
         return _no_link(
@@ -120,7 +121,7 @@ def _cannot_listen(asked: zenoh.Config, listen: Sequence[str]) -> str:
     try:
         zenoh.open(asked).close()
     except zenoh.ZError as error:
-        return f"nobody can listen on {without_secrets(', '.join(listen))}: {zenoh_reason(error)}"
+        return f"nobody can listen on {mask_secrets_in_text(', '.join(listen))}: {zenoh_reason(error)}"
     return ""
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Final, Self
 from pydantic import PlainValidator, SerializeAsAny
 
 from gateway.config.loading import load_as
-from gateway.config.section import Section, accepts
+from gateway.config.section import Section, expects
 from gateway.simulator.faults.base import Fault
 from gateway.simulator.faults.kinds import fault_of
 from gateway.simulator.scene_settings import SceneSettings, Seed
@@ -22,7 +22,7 @@ class Scenario(Section):
     """The synthetic scene at the start."""
 
     faults: Annotated[
-        tuple[Annotated[SerializeAsAny[Fault], PlainValidator(fault_of)], ...], accepts("a list of faults")
+        tuple[Annotated[SerializeAsAny[Fault], PlainValidator(fault_of)], ...], expects("a list of faults")
     ]
     """What goes wrong; see ``gateway.simulator.faults``."""
 

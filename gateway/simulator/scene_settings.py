@@ -5,18 +5,18 @@ from typing import Annotated, Self
 
 from pydantic import Field
 
-from gateway.config.section import Section, accepts
+from gateway.config.section import Section, expects
 from gateway.rtc3d_server.scene import Scene
 from gateway.simulator.synthetic import SyntheticScene
 
-Size = Annotated[int, Field(strict=True, ge=0, le=10_000), accepts("a whole number from 0 to 10000")]
+Size = Annotated[int, Field(strict=True, ge=0, le=10_000), expects("a whole number from 0 to 10000")]
 Rate = Annotated[
     float,
     Field(strict=True, ge=0.1, le=100_000, allow_inf_nan=False),
-    accepts("a number of samples per second from 0.1 to 100000"),
+    expects("a number of samples per second from 0.1 to 100000"),
 ]
-Label = Annotated[str, Field(min_length=1, max_length=60), accepts("a text of 1 to 60 characters")]
-Seed = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1), accepts("a whole number from 0")]
+Label = Annotated[str, Field(min_length=1, max_length=60), expects("a text of 1 to 60 characters")]
+Seed = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1), expects("a whole number, 0 or more")]
 
 
 class SceneSettings(Section):

@@ -8,7 +8,7 @@ import yaml
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.config.environment import PREFIX, variable_name
+from gateway.config.environment import VARIABLE_PREFIX, variable_name
 from gateway.config.loading import load
 from gateway.config.settings import Settings
 from gateway.config.yaml_document import Location
@@ -79,12 +79,12 @@ def test_variables_can_say_all_that_a_file_can(settings: Settings) -> None:
 )
 def test_any_variables_give_settings_or_lines_with_a_place(file: Path, variables: dict[str, str]) -> None:
     file.write_text("sources: [{name: lab, host: lab}]", encoding="utf-8")
-    environ = {PREFIX + name: value for name, value in variables.items()}
+    environ = {VARIABLE_PREFIX + name: value for name, value in variables.items()}
     try:
         settings = load(file, environ)
     except ConfigError as error:
-        places = (f"{file}:", *(f"{name}: " for name in environ))
+        positions = (f"{file}:", *(f"{name}: " for name in environ))
         lines = str(error).split("\n")
-        assert all(line.startswith(places) for line in lines)
+        assert all(line.startswith(positions) for line in lines)
     else:
         assert settings.sources

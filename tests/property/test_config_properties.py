@@ -161,7 +161,7 @@ def test_any_file_gives_settings_or_lines_with_its_path(file: Path, content: byt
 def test_names_are_refused_together_exactly_if_they_share_channels(first: str, second: str) -> None:
     sources = tuple(SourceSettings(name=name, host="lab") for name in (first, second))
     if topics.lcm_channel("MOCAP", first) == topics.lcm_channel("MOCAP", second):
-        with pytest.raises(ValidationError, match="shares its LCM channels"):
+        with pytest.raises(ValidationError, match="has the same LCM channels"):
             Settings(sources=sources)
     else:
         assert Settings(sources=sources).sources == sources

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple, S
 import numpy as np
 from pydantic import Field, model_validator
 
-from gateway.config.section import Section, accepts, mistake
+from gateway.config.section import Section, expects, validation_error
 from gateway.rtc3d.packets import Packet, PacketType
 
 if TYPE_CHECKING:
@@ -24,19 +24,19 @@ MAX_SECONDS: Final = 86400
 Seconds = Annotated[
     float,
     Field(strict=True, ge=0, le=MAX_SECONDS, allow_inf_nan=False),
-    accepts(f"a number of seconds from 0 to {MAX_SECONDS}"),
+    expects(f"a number of seconds from 0 to {MAX_SECONDS}"),
 ]
 Interval = Annotated[
     float,
     Field(strict=True, ge=0.01, le=MAX_SECONDS, allow_inf_nan=False),
-    accepts(f"a number of seconds from 0.01 to {MAX_SECONDS}"),
+    expects(f"a number of seconds from 0.01 to {MAX_SECONDS}"),
 ]
 Milliseconds = Annotated[
     float,
     Field(strict=True, gt=0, le=600_000, allow_inf_nan=False),
-    accepts("a number of milliseconds above 0, up to 600000"),
+    expects("a number of milliseconds above 0, up to 600000"),
 ]
-Count = Annotated[int, Field(strict=True, ge=1, le=1_000_000), accepts("a whole number from 1 to 1000000")]
+Count = Annotated[int, Field(strict=True, ge=1, le=1_000_000), expects("a whole number from 1 to 1000000")]
 
 
 def type_of(packet: bytes) -> int:
@@ -185,7 +185,7 @@ class LastingFault(Fault):
     @model_validator(mode="after")
     def _ends_before_it_begins_again(self) -> Self:
         if self.every_s is not None and self.for_s is None:
-            raise mistake("found every_s without for_s; accepted is every_s with for_s", "every_s")
+            raise validation_error("found every_s without for_s; expected both", "every_s")
         return self
 
     @property

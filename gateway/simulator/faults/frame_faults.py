@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Final, Literal
 import numpy as np
 from pydantic import Field
 
-from gateway.config.section import accepts
+from gateway.config.section import expects
 from gateway.errors import FrameError
 from gateway.rtc3d.components import (
     MISSING,
@@ -25,19 +25,19 @@ from gateway.rtc3d.frames import build_frame, byte_order_of, split_frame
 from gateway.rtc3d.packets import HEADER, PacketType, encode_packet
 from gateway.simulator.faults.base import Chunk, LineFault, Run, type_of
 
-Share = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False), accepts("a share from 0 to 1")]
+Share = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False), expects("a share from 0 to 1")]
 Jump = Annotated[
     float,
     Field(strict=True, ge=-1e12, le=1e12, allow_inf_nan=False),
-    accepts("a number of milliseconds from -1e12 to 1e12"),
+    expects("a number of milliseconds from -1e12 to 1e12"),
 ]
 FrameNumber = Annotated[
-    int, Field(strict=True, ge=-(2**31), lt=2**31), accepts("a whole number of 32 bits, with its sign")
+    int, Field(strict=True, ge=-(2**31), lt=2**31), expects("a signed 32-bit whole number")
 ]
 UnknownType = Annotated[
-    int, Field(strict=True, ge=6, le=0xFFFFFFFF), accepts("a whole number from 6 to 4294967295")
+    int, Field(strict=True, ge=6, le=0xFFFFFFFF), expects("a whole number from 6 to 4294967295")
 ]
-DataBytes = Annotated[int, Field(strict=True, ge=0, le=65536), accepts("a whole number from 0 to 65536")]
+DataBytes = Annotated[int, Field(strict=True, ge=0, le=65536), expects("a whole number from 0 to 65536")]
 
 _COUNT: Final[dict[ByteOrder, struct.Struct]] = {"big": struct.Struct(">I"), "little": struct.Struct("<I")}
 _HEADER: Final[dict[ByteOrder, struct.Struct]] = {
@@ -168,7 +168,7 @@ class WrongByteOrder(FrameFault):
 
     kind: ClassVar[str] = "wrong_byte_order"
 
-    byte_order: Annotated[Literal["big", "little", "other"], accepts("big, little or other")] = "other"
+    byte_order: Annotated[Literal["big", "little", "other"], expects("big, little or other")] = "other"
     """big or little, whatever the client asks for; other than it asked for."""
 
     def frame(self, body: bytes, byte_order: ByteOrder, run: Run) -> bytes:
@@ -204,7 +204,7 @@ class WrongCounts(FrameFault):
 
     kind: ClassVar[str] = "wrong_counts"
 
-    field: Annotated[Literal["components", "size", "items"], accepts("components, size or items")] = "items"
+    field: Annotated[Literal["components", "size", "items"], expects("components, size or items")] = "items"
     """Which is too large: the number of components, or the first component's size or number of items."""
 
     def frame(self, body: bytes, byte_order: ByteOrder, run: Run) -> bytes:

@@ -7,7 +7,7 @@ from typing import Any, Final
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from gateway.config.section import did_you_mean, mistake, shown
+from gateway.config.section import describe, spelling_hint, validation_error
 from gateway.errors import ConfigError
 from gateway.simulator.faults.base import Fault, as_given
 from gateway.simulator.faults.frame_faults import FRAME_FAULTS
@@ -47,9 +47,11 @@ def parse_fault(text: str) -> Fault:
         for mapping in mappings:
             target = target.setdefault(mapping, {})
             if not isinstance(target, dict):
-                raise ConfigError(f"fault {text!r}: {mapping} has a value and parts; accepted is one of them")
+                raise ConfigError(
+                    f"fault {text!r}: {mapping} has both a value and parts; expected only one of them"
+                )
         if not equals or name in target:
-            raise ConfigError(f"fault {text!r}: found {assignment!r}; accepted is NAME=VALUE, each name once")
+            raise ConfigError(f"fault {text!r}: found {assignment!r}; expected NAME=VALUE, each name once")
         target[name] = _value(value)
     try:
         return fault_of(values)
@@ -72,8 +74,10 @@ def fault_of(value: object) -> Fault:
         case {"fault": str(kind), **parameters} if kind in KINDS:
             return KINDS[kind].model_validate(parameters)
         case {"fault": kind}:
-            raise mistake(f"found {shown(kind)}{did_you_mean(kind, KINDS)}; accepted is {_NAMES}", "fault")
-    raise mistake(f"found {shown(value)}; accepted is a mapping with the key fault, one of {_NAMES}")
+            raise validation_error(
+                f"found {describe(kind)}{spelling_hint(kind, KINDS)}; expected {_NAMES}", "fault"
+            )
+    raise validation_error(f"found {describe(value)}; expected a mapping with the key fault, one of {_NAMES}")
 
 
 def meaning_of(kind: type[Fault]) -> str:

@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar, Final, Literal, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from gateway.config.section import accepts, one_of
+from gateway.config.section import expects, join_or
 from gateway.rtc3d.packets import HEADER, Packet, PacketType, encode_packet, text_of
 from gateway.simulator.faults.base import Count, LineFault, Milliseconds, is_acknowledgement, type_of
 from gateway.simulator.faults.line import Line
@@ -27,12 +27,12 @@ def _not_empty(verbs: tuple[Verb, ...]) -> tuple[Verb, ...]:
 
 
 Verbs = Annotated[
-    tuple[Annotated[Verb, accepts(one_of(VERBS))], ...],
+    tuple[Annotated[Verb, expects(join_or(VERBS))], ...],
     AfterValidator(_not_empty),
     BeforeValidator(lambda value: [value] if isinstance(value, str) else value),
-    accepts("a command's first word in lower case, or a list of such"),
+    expects("a command's first word in lower case, or a list of such"),
 ]
-Copies = Annotated[int, Field(strict=True, ge=2, le=100), accepts("a whole number from 2 to 100")]
+Copies = Annotated[int, Field(strict=True, ge=2, le=100), expects("a whole number from 2 to 100")]
 
 
 def _verb(command: Packet) -> str:
@@ -157,7 +157,7 @@ class ReplyText(LineFault):
 
     kind: ClassVar[str] = "reply_text"
 
-    form: Annotated[Literal["echo", "ok-verb"], accepts("echo or ok-verb")] = "ok-verb"
+    form: Annotated[Literal["echo", "ok-verb"], expects("echo or ok-verb")] = "ok-verb"
     """echo is the command as it was sent, ok-verb the likes of ok-streamframes."""
 
     def replies(self, command: Packet, replies: list[bytes], line: Line) -> list[bytes]:

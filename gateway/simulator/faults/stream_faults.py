@@ -11,25 +11,25 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Final
 
 from pydantic import Field
 
-from gateway.config.section import accepts
+from gateway.config.section import expects
 from gateway.rtc3d.packets import HEADER, PacketType
 from gateway.simulator.faults.base import Chunk, ConnectionFault, LineFault, Milliseconds, Run, StrikeFault
 
 if TYPE_CHECKING:
     from gateway.rtc3d_server.client_connection import ClientConnection
 
-Pieces = Annotated[int, Field(strict=True, ge=2, le=1000), accepts("a whole number from 2 to 1000")]
-NumBytes = Annotated[int, Field(strict=True, ge=1, le=1_000_000), accepts("a whole number from 1 to 1000000")]
+Pieces = Annotated[int, Field(strict=True, ge=2, le=1000), expects("a whole number from 2 to 1000")]
+NumBytes = Annotated[int, Field(strict=True, ge=1, le=1_000_000), expects("a whole number from 1 to 1000000")]
 TooLarge = Annotated[
-    int, Field(strict=True, ge=9, le=0xFFFFFFFF), accepts("a whole number of bytes from 9 to 4294967295")
+    int, Field(strict=True, ge=9, le=0xFFFFFFFF), expects("a whole number of bytes from 9 to 4294967295")
 ]
-TooSmall = Annotated[int, Field(strict=True, ge=0, le=7), accepts("a whole number of bytes from 0 to 7")]
+TooSmall = Annotated[int, Field(strict=True, ge=0, le=7), expects("a whole number of bytes from 0 to 7")]
 Speed = Annotated[
     float,
     Field(strict=True, gt=0, le=1e9, allow_inf_nan=False),
-    accepts("a number of bytes per second above 0, up to 1e9"),
+    expects("a number of bytes per second above 0, up to 1e9"),
 ]
-Switch = Annotated[bool, Field(strict=True), accepts("true or false")]
+Switch = Annotated[bool, Field(strict=True), expects("true or false")]
 
 _HALF_PACKET: Final = HEADER.pack(1000, PacketType.DATA) + bytes(100)
 

@@ -135,29 +135,33 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "LCM__ULR",
         "memq://",
-        "LCM__ULR: lcm.ulr: unknown key (did you mean 'url'?); known: enabled, prefix, url, queries_url, "
-        "max_rate_hz, tool_poses",
+        "LCM__ULR: lcm.ulr: unknown key (did you mean 'url'?); known keys: enabled, prefix, url, "
+        "queries_url, max_rate_hz, tool_poses",
     ),
-    ("LMC__URL", "memq://", "LMC__URL: lmc: unknown key (did you mean 'lcm'?); known: sources, "),
-    ("SOURCES__0__PORT", "abc", "SOURCES__0__PORT: sources[0].port: found 'abc'; accepted is a whole number"),
-    ("SOURCES__0__PORT", "", "SOURCES__0__PORT: sources[0].port: found nothing; accepted is a whole number"),
-    ("SOURCES__0__NAME", "7", "SOURCES__0__NAME: sources[0].name: found 7 (quotes make it text); accepted"),
-    ("SOURCES__1__NAME", "b", "SOURCES__1__NAME: sources[1].host: missing; this key has no default"),
+    ("LMC__URL", "memq://", "LMC__URL: lmc: unknown key (did you mean 'lcm'?); known keys: sources, "),
+    ("SOURCES__0__PORT", "abc", "SOURCES__0__PORT: sources[0].port: found 'abc'; expected a whole number"),
+    ("SOURCES__0__PORT", "", "SOURCES__0__PORT: sources[0].port: found nothing; expected a whole number"),
+    (
+        "SOURCES__0__NAME",
+        "7",
+        "SOURCES__0__NAME: sources[0].name: found 7 (use quotes to make it text); expected",
+    ),
+    ("SOURCES__1__NAME", "b", "SOURCES__1__NAME: sources[1].host: missing; this key is required"),
     (
         "SOURCES__2__NAME",
         "c",
-        "SOURCES__2__NAME: sources: found the index '2'; accepted is a number from 0 to 1",
+        "SOURCES__2__NAME: sources: found the index '2'; expected a number from 0 to 1",
     ),
     (
         "SOURCES__HOST",
         "c",
-        "SOURCES__HOST: sources: found the index 'host'; accepted is a number from 0 to 1",
+        "SOURCES__HOST: sources: found the index 'host'; expected a number from 0 to 1",
     ),
     (
         "SOURCES__0__STREAMS__0__RATE__DIVISOR",
         "2",
-        "SOURCES__0__STREAMS__0__RATE__DIVISOR: sources[0].streams[0].rate: has no keys to set, it is 'all' "
-        "(lab.yaml:5:34); accepted is all of it in SOURCES__0__STREAMS__0__RATE",
+        "SOURCES__0__STREAMS__0__RATE__DIVISOR: sources[0].streams[0].rate: this value has no keys, it is "
+        "'all' (lab.yaml:5:34); set the whole value with SOURCES__0__STREAMS__0__RATE",
     ),
     (
         "LCM",
@@ -166,8 +170,8 @@ MISTAKES: list[tuple[str, str, str]] = [
         "'<stream end>'; check indentation, colons, quotes and brackets here",
     ),
     ("LCM__URL", "\udcff", "LCM__URL: found the character U+DCFF, which YAML does not allow"),
-    ("", "1", ": names no key; accepted is a name such as LCM__URL"),
-    ("LCM__", "1", "LCM__: names no key; accepted is a name such as LCM__URL"),
+    ("", "1", ": names no key; expected a name such as LCM__URL"),
+    ("LCM__", "1", "LCM__: names no key; expected a name such as LCM__URL"),
     (
         "ZENOH__CONFIG__MODES",
         "peer",
@@ -196,12 +200,12 @@ def test_mistakes_of_the_file_come_first(file: Path) -> None:
 def test_a_file_that_is_no_mapping_is_told_first(file: Path) -> None:
     file.write_text("[1]", encoding="utf-8")
     [line] = refused(file, LCM__URL="memq://")
-    assert line.startswith("lab.yaml:1:1: found a list; accepted is a mapping")
+    assert line.startswith("lab.yaml:1:1: found a list; expected a mapping")
 
 
 def test_no_sources_in_the_environment_are_told() -> None:
     assert refused(None, LCM__URL="memq://") == [
-        "environment: sources: missing; this key has no default",
+        "environment: sources: missing; this key is required",
     ]
 
 
@@ -214,18 +218,18 @@ def test_one_servers_mistakes_are_told() -> None:
     with pytest.raises(ConfigError) as caught:
         read_server("two words", 0, {})
     assert str(caught.value).splitlines() == [
-        "--server: sources[0].host: found 'two words'; accepted is a host name or an IP address; "
-        "the port has a key of its own",
-        "--server: sources[0].port: found 0; accepted is a whole number from 1 to 65535",
+        "--server: sources[0].host: found 'two words'; expected a host name or an IP address; "
+        "the port has its own key",
+        "--server: sources[0].port: found 0; expected a whole number from 1 to 65535",
     ]
 
 
 def test_places_tell_where_each_value_is_from(file: Path) -> None:
-    places = read(file, with_prefix({"ZENOH__CONFIG": "{mode: client}"})).places
-    assert str(places["sources", 0, "host"]) == f"{file}:3:11"
-    assert str(places["zenoh", "config", "mode"]) == "RTC3D_GATEWAY__ZENOH__CONFIG"
-    assert ("zenoh", "config", "connect", "endpoints") not in places
-    assert ("lcm",) not in places
+    positions = read(file, with_prefix({"ZENOH__CONFIG": "{mode: client}"})).positions
+    assert str(positions["sources", 0, "host"]) == f"{file}:3:11"
+    assert str(positions["zenoh", "config", "mode"]) == "RTC3D_GATEWAY__ZENOH__CONFIG"
+    assert ("zenoh", "config", "connect", "endpoints") not in positions
+    assert ("lcm",) not in positions
 
 
 def test_a_variables_name_is_its_keys_path() -> None:

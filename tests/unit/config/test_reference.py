@@ -55,7 +55,7 @@ def accepted_by(section: type[Section], key: str) -> str:
     except ValidationError as error:
         for details in error.errors():
             if details["loc"][0] == key:
-                text = str(details["msg"]).partition("accepted is ")[2]
+                text = str(details["msg"]).partition("expected ")[2]
                 return re.sub(r"a mapping with any of the keys .*", "a mapping", text)
     raise AssertionError(f"{key} accepts anything")
 

@@ -6,7 +6,7 @@ import pytest
 
 from gateway.config.environment import variable_name
 from gateway.config.loading import load, read
-from gateway.config.secrets import masked, secrets_in, without_secrets
+from gateway.config.secrets import find_secrets, mask_secrets, mask_secrets_in_text
 from gateway.config.show import shown_configuration
 from gateway.config.values import zenoh_reason
 from gateway.errors import ConfigError
@@ -63,9 +63,9 @@ SECRETS: list[tuple[dict[str, Any], dict[str, Any]]] = [
 
 @pytest.mark.parametrize(("config", "seen"), SECRETS)
 def test_secrets_are_masked(config: dict[str, Any], seen: dict[str, Any]) -> None:
-    assert masked(config) == seen
-    assert list(secrets_in(config))
-    assert masked(seen) == seen
+    assert mask_secrets(config) == seen
+    assert list(find_secrets(config))
+    assert mask_secrets(seen) == seen
 
 
 @pytest.mark.parametrize(
@@ -85,12 +85,12 @@ def test_secrets_are_masked(config: dict[str, Any], seen: dict[str, Any]) -> Non
     ],
 )
 def test_what_is_no_secret_stays(config: dict[str, Any]) -> None:
-    assert masked(config) == config
-    assert list(secrets_in(config)) == []
+    assert mask_secrets(config) == config
+    assert list(find_secrets(config)) == []
 
 
 @pytest.mark.parametrize(
-    ("config", "place", "accepted"),
+    ("config", "position", "accepted"),
     [
         (
             "{transport: {auth: {usrpwd: {user: me, password: geheim}}}}",
@@ -121,12 +121,12 @@ def test_what_is_no_secret_stays(config: dict[str, Any]) -> None:
         ),
     ],
 )
-def test_a_secret_in_the_file_is_refused(file: Path, config: str, place: str, accepted: str) -> None:
+def test_a_secret_in_the_file_is_refused(file: Path, config: str, position: str, accepted: str) -> None:
     file.write_text(f"{SERVER}zenoh: {{config: {config}}}\n", encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
         load(file, {})
-    text = "found a secret, which does not belong in this file; accepted is"
-    assert str(caught.value) == f"{file}:{place}: {text} {accepted}"
+    text = "found a secret, which does not belong in this file; use"
+    assert str(caught.value) == f"{file}:{position}: {text} {accepted}"
 
 
 def test_a_secret_is_told_with_the_other_mistakes(file: Path) -> None:
@@ -162,7 +162,7 @@ def test_settings_in_a_log_line_show_no_password(file: Path) -> None:
 
 def test_half_a_character_in_a_password_is_refused(file: Path) -> None:
     file.write_text(SERVER, encoding="utf-8")
-    with pytest.raises(ConfigError, match="found bytes that are not UTF-8; accepted is text"):
+    with pytest.raises(ConfigError, match="found bytes that are not UTF-8; expected text"):
         load(file, {PASSWORD: "\udcff"})
 
 
@@ -211,4 +211,4 @@ def test_a_link_that_fails_is_told_without_its_key(caplog: pytest.LogCaptureFixt
 
 def test_texts_without_secrets_stay() -> None:
     text = "tls/lab:7447#so_sndbuf=1, https://lab/a@b and a:b@c, password"
-    assert without_secrets(text) == text
+    assert mask_secrets_in_text(text) == text

@@ -4,7 +4,7 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from gateway.config.section import shown
+from gateway.config.section import describe
 from gateway.config.settings import (
     LcmSettings,
     ReconnectSettings,
@@ -65,8 +65,8 @@ def test_names_that_share_channels_are_both_named() -> None:
     assert mistakes(Settings, value) == [
         (
             "sources.2.name",
-            "found 'LAB_1', which shares its LCM channels with 'lab-1', sources[1]; "
-            "accepted is a name of other letters or digits, case aside",
+            "found 'LAB_1', which has the same LCM channels as 'lab-1' (sources[1]); "
+            "expected a name that differs in letters or digits, ignoring case",
         )
     ]
 
@@ -76,8 +76,8 @@ def test_a_component_is_in_one_stream_only() -> None:
     assert mistakes(SourceSettings, source(streams=streams)) == [
         (
             "streams.2.components",
-            "found '3d', which streams[0] has too; accepted is each component in one stream, "
-            "for it has one key and one channel",
+            "found '3d', which streams[0] has too; expected each component in one stream only, "
+            "because it has one key and one channel",
         )
     ]
 
@@ -87,8 +87,8 @@ def test_frames_of_a_slow_rate_are_no_stall() -> None:
     assert mistakes(SourceSettings, source(streams=streams)) == [
         (
             "streams.1.rate.frequency_hz",
-            "found 0.25, one frame in 4 s, which stall_timeout_s (3) takes for silence; "
-            "accepted is more than 0.333333, or a longer stall_timeout_s",
+            "found 0.25, one frame in 4 s, which counts as silence because stall_timeout_s is 3; "
+            "expected more than 0.333333, or a longer stall_timeout_s",
         )
     ]
     assert SourceSettings.model_validate(source(streams=streams, stall_timeout_s=4.1))
@@ -99,16 +99,16 @@ def test_frames_of_a_slow_rate_are_no_stall() -> None:
 )
 def test_sources_and_streams_are_lists_of_at_least_one(value: object, found: str) -> None:
     assert mistakes(Settings, {"sources": value}) == [
-        ("sources", f"found {found}; accepted is a list of sources, one or more, each with name and host")
+        ("sources", f"found {found}; expected a list of sources, one or more, each with name and host")
     ]
     assert mistakes(SourceSettings, source(streams=value)) == [
-        ("streams", f"found {found}; accepted is a list of streams, one or more")
+        ("streams", f"found {found}; expected a list of streams, one or more")
     ]
 
 
 def test_the_longest_wait_is_not_below_the_first() -> None:
     assert mistakes(ReconnectSettings, {"first_delay_s": 20}) == [
-        ("max_delay_s", "found 10; accepted is first_delay_s (20) or more")
+        ("max_delay_s", "found 10; expected first_delay_s (20) or more")
     ]
     assert ReconnectSettings.model_validate({"first_delay_s": 10})
 
@@ -139,7 +139,7 @@ def test_requests_go_to_the_next_port_where_whoever_listens_gets_all(url: str, q
 def test_one_side_must_be_on() -> None:
     off = {"enabled": False}
     assert mistakes(Settings, {"sources": [source()], "zenoh": off, "lcm": off}) == [
-        ("lcm.enabled", "found false here and in zenoh; accepted is true in one of them at least")
+        ("lcm.enabled", "found false here and in zenoh.enabled; expected true in at least one of them")
     ]
     assert Settings.model_validate({"sources": [source()], "zenoh": off}).lcm.enabled
     assert Settings.model_validate({"sources": [source()], "lcm": off}).zenoh.enabled
@@ -148,24 +148,24 @@ def test_one_side_must_be_on() -> None:
 def test_every_mistake_is_told_at_once() -> None:
     sources = [source(prt=1), {"name": "b"}]
     assert dict(mistakes(Settings, {"sources": sources, "lcm": None, "zenho": {}})) == {
-        "sources.0.prt": "unknown key (did you mean 'port'?); known: name, host, port, byte_order, streams, "
-        "reconnect, connect_timeout_s, reply_timeout_s, stall_timeout_s, max_lag_ms, "
+        "sources.0.prt": "unknown key (did you mean 'port'?); known keys: name, host, port, byte_order, "
+        "streams, reconnect, connect_timeout_s, reply_timeout_s, stall_timeout_s, max_lag_ms, "
         "max_packet_bytes, max_c3d_bytes, "
         "query_timeout_s, fresh_interval_s, remote_control",
-        "sources.1.host": "missing; this key has no default",
-        "lcm": "found nothing; accepted is a mapping with any of the keys enabled, prefix, url, queries_url, "
+        "sources.1.host": "missing; this key is required",
+        "lcm": "found nothing; expected a mapping with any of the keys enabled, prefix, url, queries_url, "
         "max_rate_hz, tool_poses",
-        "zenho": "unknown key (did you mean 'zenoh'?); known: sources, spool, zenoh, lcm, metrics",
+        "zenho": "unknown key (did you mean 'zenoh'?); known keys: sources, spool, zenoh, lcm, metrics",
     }
 
 
 def test_what_is_shown_is_one_bounded_line() -> None:
-    assert shown("a\nb\x1b" + "x" * 1000) == repr("a\nb\x1b" + "x" * 56 + "…")
+    assert describe("a\nb\x1b" + "x" * 1000) == repr("a\nb\x1b" + "x" * 56 + "…")
 
 
 def test_what_is_shown_has_no_password() -> None:
-    assert shown("tcpq://me:geheim@lab:7700") == "'tcpq://me:***@lab:7700'"
-    assert shown("x" * 50 + "tls/lab#connect_private_key_base64=geheim").count("geheim") == 0
+    assert describe("tcpq://me:geheim@lab:7700") == "'tcpq://me:***@lab:7700'"
+    assert describe("x" * 50 + "tls/lab#connect_private_key_base64=geheim").count("geheim") == 0
 
 
 def test_every_key_has_a_description_in_the_schema() -> None:

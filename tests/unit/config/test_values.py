@@ -1,6 +1,6 @@
 import pytest
 
-from gateway.config.section import shown
+from gateway.config.section import describe
 from gateway.config.settings import (
     DEFAULT_LCM_URL,
     LcmSettings,
@@ -32,7 +32,7 @@ MARKERS, TOOLS, ANALOG = ComponentType.MARKERS, ComponentType.TOOLS, ComponentTy
 )
 def test_a_port_is_a_whole_number_of_16_bits(port: object, found: str) -> None:
     assert mistakes(SourceSettings, source(port=port)) == [
-        ("port", f"found {found}; accepted is a whole number from 1 to 65535")
+        ("port", f"found {found}; expected a whole number from 1 to 65535")
     ]
 
 
@@ -41,7 +41,7 @@ def test_a_port_is_a_whole_number_of_16_bits(port: object, found: str) -> None:
 def test_a_time_is_a_bounded_number_of_seconds(key: str, value: object) -> None:
     [(location, text)] = mistakes(SourceSettings, source(**{key: value}))
     assert location == key
-    assert text.endswith("; accepted is a number of seconds from 0.001 to 86400")
+    assert text.endswith("; expected a number of seconds from 0.001 to 86400")
 
 
 def test_a_whole_number_of_seconds_is_a_number() -> None:
@@ -51,13 +51,13 @@ def test_a_whole_number_of_seconds_is_a_number() -> None:
 @pytest.mark.parametrize("value", [1023, 2**32, 1e6, True, "16 MiB"])
 def test_a_limit_fits_the_size_field(value: object) -> None:
     [(_, text)] = mistakes(SourceSettings, source(max_c3d_bytes=value))
-    assert text.endswith("; accepted is a whole number of bytes from 1024 to 4294967295")
+    assert text.endswith("; expected a whole number of bytes from 1024 to 4294967295")
 
 
 @pytest.mark.parametrize("value", [1, 0, "yes", None])
 def test_a_switch_is_true_or_false(value: object) -> None:
     assert mistakes(ZenohSettings, {"express": value}) == [
-        ("express", f"found {shown(value)}; accepted is true or false")
+        ("express", f"found {describe(value)}; expected true or false")
     ]
 
 
@@ -87,15 +87,15 @@ def test_a_host_is_a_name_or_an_address(host: str) -> None:
 def test_what_is_no_host_is_refused(host: str) -> None:
     [(location, text)] = mistakes(SourceSettings, source(host=host))
     assert location == "host"
-    assert text.endswith("; accepted is a host name or an IP address; the port has a key of its own")
+    assert text.endswith("; expected a host name or an IP address; the port has its own key")
 
 
 def test_a_number_as_a_name_wants_quotes() -> None:
     assert mistakes(SourceSettings, source(name=5)) == [
         (
             "name",
-            "found 5 (quotes make it text); accepted is 1 to 24 of the letters A to Z and a to z, digits, "
-            "'_' and '-'",
+            "found 5 (use quotes to make it text); expected 1 to 24 of the letters A to Z and a to z, "
+            "digits, '_' and '-'",
         )
     ]
 
@@ -122,37 +122,37 @@ def test_a_rate_has_three_forms(value: object, rate: Rate) -> None:
 @pytest.mark.parametrize(
     ("value", "location", "text"),
     [
-        ("fast", "rate", "found 'fast'; accepted is all, {frequency_hz: 60} or {divisor: 4}"),
-        (60, "rate", "found 60; accepted is all, {frequency_hz: 60} or {divisor: 4}"),
-        (None, "rate", "found nothing; accepted is all, {frequency_hz: 60} or {divisor: 4}"),
-        ({"hz": 60}, "rate", "found a mapping; accepted is all, {frequency_hz: 60} or {divisor: 4}"),
+        ("fast", "rate", "found 'fast'; expected all, {frequency_hz: 60} or {divisor: 4}"),
+        (60, "rate", "found 60; expected all, {frequency_hz: 60} or {divisor: 4}"),
+        (None, "rate", "found nothing; expected all, {frequency_hz: 60} or {divisor: 4}"),
+        ({"hz": 60}, "rate", "found a mapping; expected all, {frequency_hz: 60} or {divisor: 4}"),
         (
             {"frequency_hz": 0},
             "rate.frequency_hz",
-            "found 0; accepted is a number of frames per second above 0, up to 1000000",
+            "found 0; expected a number of frames per second above 0, up to 1000000",
         ),
         (
             {"frequency_hz": "60"},
             "rate.frequency_hz",
-            "found '60'; accepted is a number of frames per second above 0, up to 1000000",
+            "found '60'; expected a number of frames per second above 0, up to 1000000",
         ),
         (
             {"frequency_hz": float("inf")},
             "rate.frequency_hz",
-            "found inf; accepted is a number of frames per second above 0, up to 1000000",
+            "found inf; expected a number of frames per second above 0, up to 1000000",
         ),
-        ({"divisor": 0}, "rate.divisor", "found 0; accepted is a whole number from 1 to 1000000"),
-        ({"divisor": 1.5}, "rate.divisor", "found 1.5; accepted is a whole number from 1 to 1000000"),
-        ({"divisor": True}, "rate.divisor", "found true; accepted is a whole number from 1 to 1000000"),
+        ({"divisor": 0}, "rate.divisor", "found 0; expected a whole number from 1 to 1000000"),
+        ({"divisor": 1.5}, "rate.divisor", "found 1.5; expected a whole number from 1 to 1000000"),
+        ({"divisor": True}, "rate.divisor", "found true; expected a whole number from 1 to 1000000"),
         (
             {"divisor": 2, "divisors": 2},
             "rate.divisors",
-            "unknown key (did you mean 'divisor'?); known: divisor",
+            "unknown key (did you mean 'divisor'?); known keys: divisor",
         ),
         (
             {"divisor": 2, "frequency_hz": 2},
             "rate",
-            "found frequency_hz and divisor together; accepted is one of them",
+            "found frequency_hz and divisor together; expected one of them",
         ),
     ],
 )
@@ -180,19 +180,19 @@ def test_components_are_kept_in_wire_order(value: object, components: tuple[Comp
         (
             [],
             "components",
-            "found an empty list; accepted is a list of 3d, 6d, analog, force or event, or [all]",
+            "found an empty list; expected a list of 3d, 6d, analog, force or event, or [all]",
         ),
-        ("all", "components", "found 'all'; accepted is a list of 3d, 6d, analog, force or event, or [all]"),
-        (None, "components", "found nothing; accepted is a list of 3d, 6d, analog, force or event, or [all]"),
-        (["all", "3d"], "components.0", "found 'all' beside others; accepted is [all] alone"),
-        (["3d", "6d", "3d"], "components.2", "found '3d' again; accepted is each component once"),
+        ("all", "components", "found 'all'; expected a list of 3d, 6d, analog, force or event, or [all]"),
+        (None, "components", "found nothing; expected a list of 3d, 6d, analog, force or event, or [all]"),
+        (["all", "3d"], "components.0", "found 'all' beside other components; expected [all] alone"),
+        (["3d", "6d", "3d"], "components.2", "found '3d' twice; expected each component once"),
         (
             ["3d", "Events"],
             "components.1",
-            "found 'Events' (did you mean 'event'?); accepted is 3d, 6d, analog, force or event",
+            "found 'Events' (did you mean 'event'?); expected 3d, 6d, analog, force or event",
         ),
-        (["markers"], "components.0", "found 'markers'; accepted is 3d, 6d, analog, force or event"),
-        ([1], "components.0", "found 1; accepted is 3d, 6d, analog, force or event"),
+        (["markers"], "components.0", "found 'markers'; expected 3d, 6d, analog, force or event"),
+        ([1], "components.0", "found 1; expected 3d, 6d, analog, force or event"),
     ],
 )
 def test_other_components_are_refused(value: object, location: str, text: str) -> None:
@@ -210,7 +210,7 @@ def test_a_key_prefix_is_one_or_more_chunks(prefix: str) -> None:
 def test_a_key_prefix_without_wildcards_and_empty_chunks(prefix: str) -> None:
     [(location, text)] = mistakes(ZenohSettings, {"prefix": prefix})
     assert location == "prefix"
-    assert text.startswith(f"found {shown(prefix)}; accepted is a Zenoh key")
+    assert text.startswith(f"found {describe(prefix)}; expected a Zenoh key")
 
 
 def test_zenoh_reads_its_own_keys() -> None:
@@ -228,10 +228,10 @@ def test_zenoh_reads_its_own_keys() -> None:
         ({"connect": {"endpoints": ["nowhere"]}}, "Zenoh refuses these keys: Endpoints must be of the form"),
         ({"mode": float("nan")}, "Zenoh refuses these keys: Out of range float"),
         ({"mode": b"peer"}, "Zenoh refuses these keys: Object of type bytes"),
-        ([], "found an empty list; accepted is a JSON5 file's path or a mapping with Zenoh's own keys"),
-        ("a\nb", "found 'a\\nb'; accepted is a JSON5 file's path or a mapping with Zenoh's own keys"),
-        ("", "found ''; accepted is a JSON5 file's path or a mapping with Zenoh's own keys"),
-        (True, "found true; accepted is a JSON5 file's path or a mapping with Zenoh's own keys"),
+        ([], "found an empty list; expected a JSON5 file's path or a mapping with Zenoh's own keys"),
+        ("a\nb", "found 'a\\nb'; expected a JSON5 file's path or a mapping with Zenoh's own keys"),
+        ("", "found ''; expected a JSON5 file's path or a mapping with Zenoh's own keys"),
+        (True, "found true; expected a JSON5 file's path or a mapping with Zenoh's own keys"),
     ],
 )
 def test_what_zenoh_refuses_is_refused(config: object, text: str) -> None:
@@ -267,8 +267,8 @@ def test_other_lcm_urls_are_refused(url: str) -> None:
     assert mistakes(LcmSettings, {"url": url}) == [
         (
             "url",
-            f"found {shown(url)}; accepted is a URL that begins with udpm://, mpudpm://, memq://, tcpq:// "
-            "or file://, and has no user",
+            f"found {describe(url)}; expected a URL that begins with udpm://, mpudpm://, memq://, tcpq:// "
+            "or file://, without a user name",
         )
     ]
 

@@ -69,31 +69,31 @@ def test_there_is_a_shipped_scenario() -> None:
     [
         (
             "faults: [{fault: dely}]",
-            "1:18: faults[0].fault: found 'dely' (did you mean 'delay'?); accepted is ",
+            "1:18: faults[0].fault: found 'dely' (did you mean 'delay'?); expected ",
         ),
         (
             "faults: [{delay_ms: 3}]",
-            "1:10: faults[0]: found a mapping; accepted is a mapping with the key fault",
+            "1:10: faults[0]: found a mapping; expected a mapping with the key fault",
         ),
         (
             "faults: [{fault: cut, at: 3}]",
-            "1:23: faults[0].at: unknown key (did you mean 'at_s'?); known: at_s,",
+            "1:23: faults[0].at: unknown key (did you mean 'at_s'?); known keys: at_s,",
         ),
         (
             "faults: [{fault: cut, at_s: x}]",
-            "1:29: faults[0].at_s: found 'x'; accepted is a number of seconds",
+            "1:29: faults[0].at_s: found 'x'; expected a number of seconds",
         ),
         (
             "faults: [{fault: restart, scene: {marker: 3}}]",
             "1:35: faults[0].scene.marker: unknown key (did you mean 'markers'?)",
         ),
-        ("faults: delay", "1:9: faults: found 'delay'; accepted is a list of faults"),
+        ("faults: delay", "1:9: faults: found 'delay'; expected a list of faults"),
         (
             "scene: {markers: -1}\nfaults: []",
-            "1:18: scene.markers: found -1; accepted is a whole number from 0",
+            "1:18: scene.markers: found -1; expected a whole number from 0",
         ),
-        ("seed: 1", "1:1: faults: missing; this key has no default"),
-        ("", "empty; accepted is a mapping, with the key faults at least"),
+        ("seed: 1", "1:1: faults: missing; this key is required"),
+        ("", "empty; expected a mapping with at least the key faults"),
     ],
 )
 def test_a_mistake_is_told_with_its_place(file: Path, line: str, expected: str) -> None:
