@@ -9,7 +9,7 @@ from benchmarks.report import Goal, Progress, Table
 from benchmarks.stage import GATEWAY, PLAIN, RELAY, Stage
 from benchmarks.subscribers import subscribe_tcp
 from benchmarks.workloads import DENSE, cuts
-from gateway.messages.splice import PREFIX_BYTES
+from gateway.messages.splice import CONTENT_OFFSET
 
 TITLE: Final = "Latency: from the server's send to the subscriber's callback"
 GOAL_P50: Final = 1.10
@@ -62,7 +62,7 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
 
 def _shape() -> tuple[int, int]:
     packet = DENSE.packet()
-    return len(packet), cuts(packet)[0].first + PREFIX_BYTES
+    return len(packet), cuts(packet)[0].first + CONTENT_OFFSET
 
 
 def _run(stage: Stage, plain: Worker, name: str, rate_hz: float, lasting_s: float) -> list[float]:

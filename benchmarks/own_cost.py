@@ -80,7 +80,7 @@ class _KeepingOutput(MemoryOutput):
         self.kept: dict[tuple[str, ...], _Kept] = {}
 
     def publisher(self, topic: Topic) -> Any:
-        return self.kept.setdefault(topic.parts, _Kept())
+        return self.kept.setdefault(topic.path, _Kept())
 
 
 class _Fed:

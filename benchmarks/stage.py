@@ -15,7 +15,7 @@ from benchmarks.processes import Program, Worker, zenoh_keys
 from benchmarks.sender import Blast, Paced, Sent, send
 from benchmarks.subscribers import Subscription, subscribe
 from benchmarks.workloads import Workload, cuts
-from gateway.messages.splice import MESSAGE_TYPES, type_name
+from gateway.messages.splice import MESSAGE_TYPES, lcm_type_name
 from tests.networks import free_port
 
 GATEWAY: Final = "lab"
@@ -105,7 +105,7 @@ class Stage:
             "zenoh": keys if self.zenoh else None,
             "lcm": self.lcm_urls[RELAY] if self.lcm else None,
             "cuts": [
-                (cut.first, cut.last, cut.component.key, type_name(MESSAGE_TYPES[cut.component]))
+                (cut.first, cut.last, cut.component.key, lcm_type_name(MESSAGE_TYPES[cut.component]))
                 for cut in cuts(self.workload.packet())
             ],
         }

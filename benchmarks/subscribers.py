@@ -13,7 +13,7 @@ from typing import Any, Final
 import lcm
 import zenoh
 
-from gateway.messages.splice import PREFIX_BYTES
+from gateway.messages.splice import CONTENT_OFFSET
 from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import BY_KEY
 from gateway.rtc3d.packets import HEADER, PacketType, encode_packet
@@ -56,7 +56,7 @@ class Heard:
         now_us = time.monotonic_ns() / 1000
         if topic.rpartition("/")[2] not in _COMPONENTS and topic.rpartition("_")[2] not in _COMPONENTS:
             return
-        number, stamp_us = _CONTENT.unpack_from(message, PREFIX_BYTES)
+        number, stamp_us = _CONTENT.unpack_from(message, CONTENT_OFFSET)
         self.messages[topic] += 1
         self.message_bytes[topic] += len(message)
         self.numbers.setdefault(topic, []).append(number)

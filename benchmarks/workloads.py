@@ -6,7 +6,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from gateway.messages.splice import PREFIX_BYTES
+from gateway.messages.splice import CONTENT_OFFSET
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import HEADER
 from gateway.rtc3d_server.frame_builder import FrameBuilder
@@ -78,7 +78,7 @@ def cuts(packet: bytes) -> list[Cut]:
     at = HEADER.size + 4  # behind the packet's header and the count of components
     while at < len(packet):
         size, number = _COMPONENT.unpack_from(packet, at)
-        first = at + _COMPONENT.size - PREFIX_BYTES
+        first = at + _COMPONENT.size - CONTENT_OFFSET
         found.append(Cut(ComponentType(number), first, at + size))
         at += size
     return found
@@ -91,7 +91,7 @@ class Frames:
         self.data = bytearray(packet * count)
         """The packets, one behind the other."""
         self.packet_bytes = len(packet)
-        contents = [cut.first + PREFIX_BYTES for cut in cuts(packet)]
+        contents = [cut.first + CONTENT_OFFSET for cut in cuts(packet)]
         self._numbers = [self._fields(">i4", at) for at in contents]
         self._stamps_us = [self._fields(">i8", at + 4) for at in contents]
         self._steps = np.arange(count)

@@ -22,7 +22,7 @@ class Running:
         self.status = self.source.statuses[0]
 
     def messages(self, component: str) -> list[Any]:
-        return [decode(data) for topic, data in self.output.messages if topic.parts == (component,)]
+        return [decode(data) for topic, data in self.output.messages if topic.path == (component,)]
 
     async def until(self, condition: Callable[[], object]) -> None:
         await wait_until_async(condition)

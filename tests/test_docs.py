@@ -21,7 +21,7 @@ from gateway.cli.main import app
 from gateway.config import loading
 from gateway.config.settings import Settings
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME
-from gateway.messages.splice import MESSAGE_HEADER_BYTES, MESSAGE_TYPES
+from gateway.messages.splice import ITEMS_OFFSET, MESSAGE_TYPES
 from gateway.rtc3d.components import ITEM_DTYPES
 from gateway.simulator.scenario import load_scenario
 from tests.documents import ROOT, Block, all_blocks, blocks, documents
@@ -151,7 +151,7 @@ def test_the_reference_has_the_fingerprint_and_sizes_of_every_type() -> None:
     sizes = {name: (header_bytes, item_bytes) for name, _, header_bytes, item_bytes in rows}
     for component, message_type in MESSAGE_TYPES.items():
         item_bytes = ITEM_DTYPES[component].itemsize
-        assert sizes[message_type.__name__] == (str(MESSAGE_HEADER_BYTES), str(item_bytes))
+        assert sizes[message_type.__name__] == (str(ITEMS_OFFSET), str(item_bytes))
     assert sizes["tool_pose_t"] == (f"{len(rtc3d.tool_pose_t().encode())} in all", "")
 
 

@@ -46,11 +46,11 @@ class ToyOutput:
 
     def tool_names(self) -> list[str]:
         """Return the names of the tools that have a topic now."""
-        return [topic.parts[1] for topic in self.declared if len(topic.parts) == 2]
+        return [topic.path[1] for topic in self.declared if len(topic.path) == 2]
 
     def poses(self, name: str) -> list[Any]:
         """Return the decoded messages of one tool."""
-        return [decode(message) for topic, message in self.messages if topic.parts == ("6d", name)]
+        return [decode(message) for topic, message in self.messages if topic.path == ("6d", name)]
 
 
 class ToyPublisher:
@@ -60,7 +60,7 @@ class ToyPublisher:
 
     @property
     def wanted(self) -> bool:
-        return self._topic.parts[-1] in self._output.listened
+        return self._topic.path[-1] in self._output.listened
 
     def publish(self, message: bytes) -> None:
         if self._output.error is not None:

@@ -4,7 +4,7 @@ import numpy as np
 import numpy.typing as npt
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.messages.splice import MESSAGE_HEADER_BYTES
+from gateway.messages.splice import ITEMS_OFFSET
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters_xml import ParsedParameters
@@ -32,7 +32,7 @@ class ComponentSeen:
         self._last_utime = utime
         self.frames += 1
         self._timestamps_us.append(component.timestamp_us)
-        size = MESSAGE_HEADER_BYTES + component.num_items * component.item_bytes
+        size = ITEMS_OFFSET + component.num_items * component.item_bytes
         self.message_bytes = max(self.message_bytes, size)
         if component.type in {ComponentType.MARKERS, ComponentType.TOOLS}:
             self._look(component)

@@ -1,4 +1,4 @@
-"""Zenoh key expressions and LCM channels of everything that is published, and the cleaning of labels."""
+"""Zenoh key expressions and LCM channels of everything the gateway publishes."""
 
 import re
 from collections.abc import Container
@@ -6,52 +6,54 @@ from typing import NamedTuple
 from urllib.parse import quote
 
 MAX_CHANNEL_LENGTH = 63
-"""What LCM allows; a longer name is refused by ``publish``."""
+"""LCM's limit: its ``publish`` refuses longer names."""
 
 MAX_LABEL_LENGTH = 200
-"""What is kept of a tool's label, which is the server's word: Zenoh panics over keys of 64 kB."""
+"""Limit on a tool's label, which the server chooses: Zenoh panics over keys of 64 kB."""
 
 
 class Topic(NamedTuple):
-    """One stream of messages: of ``source``, under ``parts`` (its name on both sides), of one LCM type.
+    """One stream of messages of one LCM type from ``source``.
 
-    ``parts`` is one of ("3d",), ("6d",), ("analog",), ("force",), ("event",), ("status",), or
-    ("6d", label) for the pose of one tool. ``type_name`` is the LCM type: "rtc3d.markers_t".
+    ``path`` names the messages within the source, in keys and channels. It is one of ("3d",), ("6d",),
+    ("analog",), ("force",), ("event",), ("status",), ("clock",), or ("6d", label) for the pose of one tool.
+    ``type_name`` is the LCM type: "rtc3d.markers_t".
     """
 
     source: str
-    parts: tuple[str, ...]
+    path: tuple[str, ...]
     type_name: str
 
 
-def zenoh_key(prefix: str, source: str, *parts: str) -> str:
-    """Return the key PREFIX/SOURCE/PART…; what Zenoh refuses in a part is percent-escaped (UTF-8)."""
-    return "/".join([prefix, source, *(escape_key_chunk(part) for part in parts)])
+def zenoh_key(prefix: str, source: str, *path: str) -> str:
+    """Return the key ``prefix/source/path…`` with every element of ``path`` escaped."""
+    return "/".join([prefix, source, *(escape_key_chunk(name) for name in path)])
 
 
 def escape_key_chunk(label: str) -> str:
-    """Return ``label`` as one chunk of a key expression, losslessly.
+    """Return ``label`` as one chunk of a key expression, without loss.
 
-    Letters, digits and ``_ . - ~`` stay; everything else is percent-escaped, ``/ * $ # ?`` of Zenoh's
-    syntax among it. ``urllib.parse.unquote`` gives the label back. An empty label becomes ``%``,
-    which is no escape of anything.
+    Letters, digits and ``_ . - ~`` stay; everything else is percent-escaped (UTF-8), including ``/ * $ # ?``
+    of Zenoh's syntax. ``urllib.parse.unquote`` returns the label. An empty label becomes ``%``, which is
+    not an escape sequence.
     """
     return quote(label, safe="") or "%"
 
 
-def lcm_channel(prefix: str, source: str, *parts: str) -> str:
-    """Return the channel PREFIX_SOURCE_PART…; behind ``prefix`` only upper-case ASCII, digits and ``_``.
+def lcm_channel(prefix: str, source: str, *path: str) -> str:
+    """Return the channel ``prefix_SOURCE_PATH…``, cut to MAX_CHANNEL_LENGTH.
 
-    It is cut to MAX_CHANNEL_LENGTH. Two labels can give one channel: see ``unique_name``.
+    After ``prefix`` it has only upper-case ASCII letters, digits and ``_``. Two labels can give the same
+    channel: see ``unique_name``.
     """
-    names = (_channel_part(part) for part in (source, *parts))
+    names = (_channel_name(name) for name in (source, *path))
     return "_".join([prefix, *names])[:MAX_CHANNEL_LENGTH]
 
 
 def unique_name(name: str, taken: Container[str], max_length: int = MAX_CHANNEL_LENGTH) -> str:
-    """Return ``name``, or with ``_2``, ``_3``, … behind it the first that is not ``taken``.
+    """Return ``name`` if it is not ``taken``, else the first free of ``name_2``, ``name_3``, …
 
-    It is cut to ``max_length``, the number included.
+    The result is cut to ``max_length`` characters; its number is kept.
     """
     candidate, number = name[:max_length], 1
     while candidate in taken:
@@ -61,5 +63,5 @@ def unique_name(name: str, taken: Container[str], max_length: int = MAX_CHANNEL_
     return candidate
 
 
-def _channel_part(text: str) -> str:
+def _channel_name(text: str) -> str:
     return re.sub(r"[^A-Z0-9]+", "_", text.upper()).strip("_") or "_"

@@ -5,13 +5,13 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Final
 
 from gateway.messages.splice import (
-    FINGERPRINTS,
     MESSAGE_TYPES,
-    Stamp,
-    canonical_content,
-    is_canonical,
-    timestamp_us_of,
+    content_timestamp_us,
+    has_lcm_form,
+    lcm_content,
+    splice_content,
 )
+from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import Output
 from gateway.outputs.status import OutputStatus
 from gateway.publish.routes import ComponentRoute, OutputRoute
@@ -28,10 +28,10 @@ logger = logging.getLogger(__name__)
 class _Fan:
     """One component on its way to all outputs."""
 
-    __slots__ = ("fingerprint", "frames", "lanes", "newest")
+    __slots__ = ("component", "frames", "lanes", "newest")
 
     def __init__(self, component: ComponentType) -> None:
-        self.fingerprint = FINGERPRINTS[component]
+        self.component = component
         self.lanes: list[ComponentRoute] = []
         self.frames = 0
         self.newest: bytes | None = None
@@ -52,7 +52,7 @@ class _Plan:
         parts = [(part.type, index) for index, part in enumerate(layout.parts) if part.type in wanted]
         self.fans = [(fans[kind], index) for kind, index in parts]
         """Of each component that is wanted, with its index in the frame."""
-        self.is_canonical = all(is_canonical(part, layout.byte_order) for part in layout.parts)
+        self.is_canonical = all(has_lcm_form(part, layout.byte_order) for part in layout.parts)
         """Whether the contents go into messages as they come."""
         self.tools = [index for kind, index in parts if with_tools and kind is ComponentType.TOOLS]
         """Which components are tools with messages of their own."""
@@ -137,19 +137,19 @@ class FanOut:
         # The inner loop of the gateway: attributes instead of dictionaries, and calls only to what sends.
         plan = self._plan_of(frame.layout, wanted)
         for fan, index in plan.fans:
-            content = frame.content(index) if plan.is_canonical else canonical_content(frame.component(index))
+            content = frame.content(index) if plan.is_canonical else lcm_content(frame.component(index))
             fan.frames += 1
             message = b""
             spliced = -1  # the number in it, if any
             for lane in fan.lanes:
                 if lane.pacer is not None and not lane.pacer.due(
-                    timestamp_us_of(content) if stamp.has_clock else None, stamp.utime
+                    content_timestamp_us(content) if stamp.has_clock else None, stamp.utime
                 ):
                     continue
                 sequence = lane.sequence
                 if spliced != sequence:
                     spliced = sequence
-                    message = b"%b%b%b" % (fan.fingerprint, stamp.packed(sequence), content)
+                    message = splice_content(fan.component, content, stamp, sequence)
                 lane.sequence = sequence + 1
                 try:
                     lane.publish(message)

@@ -4,7 +4,7 @@ import logging
 
 from gateway.errors import OutputError
 from gateway.log import HOLD_S, FailureLog
-from gateway.messages.splice import MESSAGE_TYPES, type_name
+from gateway.messages.splice import MESSAGE_TYPES, lcm_type_name
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import Output, Publisher
 from gateway.outputs.status import OutputStatus
@@ -23,7 +23,7 @@ class OutputRoute:
             kind: ComponentRoute(
                 self,
                 kind,
-                Topic(source, (kind.key,), type_name(message_type)),
+                Topic(source, (kind.key,), lcm_type_name(message_type)),
                 None if before is None else before.lanes[kind],
             )
             for kind, message_type in MESSAGE_TYPES.items()

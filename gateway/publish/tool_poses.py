@@ -7,7 +7,9 @@ from typing import Final
 import rtc3d
 
 from gateway.log import HOLD_S, FailureLog
-from gateway.messages.splice import Stamp, metres_per_unit, tool_poses, type_name
+from gateway.messages.splice import lcm_type_name
+from gateway.messages.stamp import Stamp
+from gateway.messages.tool_pose import metres_per_unit, tool_poses
 from gateway.messages.topics import MAX_LABEL_LENGTH, Topic, unique_name
 from gateway.outputs.contract import Publisher
 from gateway.publish.routes import OutputRoute
@@ -62,7 +64,7 @@ class ToolPoses:
         self._publishers = [publisher for _, sending in self._tools for _, publisher in sending]
 
     def _topic(self, name: str) -> Topic:
-        return Topic(self._source, (ComponentType.TOOLS.key, name), type_name(rtc3d.tool_pose_t))
+        return Topic(self._source, (ComponentType.TOOLS.key, name), lcm_type_name(rtc3d.tool_pose_t))
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Take the tools' labels (§6.3) and the unit of length (§6.2)."""

@@ -19,7 +19,8 @@ from gateway.errors import (
     ServerError,
 )
 from gateway.messages.host_time import now_utime
-from gateway.messages.splice import FINGERPRINT_BYTES, STAMP, Stamp, splice
+from gateway.messages.splice import FINGERPRINT_BYTES, splice
+from gateway.messages.stamp import PREFIX, Stamp
 from gateway.queries.answers import (
     JSON,
     XML,
@@ -327,5 +328,5 @@ class SourceQueries:
 
 
 def _session_of(message: bytes) -> int:
-    session: int = STAMP.unpack_from(message, FINGERPRINT_BYTES)[3]
+    session: int = PREFIX.unpack_from(message, FINGERPRINT_BYTES)[3]
     return session

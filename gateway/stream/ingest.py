@@ -5,7 +5,7 @@ from collections.abc import Callable
 from typing import Final
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.messages.splice import Stamp
+from gateway.messages.stamp import Stamp
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.stream.rate_control import LagControl

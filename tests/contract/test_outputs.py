@@ -71,7 +71,7 @@ class MemoryRig:
 
     @property
     def received(self) -> list[tuple[str, bytes]]:
-        return [("/".join((topic.source, *topic.parts)), message) for topic, message in self.output.messages]
+        return [("/".join((topic.source, *topic.path)), message) for topic, message in self.output.messages]
 
     def listen(self) -> None: ...
 
@@ -226,7 +226,7 @@ def test_messages_arrive_as_they_are_in_order_under_their_own_name(rig: Rig) -> 
     sent: dict[str, list[bytes]] = {rig.names[topic]: [] for topic in publishers}
     for number in range(20):
         for topic, publisher in publishers.items():
-            message = bytes([number, *topic.parts[0].encode()]) * (number * 20)  # 0 to 2.6 kB
+            message = bytes([number, *topic.path[0].encode()]) * (number * 20)  # 0 to 2.6 kB
             publisher.publish(message)
             sent[rig.names[topic]].append(message)
     wait_until(lambda: len(rig.received) >= 60)

@@ -20,7 +20,8 @@ with atheris.instrument_imports(include=["gateway"]):
     from gateway.config.loading import load
     from gateway.errors import CommandError, ConfigError, FrameError, ParametersError, ProtocolError
     from gateway.messages.decode import decode, one_line, to_json
-    from gateway.messages.splice import Stamp, splice
+    from gateway.messages.splice import splice
+    from gateway.messages.stamp import Stamp
     from gateway.rtc3d.client_protocol import ClientProtocol, State
     from gateway.rtc3d.commands import SendParameters, StreamFrames, Version, parse_command
     from gateway.rtc3d.frames import byte_order_of, split_frame

@@ -17,11 +17,11 @@ import pytest
 from gateway.cli.subscribers import LcmListener, ZenohListener, channel_pattern, key_pattern, open_zenoh
 from gateway.config.settings import LcmSettings, Settings, SourceSettings, StreamSettings, ZenohSettings
 from gateway.gateway import Gateway
-from gateway.messages.splice import message_items
+from gateway.messages.splice import ITEMS_OFFSET
 from gateway.outputs.contract import Output
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.zenoh.output import ZenohOutput
-from gateway.rtc3d.components import BY_KEY, ComponentType
+from gateway.rtc3d.components import BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.rtc3d_server.scene import Scene
 from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.c3d_scene import C3dScene
@@ -119,7 +119,7 @@ def assert_equal_to_file(messages: list[bytes], component: str, expected: Bits) 
     seen = set()
     for message in messages:
         number = int.from_bytes(message[36:40], "big", signed=True) - 1
-        items = np.ascontiguousarray(message_items(message, BY_KEY[component]))
+        items = np.frombuffer(message, ITEM_DTYPES[BY_KEY[component]], offset=ITEMS_OFFSET)
         bits = items.view(">u4").reshape(len(items), -1)[:, : expected.shape[2]]
         np.testing.assert_array_equal(bits, expected[number % len(expected)])
         seen.add(number % len(expected))

@@ -6,7 +6,9 @@ from hypothesis import strategies as st
 
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode, one_line, to_json
-from gateway.messages.splice import Stamp, splice, tool_poses
+from gateway.messages.splice import splice
+from gateway.messages.stamp import Stamp
+from gateway.messages.tool_pose import tool_poses
 from gateway.outputs.status import OutputHealth, OutputStatus
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.rtc3d.components import ComponentType

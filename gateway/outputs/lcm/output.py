@@ -123,7 +123,7 @@ class LcmOutput:
 
     def publisher(self, topic: Topic) -> LcmPublisher:
         """Return a new publisher of ``topic`` on a channel that no other publisher of ours has."""
-        name = lcm_channel(self.settings.prefix, topic.source, *topic.parts)
+        name = lcm_channel(self.settings.prefix, topic.source, *topic.path)
         channel = unique_name(name, self._channels)
         self._channels.add(channel)
         return LcmPublisher(self, channel)

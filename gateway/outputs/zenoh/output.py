@@ -75,7 +75,7 @@ class ZenohPublisher:
 
     def __init__(self, output: "ZenohOutput", topic: Topic) -> None:
         self._output = output
-        self._key = zenoh_key(output.settings.prefix, topic.source, *topic.parts)
+        self._key = zenoh_key(output.settings.prefix, topic.source, *topic.path)
         self._type_name = topic.type_name
         self._publisher: zenoh.Publisher | None = None
         self._closed = False

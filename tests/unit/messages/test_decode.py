@@ -7,22 +7,18 @@ import rtc3d
 
 from gateway.errors import ProtocolError
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME, decode, one_line, to_json
-from gateway.messages.splice import Stamp, splice, tool_poses
+from gateway.messages.splice import splice
+from gateway.messages.stamp import Stamp
+from gateway.messages.tool_pose import tool_poses
 from gateway.outputs.status import OutputHealth, OutputStatus
 from gateway.publish.status_messages import clock_message, status_message
-from gateway.rtc3d.components import Component
-from gateway.rtc3d.frames import split_frame
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
+from tests.unit.messages.received import received
 from tests.vectors import ANALOG, COMPONENTS, FORCE, LONG_EVENTS, MARKERS, TOOLS, ComponentVector
 
 STAMP = Stamp(utime=2_000, capture_utime=1_000, session=3)
 MISSING = [None] * 3
-
-
-def received(vector: ComponentVector) -> Component:
-    (component,) = split_frame((1).to_bytes(4, "big") + vector.wire["big"], "big").components
-    return component
 
 
 def message_of(vector: ComponentVector) -> bytes:

@@ -11,7 +11,7 @@ from prometheus_client.parser import text_string_to_metric_families
 from gateway import __version__
 from gateway.config.settings import MetricsSettings, Settings, SourceSettings, StreamSettings
 from gateway.gateway import Gateway
-from gateway.messages.splice import Stamp
+from gateway.messages.stamp import Stamp
 from gateway.monitoring.loop_delay import LoopDelay
 from gateway.monitoring.metrics import metrics_page, metrics_registry
 from gateway.rtc3d.components import ComponentType, build_component

@@ -6,7 +6,8 @@ import pytest
 
 from gateway.errors import OutputError
 from gateway.messages.decode import decode
-from gateway.messages.splice import Stamp, splice
+from gateway.messages.splice import splice
+from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.memory import MemoryOutput
 from gateway.publish.fan_out import FanOut
@@ -46,7 +47,7 @@ def test_every_component_goes_to_every_output_under_its_topic() -> None:
 def test_all_topics_are_declared_before_the_first_frame() -> None:
     output = ToyOutput()
     FanOut("lab", [output])
-    assert {topic.parts for topic in output.declared} == {
+    assert {topic.path for topic in output.declared} == {
         ("3d",), ("6d",), ("analog",), ("force",), ("event",), ("status",), ("clock",),
     }  # fmt: skip
     assert {topic.source for topic in output.declared} == {"lab"}
@@ -63,7 +64,7 @@ def test_each_component_counts_for_itself_and_across_sessions(memory: MemoryOutp
     fan_out.publish(FULL, STAMP, ALL)
     fan_out.publish(FULL, STAMP, MARKERS)
     fan_out.publish(FULL, Stamp(STAMP.utime, STAMP.capture_utime, 2), ALL)
-    messages = [(topic.parts, decode(message)) for topic, message in memory.messages]
+    messages = [(topic.path, decode(message)) for topic, message in memory.messages]
     counted = {
         key: [(message.sequence, message.session) for parts, message in messages if parts == (key,)]
         for key in ("3d", "analog")
@@ -73,7 +74,7 @@ def test_each_component_counts_for_itself_and_across_sessions(memory: MemoryOutp
 
 def test_components_that_the_stream_does_not_want_are_not_published(memory: MemoryOutput) -> None:
     FanOut("lab", [memory]).publish(FULL, STAMP, frozenset({ComponentType.TOOLS, ComponentType.EVENT}))
-    assert [topic.parts for topic, _ in memory.messages] == [("6d",), ("event",)]
+    assert [topic.path for topic, _ in memory.messages] == [("6d",), ("event",)]
 
 
 def test_an_empty_frame_publishes_nothing(memory: MemoryOutput) -> None:
@@ -108,7 +109,7 @@ def test_frames_messages_and_bytes_are_counted_by_component(memory: MemoryOutput
     [(_, status)] = fan_out.outputs
     sizes: Counter[str] = Counter()
     for topic, message in memory.messages:
-        sizes[topic.parts[0]] += len(message)
+        sizes[topic.path[0]] += len(message)
     assert status.message_bytes == sizes
     assert min(sizes.values()) > 0
 

@@ -1,7 +1,7 @@
 """A fan-out whose outputs change while frames flow."""
 
 from gateway.messages.decode import decode
-from gateway.messages.splice import Stamp
+from gateway.messages.stamp import Stamp
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.rtc3d.frames import split_frame
@@ -19,7 +19,7 @@ def publish(fan_out: FanOut) -> None:
 
 
 def sequences(output: ToyOutput, component: str) -> list[int]:
-    return [decode(message).sequence for topic, message in output.messages if topic.parts == (component,)]
+    return [decode(message).sequence for topic, message in output.messages if topic.path == (component,)]
 
 
 def test_an_output_that_stays_notices_nothing_of_another_that_is_replaced() -> None:

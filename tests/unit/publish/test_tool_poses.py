@@ -5,7 +5,7 @@ from itertools import chain
 
 import pytest
 
-from gateway.messages.splice import Stamp
+from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import WIRE_ORDER
@@ -39,7 +39,7 @@ def test_tools_have_topics_where_switched_on_only() -> None:
     fan_out = FanOut("lab", [with_tools, without], ["with"])
     fan_out.set_parameters(parameters("Probe"))
     publish_tools(fan_out, 1)
-    [(topic, _)] = [each for each in with_tools.messages if len(each[0].parts) == 2]
+    [(topic, _)] = [each for each in with_tools.messages if len(each[0].path) == 2]
     assert topic == Topic("lab", ("6d", "Probe"), "rtc3d.tool_pose_t")
     assert without.tool_names() == []
 

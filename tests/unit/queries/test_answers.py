@@ -5,7 +5,8 @@ import pytest
 import rtc3d
 
 from gateway.errors import QueryError
-from gateway.messages.splice import Stamp, splice
+from gateway.messages.splice import splice
+from gateway.messages.stamp import Stamp
 from gateway.queries.answers import (
     JSON,
     SCHEMA_TYPES,

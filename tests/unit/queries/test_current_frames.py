@@ -6,7 +6,8 @@ import json
 import pytest
 
 from gateway.errors import QueryError, ServerError
-from gateway.messages.splice import Stamp, splice
+from gateway.messages.splice import splice
+from gateway.messages.stamp import Stamp
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet, PacketType

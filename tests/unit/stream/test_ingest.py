@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.messages.splice import Stamp
+from gateway.messages.stamp import Stamp
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, build_component
 from gateway.rtc3d.frames import Frame, build_frame, split_frame
 from gateway.stream.ingest import Ingest

@@ -1,0 +1,28 @@
+"""The prefix of every message: times, sequence number and session of its frame."""
+
+import struct
+from typing import Final
+
+PREFIX: Final = struct.Struct(">qqqi")
+"""The fields after the fingerprint: utime, capture_utime, sequence, session."""
+
+
+class Stamp:
+    """What the messages of one frame have in common in their prefixes.
+
+    ``utime`` is when the frame arrived and ``capture_utime`` when the server captured it, both in µs since
+    the Unix epoch; ``session`` is the number of the connection. ``has_clock`` is False where the server's
+    time stamps cannot be used as a clock.
+    """
+
+    __slots__ = ("capture_utime", "has_clock", "session", "utime")
+
+    def __init__(self, utime: int, capture_utime: int, session: int, has_clock: bool = True) -> None:
+        self.utime = utime
+        self.capture_utime = capture_utime
+        self.session = session
+        self.has_clock = has_clock
+
+    def prefix(self, sequence: int) -> bytes:
+        """Return the prefix of a message with this sequence number: 28 bytes."""
+        return PREFIX.pack(self.utime, self.capture_utime, sequence, self.session)
