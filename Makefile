@@ -6,7 +6,7 @@ BIN := .venv/bin
 PREFIX := /opt/rtc3d-gateway
 CONFIG := /etc/rtc3d-gateway
 LIB := /usr/local/lib
-UNITS := rtc3d-gateway.service.daemon rtc3d-gateway@.service
+UNITS := rtc3d-gateway.service rtc3d-gateway@.service
 
 # What tests of installing use; sudo finds this one, and the service can reach it.
 SYSTEM_PYTHON ?= /usr/bin/python3
@@ -116,7 +116,7 @@ install:
 # As root. What stays: the configurations in $(CONFIG), the C3D files in /var/lib/rtc3d-gateway, and the user that
 # they belong to.
 uninstall:
-	[ ! -d /run/systemd/system ] || systemctl stop rtc3d-gateway.service.daemon 'rtc3d-gateway@*.service'
+	[ ! -d /run/systemd/system ] || systemctl stop rtc3d-gateway.service 'rtc3d-gateway@*.service'
 	[ ! -d /run/systemd/system ] || systemctl disable $(UNITS)
 	rm -f $(UNITS:%=$(LIB)/systemd/system/%) $(LIB)/sysusers.d/rtc3d-gateway.conf \
 	    $(LIB)/tmpfiles.d/rtc3d-gateway.conf /usr/local/bin/rtc3d-gateway $(CONFIG)/gateway.schema.json

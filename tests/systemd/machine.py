@@ -12,7 +12,7 @@ import yaml
 from tests.clones import ROOT, SYSTEM_PYTHON, WHEELHOUSE, pip_environment
 from tests.networks import zenoh_keys
 
-UNIT: Final = "rtc3d-gateway.service.daemon"
+UNIT: Final = "rtc3d-gateway.service"
 CONFIG: Final = "/etc/rtc3d-gateway/gateway.yaml"
 DROP_INS: Final = f"/etc/systemd/system/{UNIT}.d"
 CLONE: Final = "/tmp/clone"
