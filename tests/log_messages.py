@@ -1,4 +1,4 @@
-"""What the gateway can say in its log at WARNING and above, read from its source text."""
+"""Finds the messages that the gateway can log at WARNING and above, by reading its source text."""
 
 import ast
 import re
@@ -8,31 +8,31 @@ from pathlib import Path
 from typing import Final
 
 _LOGGERS: Final = {"logger", "_log"}
-_LOUD: Final = {"warning", "error", "exception", "critical"}
-"""Their methods at WARNING and above; ``log`` may be, too."""
+_LOUD_METHODS: Final = {"warning", "error", "exception", "critical"}
+"""Methods of loggers that log at WARNING and above; ``log`` may, too."""
 
-_TELLING: Final = {"failed", "limit", "_limit"}
-"""Methods that log what they are given as WARNING, the first time at least."""
+_WARNING_METHODS: Final = {"failed", "limit", "_limit"}
+"""Methods that log their argument as WARNING, at least the first time."""
 
-_TOLD: Final = {
+_LOGGED_CLASSES: Final = {
     *("LinkError", "ConnectError", "ReplyTimeoutError", "SilenceError", "ClosedError"),
     *("PacketError", "OutputError", "OutputHealth", "SpoolError"),
 }
-"""Objects whose texts become such messages."""
+"""Classes whose texts are logged as WARNING or ERROR."""
 
-_PRINTED: Final = {"cli", "cli_configuration", "demo", "echo", "listening", "params", "doctor"}
-"""Commands that end with their errors, printed and not logged."""
+_PRINTING_PACKAGES: Final = {"cli", "demo", "doctor"}
+"""Commands that print their errors instead of logging them."""
 
 
-def told_patterns(package: Path) -> dict[str, str]:
-    """Return a regular expression for each message, and where it is; values in it are ``.+``."""
+def message_patterns(package: Path) -> dict[str, str]:
+    """Return a regular expression for each message, with ``.+`` for its values, and where it is logged."""
     found: dict[str, str] = {}
     for path in sorted(package.rglob("*.py")):
-        if path.relative_to(package).parts[0].removesuffix(".py") in _PRINTED:
+        if path.relative_to(package).parts[0].removesuffix(".py") in _PRINTING_PACKAGES:
             continue
         module = ast.parse(path.read_text())
         for scope in _scopes(module):
-            for call in _calls(scope):
+            for call in _logging_calls(scope):
                 texts = chain.from_iterable(_texts(node, scope, module) for node in call.args)
                 for text in filter(re.compile("[a-z]{3}").search, texts):
                     found.setdefault(text, f"{path.relative_to(package)}:{call.lineno}")
@@ -40,6 +40,7 @@ def told_patterns(package: Path) -> dict[str, str]:
 
 
 def _scopes(module: ast.Module) -> Iterator[ast.AST]:
+    """Yield the functions, and the assignments outside functions."""
     for node in ast.walk(module):
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
             yield node
@@ -48,23 +49,24 @@ def _scopes(module: ast.Module) -> Iterator[ast.AST]:
             yield node
 
 
-def _calls(scope: ast.AST) -> Iterator[ast.Call]:
+def _logging_calls(scope: ast.AST) -> Iterator[ast.Call]:
     for node in ast.walk(scope):
         match node:
             case ast.Call(func=ast.Attribute(value=ast.Name(owner), attr=name)) if owner in _LOGGERS:
-                if name in _LOUD or (name == "log" and re.search("level|WARNING", ast.unparse(node.args[0]))):
+                is_loud = name == "log" and re.search("level|WARNING", ast.unparse(node.args[0]))
+                if name in _LOUD_METHODS or is_loud:
                     yield node
-            case ast.Call(func=ast.Attribute(attr=name)) if name in _TELLING:
+            case ast.Call(func=ast.Attribute(attr=name)) if name in _WARNING_METHODS:
                 yield node
-            case ast.Call(func=ast.Name(name)) if name in _TOLD:
+            case ast.Call(func=ast.Name(name)) if name in _LOGGED_CLASSES:
                 yield node
 
 
 def _texts(node: ast.expr, scope: ast.AST, module: ast.Module) -> Iterator[str]:
-    """Yield patterns of what a text can be: literals, and what names and functions stand for."""
-    todo, seen = [(node, scope)], set()
-    while todo:
-        node, scope = todo.pop()
+    """Yield a pattern for each text that ``node`` can be, following names and calls to their literals."""
+    pending, seen = [(node, scope)], set()
+    while pending:
+        node, scope = pending.pop()
         if node in seen:
             continue
         seen.add(node)
@@ -76,17 +78,18 @@ def _texts(node: ast.expr, scope: ast.AST, module: ast.Module) -> Iterator[str]:
                     re.escape(str(part.value)) if isinstance(part, ast.Constant) else ".+" for part in parts
                 )
             case ast.BoolOp(values=choices):
-                todo += [(choice, scope) for choice in choices]
+                pending += [(choice, scope) for choice in choices]
             case ast.Name(name):
-                todo += [(value, scope) for value in _assigned(name, scope)]
+                pending += [(value, scope) for value in _assigned(name, scope)]
             case ast.Attribute(attr=name):
-                todo += [(value, scope) for value in _assigned(name, module)]
+                pending += [(value, scope) for value in _assigned(name, module)]
             case ast.Call(func=ast.Name(name)):
-                todo += _returned(name, module)
+                pending += _returned(name, module)
 
 
-def _assigned(name: str, where: ast.AST) -> Iterator[ast.expr]:
-    for node in ast.walk(where):
+def _assigned(name: str, scope: ast.AST) -> Iterator[ast.expr]:
+    """Yield the values that are assigned to a variable or an attribute."""
+    for node in ast.walk(scope):
         match node:
             case ast.Assign(targets=[ast.Name(target) | ast.Attribute(attr=target)], value=value):
                 if target == name:
@@ -94,6 +97,7 @@ def _assigned(name: str, where: ast.AST) -> Iterator[ast.expr]:
 
 
 def _returned(name: str, module: ast.Module) -> Iterator[tuple[ast.expr, ast.AST]]:
+    """Yield the values that a function of the module returns."""
     for function in module.body:
         if isinstance(function, ast.FunctionDef) and function.name == name:
             for node in ast.walk(function):

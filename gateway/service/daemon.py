@@ -1,4 +1,4 @@
-"""The gateway as a service: what its signals do, and what systemd hears of it."""
+"""The gateway as a daemon: it handles signals, reloads the configuration and notifies systemd."""
 
 import asyncio
 import logging
@@ -9,86 +9,96 @@ from collections.abc import Callable
 from gateway.config.settings import Settings
 from gateway.errors import ConfigError
 from gateway.gateway import Gateway
-from gateway.service.systemd import Systemd
+from gateway.service.systemd import SystemdNotifier
 
 logger = logging.getLogger(__name__)
 
 
 async def serve(load: Callable[[], Settings]) -> None:
-    """Run a gateway with the settings that ``load`` gives, until SIGTERM or SIGINT.
+    """Run a gateway with the settings that ``load`` returns, until SIGTERM or SIGINT.
 
-    SIGHUP loads them anew: what differs is changed over, and what cannot be used is refused whole.
-    Raises ConfigError if they cannot be used at the start.
+    SIGHUP calls ``load`` again and applies what has changed; a configuration with an error is refused
+    as a whole. Raises ConfigError if the settings cannot be used at the start.
     """
-    await _Service(load, Gateway(load())).run()
+    await Daemon(load, Gateway(load())).run()
 
 
-class _Service:
+class Daemon:
+    """Runs one gateway for the lifetime of the process; ``load`` returns its current settings."""
+
     def __init__(self, load: Callable[[], Settings], gateway: Gateway) -> None:
         self._load = load
         self._gateway = gateway
-        self._systemd = Systemd()
+        self._systemd = SystemdNotifier()
         self._stop = asyncio.Event()
-        self._reload_wanted = asyncio.Event()
-        self._has_terminal = os.isatty(0)
-        self._refusal = ""
+        self._reload_requested = asyncio.Event()
+        self._started_on_terminal = os.isatty(0)
+        self._reload_problem = ""
+        """Why the last reload was refused; empty if it was not."""
 
     async def run(self) -> None:
+        """Run until SIGTERM, SIGINT or the end of the controlling terminal."""
         loop = asyncio.get_running_loop()
         for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, self._on_stop)
+            loop.add_signal_handler(number, self._request_stop)
         loop.add_signal_handler(signal.SIGHUP, self._on_hangup)
         async with asyncio.TaskGroup() as tasks:
-            companions = [tasks.create_task(self._keep_systemd_told()), tasks.create_task(self._reload())]
+            background = [
+                tasks.create_task(self._notify_systemd()),
+                tasks.create_task(self._handle_reloads()),
+            ]
             await self._gateway.run(self._stop)
-            for companion in companions:
-                companion.cancel()
+            for task in background:
+                task.cancel()
 
-    def _on_stop(self) -> None:
-        self._systemd.stopping()
+    def _request_stop(self) -> None:
+        self._systemd.notify_stopping()
         self._stop.set()
 
     def _on_hangup(self) -> None:
-        """SIGHUP says that there is a new configuration, or that the terminal has gone."""
-        if self._has_terminal and not os.isatty(0):
-            self._on_stop()
+        """Stop if SIGHUP means that the terminal is gone; otherwise reload the configuration."""
+        if self._started_on_terminal and not os.isatty(0):
+            self._request_stop()
         else:
-            self._reload_wanted.set()
+            self._reload_requested.set()
 
-    async def _keep_systemd_told(self) -> None:
-        """From the event loop, so that the watchdog bites when that hangs."""
+    async def _notify_systemd(self) -> None:
+        """Report the start, then the status periodically.
+
+        This runs in the event loop so that the watchdog restarts the service when the loop hangs.
+        """
         await self._gateway.opened.wait()
-        self._systemd.alive(self._status())
-        self._systemd.ready()
+        self._systemd.notify_alive(self._status_line())
+        self._systemd.notify_ready()
         while True:
             await asyncio.sleep(self._systemd.period_s)
-            self._systemd.alive(self._status())
+            self._systemd.notify_alive(self._status_line())
 
-    def _status(self) -> str:
-        return "; ".join(filter(None, (self._refusal, *self._gateway.lines())))
+    def _status_line(self) -> str:
+        return "; ".join(filter(None, (self._reload_problem, *self._gateway.lines())))
 
-    async def _reload(self) -> None:
+    async def _handle_reloads(self) -> None:
         await self._gateway.opened.wait()
         while True:
-            await self._reload_wanted.wait()
-            self._reload_wanted.clear()
-            self._systemd.reloading()
-            await self._change_over()
-            self._systemd.alive(self._status())
-            self._systemd.ready()
+            await self._reload_requested.wait()
+            self._reload_requested.clear()
+            self._systemd.notify_reloading()
+            await self._reload()
+            self._systemd.notify_alive(self._status_line())
+            self._systemd.notify_ready()
 
-    async def _change_over(self) -> None:
+    async def _reload(self) -> None:
         try:
-            # In a thread: frames go on while a large file is read.
+            # In a thread, so that reading a large file does not delay frames.
             settings = await asyncio.to_thread(self._load)
             changes = await self._gateway.reload(settings)
         except ConfigError as error:
             problems = str(error).splitlines()
             for problem in problems:
-                logger.error("new configuration refused: %s", problem)  # noqa: TRY400 - says it all
-            self._refusal = f"new configuration refused, the old one runs on: {problems[0]}"
+                logger.error("new configuration refused: %s", problem)  # noqa: TRY400 - no traceback needed
+            self._reload_problem = f"new configuration refused, the old one stays in use: {problems[0]}"
             if len(problems) > 1:
-                self._refusal += f" (and {len(problems) - 1} more in the log)"
+                self._reload_problem += f" (and {len(problems) - 1} more in the log)"
         else:
-            self._refusal = ""
-            logger.info("new configuration: %s", ", ".join(changes) or "nothing differs")
+            self._reload_problem = ""
+            logger.info("configuration reloaded: %s", ", ".join(changes) or "nothing changed")

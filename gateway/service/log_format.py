@@ -1,4 +1,4 @@
-"""The forms of the log: text for people, JSON lines for collectors, the journal with its fields."""
+"""Log formats: text for people, JSON lines for log collectors, the systemd journal with fields."""
 
 import json
 import logging
@@ -14,7 +14,7 @@ from gateway.log import FIELDS, FieldsFilter
 
 
 class LogFormat(StrEnum):
-    """How the log is written; auto is journal under systemd, else text."""
+    """Where and how log records are written; auto is the journal under systemd, otherwise text."""
 
     AUTO = "auto"
     TEXT = "text"
@@ -23,7 +23,7 @@ class LogFormat(StrEnum):
 
 
 class LogLevel(StrEnum):
-    """What the log holds: this and what is graver; docs/operations.md tells what each level has."""
+    """The lowest level that is logged; docs/operations.md describes what each level contains."""
 
     DEBUG = "debug"
     INFO = "info"
@@ -31,38 +31,39 @@ class LogLevel(StrEnum):
     ERROR = "error"
 
 
-# The journal's priorities are syslog's.
-_PRIORITIES: Final = {
+_JOURNAL_PRIORITIES: Final = {
     logging.DEBUG: 7,
     logging.INFO: 6,
     logging.WARNING: 4,
     logging.ERROR: 3,
     logging.CRITICAL: 2,
 }
-_IDENTIFIER: Final = "rtc3d-gateway"
+"""Priorities as in syslog(3)."""
+
+_SYSLOG_IDENTIFIER: Final = "rtc3d-gateway"
 
 
 def set_up_log(level: LogLevel, log_format: LogFormat = LogFormat.AUTO) -> None:
-    """Write everything that is logged to stderr, or to the journal.
+    """Send all log records to stderr or to the journal.
 
-    Raises ConfigError if the journal is asked for and cannot be written to.
+    Raises ConfigError if ``log_format`` is JOURNAL and cysystemd is not installed.
     """
-    handler = _handler(log_format)
+    handler = _handler_for(log_format)
     handler.addFilter(FieldsFilter())
     logging.basicConfig(level=level.upper(), handlers=[handler])
 
 
-def _handler(log_format: LogFormat) -> logging.Handler:
-    if log_format is LogFormat.JOURNAL or (log_format is LogFormat.AUTO and _stderr_is_the_journal()):
+def _handler_for(log_format: LogFormat) -> logging.Handler:
+    if log_format is LogFormat.JOURNAL or (log_format is LogFormat.AUTO and _stderr_is_journal()):
         try:
             return JournalHandler()
         except ImportError as error:
             if log_format is LogFormat.JOURNAL:
                 raise ConfigError(
-                    f"no log to the journal: {error}; pip install 'rtc3d-gateway[systemd]', "
-                    "or give another --log-format"
+                    f"cannot log to the journal: {error}; pip install 'rtc3d-gateway[systemd]', "
+                    "or choose another --log-format"
                 ) from error
-            # The journal takes text from stderr as well, without the fields.
+            # systemd also forwards stderr to the journal, but as text without fields.
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(
         JsonFormatter()
@@ -72,11 +73,11 @@ def _handler(log_format: LogFormat) -> logging.Handler:
     return handler
 
 
-def _stderr_is_the_journal() -> bool:
-    """Return whether systemd connected stderr with the journal (systemd.exec(5), JOURNAL_STREAM)."""
+def _stderr_is_journal() -> bool:
+    """Return whether systemd connected stderr to the journal (systemd.exec(5), JOURNAL_STREAM)."""
     try:
         stderr = os.fstat(sys.stderr.fileno())
-    except (OSError, ValueError):  # closed, or replaced by what is no file
+    except (OSError, ValueError):  # closed, or replaced by an object without a file
         return False
     return os.environ.get("JOURNAL_STREAM") == f"{stderr.st_dev}:{stderr.st_ino}"
 
@@ -86,10 +87,13 @@ def _fields(record: logging.LogRecord) -> dict[str, str]:
 
 
 class JsonFormatter(logging.Formatter):
-    """One JSON object a line: time (UTC), level, message, logger; source, stream and peer where known."""
+    """Formats a record as one line of JSON.
+
+    The keys are time (UTC), level, message and logger; source, stream, peer and exception where present.
+    """
 
     def format(self, record: logging.LogRecord) -> str:
-        """Return the record as one line."""
+        """Return the JSON object, without a line end."""
         fields = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
@@ -103,13 +107,19 @@ class JsonFormatter(logging.Formatter):
 
 
 class JournalHandler(logging.Handler):
-    """Sends records to the journal with SOURCE, STREAM and PEER where known; raises ImportError."""
+    """Sends records to the journal with LOGGER, and with SOURCE, STREAM and PEER where known.
+
+    Raises ImportError if cysystemd is not installed.
+    """
+
+    # cysystemd's own JournaldLogHandler does not fit: it calls the field LOGGER_NAME, gives each record
+    # another MESSAGE_ID (which should identify the kind of message), adds about twenty more fields, and
+    # raises its errors, such as a KeyError for an unusual level, into the code that logs.
 
     def __init__(self) -> None:
         super().__init__()
-        self.setFormatter(logging.Formatter())  # the message alone: the journal has the rest in fields
-        # Needed under systemd only, and an extra of the package.
-        from cysystemd import journal  # noqa: PLC0415
+        self.setFormatter(logging.Formatter())  # message and traceback; the rest goes into fields
+        from cysystemd import journal  # noqa: PLC0415 - an optional extra
 
         self._send: Callable[..., None] = journal.send
 
@@ -118,10 +128,10 @@ class JournalHandler(logging.Handler):
         try:
             self._send(
                 message=self.format(record),
-                priority=_PRIORITIES.get(record.levelno, 6),
-                syslog_identifier=_IDENTIFIER,
+                priority=_JOURNAL_PRIORITIES.get(record.levelno, 6),
+                syslog_identifier=_SYSLOG_IDENTIFIER,
                 logger=record.name,
                 **_fields(record),
             )
-        except Exception:  # noqa: BLE001 - as logging's own handlers: the log must not stop the program
+        except Exception:  # noqa: BLE001 - as in logging's own handlers: logging must not stop the program
             self.handleError(record)

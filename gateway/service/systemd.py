@@ -1,7 +1,7 @@
-"""What systemd is told of the service (sd_notify); nothing happens without it ($NOTIFY_SOCKET unset).
+"""Notifications for systemd (sd_notify); without $NOTIFY_SOCKET nothing is sent.
 
-cysystemd, the extra ``systemd``, brings libsystemd along. It is no dependency of the package itself,
-because it has no wheels where there is no systemd: for Alpine's containers, for instance.
+They need cysystemd, which contains libsystemd. It is the optional extra ``systemd`` because it has no
+wheels for platforms without systemd, such as Alpine containers.
 """
 
 import logging
@@ -15,51 +15,51 @@ _DEFAULT_PERIOD_S: Final = 1.0
 logger = logging.getLogger(__name__)
 
 
-class Systemd:
-    """The service manager that started this process, if one did."""
+class SystemdNotifier:
+    """The connection to the systemd that started this process, if one did."""
 
     def __init__(self) -> None:
-        self._is_there = bool(os.environ.get("NOTIFY_SOCKET"))
-        self._telling = FailureLog(logger, "systemd")
+        self._enabled = bool(os.environ.get("NOTIFY_SOCKET"))
+        self._failures = FailureLog(logger, "systemd")
 
     @property
     def period_s(self) -> float:
-        """How often ``alive`` is to be called: once a second, or twice within the unit's WatchdogSec."""
-        # WATCHDOG_PID: the variables may have been inherited from a parent that they were meant for.
+        """How often to call ``notify_alive``: every second, or twice per WatchdogSec if that is shorter."""
+        # WATCHDOG_PID names another process if the variables were inherited from a supervised parent.
         if os.environ.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
             return _DEFAULT_PERIOD_S
         watchdog_us = int(os.environ.get("WATCHDOG_USEC", "0"))
         return min(_DEFAULT_PERIOD_S, watchdog_us / 2e6) if watchdog_us else _DEFAULT_PERIOD_S
 
-    def ready(self) -> None:
-        """Tell that the start, or a reload, is over."""
-        self._tell("READY")
+    def notify_ready(self) -> None:
+        """Report that the start or a reload is complete."""
+        self._notify("READY")
 
-    def reloading(self) -> None:
-        """Tell that a reload begins; ``ready`` ends it."""
-        self._tell("RELOADING")
+    def notify_reloading(self) -> None:
+        """Report that a reload begins; ``notify_ready`` ends it."""
+        self._notify("RELOADING")
 
-    def stopping(self) -> None:
-        """Tell that the service is about to end."""
-        self._tell("STOPPING")
+    def notify_stopping(self) -> None:
+        """Report that the service is stopping."""
+        self._notify("STOPPING")
 
-    def alive(self, status: str) -> None:
-        """Feed the watchdog, and give the line that ``systemctl status`` shows."""
-        self._tell("WATCHDOG")
-        self._tell("STATUS", " ".join(status.split()))
+    def notify_alive(self, status: str) -> None:
+        """Reset the watchdog and set the line that ``systemctl status`` shows."""
+        self._notify("WATCHDOG")
+        self._notify("STATUS", " ".join(status.split()))
 
-    def _tell(self, name: str, value: str = "") -> None:
-        if not self._is_there:
+    def _notify(self, name: str, value: str = "") -> None:
+        if not self._enabled:
             return
         try:
             from cysystemd.daemon import Notification, notify  # noqa: PLC0415 - an optional extra
 
             notify(Notification[name], value, return_exceptions=False)
         except ImportError:
-            self._is_there = False
+            self._enabled = False
             logger.warning(
-                "systemd waits to be told how the service is, and cannot be: "
-                "pip install 'rtc3d-gateway[systemd]', or set Type=exec in the unit and no WatchdogSec"
+                "systemd expects notifications, but cysystemd is not installed: "
+                "pip install 'rtc3d-gateway[systemd]', or set Type=exec and no WatchdogSec in the unit"
             )
-        except (OSError, RuntimeError, ValueError) as error:  # the last two are cysystemd's own
-            self._telling.failed(f"not told {name}: {error}")
+        except (OSError, RuntimeError, ValueError) as error:  # the last two come from cysystemd
+            self._failures.failed(f"cannot send {name}: {error}")

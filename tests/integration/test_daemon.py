@@ -1,4 +1,4 @@
-"""The gateway's process, and its signals; what a real systemd makes of it is in tests/systemd."""
+"""The gateway process and its signals; tests/systemd runs it under a real systemd."""
 
 import asyncio
 import json
@@ -30,11 +30,11 @@ session.declare_subscriber("mocap/lab/3d", lambda sample: print("heard", flush=T
 sys.stdin.read()
 """
 STOP_S = 5
-"""Twice what the gateway takes and more; closing Zenoh with a peer that does not read would take 10 s."""
+"""More than twice what the gateway needs; closing Zenoh could wait 10 s for a peer that does not read."""
 
 
 class Notifications:
-    """What a process tells systemd, of which this is the socket."""
+    """Records the notifications of a process on a socket like systemd's."""
 
     def __init__(self, socket_path: Path) -> None:
         self.path = socket_path
@@ -57,12 +57,12 @@ class Notifications:
 
 
 class Site:
-    """A configuration file, and the gateway that runs with it."""
+    """A configuration file and the gateway that runs with it."""
 
     def __init__(self, folder: Path) -> None:
         self.file = folder / "gateway.yaml"
         self.endpoint = free_endpoint()
-        self.systemd = Notifications(folder / "notify")
+        self.notifications = Notifications(folder / "notify")
 
     def configure(self, port: int, **sections: Any) -> None:
         configuration = {
@@ -75,23 +75,23 @@ class Site:
 
     @contextmanager
     def running(self, **options: Any) -> Iterator[subprocess.Popen[str]]:
-        environment = {**os.environ, "NOTIFY_SOCKET": str(self.systemd.path), "WATCHDOG_USEC": "200000"}
+        environment = {**os.environ, "NOTIFY_SOCKET": str(self.notifications.path), "WATCHDOG_USEC": "200000"}
         command = [*GATEWAY, str(self.file)]
         options = {"stdin": subprocess.DEVNULL} | options
         with subprocess.Popen(command, env=environment, text=True, **options) as process:
             try:
-                wait_until(lambda: "READY=1" in self.systemd.texts)
+                wait_until(lambda: "READY=1" in self.notifications.texts)
                 yield process
             finally:
                 process.kill()
 
     def until(self, condition: Callable[[Notifications], bool]) -> None:
-        wait_until(lambda: condition(self.systemd))
+        wait_until(lambda: condition(self.notifications))
 
 
 @contextmanager
 def subscriber(endpoint: str) -> Iterator[subprocess.Popen[str]]:
-    """Run a process that subscribes, and prints a line for each message."""
+    """Run a process that subscribes and prints one line per message."""
     command = [sys.executable, "-c", SUBSCRIBER, json.dumps(zenoh_keys("client", connect=endpoint))]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -105,73 +105,73 @@ def site(tmp_path: Path) -> Site:
     return Site(tmp_path)
 
 
-def test_start_and_stop_are_told(site: Site) -> None:
+def test_start_and_stop_are_reported_to_systemd(site: Site) -> None:
     port = free_port()
     site.configure(port)
     with site.running() as process:
-        site.until(lambda told: f"lab: waiting for 127.0.0.1:{port}" in told.status)
-        site.until(lambda told: told.texts.count("WATCHDOG=1") > 3)
+        site.until(lambda sent: f"lab: waiting for 127.0.0.1:{port}" in sent.status)
+        site.until(lambda sent: sent.texts.count("WATCHDOG=1") > 3)
         process.terminate()
         assert process.wait(STOP_S) == 0
-    assert site.systemd.stages == ["READY=1", "STOPPING=1"]
-    before = site.systemd.texts[: site.systemd.texts.index("READY=1")]
-    assert before[0] == "WATCHDOG=1"  # who is ready is alive, and has a status to show
+    assert site.notifications.stages == ["READY=1", "STOPPING=1"]
+    before = site.notifications.texts[: site.notifications.texts.index("READY=1")]
+    assert before[0] == "WATCHDOG=1"  # the watchdog and the status line are set before READY
     assert [text.partition(": ")[0] for text in before[1:]] == ["STATUS=lab"]
-    assert "zenoh" not in before[1]  # else it would say that the session is not open yet
+    assert "zenoh" not in before[1]  # the session is open by now, so it has no problem
 
 
-def test_a_hangup_loads_the_configuration_anew(site: Site) -> None:
+def test_sighup_reloads_the_configuration(site: Site) -> None:
     first, second = free_port(), free_port()
     site.configure(first)
     with site.running() as process:
         site.file.write_text("sources: {}\nbogus: 1\n")
         process.send_signal(signal.SIGHUP)
-        site.until(lambda told: "new configuration refused, the old one runs on: " in told.status)
-        site.until(lambda told: told.stages == ["READY=1", "RELOADING=1", "READY=1"])
-        assert f"{site.file}:1:10: sources: " in site.systemd.status
-        assert "(and 1 more in the log)" in site.systemd.status
-        assert f"lab: waiting for 127.0.0.1:{first}" in site.systemd.status
+        site.until(lambda sent: "new configuration refused, the old one stays in use: " in sent.status)
+        site.until(lambda sent: sent.stages == ["READY=1", "RELOADING=1", "READY=1"])
+        assert f"{site.file}:1:10: sources: " in site.notifications.status
+        assert "(and 1 more in the log)" in site.notifications.status
+        assert f"lab: waiting for 127.0.0.1:{first}" in site.notifications.status
         site.configure(second)
         process.send_signal(signal.SIGHUP)
-        site.until(lambda told: f"lab: waiting for 127.0.0.1:{second}" in told.status)
-        assert "refused" not in site.systemd.status
+        site.until(lambda sent: f"lab: waiting for 127.0.0.1:{second}" in sent.status)
+        assert "refused" not in site.notifications.status
         process.terminate()
         assert process.wait(STOP_S) == 0
 
 
-def test_the_end_of_its_terminal_is_the_end_of_the_gateway(site: Site) -> None:
+def test_the_gateway_stops_when_its_terminal_closes(site: Site) -> None:
     site.configure(free_port())
     terminal, end = pty.openpty()
     with site.running(stdin=end, stdout=end, stderr=end, start_new_session=True) as process:
         os.close(end)
         os.close(terminal)
-        process.send_signal(signal.SIGHUP)  # as the kernel does for who has it as controlling terminal
+        process.send_signal(signal.SIGHUP)  # the kernel sends it to the processes that the terminal controls
         assert process.wait(STOP_S) == 0
 
 
-def test_a_hangup_on_a_terminal_that_is_there_is_a_reload(site: Site) -> None:
+def test_sighup_reloads_while_the_terminal_exists(site: Site) -> None:
     site.configure(free_port())
     terminal, end = pty.openpty()
     with site.running(stdin=end, start_new_session=True) as process:
         process.send_signal(signal.SIGHUP)
-        site.until(lambda told: told.stages == ["READY=1", "RELOADING=1", "READY=1"])
+        site.until(lambda sent: sent.stages == ["READY=1", "RELOADING=1", "READY=1"])
         process.terminate()
         assert process.wait(STOP_S) == 0
     os.close(end)
     os.close(terminal)
 
 
-def test_a_zenoh_that_does_not_open_does_not_hold_up_the_end(site: Site) -> None:
+def test_a_zenoh_session_that_never_opens_does_not_delay_stopping(site: Site) -> None:
     away = zenoh_keys("client", connect=site.endpoint)
     away["connect"]["timeout_ms"] = -1  # opening never returns
     site.configure(free_port(), zenoh={"config": away})
     with site.running() as process:
-        assert "zenoh: the Zenoh session is not open yet" in site.systemd.status
+        assert "zenoh: the Zenoh session is not open yet" in site.notifications.status
         process.terminate()
         assert process.wait(STOP_S) == 0
 
 
-async def test_a_subscriber_that_does_not_read_does_not_hold_up_the_end(site: Site) -> None:
+async def test_a_subscriber_that_does_not_read_does_not_delay_stopping(site: Site) -> None:
     scene = SyntheticScene(markers=3000, tools=0, analog=0, plates=0, rate_hz=200)  # 48 kB a frame
     async with Simulator(scene) as server:
         site.configure(server.port)

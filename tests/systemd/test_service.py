@@ -191,7 +191,7 @@ async def test_a_bad_configuration_is_refused_and_the_old_one_runs_on(service: S
         assert refused.status != 0  # so that who reloads it in a script notices
         line = len(good.splitlines()) + 1
         await service.says(
-            f"new configuration refused, the old one runs on: {CONFIG}:{line}:1: bogus: unknown key"
+            f"new configuration refused, the old one stays in use: {CONFIG}:{line}:1: bogus: unknown key"
         )
         assert await service.machine.show("ActiveState") == "active"
         errors = [entry for entry in await service.machine.journal() if entry["PRIORITY"] == "3"]

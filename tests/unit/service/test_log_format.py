@@ -15,14 +15,14 @@ from gateway.errors import ConfigError
 from gateway.log import log_fields
 from gateway.service.log_format import JournalHandler, LogFormat, LogLevel, set_up_log
 
-LOGGER = logging.getLogger("tests.forms")
+LOGGER = logging.getLogger("tests.log_format")
 
 
 ROOT = logging.getLogger()
 
 
 @pytest.fixture(autouse=True)
-def _root_as_before() -> Iterator[None]:
+def _restore_root_logger() -> Iterator[None]:
     level = ROOT.level
     yield
     ROOT.handlers.clear()
@@ -30,13 +30,13 @@ def _root_as_before() -> Iterator[None]:
 
 
 def set_up(level: LogLevel, log_format: LogFormat = LogFormat.AUTO) -> None:
-    ROOT.handlers.clear()  # pytest's own, beside which nothing would be set up
+    ROOT.handlers.clear()  # with pytest's handlers there, basicConfig would do nothing
     set_up_log(level, log_format)
 
 
 @pytest.fixture
 def journal(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
-    """Stand in for cysystemd, which is an extra: what would be sent is in the list."""
+    """Replace cysystemd, an optional extra, and return the list of the entries that are sent."""
     sent: list[dict[str, Any]] = []
     package, module = ModuleType("cysystemd"), ModuleType("cysystemd.journal")
     vars(module)["send"] = lambda **entry: sent.append(entry)
@@ -46,11 +46,11 @@ def journal(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
     return sent
 
 
-def no_journal(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "cysystemd", None)  # import of it fails
+def uninstall_cysystemd(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "cysystemd", None)  # makes the import fail
 
 
-def test_text_is_time_level_and_message(capsys: pytest.CaptureFixture[str]) -> None:
+def test_text_has_time_level_and_message(capsys: pytest.CaptureFixture[str]) -> None:
     set_up(LogLevel.INFO, LogFormat.TEXT)
     with log_fields(source="lab"):
         LOGGER.warning("lab: %d frames", 7)
@@ -60,15 +60,17 @@ def test_text_is_time_level_and_message(capsys: pytest.CaptureFixture[str]) -> N
 
 
 @pytest.mark.parametrize("level", LogLevel)
-def test_a_level_holds_itself_and_what_is_graver(level: LogLevel, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_level_includes_itself_and_all_higher_levels(
+    level: LogLevel, capsys: pytest.CaptureFixture[str]
+) -> None:
     set_up(level, LogFormat.TEXT)
     for each in LogLevel:
         LOGGER.log(logging.getLevelNamesMapping()[each.upper()], "%s", each.value)
-    told = [line.rsplit(" ", 1)[-1] for line in capsys.readouterr().err.splitlines()]
-    assert told == [each.value for each in list(LogLevel)[list(LogLevel).index(level) :]]
+    logged = [line.rsplit(" ", 1)[-1] for line in capsys.readouterr().err.splitlines()]
+    assert logged == [each.value for each in list(LogLevel)[list(LogLevel).index(level) :]]
 
 
-def test_json_is_one_object_a_line_with_the_fields(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_writes_one_object_per_line_with_the_fields(capsys: pytest.CaptureFixture[str]) -> None:
     set_up(LogLevel.INFO, LogFormat.JSON)
     LOGGER.info("two\nlines, µ")
     with log_fields(source="lab", stream="3d 6d", peer="192.0.2.20:3020"):
@@ -76,19 +78,19 @@ def test_json_is_one_object_a_line_with_the_fields(capsys: pytest.CaptureFixture
     first, second = map(json.loads, capsys.readouterr().err.splitlines())
     time = datetime.fromisoformat(first.pop("time"))
     assert time.tzinfo is not None
-    assert first == {"level": "info", "message": "two\nlines, µ", "logger": "tests.forms"}
+    assert first == {"level": "info", "message": "two\nlines, µ", "logger": "tests.log_format"}
     assert second.pop("time")
     assert second == {
         "level": "warning",
         "message": "lab: late",
-        "logger": "tests.forms",
+        "logger": "tests.log_format",
         "source": "lab",
         "stream": "3d 6d",
         "peer": "192.0.2.20:3020",
     }
 
 
-def test_json_has_the_traceback_in_its_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_json_includes_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     set_up(LogLevel.INFO, LogFormat.JSON)
     try:
         int("a defect")
@@ -98,7 +100,7 @@ def test_json_has_the_traceback_in_its_line(capsys: pytest.CaptureFixture[str]) 
     assert json.loads(line)["exception"].endswith(": 'a defect'")
 
 
-def test_the_journal_gets_message_priority_and_fields(journal: list[dict[str, Any]]) -> None:
+def test_the_journal_receives_message_priority_and_fields(journal: list[dict[str, Any]]) -> None:
     set_up(LogLevel.DEBUG, LogFormat.JOURNAL)
     with log_fields(source="lab", stream="3d", peer="192.0.2.20:3020"):
         LOGGER.warning("lab: %s", "late")
@@ -108,7 +110,7 @@ def test_the_journal_gets_message_priority_and_fields(journal: list[dict[str, An
         "message": "lab: late",
         "priority": 4,
         "syslog_identifier": "rtc3d-gateway",
-        "logger": "tests.forms",
+        "logger": "tests.log_format",
         "source": "lab",
         "stream": "3d",
         "peer": "192.0.2.20:3020",
@@ -117,7 +119,7 @@ def test_the_journal_gets_message_priority_and_fields(journal: list[dict[str, An
     assert "source" not in journal[1]
 
 
-def test_a_traceback_goes_to_the_journal_with_its_message(journal: list[dict[str, Any]]) -> None:
+def test_the_journals_message_includes_the_traceback(journal: list[dict[str, Any]]) -> None:
     set_up(LogLevel.INFO, LogFormat.JOURNAL)
     try:
         int("a defect")
@@ -128,20 +130,22 @@ def test_a_traceback_goes_to_the_journal_with_its_message(journal: list[dict[str
     assert entry["message"].endswith(": 'a defect'")
 
 
-def test_the_journal_without_its_library_is_an_error_with_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    no_journal(monkeypatch)
+def test_the_journal_without_cysystemd_is_an_error_that_names_the_remedy(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    uninstall_cysystemd(monkeypatch)
     with pytest.raises(ConfigError, match=re.escape("pip install 'rtc3d-gateway[systemd]'")):
         set_up(LogLevel.INFO, LogFormat.JOURNAL)
 
 
-# Where auto writes ---------------------------------------------------------------------------
+# The format auto ------------------------------------------------------------------------------
 
 
-def handler_of_auto(stderr: Path, monkeypatch: pytest.MonkeyPatch, *, journal_is: Path | None) -> type[Any]:
-    """Return the kind of handler when stderr is one file and the journal, as systemd says, another."""
+def handler_for_auto(stderr: Path, monkeypatch: pytest.MonkeyPatch, *, journal_is: Path | None) -> type[Any]:
+    """Return the handler's class when stderr is one file and JOURNAL_STREAM names ``journal_is``."""
     monkeypatch.delenv("JOURNAL_STREAM", raising=False)
     if journal_is is not None:
-        status = os.stat(journal_is)  # noqa: PTH116 - as short
+        status = os.stat(journal_is)  # noqa: PTH116 - the same length
         monkeypatch.setenv("JOURNAL_STREAM", f"{status.st_dev}:{status.st_ino}")
     with stderr.open("w") as file:
         monkeypatch.setattr(sys, "stderr", file)
@@ -151,21 +155,21 @@ def handler_of_auto(stderr: Path, monkeypatch: pytest.MonkeyPatch, *, journal_is
 
 
 @pytest.mark.usefixtures("journal")
-def test_auto_is_the_journal_only_where_stderr_is_the_journal(
+def test_auto_uses_the_journal_only_if_stderr_is_the_journal(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     here, elsewhere = tmp_path / "here", tmp_path / "elsewhere"
     here.touch()
     elsewhere.touch()
-    assert handler_of_auto(here, monkeypatch, journal_is=here) is JournalHandler
-    assert handler_of_auto(here, monkeypatch, journal_is=elsewhere) is logging.StreamHandler
-    assert handler_of_auto(here, monkeypatch, journal_is=None) is logging.StreamHandler
+    assert handler_for_auto(here, monkeypatch, journal_is=here) is JournalHandler
+    assert handler_for_auto(here, monkeypatch, journal_is=elsewhere) is logging.StreamHandler
+    assert handler_for_auto(here, monkeypatch, journal_is=None) is logging.StreamHandler
 
 
-def test_auto_writes_text_to_the_journal_without_its_library(
+def test_auto_falls_back_to_text_on_stderr_without_cysystemd(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    no_journal(monkeypatch)
+    uninstall_cysystemd(monkeypatch)
     here = tmp_path / "here"
     here.touch()
-    assert handler_of_auto(here, monkeypatch, journal_is=here) is logging.StreamHandler
+    assert handler_for_auto(here, monkeypatch, journal_is=here) is logging.StreamHandler

@@ -1,4 +1,4 @@
-"""What systemd hears, on a socket as it gives to services."""
+"""The notifications, received on a socket like the one that systemd opens for services."""
 
 import logging
 import os
@@ -9,17 +9,17 @@ from pathlib import Path
 
 import pytest
 
-from gateway.service.systemd import Systemd
+from gateway.service.systemd import SystemdNotifier
 
 
 @pytest.fixture
-def told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
-    """Systemd's end of the notifications."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-        manager.bind(str(tmp_path / "notify"))
-        manager.setblocking(False)
+def manager(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+    """Return the socket on which systemd would receive the notifications."""
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as receiver:
+        receiver.bind(str(tmp_path / "notify"))
+        receiver.setblocking(False)
         monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-        yield manager
+        yield receiver
 
 
 @pytest.fixture(autouse=True)
@@ -37,52 +37,52 @@ def received(manager: socket.socket) -> list[str]:
             return texts
 
 
-def test_each_stage_is_told(told: socket.socket) -> None:
-    systemd = Systemd()
-    systemd.ready()
-    systemd.reloading()
-    systemd.stopping()
-    assert received(told) == ["READY=1", "RELOADING=1", "STOPPING=1"]
+def test_every_stage_is_reported(manager: socket.socket) -> None:
+    notifier = SystemdNotifier()
+    notifier.notify_ready()
+    notifier.notify_reloading()
+    notifier.notify_stopping()
+    assert received(manager) == ["READY=1", "RELOADING=1", "STOPPING=1"]
 
 
-def test_a_sign_of_life_feeds_the_watchdog_and_has_the_status_on_one_line(told: socket.socket) -> None:
-    Systemd().alive("lab: streaming 200.0 Hz;\nREADY=1 → µ")
-    assert received(told) == ["WATCHDOG=1", "STATUS=lab: streaming 200.0 Hz; READY=1 → µ"]
+def test_alive_resets_the_watchdog_and_sends_the_status_on_one_line(manager: socket.socket) -> None:
+    SystemdNotifier().notify_alive("lab: streaming 200.0 Hz;\nREADY=1 → µ")
+    assert received(manager) == ["WATCHDOG=1", "STATUS=lab: streaming 200.0 Hz; READY=1 → µ"]
 
 
-def test_without_systemd_nothing_happens(
+def test_without_systemd_nothing_is_sent_or_logged(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    systemd = Systemd()
-    systemd.ready()
-    systemd.alive("lab: streaming 200.0 Hz")
+    notifier = SystemdNotifier()
+    notifier.notify_ready()
+    notifier.notify_alive("lab: streaming 200.0 Hz")
     assert not caplog.records
 
 
-def test_a_systemd_that_does_not_hear_is_told_of_once(
-    told: socket.socket, caplog: pytest.LogCaptureFixture
+def test_an_unreachable_systemd_is_logged_as_a_warning_once(
+    manager: socket.socket, caplog: pytest.LogCaptureFixture
 ) -> None:
-    systemd = Systemd()
-    told.close()
+    notifier = SystemdNotifier()
+    manager.close()
     Path(os.environ["NOTIFY_SOCKET"]).unlink()
-    systemd.ready()
-    systemd.alive("lab: streaming 200.0 Hz")
+    notifier.notify_ready()
+    notifier.notify_alive("lab: streaming 200.0 Hz")
     assert [record.levelno for record in caplog.records if record.levelno > logging.DEBUG] == [
         logging.WARNING
     ]
 
 
-def test_without_cysystemd_the_remedy_is_told_once(
-    told: socket.socket, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+def test_without_cysystemd_one_warning_names_the_remedy(
+    manager: socket.socket, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setitem(sys.modules, "cysystemd.daemon", None)
-    systemd = Systemd()
-    systemd.ready()
-    systemd.alive("lab: streaming 200.0 Hz")
+    notifier = SystemdNotifier()
+    notifier.notify_ready()
+    notifier.notify_alive("lab: streaming 200.0 Hz")
     [record] = caplog.records
     assert "pip install 'rtc3d-gateway[systemd]'" in record.message
-    assert received(told) == []
+    assert received(manager) == []
 
 
 @pytest.mark.parametrize(
@@ -95,9 +95,9 @@ def test_without_cysystemd_the_remedy_is_told_once(
         ({"WATCHDOG_USEC": "500000", "WATCHDOG_PID": "1"}, 1.0),  # meant for another process
     ],
 )
-def test_a_sign_of_life_is_given_twice_within_the_watchdogs_time(
+def test_the_period_is_at_most_half_the_watchdogs_timeout(
     environment: dict[str, str], period_s: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
-    assert Systemd().period_s == period_s
+    assert SystemdNotifier().period_s == period_s
