@@ -1,12 +1,16 @@
-"""``rtc3d-gateway echo``: subscribe and print."""
+"""``rtc3d-gateway echo``: subscribe to a gateway and print its messages."""
 
-import json
 import queue
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import Any, TextIO
+from typing import Annotated, TextIO
 
+import typer
+
+from gateway.cli.message_lines import json_line, text_line
+from gateway.cli.options import ConnectOption, PrefixOption, SourceOption, UrlOption
 from gateway.cli.subscribers import (
     QUEUE_MESSAGES,
     LcmListener,
@@ -15,25 +19,50 @@ from gateway.cli.subscribers import (
     key_pattern,
     open_zenoh,
 )
-from gateway.errors import ProtocolError
-from gateway.messages.decode import decode, one_line, to_json, xml_text
+from gateway.config.settings import effective_lcm_url
 from gateway.outputs.lcm.output import open_lcm
 
 Messages = queue.Queue[tuple[str, bytes]]
-"""Keys or channels with their messages."""
+"""Messages, each with its Zenoh key or LCM channel."""
 
 
-def _put(messages: Messages, name: str, message: bytes) -> None:
-    # A terminal slower than the stream loses messages here; the sequence numbers printed show it.
-    with suppress(queue.Full):
-        messages.put_nowait((name, message))
+def echo(
+    zenoh: Annotated[bool, typer.Option("--zenoh", help="Subscribe on Zenoh (the default).")] = False,
+    lcm: Annotated[bool, typer.Option("--lcm", help="Subscribe on LCM.")] = False,
+    source: SourceOption = None,
+    component: Annotated[
+        str | None,
+        typer.Option(help="Only 3d, 6d, analog, force, event, status, clock, parameters or c3d."),
+    ] = None,
+    count: Annotated[int | None, typer.Option(min=1, help="Stop after this number of messages.")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0, help="Stop after this time.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")] = False,
+    connect: ConnectOption = None,
+    url: UrlOption = None,
+    prefix: PrefixOption = None,
+) -> None:
+    """Print what gateways publish. Exit status 1 if fewer than --count messages arrive in --seconds."""
+    if zenoh and lcm:
+        raise typer.BadParameter("give either --zenoh or --lcm")
+    if lcm:
+        subscription = subscribe_lcm(prefix or "MOCAP", source, component, effective_lcm_url(url))
+    else:
+        subscription = subscribe_zenoh(prefix or "mocap", source, component, connect)
+    with subscription as messages:
+        try:
+            printed = print_messages(messages, sys.stdout, count=count, as_json=as_json, timeout_s=seconds)
+        except KeyboardInterrupt:
+            return
+    if count is not None and printed < count:
+        print(f"{printed} of {count} messages arrived within {seconds:g} s", file=sys.stderr)
+        raise typer.Exit(1)
 
 
 @contextmanager
-def zenoh_messages(
+def subscribe_zenoh(
     prefix: str, source: str | None, component: str | None, connect: str | None
 ) -> Iterator[Messages]:
-    """Give the queue of what comes on Zenoh; raises OutputError if no session opens."""
+    """Provide a queue of messages from Zenoh; raises OutputError if no session opens."""
     messages: Messages = queue.Queue(QUEUE_MESSAGES)
     session = open_zenoh(connect)
     try:
@@ -46,8 +75,8 @@ def zenoh_messages(
 
 
 @contextmanager
-def lcm_messages(prefix: str, source: str | None, component: str | None, url: str) -> Iterator[Messages]:
-    """Give the queue of what comes on LCM; raises OutputError if LCM does not open."""
+def subscribe_lcm(prefix: str, source: str | None, component: str | None, url: str) -> Iterator[Messages]:
+    """Provide a queue of messages from LCM; raises OutputError if LCM does not open."""
     messages: Messages = queue.Queue(QUEUE_MESSAGES)
     pattern = channel_pattern(prefix, source, component)
     listener = LcmListener(open_lcm(url), pattern, lambda *event: _put(messages, *event))
@@ -57,64 +86,28 @@ def lcm_messages(prefix: str, source: str | None, component: str | None, url: st
         listener.close()
 
 
-def echo(
+def _put(messages: Messages, name: str, message: bytes) -> None:
+    # When the terminal is slower than the stream, messages are lost here; the printed sequence shows it.
+    with suppress(queue.Full):
+        messages.put_nowait((name, message))
+
+
+def print_messages(
     messages: Messages, out: TextIO, *, count: int | None, as_json: bool, timeout_s: float | None = None
 ) -> int:
-    """Print messages until ``count`` of them or, if given, ``timeout_s``; return how many were printed.
+    """Print ``count`` messages, one per line, and return how many were printed.
 
-    Text is one line a message for reading; JSON is one object a line, the message's fields and ``key``.
+    Stops earlier when ``timeout_s`` has passed. ``count`` None means no limit.
     """
     printed = 0
     deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
+    line = json_line if as_json else text_line
     while count is None or printed < count:
         try:
             wait_s = None if deadline_s is None else max(0.0, deadline_s - time.monotonic())
             name, message = messages.get(timeout=wait_s)
         except queue.Empty:
             break
-        line = _json_line(name, message) if as_json else _text_line(name, message)
-        print(line, file=out, flush=True)
+        print(line(name, message), file=out, flush=True)
         printed += 1
     return printed
-
-
-def _json_line(name: str, message: bytes) -> str:
-    try:
-        fields = to_json(decode(message))
-    except ProtocolError as error:
-        match _without_type(message):
-            case bytes() as xml:
-                fields = {"xml": xml.decode("utf-8", "replace")}
-            case dict() as announcement:
-                fields = announcement
-            case _:
-                fields = {"error": str(error)}
-    return json.dumps({"key": name} | fields)
-
-
-def _text_line(name: str, message: bytes) -> str:
-    try:
-        line = f"{name} {one_line(decode(message))}"
-    except ProtocolError as error:
-        match _without_type(message):
-            case bytes() as xml:
-                line = f"{name} {xml_text(xml)}"
-            case dict() as announcement:
-                line = f"{name} " + ", ".join(f"{key} {value}" for key, value in announcement.items())
-            case _:
-                line = f"{name}: {error}"
-    # Texts of servers and of strangers: none may steer the terminal.
-    return "".join(
-        character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in line
-    )
-
-
-def _without_type(message: bytes) -> bytes | dict[str, Any] | None:
-    """Return what Zenoh carries besides LCM messages: a server's XML, or the object of a JSON text."""
-    if message.lstrip().startswith(b"<"):
-        return message
-    try:
-        value = json.loads(message)
-    except (ValueError, RecursionError):
-        return None
-    return value if isinstance(value, dict) else None

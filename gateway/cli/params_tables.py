@@ -1,4 +1,4 @@
-"""A server's parameters (§6) as people and programs want to see them: tables, JSON, XML as it came."""
+"""Parameters of servers (§6) as tables, as JSON, or as unchanged XML."""
 
 import json
 from collections.abc import Callable, Iterator, Sequence
@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from gateway.cli.asking import ParametersReply
 from gateway.errors import ParametersError, QueryError
 from gateway.queries.answers import SECTION_FIELDS, parameters_json
 from gateway.rtc3d.parameters import (
@@ -25,98 +26,89 @@ from gateway.rtc3d.parameters import (
 )
 from gateway.rtc3d.parameters_xml import parse_parameters
 
-Form = Literal["table", "json", "xml"]
-
-Sections = tuple[str, ...]
-"""Of SECTIONS; () for all."""
+OutputFormat = Literal["table", "json", "xml"]
 
 _Rows = Sequence[Sequence[object]]
 
 
-class Told(NamedTuple):
-    """What one source's server says about ``sections``, and how long ago it said so; None: unknown."""
-
-    source: str
-    sections: Sections
-    xml: bytes
-    age_s: float | None
-
-
-class _Source(NamedTuple):
-    """What was told of one source, and the age of the oldest of it."""
+class _SourceParameters(NamedTuple):
+    """The parameters of one source, merged from its replies, and the age of the oldest reply in s."""
 
     parameters: Parameters
     age_s: float | None
 
 
-def show(told: Sequence[Told], form: Form, out: TextIO) -> list[QueryError]:
-    """Write what servers told; return what is wrong with it.
+def write_replies(
+    replies: Sequence[ParametersReply], output_format: OutputFormat, out: TextIO
+) -> list[QueryError]:
+    """Write the parameters of all sources to ``out``; return what is wrong with the replies.
 
-    A table for each section; or one JSON object, by source; or the XML as it came, a comment with the
-    source's name above each if there are several.
+    Writes a table per section; or one JSON object with the sources as keys; or the XML unchanged, each
+    piece after a comment with the source's name if there are several.
     """
-    if form == "xml":
-        _write_xml(told, out.buffer)
+    if output_format == "xml":
+        _write_xml(replies, out.buffer)
         return []
     problems: list[QueryError] = []
-    by_source: dict[str, _Source] = {}
-    for each in told:
-        before = by_source.get(each.source, _Source(Parameters(), None))
-        ages_s = [age_s for age_s in (before.age_s, each.age_s) if age_s is not None]
-        parameters = _with_sections(before.parameters, each, problems)
-        by_source[each.source] = _Source(parameters, max(ages_s, default=None))
-    if form == "json":
+    by_source: dict[str, _SourceParameters] = {}
+    for reply in replies:
+        merged = by_source.get(reply.source, _SourceParameters(Parameters(), None))
+        ages_s = [age_s for age_s in (merged.age_s, reply.age_s) if age_s is not None]
+        parameters = _merge(merged.parameters, reply, problems)
+        by_source[reply.source] = _SourceParameters(parameters, max(ages_s, default=None))
+    if output_format == "json":
         _write_json(by_source, out.buffer)
     else:
         _write_tables(by_source, out)
     return problems
 
 
-def _with_sections(parameters: Parameters, told: Told, problems: list[QueryError]) -> Parameters:
-    """Return ``parameters`` with the sections that were asked for; what is missing is a problem."""
-    name = f"source {told.source!r}"
+def _merge(parameters: Parameters, reply: ParametersReply, problems: list[QueryError]) -> Parameters:
+    """Return ``parameters`` with the sections of ``reply``; append problems to ``problems``."""
+    name = f"source {reply.source!r}"
     try:
-        found = parse_parameters(told.xml).parameters
+        parsed = parse_parameters(reply.xml).parameters
     except ParametersError as error:
-        problems.append(QueryError(f"{name}: {error}; see it with --xml", code="unreadable"))
+        problems.append(QueryError(f"{name}: {error}; use --xml to see it", code="unreadable"))
         return parameters
-    values = {section: getattr(found, SECTION_FIELDS[section]) for section in told.sections or SECTION_FIELDS}
-    missing = [section for section, value in values.items() if value is None]
-    if told.sections and missing:
-        text = f"{name}: the server's answer has no section {', '.join(missing)}"
+    sections = reply.sections or tuple(SECTION_FIELDS)
+    fields = {SECTION_FIELDS[section]: getattr(parsed, SECTION_FIELDS[section]) for section in sections}
+    missing = [section for section in reply.sections if fields[SECTION_FIELDS[section]] is None]
+    if missing:
+        text = f"{name}: the server's reply has no section {', '.join(missing)}"
         problems.append(QueryError(text, code="nothing-yet"))
-    return replace(parameters, **{SECTION_FIELDS[section]: value for section, value in values.items()})
+    return replace(parameters, **fields)
 
 
-def _write_xml(told: Sequence[Told], out: BinaryIO) -> None:
-    for each in told:
-        if len(told) > 1:
-            out.write(f"<!-- {each.source} {' '.join(each.sections)} -->\n".encode())
-        out.write(each.xml.rstrip(b"\0\r\n") + b"\n")
+def _write_xml(replies: Sequence[ParametersReply], out: BinaryIO) -> None:
+    for reply in replies:
+        if len(replies) > 1:
+            out.write(f"<!-- {reply.source} {' '.join(reply.sections)} -->\n".encode())
+        out.write(reply.xml.rstrip(b"\0\r\n") + b"\n")
 
 
-def _write_json(by_source: dict[str, _Source], out: BinaryIO) -> None:
+def _write_json(by_source: dict[str, _SourceParameters], out: BinaryIO) -> None:
     values = {
         source: {
-            "age_s": each.age_s and round(each.age_s, 3),
-            "parameters": json.loads(parameters_json(each.parameters, "") or b"{}"),
+            "age_s": None if merged.age_s is None else round(merged.age_s, 3),
+            "parameters": json.loads(parameters_json(merged.parameters, "") or b"{}"),
         }
-        for source, each in by_source.items()
+        for source, merged in by_source.items()
     }
     out.write(json.dumps(values, indent=2, ensure_ascii=False).encode() + b"\n")
 
 
-def _write_tables(by_source: dict[str, _Source], out: TextIO) -> None:
+def _write_tables(by_source: dict[str, _SourceParameters], out: TextIO) -> None:
     console = Console(file=out)
-    for source, each in by_source.items():
-        for table in _tables(source, each.parameters):
+    for source, merged in by_source.items():
+        for table in _tables(source, merged.parameters):
             console.print(table)
-        if each.age_s is not None:
-            console.print(Text(_plain(f"{source}: the server said so {each.age_s:.1f} s ago")))
+        if merged.age_s is not None:
+            console.print(Text(_plain(f"{source}: parameters are {merged.age_s:.1f} s old")))
 
 
 def _tables(source: str, parameters: Parameters) -> Iterator[Table]:
-    """Yield one table for each section that ``parameters`` holds; ``source`` begins their titles."""
+    """Yield one table for each section in ``parameters``, with ``source`` in its title."""
     sections: tuple[tuple[Any, Callable[[Any], tuple[str, Sequence[str], _Rows]]], ...] = (
         (parameters.general, _general),
         (parameters.markers, _markers),
@@ -132,14 +124,16 @@ def _tables(source: str, parameters: Parameters) -> Iterator[Table]:
 
 
 def _plain(value: object) -> str:
-    """Return a value fit for a terminal, which no text of a server's may steer: "" for None.
+    """Return a value as text for a terminal: "" for None, one line per item of a tuple.
 
-    The items of a tuple stand below each other.
+    Labels come from servers: control characters are replaced, so that they cannot control the terminal.
     """
     if isinstance(value, tuple):
         return "\n".join(map(_plain, value))
     text = f"{value:g}" if isinstance(value, float) else "" if value is None else str(value)
-    return "".join(each if each.isprintable() else "\N{REPLACEMENT CHARACTER}" for each in text)
+    return "".join(
+        character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text
+    )
 
 
 def _table(title: str, headings: Sequence[str], rows: _Rows) -> Table:
@@ -147,7 +141,7 @@ def _table(title: str, headings: Sequence[str], rows: _Rows) -> Table:
     for heading in headings:
         table.add_column(heading, overflow="fold")
     for row in rows:
-        # As Text, because square brackets in a label are no markup.
+        # Text objects, because rich would read square brackets in a string as markup.
         table.add_row(*(Text(_plain(value)) for value in row))
     return table
 

@@ -82,7 +82,7 @@ async def test_a_table_is_printed_by_default(side: str) -> None:
     async with lab(LabServer("Left knee")) as at:
         done = await run("params", *at.on(side))
     assert (done.status, done.problem) == (0, "")
-    for text in ("lab: general", "lab: 3D, 1 marker, 100 Hz, mm", "Left knee", "lab: the server said so "):
+    for text in ("lab: general", "lab: 3D, 1 marker, 100 Hz, mm", "Left knee", "lab: parameters are "):
         assert text in done.out
 
 
@@ -135,7 +135,7 @@ async def test_a_router_without_a_gateway_is_status_3() -> None:
     finally:
         router.close()
     assert done.status == 3
-    assert done.problem.startswith("no gateway is there on Zenoh (mocap/*/alive): is it running")
+    assert done.problem.startswith("no gateway found on Zenoh (mocap/*/alive); check that it is running")
 
 
 @sides
@@ -144,9 +144,9 @@ async def test_a_source_that_nobody_serves_is_status_3(side: str) -> None:
         done = await run("params", "--timeout", "0.5", *at.on(side), "--source", "hall")
     assert done.status == 3
     expected = (
-        "no gateway serves source 'hall'; there are: lab"
+        "no gateway serves source 'hall'; sources found: lab"
         if side == "zenoh"
-        else "no gateway is heard on LCM (MOCAP_HALL"
+        else "no gateway heard on LCM (MOCAP_HALL"
     )
     assert done.problem.startswith(expected)
 
@@ -181,7 +181,7 @@ async def test_a_gateway_that_does_not_answer_in_time_is_status_5(side: str) -> 
         at.server.silent = ("SendParameters",)
         done = await run("params", "--fresh", "--timeout", "0.2", *at.on(side))
     assert done.status == 5
-    assert "within 0.2 s, though a gateway is there" in done.problem
+    assert "within 0.2 s although a gateway is running" in done.problem
 
 
 @sides

@@ -1,4 +1,4 @@
-"""docs/reference/commands.md says of every command and option what the program says of it."""
+"""docs/reference/commands.md agrees with the help texts of every command and option."""
 
 import re
 from collections.abc import Iterator
@@ -17,7 +17,7 @@ REFERENCE = (Path(__file__).parents[3] / "docs/reference/commands.md").read_text
 def commands(
     command: object = None, name: str = "rtc3d-gateway"
 ) -> Iterator[tuple[str, typer.core.TyperCommand]]:
-    """Yield the commands that can be run, each with its whole name."""
+    """Yield every command that is not a group, with its full name."""
     command = typer.main.get_command(app) if command is None else command
     if isinstance(command, typer.core.TyperGroup):
         for subcommand_name, subcommand in command.commands.items():
@@ -50,17 +50,17 @@ def table(command: typer.core.TyperCommand) -> str:
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_is_told_with_all_its_options(name: str) -> None:
+def test_reference_has_all_options_of_a_command(name: str) -> None:
     command = COMMANDS[name]
     part = REFERENCE.partition(f"\n## {name}\n")[2].partition("\n## ")[0]
     expected = table(command) if command.params else "It has no options.\n"
     assert expected in part, f"put this below ## {name}:\n{expected}"
 
 
-def test_every_command_that_is_told_is_there() -> None:
+def test_reference_has_exactly_the_commands_of_the_program() -> None:
     assert set(re.findall(r"^## (rtc3d-gateway .*)$", REFERENCE, re.MULTILINE)) == COMMANDS.keys()
 
 
-def test_every_exit_status_is_told() -> None:
-    told = set(re.findall(r"^\| (\d) \| ", REFERENCE, re.MULTILINE))
-    assert told == {"0", "1", "2"} | {str(status) for status in EXIT_STATUSES.values()}
+def test_reference_has_every_exit_status() -> None:
+    documented = set(re.findall(r"^\| (\d) \| ", REFERENCE, re.MULTILINE))
+    assert documented == {"0", "1", "2"} | {str(status) for status in EXIT_STATUSES.values()}

@@ -1,4 +1,4 @@
-"""What ``echo`` prints of a message; the listening itself is tested with the command."""
+"""What ``echo`` prints for a message; tests/integration/test_params_command.py runs the command."""
 
 import io
 import json
@@ -7,7 +7,7 @@ import queue
 import pytest
 import rtc3d
 
-from gateway.cli.echo import Messages, echo
+from gateway.cli.echo import Messages, print_messages
 from tests.spec_parameters import in_root, spec_xml
 
 MARKERS_BYTES = len(spec_xml("3d"))
@@ -17,7 +17,7 @@ def printed(name: str, message: bytes, *, as_json: bool = False) -> str:
     messages: Messages = queue.Queue()
     messages.put((name, message))
     out = io.StringIO()
-    assert echo(messages, out, count=1, as_json=as_json, timeout_s=10) == 1
+    assert print_messages(messages, out, count=1, as_json=as_json, timeout_s=10) == 1
     return out.getvalue().removesuffix("\n")
 
 
@@ -87,24 +87,24 @@ def reply(error: str = "") -> bytes:
         ),
     ],
 )
-def test_a_line_says_what_came(name: str, message: bytes, line: str) -> None:
+def test_a_line_summarises_a_message(name: str, message: bytes, line: str) -> None:
     assert printed(name, message) == line
 
 
 @pytest.mark.parametrize(
     "message", [b"", b"12345678 of something else", b"[1]", b"[" * 100_000, b"{", b"\xff{"]
 )
-def test_what_is_no_message_of_the_gateway_is_said_to_be_none(message: bytes) -> None:
+def test_a_message_of_another_program_is_printed_as_an_error(message: bytes) -> None:
     assert "are no message of this gateway" in printed("mocap/lab/parameters", message)
     assert "are no message" in json.loads(printed("mocap/lab/parameters", message, as_json=True))["error"]
 
 
-def test_json_has_the_xml_as_a_text() -> None:
+def test_json_has_xml_as_text() -> None:
     value = json.loads(printed("mocap/lab/parameters", spec_xml("force"), as_json=True))
     assert value == {"key": "mocap/lab/parameters", "xml": spec_xml("force").decode()}
 
 
-def test_json_has_the_fields_of_an_announcement() -> None:
+def test_json_has_the_fields_of_a_json_message() -> None:
     value = json.loads(printed("mocap/lab/c3d", b'{"name":"a.c3d","bytes":1}', as_json=True))
     assert value == {"key": "mocap/lab/c3d", "name": "a.c3d", "bytes": 1}
 

@@ -1,11 +1,12 @@
-"""The forms in which ``params`` writes what servers told."""
+"""What ``params`` writes: tables, JSON and XML."""
 
 import io
 import json
 
 import pytest
 
-from gateway.cli.params_tables import Form, Told, show
+from gateway.cli.asking import ParametersReply, Sections
+from gateway.cli.params_tables import OutputFormat, write_replies
 from gateway.messages.decode import to_json
 from gateway.rtc3d.commands import SECTIONS
 from tests.spec_parameters import ALL, in_root, spec_body, spec_xml
@@ -13,11 +14,15 @@ from tests.spec_parameters import ALL, in_root, spec_body, spec_xml
 EVERYTHING = in_root(*(spec_body(section).decode() for section in ("general", "3d", "6d", "analog")))
 
 
-def shown(form: Form, *told: Told) -> tuple[str, list[tuple[str, str]]]:
-    """Return what is written, in a wide terminal, and code and text of what is wrong."""
+def reply(source: str, sections: Sections, xml: bytes, age_s: float | None = 0.0) -> ParametersReply:
+    return ParametersReply(source, sections, xml, age_s)
+
+
+def written(output_format: OutputFormat, *replies: ParametersReply) -> tuple[str, list[tuple[str, str]]]:
+    """Return the text written, and code and text of each problem."""
     buffer = io.BytesIO()
     out = io.TextIOWrapper(buffer, encoding="utf-8", write_through=True)
-    problems = show(told, form, out)
+    problems = write_replies(replies, output_format, out)
     return buffer.getvalue().decode(), [(problem.code, str(problem)) for problem in problems]
 
 
@@ -27,7 +32,7 @@ def wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def cells(text: str) -> list[list[str]]:
-    """Return the contents of the tables' rows."""
+    """Return the cells of the tables' rows."""
     lines = [line for line in text.splitlines() if line.startswith("│")]
     return [[cell.strip() for cell in line.strip("│").split("│")] for line in lines]
 
@@ -61,50 +66,50 @@ def cells(text: str) -> list[list[str]]:
     ],
 )  # fmt: skip
 def test_each_section_is_a_table(section: str, title: str, rows: list[list[str]]) -> None:
-    text, problems = shown("table", Told("lab", (section,), spec_xml(section), 0.44))
+    text, problems = written("table", reply("lab", (section,), spec_xml(section), 0.44))
     assert problems == []
     assert text.splitlines()[0].rstrip() == title
     assert [row for row in rows if row not in cells(text)] == []
-    assert text.splitlines()[-1] == "lab: the server said so 0.4 s ago"
+    assert text.splitlines()[-1] == "lab: parameters are 0.4 s old"
 
 
-def test_the_sections_asked_for_are_shown_and_no_others() -> None:
-    text, problems = shown("table", Told("lab", ("6d", "3d"), EVERYTHING, None))
+def test_only_requested_sections_are_written() -> None:
+    text, problems = written("table", reply("lab", ("6d", "3d"), EVERYTHING, None))
     titles = [line.rstrip() for line in text.splitlines() if line.startswith("lab:")]
     assert titles == ["lab: 3D, 1 marker, 60 Hz, mm", "lab: 6D, 1 tool, 60 Hz"]
     assert problems == []
 
 
-def test_of_everything_what_is_there_is_shown() -> None:
-    text, problems = shown("table", Told("lab", (), EVERYTHING, 0.0))
+def test_a_request_for_all_sections_gets_those_that_exist() -> None:
+    text, problems = written("table", reply("lab", (), EVERYTHING))
     titles = [line.split(",")[0].rstrip() for line in text.splitlines() if line.startswith("lab:")]
     assert titles == [
         "lab: general",
         "lab: 3D",
         "lab: 6D",
         "lab: analog",
-        "lab: the server said so 0.0 s ago",
+        "lab: parameters are 0.0 s old",
     ]
     assert problems == []
 
 
-def test_each_source_is_shown_under_its_name() -> None:
-    text, _ = shown("table", *(Told(name, ("3d",), spec_xml("3d"), 1.0) for name in ("lab", "hall")))
+def test_each_source_has_its_own_tables() -> None:
+    text, _ = written("table", *(reply(name, ("3d",), spec_xml("3d"), 1.0) for name in ("lab", "hall")))
     assert "lab: 3D, 1 marker" in text
     assert "hall: 3D, 1 marker" in text
 
 
-def test_labels_of_a_server_steer_no_terminal_and_are_no_markup() -> None:
+def test_labels_cannot_control_the_terminal_and_are_not_markup() -> None:
     marker = "<Markers><Marker id='1'><Label>[bold]L</Label></Marker></Markers>"
     xml = in_root(f"<The_3D><Unit>[red]\u202emm</Unit>{marker}</The_3D>")
-    text, _ = shown("table", Told("lab", ("3d",), xml, 0.0))
+    text, _ = written("table", reply("lab", ("3d",), xml))
     assert "[red]\N{REPLACEMENT CHARACTER}mm" in text
     assert ["1", "1", "[bold]L", ""] in cells(text)
 
 
-def test_json_has_every_source_with_its_sections_and_age() -> None:
-    told = [Told("lab", (section,), spec_xml(section), 0.1) for section in SECTIONS]
-    text, problems = shown("json", *told, Told("hall", ("3d",), spec_xml("3d"), None))
+def test_json_has_sections_and_age_of_every_source() -> None:
+    replies = [reply("lab", (section,), spec_xml(section), 0.1) for section in SECTIONS]
+    text, problems = written("json", *replies, reply("hall", ("3d",), spec_xml("3d"), None))
     value = json.loads(text)
     assert list(value) == ["lab", "hall"]
     expected = dict(zip(SECTIONS, to_json(ALL).values(), strict=True))
@@ -113,28 +118,28 @@ def test_json_has_every_source_with_its_sections_and_age() -> None:
     assert problems == []
 
 
-def test_xml_is_written_as_it_came() -> None:
-    text, problems = shown("xml", Told("lab", ("force",), spec_xml("force") + b"\0", 0.0))
+def test_xml_is_written_unchanged() -> None:
+    text, problems = written("xml", reply("lab", ("force",), spec_xml("force") + b"\0"))
     assert text.encode() == spec_xml("force").rstrip() + b"\n"
     assert problems == []
 
 
-def test_several_pieces_of_xml_are_told_apart_by_a_comment() -> None:
-    text, _ = shown("xml", Told("lab", ("3d",), b"<a/>", 0.0), Told("hall", (), b"<b/>\n", 0.0))
+def test_a_comment_with_the_source_precedes_each_of_several_xml_pieces() -> None:
+    text, _ = written("xml", reply("lab", ("3d",), b"<a/>"), reply("hall", (), b"<b/>\n"))
     assert text == "<!-- lab 3d -->\n<a/>\n<!-- hall  -->\n<b/>\n"
 
 
-@pytest.mark.parametrize("form", ["table", "json"])
-def test_a_section_that_is_not_there_is_a_problem_and_the_others_are_shown(form: Form) -> None:
-    text, problems = shown(form, Told("lab", ("3d", "events"), spec_xml("3d"), 0.0))
-    assert problems == [("nothing-yet", "source 'lab': the server's answer has no section events")]
+@pytest.mark.parametrize("output_format", ["table", "json"])
+def test_a_missing_section_is_a_problem_and_other_sections_are_written(output_format: OutputFormat) -> None:
+    text, problems = written(output_format, reply("lab", ("3d", "events"), spec_xml("3d")))
+    assert problems == [("nothing-yet", "source 'lab': the server's reply has no section events")]
     assert "marker 1" in text
 
 
-def test_xml_that_cannot_be_read_is_a_problem_and_other_sources_are_shown() -> None:
-    text, problems = shown("table", Told("lab", (), b"3 o'clock", 0.0), Told("hall", (), EVERYTHING, 0.0))
+def test_unreadable_xml_is_a_problem_and_other_sources_are_written() -> None:
+    text, problems = written("table", reply("lab", (), b"3 o'clock"), reply("hall", (), EVERYTHING))
     [(code, problem)] = problems
     assert code == "unreadable"
     assert problem.startswith("source 'lab': ")
-    assert problem.endswith("see it with --xml")
+    assert problem.endswith("use --xml to see it")
     assert "hall: 3D, 1 marker" in text

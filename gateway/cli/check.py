@@ -1,0 +1,14 @@
+"""``rtc3d-gateway check``: is this configuration file valid?"""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from gateway.config.loading import load
+
+
+def check(file: Annotated[Path, typer.Argument(help="The configuration file to check.")]) -> None:
+    """Check a configuration file and print every mistake with its line. Starts nothing."""
+    names = [source.name for source in load(file).sources]
+    print(f"{file}: valid; {len(names)} source{'' if len(names) == 1 else 's'}: {', '.join(names)}")

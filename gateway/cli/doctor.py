@@ -1,0 +1,52 @@
+"""``rtc3d-gateway doctor``: find what keeps data from flowing."""
+
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+import uvloop
+from rich.console import Console
+
+from gateway.cli.options import ConfigOption, ServerOption, configuration_from_options
+from gateway.doctor.examination import examine, without_settings
+from gateway.doctor.report import Report
+from gateway.errors import ConfigError
+from gateway.service.log_format import LogFormat, LogLevel, set_up_log
+
+_INSTALLED_CONFIG: Final = Path("/etc/rtc3d-gateway/gateway.yaml")
+
+
+def doctor(
+    config: ConfigOption = None,
+    server: ServerOption = None,
+    seconds: Annotated[
+        float, typer.Option(min=0.1, max=3600, help="How long to watch each source, and to wait for Zenoh.")
+    ] = 3.0,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+) -> None:
+    """Find what keeps data from flowing, layer by layer. Exit status 1 if a check fails.
+
+    Without options, it uses the installed configuration, /etc/rtc3d-gateway/gateway.yaml.
+    """
+    set_up_log(LogLevel.ERROR, LogFormat.TEXT)  # the findings contain everything that is a warning
+    report = Report(Console(quiet=as_json))
+    uvloop.run(_examine(report, config, server, seconds))
+    if as_json:
+        print(report.as_json())
+    if not report.is_good:
+        raise typer.Exit(1)
+
+
+async def _examine(report: Report, config: Path | None, server: str | None, seconds: float) -> None:
+    if config is None and server is None and _INSTALLED_CONFIG.exists():
+        config = _INSTALLED_CONFIG
+    try:
+        settings = configuration_from_options(config, server).settings
+    except ConfigError as error:
+        for finding in without_settings(error):
+            report.add(finding)
+    else:
+        origin = str(config or server or "environment")
+        async for finding in examine(settings, origin, seconds):
+            report.add(finding)
+    report.end()

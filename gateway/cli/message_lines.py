@@ -1,0 +1,51 @@
+"""One line of text or JSON for each message that a gateway publishes."""
+
+import json
+from typing import Any
+
+from gateway.errors import ProtocolError
+from gateway.messages.decode import decode, one_line, to_json, xml_text
+
+
+def json_line(name: str, message: bytes) -> str:
+    """Return a JSON object: the fields of the message, and ``name`` (the key or channel) as ``key``."""
+    try:
+        fields = to_json(decode(message))
+    except ProtocolError as error:
+        match _xml_or_json(message):
+            case bytes() as xml:
+                fields = {"xml": xml.decode("utf-8", "replace")}
+            case dict() as json_object:
+                fields = json_object
+            case _:
+                fields = {"error": str(error)}
+    return json.dumps({"key": name} | fields)
+
+
+def text_line(name: str, message: bytes) -> str:
+    """Return a line for people: ``name`` (the key or channel) and a summary of the message."""
+    try:
+        line = f"{name} {one_line(decode(message))}"
+    except ProtocolError as error:
+        match _xml_or_json(message):
+            case bytes() as xml:
+                line = f"{name} {xml_text(xml)}"
+            case dict() as json_object:
+                line = f"{name} " + ", ".join(f"{key} {value}" for key, value in json_object.items())
+            case _:
+                line = f"{name}: {error}"
+    # The text comes from servers and unknown publishers: control characters must not reach the terminal.
+    return "".join(
+        character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in line
+    )
+
+
+def _xml_or_json(message: bytes) -> bytes | dict[str, Any] | None:
+    """Return a server's XML as it is, or the object in a JSON text: Zenoh carries both; else None."""
+    if message.lstrip().startswith(b"<"):
+        return message
+    try:
+        value = json.loads(message)
+    except (ValueError, RecursionError):
+        return None
+    return value if isinstance(value, dict) else None

@@ -1,0 +1,87 @@
+"""Options that several commands share."""
+
+import os
+from pathlib import Path
+from typing import Annotated, Final
+
+import typer
+
+from gateway.config.environment import VARIABLE_PREFIX
+from gateway.config.loading import Configuration, read, read_server
+from gateway.service.log_format import LogFormat, LogLevel
+
+DEFAULT_PORT: Final = 3020
+
+ConfigOption = Annotated[
+    Path | None,
+    typer.Option(
+        help="The configuration file, YAML; see config/gateway.yaml. Environment variables "
+        f"{VARIABLE_PREFIX}… override it or replace it."
+    ),
+]
+ServerOption = Annotated[
+    str | None,
+    typer.Option(help="HOST[:PORT] of an RT server, for a quick try without a configuration file."),
+]
+
+LogLevelOption = Annotated[
+    LogLevel, typer.Option(case_sensitive=False, help="The lowest level of messages to log.")
+]
+LogFormatOption = Annotated[
+    LogFormat,
+    typer.Option(case_sensitive=False, help="auto means the journal under systemd, text elsewhere."),
+]
+
+MarkersOption = Annotated[int, typer.Option(min=0, max=10_000, help="Markers in the synthetic scene.")]
+ToolsOption = Annotated[int, typer.Option(min=0, max=1_000, help="6D tools in the synthetic scene.")]
+AnalogOption = Annotated[int, typer.Option(min=0, max=10_000, help="Analog channels in the synthetic scene.")]
+PlatesOption = Annotated[int, typer.Option(min=0, max=100, help="Force plates in the synthetic scene.")]
+RateOption = Annotated[float, typer.Option(min=0.1, max=10_000, help="3D and 6D frames per second, in Hz.")]
+AnalogRateOption = Annotated[
+    float, typer.Option(min=0.1, max=100_000, help="Analog and force samples per second, in Hz.")
+]
+C3dOption = Annotated[
+    Path | None, typer.Option("--c3d", help="Play this C3D file instead of a synthetic scene.")
+]
+
+SourceOption = Annotated[str | None, typer.Option(help="Only this source.")]
+ConnectOption = Annotated[
+    str | None,
+    typer.Option(help="Zenoh endpoint of the gateway or router, for example tcp/192.0.2.5:7447."),
+]
+UrlOption = Annotated[
+    str | None, typer.Option(help="LCM URL; the default is $LCM_DEFAULT_URL, else LCM's own default.")
+]
+PrefixOption = Annotated[
+    str | None, typer.Option(help="The gateway's prefix; the default is mocap on Zenoh, MOCAP on LCM.")
+]
+
+
+def configuration_from_options(config: Path | None, server: str | None) -> Configuration:
+    """Return the configuration that ``--config``, ``--server`` and the environment give.
+
+    Raises ConfigError if it is not valid, BadParameter if none or both of the options are given.
+    """
+    if server is not None and config is None:
+        return read_server(*_host_and_port(server))
+    if server is None and (
+        config is not None or any(name.startswith(VARIABLE_PREFIX) for name in os.environ)
+    ):
+        return read(config)
+    raise typer.BadParameter("give either --config FILE or --server HOST[:PORT]")
+
+
+def _host_and_port(server: str) -> tuple[str, int]:
+    """Split HOST, HOST:PORT or [IPV6]:PORT."""
+    if server.startswith("["):
+        host, _, rest = server[1:].partition("]")
+        port = rest.removeprefix(":")
+    elif server.count(":") == 1:
+        host, _, port = server.partition(":")
+    else:
+        host, port = server, ""
+    if not port:
+        return host, DEFAULT_PORT
+    if not (port.isdecimal() and 0 < int(port) < 65536):
+        raise typer.BadParameter(f"{server!r}: the port must be a number from 1 to 65535")
+    return host, int(port)

@@ -1,0 +1,109 @@
+"""``rtc3d-gateway simulate``: an RTC3D server without a camera."""
+
+import asyncio
+import contextlib
+import signal
+from pathlib import Path
+from typing import Annotated
+
+import typer
+import uvloop
+
+from gateway.cli.options import (
+    DEFAULT_PORT,
+    AnalogOption,
+    AnalogRateOption,
+    C3dOption,
+    LogFormatOption,
+    LogLevelOption,
+    MarkersOption,
+    PlatesOption,
+    RateOption,
+    ToolsOption,
+)
+from gateway.rtc3d_server.server import Simulator
+from gateway.service.log_format import LogFormat, LogLevel, set_up_log
+from gateway.simulator.c3d_scene import C3dScene
+from gateway.simulator.faults.kinds import list_of_kinds, parse_fault
+from gateway.simulator.scenario import Scenario, load_scenario
+
+
+def _list_faults(wanted: bool) -> None:
+    if wanted:
+        print(list_of_kinds())
+        raise typer.Exit
+
+
+def simulate(
+    context: typer.Context,
+    host: Annotated[str, typer.Option(help="The address to listen on.")] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="The port to listen on; 0 picks a free one.")
+    ] = DEFAULT_PORT,
+    seconds: Annotated[
+        float | None, typer.Option(min=0, help="Stop after this time; the default is to run until Ctrl-C.")
+    ] = None,
+    markers: MarkersOption = 24,
+    tools: ToolsOption = 4,
+    analog: AnalogOption = 16,
+    plates: PlatesOption = 2,
+    rate: RateOption = 200.0,
+    analog_rate: AnalogRateOption = 2000.0,
+    c3d: C3dOption = None,
+    once: Annotated[bool, typer.Option("--once", help="Play the C3D file once, then send No Data.")] = False,
+    scenario: Annotated[
+        Path | None,
+        typer.Option(help="A YAML file with a scene and faults; see config/scenarios/bad-day.yaml."),
+    ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(help="A fault, for example 'delay,delay_ms=80,at_s=5'; can be repeated."),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(min=0, help="Seed of the random choices that faults make.")
+    ] = None,
+    list_faults: Annotated[  # noqa: ARG001 - the callback does the work
+        bool,
+        typer.Option("--list-faults", callback=_list_faults, is_eager=True, help="List all faults and exit."),
+    ] = False,
+    log_level: LogLevelOption = LogLevel.INFO,
+    log_format: LogFormatOption = LogFormat.AUTO,
+) -> None:
+    """Simulate an RTC3D server that plays a synthetic scene or a C3D file, with faults on request."""
+    if once and c3d is None:
+        raise typer.BadParameter("--once needs --c3d: a synthetic scene has no end")
+    set_up_log(log_level, log_format)
+    scene_options: dict[str, float] = {
+        "markers": markers,
+        "tools": tools,
+        "analog": analog,
+        "plates": plates,
+        "rate_hz": rate,
+        "analog_rate_hz": analog_rate,
+    }
+    # Only options given on the command line override the scenario's scene.
+    overrides = {
+        name: value
+        for name, value in scene_options.items()
+        if _is_on_command_line(context, name.removesuffix("_hz"))
+    }
+    base = Scenario(faults=()) if scenario is None else load_scenario(scenario)
+    extended = base.extended(overrides, map(parse_fault, fault or ()), seed)
+    scene = extended.scene.build() if c3d is None else C3dScene(c3d)
+    uvloop.run(_run_simulator(Simulator(scene, host=host, port=port, once=once), extended, seconds))
+
+
+def _is_on_command_line(context: typer.Context, option: str) -> bool:
+    source = context.get_parameter_source(option)
+    return source is not None and source.name == "COMMANDLINE"
+
+
+async def _run_simulator(simulator: Simulator, scenario: Scenario, seconds: float | None) -> None:
+    stop = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        asyncio.get_running_loop().add_signal_handler(number, stop.set)
+    async with simulator:
+        print(f"RTC3D server on {simulator.host}:{simulator.port}; press Ctrl-C to stop", flush=True)
+        simulator.faults.play(scenario.faults, seed=scenario.seed, scene=scenario.scene)
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(stop.wait(), seconds)
