@@ -1,4 +1,4 @@
-"""Whether the gateway does what it is for: frames come, and the outputs are connected."""
+"""The health check: every stream receives frames and every output is connected."""
 
 import json
 from http import HTTPStatus
@@ -8,6 +8,7 @@ from gateway.config.settings import StreamSettings
 from gateway.messages.host_time import now_utime
 from gateway.monitoring.http_pages import Page
 from gateway.monitoring.monitored import Watched
+from gateway.outputs.contract import Output
 from gateway.rtc3d.components import ComponentType
 from gateway.source import Source
 from gateway.stream.state import StreamState
@@ -17,48 +18,54 @@ _ONLY_EVENTS: Final = {ComponentType.EVENT}
 
 
 def health_page(gateway: Watched) -> Page:
-    """Return /healthz: status 200 if all is well, else 503, and JSON that says what is not."""
+    """Return the page /healthz: status 200, or 503 if something has a problem, and the details as JSON."""
     utime = now_utime()
     streams = [
-        _stream(source, stream, status, utime)
+        _stream_health(source, stream, status, utime)
         for source in gateway.sources
         for stream, status in zip(source.source.streams, source.statuses, strict=True)
     ]
-    outputs = [
-        {"output": output.name, "problem": output.health().problem if not output.health().connected else ""}
-        for output in gateway.outputs
-    ]
+    outputs = [_output_health(output) for output in gateway.outputs]
     healthy = not any(each["problem"] for each in (*streams, *outputs))
     body = {"healthy": healthy, "streams": streams, "outputs": outputs}
     status = HTTPStatus.OK if healthy else HTTPStatus.SERVICE_UNAVAILABLE
     return Page(status, "application/json", json.dumps(body, ensure_ascii=False, indent=2).encode() + b"\n")
 
 
-def _stream(source: Source, stream: StreamSettings, status: StreamStatus, utime: int) -> dict[str, Any]:
+def _stream_health(
+    source: Source, stream: StreamSettings, status: StreamStatus, utime: int
+) -> dict[str, Any]:
     age_s = (utime - status.last_frame_utime) / 1e6 if status.last_frame_utime else None
     return {
         "source": source.source.name,
         "stream": status.components,
         "state": status.state.value,
         "last_frame_age_s": age_s,
-        "problem": _problem(source, stream, status, age_s),
+        "problem": _stream_problem(source, stream, status, age_s),
     }
 
 
-def _problem(source: Source, stream: StreamSettings, status: StreamStatus, age_s: float | None) -> str:
-    """Return what is wrong with a stream and what to do; "" if it has frames, or need not have any."""
-    limit_s = source.source.stall_timeout_s
-    if age_s is not None and age_s < limit_s:
+def _output_health(output: Output) -> dict[str, str]:
+    health = output.health()
+    return {"output": output.name, "problem": "" if health.connected else health.problem}
+
+
+def _stream_problem(source: Source, stream: StreamSettings, status: StreamStatus, age_s: float | None) -> str:
+    """Return what is wrong with a stream and what to check; "" if it has frames or needs none."""
+    max_age_s = source.source.stall_timeout_s
+    if age_s is not None and age_s < max_age_s:
         return ""
-    quiet = "no frame so far" if age_s is None else f"no frame for {age_s:.1f} s, the limit is {limit_s:g} s"
+    silence = "no frame so far" if age_s is None else f"no frame for {age_s:.1f} s (limit {max_age_s:g} s)"
     match status.state:
         case StreamState.NO_MEASUREMENT:
             return ""
         case StreamState.IDLE | StreamState.STREAMING if set(stream.components) == _ONLY_EVENTS:
-            return ""  # they come when they come
+            return ""  # events are sporadic
         case StreamState.IDLE if stream.on_demand and not source.fan_out.listened(stream.components):
             return ""
         case StreamState.IDLE:
-            return f"{quiet}: {source.source.host} is connected and silent; does a measurement run there?"
+            return (
+                f"{silence}: {source.source.host} is connected but sends nothing; is a measurement running?"
+            )
     reason = status.last_error or f"connecting to {source.source.host}:{source.source.port}"
-    return f"{quiet}: {reason}"
+    return f"{silence}: {reason}"

@@ -1,7 +1,7 @@
-"""A few pages over HTTP/1.1 for programs that watch: GET alone, small requests, one per connection.
+"""A minimal HTTP/1.1 server for monitoring: GET only, small requests, one per connection.
 
-It runs in the event loop, so that a page is made of counters that agree with each other. Whoever may
-connect may be hostile: how long, how large and how many requests are is bounded.
+It runs in the event loop, so the counters on a page are consistent with each other. Clients are
+untrusted: size, duration and number of requests are bounded.
 """
 
 import asyncio
@@ -11,17 +11,17 @@ from http import HTTPStatus
 from typing import Final, NamedTuple
 
 MAX_REQUEST_BYTES: Final = 8192
-"""Of a request's head; who sends more is cut off."""
+"""The size limit of a request's head; a connection that exceeds it is closed."""
 
 MAX_CONNECTIONS: Final = 16
-"""At once; the next is closed unanswered."""
+"""How many connections may be open; further ones are closed without an answer."""
 
-REQUEST_S: Final = 5.0
+REQUEST_TIMEOUT_S: Final = 5.0
 """How long a connection may last."""
 
 
 class Page(NamedTuple):
-    """An answer."""
+    """An HTTP response."""
 
     status: HTTPStatus
     content_type: str
@@ -29,7 +29,7 @@ class Page(NamedTuple):
 
 
 class HttpPages:
-    """Serves ``pages``, made anew for each request, by their paths."""
+    """Serves ``pages``, functions by their paths; each request calls its function."""
 
     def __init__(self, pages: Mapping[str, Callable[[], Page]]) -> None:
         self._pages = pages
@@ -37,14 +37,14 @@ class HttpPages:
         self._connections: dict[asyncio.Task[None], asyncio.WriteTransport] = {}
 
     async def start(self, address: str, port: int) -> None:
-        """Listen; raises OSError if that address or port is not to be had."""
+        """Listen; raises OSError if the address or the port cannot be bound."""
         self._server = await asyncio.start_server(self._serve, address, port, limit=MAX_REQUEST_BYTES)
 
     async def close(self) -> None:
-        """Stop listening, and cut off who is connected."""
+        """Stop listening and close all connections."""
         if self._server is not None:
             self._server.close()
-        # Not cancelled: asyncio's streams log that as an error (before Python 3.12).
+        # Not cancelled: before Python 3.12, asyncio's streams log a cancellation as an error.
         for transport in self._connections.values():
             transport.abort()
         await asyncio.gather(*self._connections, return_exceptions=True)
@@ -56,13 +56,13 @@ class HttpPages:
             return
         self._connections[task] = writer.transport
         try:
-            # Whatever goes wrong here is the other side's affair, and nobody is there to be told.
+            # These errors are the client's; nobody here could act on them.
             with contextlib.suppress(
                 TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError
             ):
-                async with asyncio.timeout(REQUEST_S):
+                async with asyncio.timeout(REQUEST_TIMEOUT_S):
                     head = await reader.readuntil(b"\r\n\r\n")
-                    writer.write(_encoded(self._answer(head)))
+                    writer.write(_encode(self._respond(head)))
                     await writer.drain()
                     writer.close()
                     await writer.wait_closed()
@@ -70,25 +70,25 @@ class HttpPages:
             writer.transport.abort()
             del self._connections[task]
 
-    def _answer(self, head: bytes) -> Page:
+    def _respond(self, head: bytes) -> Page:
         request = head.split(b"\r\n", 1)[0].decode("latin-1").split(" ")
         if len(request) != 3 or not request[2].startswith("HTTP/1."):
-            return _refusal(HTTPStatus.BAD_REQUEST)
+            return _error_page(HTTPStatus.BAD_REQUEST)
         method, target, _ = request
         page = self._pages.get(target.partition("?")[0])
         if page is None:
-            known = "".join(f"{path}\n" for path in self._pages)
-            return Page(HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", f"There is:\n{known}".encode())
+            paths = "".join(f"{path}\n" for path in self._pages)
+            return Page(HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", f"Pages:\n{paths}".encode())
         if method != "GET":
-            return _refusal(HTTPStatus.METHOD_NOT_ALLOWED)
+            return _error_page(HTTPStatus.METHOD_NOT_ALLOWED)
         return page()
 
 
-def _refusal(status: HTTPStatus) -> Page:
+def _error_page(status: HTTPStatus) -> Page:
     return Page(status, "text/plain; charset=utf-8", f"{status.phrase}; only GET is served\n".encode())
 
 
-def _encoded(page: Page) -> bytes:
+def _encode(page: Page) -> bytes:
     head = (
         f"HTTP/1.1 {page.status} {page.status.phrase}\r\n"
         f"Content-Type: {page.content_type}\r\n"

@@ -1,4 +1,4 @@
-"""Serves what there is to see of a gateway: /metrics for Prometheus, /healthz for whoever restarts it."""
+"""The monitoring server of a gateway: /metrics for Prometheus, /healthz for health checks."""
 
 import logging
 
@@ -13,7 +13,7 @@ logger = logging.getLogger(__name__)
 
 
 class MonitoringServer:
-    """The HTTP side of one gateway."""
+    """Serves the metrics and the health of one gateway over HTTP."""
 
     def __init__(self, settings: MetricsSettings, gateway: Watched) -> None:
         self._settings = settings
@@ -24,7 +24,7 @@ class MonitoringServer:
         )
 
     async def start(self) -> None:
-        """Listen, if the settings want it; a port that is not to be had is told, and is no reason to stop."""
+        """Listen if it is enabled. If the port cannot be bound, log a warning and continue without it."""
         if not self._settings.enabled:
             return
         address, port = self._settings.address, self._settings.port
@@ -33,8 +33,9 @@ class MonitoringServer:
             await self._pages.start(address, port)
         except OSError as error:
             logger.warning(
-                "metrics: cannot listen on %s, port %d: %s; running on without /metrics and /healthz: "
-                "end what has the port, or set metrics.address and metrics.port, and start the gateway again",
+                "metrics: cannot listen on %s, port %d: %s; continuing without /metrics and /healthz: "
+                "stop the program that uses the port, or set metrics.address and metrics.port, and restart "
+                "the gateway",
                 *(address, port, error.strerror or error),
             )
         else:

@@ -1,4 +1,4 @@
-"""How the gateway is, in one line for people: what ``systemctl status`` shows."""
+"""The gateway's status in one line for people, shown by ``systemctl status``."""
 
 from collections.abc import Iterable, Sequence
 
@@ -9,20 +9,21 @@ from gateway.stream.status import StreamStatus
 
 
 def source_line(source: SourceSettings, streams: Sequence[tuple[StreamStatus, float]]) -> str:
-    """Return "lab: streaming 200.0 Hz"; ``streams`` come with their rates in Hz.
+    """Return the status of a source, such as "lab: streaming 200.0 Hz".
 
-    Streams that are in different states are told apart by their components.
+    ``streams`` are pairs of a status and a frame rate in Hz. If they have different texts, each text
+    follows the components of its stream.
     """
     server = f"{source.host}:{source.port}"
     texts = [_stream_text(server, status, rate_hz) for status, rate_hz in streams]
     if len(set(texts)) == 1:
         return f"{source.name}: {texts[0]}"
-    parts = (f"{status.components} {text}" for (status, _), text in zip(streams, texts, strict=True))
-    return f"{source.name}: {', '.join(parts)}"
+    named = (f"{status.components} {text}" for (status, _), text in zip(streams, texts, strict=True))
+    return f"{source.name}: {', '.join(named)}"
 
 
 def output_lines(outputs: Iterable[tuple[str, OutputHealth]]) -> list[str]:
-    """Return a line for each output that cannot send; ``outputs`` come with their names."""
+    """Return a line for each output that cannot send; ``outputs`` are pairs of a name and its health."""
     return [f"{name}: {health.problem}" for name, health in outputs if not health.connected]
 
 
@@ -31,13 +32,13 @@ def _stream_text(server: str, status: StreamStatus, rate_hz: float) -> str:
         case StreamState.STREAMING:
             return f"streaming {rate_hz:.1f} Hz"
         case StreamState.IDLE:
-            return f"connected to {server}, no frames asked for"
+            return f"connected to {server}, no frames requested"
         case StreamState.NO_MEASUREMENT:
-            return f"connected to {server}, no measurement runs"
+            return f"connected to {server}, no measurement running"
         case StreamState.HANDSHAKING:
-            return f"connected to {server}, shaking hands"
+            return f"connected to {server}, handshake in progress"
         case StreamState.STALLED:
-            return f"nothing comes from {server}"
+            return f"no frames from {server}"
         case StreamState.CONNECTING | StreamState.WAITING:
             tries = f", {status.tries} {'try' if status.tries == 1 else 'tries'}" if status.tries else ""
             return f"waiting for {server}{tries}"

@@ -1,4 +1,4 @@
-"""A gateway that is watched as in a lab: HTTP, Prometheus' text, the dashboard, the alerts, the log."""
+"""Monitoring of a running gateway: HTTP, Prometheus' text format, dashboard, alerts and log."""
 
 import asyncio
 import json
@@ -45,12 +45,12 @@ STREAMS = (
     StreamSettings(components=(ComponentType.MARKERS, ComponentType.TOOLS)),
     StreamSettings(components=(ComponentType.ANALOG,)),
 )
-OF_PROMETHEUS = {"job", "instance"}
-"""Labels that Prometheus itself adds."""
+PROMETHEUS_LABELS = {"job", "instance"}
+"""Labels that Prometheus adds."""
 
 
-class Watched:
-    """A gateway of the source "lab" to a server on ``port``, with Zenoh and LCM, and its HTTP side."""
+class Lab:
+    """A gateway for the source "lab" on ``port``, with Zenoh, LCM and the monitoring server."""
 
     def __init__(self, port: int, metrics_port: int) -> None:
         self.port = metrics_port
@@ -72,7 +72,7 @@ class Watched:
         self.source = self.gateway.sources[0]
 
     async def get(self, path: str) -> tuple[int, str]:
-        """Return the status and the body of a page."""
+        """Return the HTTP status and the body of a page."""
         return await asyncio.to_thread(self._get, path)
 
     def _get(self, path: str) -> tuple[int, str]:
@@ -89,7 +89,7 @@ class Watched:
         return status, json.loads(body)
 
     async def scrape(self) -> dict[str, Metric]:
-        """Return the metric families by name; their samples have the names that queries use."""
+        """Return the metric families by name; the samples have the names that PromQL queries use."""
         status, body = await self.get("/metrics")
         assert status == 200
         return {family.name: family for family in text_string_to_metric_families(body)}
@@ -102,8 +102,8 @@ class Watched:
 
 
 @asynccontextmanager
-async def watched(port: int, metrics_port: int | None = None) -> AsyncIterator[Watched]:
-    lab = Watched(port, metrics_port or free_port())
+async def running_lab(port: int, metrics_port: int | None = None) -> AsyncIterator[Lab]:
+    lab = Lab(port, metrics_port or free_port())
     stop = asyncio.Event()
     task = asyncio.create_task(lab.gateway.run(stop))
     try:
@@ -121,15 +121,15 @@ def simulator(port: int = 0) -> Simulator:
     return Simulator(scene, port=port)
 
 
-# What is scraped -----------------------------------------------------------------------------
+# Metrics -------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def families() -> dict[str, Metric]:
-    """Return what a gateway that has streamed long enough to know the clock is scraped for."""
+    """Return the metrics of a gateway that has streamed long enough for a valid clock."""
 
     async def run() -> dict[str, Metric]:
-        async with simulator() as server, watched(server.port) as lab:
+        async with simulator() as server, running_lab(server.port) as lab:
             await lab.until(lambda: all(status.clock.has_clock for status in lab.source.statuses))
             await lab.until(lambda: all(s.messages["status"] for _, s in lab.source.fan_out.outputs))
             return await lab.scrape()
@@ -139,11 +139,11 @@ def families() -> dict[str, Metric]:
 
 @pytest.fixture(scope="module")
 def series(families: dict[str, Metric]) -> dict[str, set[str]]:
-    """Return the labels of each name that queries use."""
+    """Return the labels of each sample name."""
     return {sample.name: set(sample.labels) for family in families.values() for sample in family.samples}
 
 
-def test_frames_and_messages_are_counted_on_both_outputs(families: dict[str, Metric]) -> None:
+def test_frames_and_messages_are_counted_for_both_outputs(families: dict[str, Metric]) -> None:
     frames = {
         sample.labels["component"]: sample.value
         for sample in families["rtc3d_gateway_component_frames"].samples
@@ -161,7 +161,7 @@ def test_frames_and_messages_are_counted_on_both_outputs(families: dict[str, Met
     assert {sample.labels["output"]: sample.value for sample in connected} == {"zenoh": 1, "lcm": 1}
 
 
-def test_names_and_units_are_as_prometheus_asks(families: dict[str, Metric]) -> None:
+def test_names_and_units_follow_prometheus_conventions(families: dict[str, Metric]) -> None:
     base_units = {"seconds", "bytes", "ratio"}
     others = {"milliseconds", "ms", "us", "microseconds", "minutes", "percent", "ppm", "kilobytes", "hz"}
     for family in families.values():
@@ -178,7 +178,9 @@ def test_names_and_units_are_as_prometheus_asks(families: dict[str, Metric]) -> 
         assert family.type in {"counter", "gauge"}, family.name
         assert "total" not in words, family.name
         assert len({frozenset(sample.labels) for sample in family.samples}) <= 1, family.name
-        assert not {"le", "quantile", *OF_PROMETHEUS} & {label for s in family.samples for label in s.labels}
+        assert not {"le", "quantile", *PROMETHEUS_LABELS} & {
+            label for s in family.samples for label in s.labels
+        }
         unique = {tuple(sorted(sample.labels.items())) for sample in family.samples}
         assert len(unique) == len(family.samples), family.name
 
@@ -188,25 +190,25 @@ def test_every_metric_has_samples(families: dict[str, Metric]) -> None:
 
 
 def unit(name: str) -> str:
-    """Return the unit that a metric's name tells."""
+    """Return the unit in a metric's name."""
     last = name.removesuffix("_total").rpartition("_")[2]
     return {"seconds": "s", "bytes": "bytes", "ratio": "1"}.get(last, "")
 
 
-def test_the_references_table_is_the_truth(families: dict[str, Metric]) -> None:
+def test_the_reference_lists_every_metric_with_type_labels_and_unit(families: dict[str, Metric]) -> None:
     rows = re.findall(
         r"^\| `((?:rtc3d|process)_\w+)` \| (\w+) \| ([\w, ]*?) ?\| (\w*) ?\| ", REFERENCE, re.MULTILINE
     )
-    told = {
-        (name, kind, frozenset(filter(None, labels.split(", "))), told_unit)
-        for name, kind, labels, told_unit in rows
+    documented = {
+        (name, kind, frozenset(filter(None, labels.split(", "))), documented_unit)
+        for name, kind, labels, documented_unit in rows
     }
     scraped = {
         (sample.name, family.type, frozenset(sample.labels), unit(sample.name))
         for family in families.values()
         for sample in family.samples
     }
-    assert told == scraped
+    assert documented == scraped
 
 
 # Queries -------------------------------------------------------------------------------------
@@ -224,7 +226,7 @@ ALERTS = [
 
 
 def selected(query: str) -> list[tuple[str, str]]:
-    """Return each metric of a query with what stands behind it in braces."""
+    """Return each metric of a query with its label selectors."""
     return re.findall(r"\b((?:rtc3d_gateway|process)_\w+)(?:\{([^}]*)\})?", query)
 
 
@@ -235,22 +237,24 @@ def grouped(query: str) -> set[str]:
 
 
 @pytest.mark.parametrize("query", [*QUERIES, *(rule["expr"] for rule in ALERTS)])
-def test_queries_ask_for_metrics_and_labels_that_exist(query: str, series: dict[str, set[str]]) -> None:
+def test_queries_use_existing_metrics_and_labels(query: str, series: dict[str, set[str]]) -> None:
     metrics = selected(query)
     assert metrics or query.startswith("up{")
     known = set().union(*(series[name] for name, _ in metrics)) if metrics else set()
     for name, selectors in metrics:
         labels = set(re.findall(r"(\w+) ?(?:=~|!~|!=|=)", selectors))
-        assert labels <= series[name] | OF_PROMETHEUS, name
-    assert grouped(query) <= known | OF_PROMETHEUS
+        assert labels <= series[name] | PROMETHEUS_LABELS, name
+    assert grouped(query) <= known | PROMETHEUS_LABELS
 
 
-def test_states_in_queries_are_those_that_there_are() -> None:
-    asked = re.findall(r'state=~?"([^"]*)"', " ".join([*QUERIES, *(rule["expr"] for rule in ALERTS)]))
-    states = {state for choice in asked for state in choice.split("|")}
+def test_queries_and_the_dashboard_use_existing_states() -> None:
+    selected_states = re.findall(
+        r'state=~?"([^"]*)"', " ".join([*QUERIES, *(rule["expr"] for rule in ALERTS)])
+    )
+    states = {state for choice in selected_states for state in choice.split("|")}
     assert states <= {state.value for state in StreamState}
     [timeline] = [panel for panel in DASHBOARD["panels"] if panel["title"] == "Streams"]
-    shown = {
+    legend = {
         int(number): mapping["text"]
         for number, mapping in timeline["fieldConfig"]["defaults"]["mappings"][0]["options"].items()
     }
@@ -258,26 +262,26 @@ def test_states_in_queries_are_those_that_there_are() -> None:
         int(number): state
         for state, number in re.findall(r'state="([^"]*)"\} \* (\d)', timeline["targets"][0]["expr"])
     }
-    assert weights == shown
-    assert set(shown.values()) == {state.value for state in StreamState}
+    assert weights == legend
+    assert set(legend.values()) == {state.value for state in StreamState}
 
 
 def test_the_dashboard_shows_every_metric(series: dict[str, set[str]]) -> None:
-    asked = {name for query in QUERIES for name, _ in selected(query)}
-    # Per component is seen instead; the clock's curves end when it is not valid.
+    queried = {name for query in QUERIES for name, _ in selected(query)}
+    # The dashboard shows frames per component, and the clock curves end while the clock is not valid.
     hidden = {"rtc3d_gateway_frames_received_total", "rtc3d_gateway_clock_valid"}
-    assert asked | hidden == series.keys()
+    assert queried | hidden == series.keys()
 
 
-def test_panels_have_places_of_their_own_and_legends_that_name_labels(series: dict[str, set[str]]) -> None:
+def test_panels_do_not_overlap_and_their_legends_use_existing_labels(series: dict[str, set[str]]) -> None:
     cells: set[tuple[int, int]] = set()
     for panel in DASHBOARD["panels"]:
-        place = panel["gridPos"]
-        assert place["x"] + place["w"] <= 24
+        position = panel["gridPos"]
+        assert position["x"] + position["w"] <= 24
         taken = {
             (column, row)
-            for column in range(place["x"], place["x"] + place["w"])
-            for row in range(place["y"], place["y"] + place["h"])
+            for column in range(position["x"], position["x"] + position["w"])
+            for row in range(position["y"], position["y"] + position["h"])
         }
         assert not taken & cells, panel["title"]
         cells |= taken
@@ -289,18 +293,18 @@ def test_panels_have_places_of_their_own_and_legends_that_name_labels(series: di
     assert len({panel["id"] for panel in DASHBOARD["panels"]}) == len(DASHBOARD["panels"])
 
 
-def test_alerts_say_what_is_wrong_with_labels_that_exist(series: dict[str, set[str]]) -> None:
+def test_alert_summaries_use_existing_labels(series: dict[str, set[str]]) -> None:
     assert len({rule["alert"] for rule in ALERTS}) == len(ALERTS) > 5
     for rule in ALERTS:
-        known = set().union(OF_PROMETHEUS, *(series[name] for name, _ in selected(rule["expr"])))
+        known = set().union(PROMETHEUS_LABELS, *(series[name] for name, _ in selected(rule["expr"])))
         assert set(re.findall(r"\$labels\.(\w+)", rule["annotations"]["summary"])) <= known, rule["alert"]
 
 
 # Health --------------------------------------------------------------------------------------
 
 
-async def test_health_follows_the_server() -> None:
-    async with simulator() as server, watched(server.port) as lab:
+async def test_health_depends_on_the_servers_state() -> None:
+    async with simulator() as server, running_lab(server.port) as lab:
         await lab.streaming()
         status, body = await lab.health()
         assert (status, body["healthy"]) == (200, True)
@@ -308,7 +312,7 @@ async def test_health_follows_the_server() -> None:
         await lab.until(lambda: {each.state for each in lab.source.statuses} == {StreamState.NO_MEASUREMENT})
         assert (await lab.health())[0] == 200
         port = server.port
-    async with watched(port) as lab:
+    async with running_lab(port) as lab:
         await lab.until(lambda: all(each.last_error for each in lab.source.statuses))
         status, body = await lab.health()
         assert (status, body["healthy"]) == (503, False)
@@ -320,10 +324,10 @@ async def test_health_follows_the_server() -> None:
             assert (await lab.health())[0] == 200
 
 
-async def test_a_port_in_use_is_told_once_and_the_gateway_runs_on(caplog: pytest.LogCaptureFixture) -> None:
-    async with simulator() as server, watched(server.port) as first:
+async def test_a_port_in_use_is_logged_once_and_the_gateway_runs(caplog: pytest.LogCaptureFixture) -> None:
+    async with simulator() as server, running_lab(server.port) as first:
         caplog.clear()
-        async with watched(server.port, first.port) as second:
+        async with running_lab(server.port, first.port) as second:
             await second.streaming()
         [warning] = [record for record in caplog.records if record.name == "gateway.monitoring.server"]
     assert warning.levelno == logging.WARNING
@@ -331,37 +335,37 @@ async def test_a_port_in_use_is_told_once_and_the_gateway_runs_on(caplog: pytest
     assert "metrics.port" in warning.getMessage()
 
 
-async def test_the_port_is_free_again_once_the_gateway_has_stopped() -> None:
+async def test_stopping_the_gateway_frees_the_port() -> None:
     async with simulator() as server:
-        async with watched(server.port) as lab:
+        async with running_lab(server.port) as lab:
             pass
-        async with watched(server.port, lab.port) as again:
+        async with running_lab(server.port, lab.port) as again:
             assert (await again.get("/metrics"))[0] == 200
 
 
 # The log -------------------------------------------------------------------------------------
 
 
-async def test_what_is_logged_of_a_connection_says_of_which(caplog: pytest.LogCaptureFixture) -> None:
+async def test_log_records_of_a_connection_have_its_fields(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     with caplog.filtering(FieldsFilter()):
-        async with simulator() as server, watched(server.port) as lab:
+        async with simulator() as server, running_lab(server.port) as lab:
             await lab.streaming()
             port = server.port
-    told = [
+    logged_fields = [
         tuple(getattr(record, name, "") for name in FIELDS)
         for record in caplog.records
         if record.name in {"gateway.stream.status", "gateway.stream.supervisor", "gateway.stream.session"}
     ]
-    assert set(told) == {("lab", stream, f"127.0.0.1:{port}") for stream in ("3d 6d", "analog")}
-    of_the_whole = [
+    assert set(logged_fields) == {("lab", stream, f"127.0.0.1:{port}") for stream in ("3d 6d", "analog")}
+    gateway_records = [
         record for record in caplog.records if record.name in {"gateway.monitoring.server", "gateway.gateway"}
     ]
-    assert of_the_whole
-    assert not any(hasattr(record, "source") for record in of_the_whole)
+    assert gateway_records
+    assert not any(hasattr(record, "source") for record in gateway_records)
 
 
-async def test_what_is_logged_of_status_messages_says_of_which_source(
+async def test_log_records_of_status_messages_have_the_source(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     output = ToyOutput()
@@ -371,11 +375,11 @@ async def test_what_is_logged_of_status_messages_says_of_which_source(
     with caplog.filtering(FieldsFilter()):
         for source in gateway.sources:
             source.publish_status()
-    told = [(getattr(record, "source", ""), record.message) for record in caplog.records]
-    assert told == [("hall", "hall to toy: no router"), ("lab", "lab to toy: no router")]
+    logged = [(getattr(record, "source", ""), record.message) for record in caplog.records]
+    assert logged == [("hall", "hall to toy: no router"), ("lab", "lab to toy: no router")]
 
 
-async def test_a_program_writes_the_form_of_log_that_it_is_asked_for() -> None:
+async def test_the_log_format_option_selects_the_format() -> None:
     arguments = ("simulate", "--port", "0", "--seconds", "0.1", "--log-format", "json")
     program = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "gateway", *arguments), stderr=asyncio.subprocess.PIPE
@@ -384,4 +388,4 @@ async def test_a_program_writes_the_form_of_log_that_it_is_asked_for() -> None:
     assert program.returncode == 0
     lines = [json.loads(line) for line in errors.splitlines()]
     assert {"info"} == {line["level"] for line in lines}
-    assert all(line["logger"].startswith("gateway.simulator") for line in lines)
+    assert all(line["logger"].startswith("gateway.rtc3d_server") for line in lines)

@@ -1,4 +1,4 @@
-"""The pages over real sockets, for those who ask as they should and for those who do not."""
+"""HTTP pages over real sockets, with well-behaved and with hostile clients."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -14,7 +14,7 @@ from tests.waiting import wait_until_async
 
 
 class Site:
-    """Pages on a port of this machine; ``served`` counts how often the page was made."""
+    """Pages on a local port; ``served`` counts the calls of the page's function."""
 
     def __init__(self) -> None:
         self.port = free_port()
@@ -31,8 +31,8 @@ class Site:
     async def connect(self) -> tuple[asyncio.StreamReader, asyncio.StreamWriter]:
         return await asyncio.open_connection("127.0.0.1", self.port)
 
-    async def ask(self, request: bytes) -> bytes:
-        """Return all that comes for ``request`` until the other side closes."""
+    async def send(self, request: bytes) -> bytes:
+        """Return everything that is received until the server closes the connection."""
         reader, writer = await self.connect()
         try:
             writer.write(request)
@@ -57,9 +57,9 @@ def status_of(answer: bytes) -> int:
     return int(answer.split()[1])
 
 
-async def test_a_page_is_made_anew_for_each_request(site: Site) -> None:
-    await site.ask(b"GET /page HTTP/1.1\r\n\r\n")
-    answer = await site.ask(b"GET /page HTTP/1.1\r\nHost: localhost\r\n\r\n")
+async def test_each_request_calls_the_pages_function(site: Site) -> None:
+    await site.send(b"GET /page HTTP/1.1\r\n\r\n")
+    answer = await site.send(b"GET /page HTTP/1.1\r\nHost: localhost\r\n\r\n")
     head, _, body = answer.partition(b"\r\n\r\n")
     assert head.split(b"\r\n") == [
         b"HTTP/1.1 200 OK",
@@ -73,7 +73,7 @@ async def test_a_page_is_made_anew_for_each_request(site: Site) -> None:
     assert site.served == 2
 
 
-async def test_a_request_may_come_in_pieces_and_with_a_query(site: Site) -> None:
+async def test_a_request_may_arrive_in_pieces_and_have_a_query_string(site: Site) -> None:
     reader, writer = await site.connect()
     for piece in (b"GET /page?x=", b"1 HTTP/1.0\r\n", b"\r", b"\n"):
         writer.write(piece)
@@ -98,56 +98,58 @@ async def test_a_request_may_come_in_pieces_and_with_a_query(site: Site) -> None
         (b"", 400),
     ],
 )
-async def test_what_is_not_served_is_refused(site: Site, request_line: bytes, status: int) -> None:
-    assert status_of(await site.ask(request_line + b"\r\n\r\n")) == status
+async def test_other_requests_get_an_error(site: Site, request_line: bytes, status: int) -> None:
+    assert status_of(await site.send(request_line + b"\r\n\r\n")) == status
     assert site.served == 0
 
 
-async def test_what_is_not_there_is_told_with_what_is(site: Site) -> None:
-    assert b"/page\n" in await site.ask(b"GET / HTTP/1.1\r\n\r\n")
+async def test_an_unknown_path_gets_the_list_of_pages(site: Site) -> None:
+    assert b"/page\n" in await site.send(b"GET / HTTP/1.1\r\n\r\n")
 
 
-async def test_a_request_that_is_too_large_is_cut_off(site: Site) -> None:
-    assert await site.ask(b"GET /page HTTP/1.1\r\nX: " + b"x" * (MAX_REQUEST_BYTES + 1)) == b""
-    assert await site.ask(b"x" * 1_000_000) == b""
+async def test_a_request_that_is_too_large_is_disconnected(site: Site) -> None:
+    assert await site.send(b"GET /page HTTP/1.1\r\nX: " + b"x" * (MAX_REQUEST_BYTES + 1)) == b""
+    assert await site.send(b"x" * 1_000_000) == b""
 
 
-async def test_a_request_that_never_ends_is_cut_off(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(http_pages, "REQUEST_S", 0.05)
-    assert await site.ask(b"GET /page HTTP/1.1\r\n") == b""
+async def test_a_request_that_never_ends_is_disconnected(site: Site, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(http_pages, "REQUEST_TIMEOUT_S", 0.05)
+    assert await site.send(b"GET /page HTTP/1.1\r\n") == b""
 
 
-async def test_connections_are_limited_and_freed(site: Site) -> None:
+async def test_the_number_of_connections_is_limited(site: Site) -> None:
     connections = [await site.connect() for _ in range(MAX_CONNECTIONS)]
-    assert await site.ask(b"GET /page HTTP/1.1\r\n\r\n") == b""
+    assert await site.send(b"GET /page HTTP/1.1\r\n\r\n") == b""
     for _, writer in connections:
         writer.close()
 
     async def answered() -> bool:
-        return bool(await site.ask(b"GET /page HTTP/1.1\r\n\r\n"))
+        return bool(await site.send(b"GET /page HTTP/1.1\r\n\r\n"))
 
     async with asyncio.timeout(10):
         while not await answered():
             pass
 
 
-async def test_who_hangs_up_early_is_no_error(site: Site, caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_client_that_disconnects_early_is_not_an_error(
+    site: Site, caplog: pytest.LogCaptureFixture
+) -> None:
     _, writer = await site.connect()
     writer.write(b"GET /pa")
     writer.transport.abort()
-    assert status_of(await site.ask(b"GET /page HTTP/1.1\r\n\r\n")) == 200
+    assert status_of(await site.send(b"GET /page HTTP/1.1\r\n\r\n")) == 200
     assert not caplog.records
 
 
-async def test_a_defect_in_a_page_is_logged_and_ends_only_that_request(
+async def test_an_exception_in_a_page_is_logged_and_ends_only_that_request(
     site: Site, caplog: pytest.LogCaptureFixture
 ) -> None:
-    assert await site.ask(b"GET /defect HTTP/1.1\r\n\r\n") == b""
+    assert await site.send(b"GET /defect HTTP/1.1\r\n\r\n") == b""
     await wait_until_async(lambda: caplog.records)
-    assert status_of(await site.ask(b"GET /page HTTP/1.1\r\n\r\n")) == 200
+    assert status_of(await site.send(b"GET /page HTTP/1.1\r\n\r\n")) == 200
 
 
-async def test_closing_cuts_off_who_is_connected_and_frees_the_port(site: Site) -> None:
+async def test_closing_disconnects_clients_and_frees_the_port(site: Site) -> None:
     reader, writer = await site.connect()
     await wait_until_async(lambda: site.pages._connections)
     await site.pages.close()

@@ -5,32 +5,32 @@ from gateway.monitoring.loop_delay import LoopDelay
 from tests.waiting import wait_until_async
 
 
-def test_the_last_delay_and_the_largest_are_told() -> None:
+def test_the_last_and_the_largest_delay_are_kept() -> None:
     delay = LoopDelay()
     for now_s, delay_s in ((0.1, 0.2), (0.2, 0.5), (0.3, 0.0)):
-        delay.note(now_s, delay_s)
+        delay.record(now_s, delay_s)
     assert (delay.last_s, delay.max_s) == (0.0, 0.5)
 
 
-def test_the_largest_is_forgotten_after_one_to_two_minutes() -> None:
+def test_the_largest_delay_expires_after_one_to_two_minutes() -> None:
     delay = LoopDelay()
     largest = []
     for now_s, delay_s in ((0.0, 0.0), (59.0, 0.5), (61.0, 0.1), (119.0, 0.2), (121.5, 0.0), (182.0, 0.0)):
-        delay.note(now_s, delay_s)
+        delay.record(now_s, delay_s)
         largest.append(delay.max_s)
     assert largest == [0.0, 0.5, 0.5, 0.5, 0.2, 0.0]
 
 
-async def test_what_holds_the_loop_up_is_measured() -> None:
+async def test_a_blocked_event_loop_is_measured() -> None:
     delay = LoopDelay()
     delay.start()
     await asyncio.sleep(0)
-    time.sleep(0.3)  # noqa: ASYNC251 - the loop is to be held up, 0.2 s beyond when it should call
+    time.sleep(0.3)  # noqa: ASYNC251 - blocks the loop on purpose, 0.2 s past the timer
     await wait_until_async(lambda: delay.max_s >= 0.2)
     delay.close()
 
 
-async def test_nothing_is_measured_once_closed() -> None:
+async def test_closing_stops_the_measurement() -> None:
     delay = LoopDelay()
     delay.start()
     await wait_until_async(lambda: delay.last_s > 0)

@@ -1,4 +1,4 @@
-"""The metrics of counters set by hand, read back as Prometheus would."""
+"""Metrics of known counters, parsed as Prometheus does."""
 
 import math
 from collections.abc import Iterator
@@ -26,7 +26,7 @@ STREAMS = (
 
 
 class Lab:
-    """A gateway of two streams and two outputs that does not run."""
+    """A gateway with two streams and two outputs that is not running."""
 
     def __init__(self) -> None:
         settings = Settings(
@@ -64,7 +64,7 @@ MARKERS = {"source": "lab", "stream": "3d 6d"}
 ANALOG = {"source": "lab", "stream": "analog"}
 
 
-async def test_what_streams_count_is_there_for_each(lab: Lab) -> None:
+async def test_every_stream_has_its_counters(lab: Lab) -> None:
     lab.markers.frames_in, lab.analog.frames_in = 7, 70
     lab.markers.bytes_in = 1000
     lab.markers.session, lab.markers.reconnects, lab.markers.restarts = 3, 5, 2
@@ -80,7 +80,7 @@ async def test_what_streams_count_is_there_for_each(lab: Lab) -> None:
     assert list(lab.samples("last_frame_timestamp_seconds")) == [(MARKERS, 1_700_000_000.25)]
 
 
-async def test_a_stream_is_in_one_state(lab: Lab) -> None:
+async def test_exactly_one_state_of_a_stream_is_1(lab: Lab) -> None:
     for happened in (StreamInput.DIAL, StreamInput.CONNECTED, StreamInput.FRAME):
         lab.markers.move(happened, "test")
     states = {
@@ -91,18 +91,18 @@ async def test_a_stream_is_in_one_state(lab: Lab) -> None:
     assert states == {state.value: float(state is StreamState.STREAMING) for state in StreamState}
 
 
-async def test_drops_are_told_by_cause_the_usual_ones_from_0_on(lab: Lab) -> None:
+async def test_drops_have_a_cause_and_common_causes_start_at_0(lab: Lab) -> None:
     lab.markers.drops["frame rejected"] = 2
     lab.markers.drops["quite unusual"] = 1
     [(zenoh, zenoh_status), (toy, toy_status)] = lab.source.fan_out.outputs
     zenoh_status.drops["no router"] = 9
     toy_status.drops["ValueError"] = 1
-    told = {
+    samples = {
         labels["cause"]: value
         for labels, value in lab.samples("stream_drops_total")
         if MARKERS.items() <= labels.items()
     }
-    assert told == {
+    assert samples == {
         "frame rejected": 2,
         "unknown component": 0,
         "skipped while behind": 0,
@@ -119,7 +119,7 @@ async def test_drops_are_told_by_cause_the_usual_ones_from_0_on(lab: Lab) -> Non
     }
 
 
-async def test_messages_and_bytes_are_told_by_component_and_output(lab: Lab) -> None:
+async def test_messages_and_bytes_are_counted_by_component_and_output(lab: Lab) -> None:
     _, (toy, status) = lab.source.fan_out.outputs
     status.messages.update({"3d": 4, "status": 1})
     status.message_bytes.update({"3d": 400, "status": 50})
@@ -127,22 +127,22 @@ async def test_messages_and_bytes_are_told_by_component_and_output(lab: Lab) -> 
         ("messages_total", {"3d": 4, "status": 1}),
         ("message_bytes_total", {"3d": 400, "status": 50}),
     ):
-        told = {
+        samples = {
             labels["component"]: value for labels, value in lab.samples(name) if labels["output"] == toy.name
         }
-        assert told == {"3d": 0, "6d": 0, "analog": 0} | counted
+        assert samples == {"3d": 0, "6d": 0, "analog": 0} | counted
 
 
-async def test_frames_are_told_by_the_components_that_are_configured(lab: Lab) -> None:
+async def test_frames_are_counted_by_configured_component(lab: Lab) -> None:
     analog = build_component(ComponentType.ANALOG, 1, 1, np.zeros(3, ">f4"))
     frame = split_frame(build_frame([analog]), "big")
     for _ in range(12):
         lab.source.fan_out.publish(frame, Stamp(2, 1, 1), frozenset({ComponentType.ANALOG}))
-    told = {labels["component"]: value for labels, value in lab.samples("component_frames_total")}
-    assert told == {"3d": 0, "6d": 0, "analog": 12}
+    samples = {labels["component"]: value for labels, value in lab.samples("component_frames_total")}
+    assert samples == {"3d": 0, "6d": 0, "analog": 12}
 
 
-async def test_the_clock_is_told_once_there_is_one(lab: Lab) -> None:
+async def test_clock_metrics_appear_once_the_clock_is_valid(lab: Lab) -> None:
     boot_utime = 1_700_000_000_000_000
     assert lab.value("clock_valid", **MARKERS) == 0
     for name in ("clock_offset_seconds", "clock_drift_ratio", "clock_uncertainty_seconds"):
@@ -156,9 +156,9 @@ async def test_the_clock_is_told_once_there_is_one(lab: Lab) -> None:
     assert math.isfinite(lab.value("clock_uncertainty_seconds", **MARKERS))
 
 
-async def test_outputs_delay_and_versions_are_told(lab: Lab) -> None:
-    lab.loop_delay.note(0.0, 0.5)
-    lab.loop_delay.note(0.1, 0.25)
+async def test_outputs_loop_delay_and_versions_are_reported(lab: Lab) -> None:
+    lab.loop_delay.record(0.0, 0.5)
+    lab.loop_delay.record(0.1, 0.25)
     assert lab.value("output_connected", output="zenoh") == 1
     assert lab.value("loop_delay_seconds") == 0.25
     assert lab.value("loop_delay_max_seconds") == 0.5
@@ -167,19 +167,19 @@ async def test_outputs_delay_and_versions_are_told(lab: Lab) -> None:
     assert versions.keys() == {"version", "python", "zenoh", "lcm"}
 
 
-async def test_the_process_is_told_under_the_usual_names(lab: Lab) -> None:
-    told = {sample.name: sample.value for family in lab.families() for sample in family.samples}
-    assert told["process_cpu_seconds_total"] > 0
-    assert told["process_resident_memory_bytes"] > 1_000_000
+async def test_process_metrics_have_their_usual_names(lab: Lab) -> None:
+    samples = {sample.name: sample.value for family in lab.families() for sample in family.samples}
+    assert samples["process_cpu_seconds_total"] > 0
+    assert samples["process_resident_memory_bytes"] > 1_000_000
 
 
-async def test_what_strangers_send_makes_no_series(lab: Lab) -> None:
+async def test_texts_from_the_network_add_no_series(lab: Lab) -> None:
     def names() -> set[tuple[str, ...]]:
         return {
             (sample.name, *sample.labels.values()) for family in lab.families() for sample in family.samples
         }
 
     before = names()
-    lab.markers.note_error("whatever a server says")
+    lab.markers.note_error("a text from a server")
     lab.markers.limit("the server refused something")
     assert names() == before

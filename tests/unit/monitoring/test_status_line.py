@@ -1,4 +1,4 @@
-"""The line for people: one source with its streams, and outputs with a problem."""
+"""The status line of a source and its streams, and of outputs with a problem."""
 
 import pytest
 
@@ -27,22 +27,22 @@ TWO = SourceSettings(
         (StreamState.WAITING, 0, "lab: waiting for 192.0.2.9:3020"),
         (StreamState.WAITING, 1, "lab: waiting for 192.0.2.9:3020, 1 try"),
         (StreamState.CONNECTING, 12, "lab: waiting for 192.0.2.9:3020, 12 tries"),
-        (StreamState.HANDSHAKING, 1, "lab: connected to 192.0.2.9:3020, shaking hands"),
-        (StreamState.IDLE, 0, "lab: connected to 192.0.2.9:3020, no frames asked for"),
-        (StreamState.NO_MEASUREMENT, 0, "lab: connected to 192.0.2.9:3020, no measurement runs"),
-        (StreamState.STALLED, 0, "lab: nothing comes from 192.0.2.9:3020"),
+        (StreamState.HANDSHAKING, 1, "lab: connected to 192.0.2.9:3020, handshake in progress"),
+        (StreamState.IDLE, 0, "lab: connected to 192.0.2.9:3020, no frames requested"),
+        (StreamState.NO_MEASUREMENT, 0, "lab: connected to 192.0.2.9:3020, no measurement running"),
+        (StreamState.STALLED, 0, "lab: no frames from 192.0.2.9:3020"),
     ],
 )
-def test_every_state_has_words(state: StreamState, tries: int, line: str) -> None:
+def test_every_state_has_a_text(state: StreamState, tries: int, line: str) -> None:
     assert source_line(LAB, [(StreamStatus("3d", state=state, tries=tries), 199.96)]) == line
 
 
-def test_streams_in_one_state_are_told_once() -> None:
+def test_streams_with_the_same_text_are_combined() -> None:
     waiting = [(StreamStatus(name, tries=3), 0.0) for name in ("3d", "analog")]
     assert source_line(TWO, waiting) == "lab: waiting for 192.0.2.9:3020, 3 tries"
 
 
-def test_streams_in_different_states_are_told_apart() -> None:
+def test_streams_with_different_texts_are_listed_by_components() -> None:
     streams = [
         (StreamStatus("3d", state=StreamState.STREAMING), 200.0),
         (StreamStatus("analog", state=StreamState.STREAMING), 2000.0),
@@ -50,12 +50,12 @@ def test_streams_in_different_states_are_told_apart() -> None:
     assert source_line(TWO, streams) == "lab: 3d streaming 200.0 Hz, analog streaming 2000.0 Hz"
 
 
-def test_outputs_are_told_while_they_cannot_send() -> None:
+def test_only_outputs_that_cannot_send_have_a_line() -> None:
     health = {"zenoh": OutputHealth(False, "no router"), "lcm": OutputHealth(True)}
     assert output_lines(health.items()) == ["zenoh: no router"]
 
 
-def test_tries_count_from_the_last_handshake() -> None:
+def test_tries_are_counted_since_the_last_handshake() -> None:
     status = StreamStatus("3d")
     for happened in (StreamInput.DIAL, StreamInput.ENDED, StreamInput.DIAL):
         status.move(happened, "")
