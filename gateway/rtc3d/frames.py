@@ -1,14 +1,9 @@
-"""Data frames (§7.1): split into components, recognised by how the ones before were laid out, built.
-
-Frame after frame of a stream has the same components with as many items, so nothing but numbers, times
-and items differs. ``split_frame`` reads a frame field by field; a template of the ``Layout`` that it finds
-recognises the next ones by comparing all that stays in one go. Contents are cut out when they are asked for.
-"""
+"""Data frames (§7.1): split into components, and built from them."""
 
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from functools import lru_cache
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 from gateway.errors import FrameError
 from gateway.rtc3d.components import (
@@ -21,15 +16,10 @@ from gateway.rtc3d.components import (
     Component,
     ComponentType,
 )
-from gateway.rtc3d.packets import HEADER, PacketType
 
 _SIZE_AND_TYPE: Final = {"big": struct.Struct(">II"), "little": struct.Struct("<II")}
 _COUNT: Final = {"big": struct.Struct(">I"), "little": struct.Struct("<I")}
 _ITEM_BYTES: Final = {int(component): (component, dtype.itemsize) for component, dtype in ITEM_DTYPES.items()}
-_Unpack = Callable[[bytes, int], tuple[Any, ...]]
-
-_KEY_BYTES: Final = 12  # a packet's size and type, and the frame's component count
-_MAX_LAYOUTS: Final = 32
 
 
 class ComponentLayout(NamedTuple):
@@ -51,8 +41,7 @@ class _Header(NamedTuple):
 class Layout:
     """All that frames laid out alike have in common; ``layout_of`` gives the same object for the same layout.
 
-    ``parts`` are the known components in their order, ``unknown_types`` the types of those skipped, and
-    ``packet_bytes`` is the size of the whole packet.
+    ``parts`` are the known components in their order, ``unknown_types`` the types of those skipped.
     """
 
     def __init__(self, byte_order: ByteOrder, headers: tuple[_Header, ...]) -> None:
@@ -61,19 +50,16 @@ class Layout:
         self.first_type = self.parts[0].type if self.parts else None
         """Of the first known component; None in a frame without any."""
         self.unknown_types = tuple(header.type for header in headers if header.part is None)
-        self.packet_bytes = _KEY_BYTES + sum(header.size for header in headers)
         self.number_and_time = NUMBER_AND_TIME[byte_order].unpack_from
         """Called with a component's content: its frame number and time stamp in µs."""
-        self.key = HEADER.pack(self.packet_bytes, PacketType.DATA) + _COUNT[byte_order].pack(len(headers))
-        """The first 12 bytes of the packets: size, type, component count."""
         self.headers = headers
         """What stays of every component's header, those of unknown type included."""
         self.spans = tuple(_spans(headers))
-        """Where in the packet each known component's content begins and ends."""
+        """Where in the body each known component's content begins and ends."""
 
 
 def _spans(headers: tuple[_Header, ...]) -> Iterator[tuple[int, int]]:
-    start = _KEY_BYTES
+    start = 4
     for size, _, part in headers:
         if part is not None:
             yield start + 8, start + size
@@ -84,24 +70,22 @@ layout_of = lru_cache(256)(Layout)
 
 
 class Frame:
-    """A data frame: its layout, and ``data`` with its packet at ``start``, which is cut when asked for.
+    """A data frame: its layout, and the packet's ``body``, from which contents are cut when asked for.
 
-    What a known component holds after size and type is its content: frame number, time stamp, count
-    and items, in the layout's byte order. ``data`` may hold more; it is kept as long as the frame is.
+    A component's content is what follows its size and type: frame number, time stamp, count and items,
+    in the layout's byte order.
     """
 
-    __slots__ = ("_data", "_start", "layout")
+    __slots__ = ("body", "layout")
 
-    def __init__(self, layout: Layout, data: bytes, start: int) -> None:
+    def __init__(self, layout: Layout, body: bytes) -> None:
         self.layout = layout
-        self._data = data
-        self._start = start
+        self.body = body
 
     def content(self, index: int) -> bytes:
         """Return the content of the known component at ``index``."""
-        first, end = self.layout.spans[index]
-        start = self._start
-        return self._data[start + first : start + end]
+        start, end = self.layout.spans[index]
+        return self.body[start:end]
 
     @property
     def contents(self) -> tuple[bytes, ...]:
@@ -112,7 +96,7 @@ class Frame:
     def number_and_time(self) -> tuple[int, int]:
         """Frame number and time stamp in µs of the first known component; there must be one."""
         layout = self.layout
-        return layout.number_and_time(self._data, self._start + layout.spans[0][0])
+        return layout.number_and_time(self.body, layout.spans[0][0])
 
     @property
     def components(self) -> tuple[Component, ...]:
@@ -138,78 +122,6 @@ class Frame:
     def unknown_types(self) -> tuple[int, ...]:
         """The types of the components that were skipped as unknown."""
         return self.layout.unknown_types
-
-
-class _Template:
-    """Recognises the packets of one layout."""
-
-    def __init__(self, layout: Layout) -> None:
-        order = ">" if layout.byte_order == "big" else "<"
-        constants_at = f"{order}QI"
-        example = layout.key
-        for size, kind, part in layout.headers:
-            if part is None:
-                constants_at += f"Q{size - 8}x"
-                example += struct.pack(f"{order}II{size - 8}x", size, kind)
-            else:
-                constants_at += f"Q12xI{size - HEADER_BYTES}x"
-                example += struct.pack(f"{order}II12xI{size - HEADER_BYTES}x", size, kind, part.num_items)
-        self.layout = layout
-        self.packet_bytes = layout.packet_bytes
-        self._constants_at: _Unpack = struct.Struct(constants_at).unpack_from
-        self._constants = self._constants_at(example, 0)
-        """What is the same in every packet of this layout: key, sizes with types, counts."""
-
-    def find(self, data: bytes, start: int) -> Frame | None:
-        """Return the frame in the packet at ``start``; None if it is laid out otherwise.
-
-        The packet's ``packet_bytes`` must be there. One call of struct does it: a dense frame takes 0.3 µs,
-        ``split_frame`` 4 µs.
-        """
-        if self._constants_at(data, start) != self._constants:
-            return None
-        return Frame(self.layout, data, start)
-
-
-class KnownLayouts:
-    """The layouts of a connection's frames so far, at most 32: with no, one or two events, for example."""
-
-    def __init__(self) -> None:
-        self._by_key: dict[bytes, _Template] = {}
-        self._newest: _Template | None = None
-
-    @property
-    def newest_bytes(self) -> int:
-        """The size of the packets laid out like the newest; 0 before the first."""
-        return 0 if self._newest is None else self._newest.packet_bytes
-
-    def learn(self, layout: Layout) -> None:
-        """Keep a layout; when there are too many all others are forgotten."""
-        template = self._by_key.get(layout.key)
-        if template is None or template.layout is not layout:
-            if len(self._by_key) >= _MAX_LAYOUTS:
-                self._by_key.clear()
-            template = self._by_key[layout.key] = _Template(layout)
-        self._newest = template
-
-    def cut(self, data: bytes, start: int, frames: list[Any]) -> int:
-        """Append the frames that are in the packets from ``start`` on and return where these end.
-
-        That is at the first packet which is unfinished, no frame, or laid out as none before.
-        """
-        total = len(data)
-        template = self._newest
-        while template is not None and total - start >= template.packet_bytes:
-            frame = template.find(data, start)
-            if frame is not None:
-                frames.append(frame)
-                start += template.packet_bytes
-            else:
-                known = self._by_key.get(data[start : start + _KEY_BYTES])
-                if known is template:  # looked alike, and is not
-                    break
-                template = known
-        return start
 
 
 def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
@@ -244,7 +156,7 @@ def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
         start = end
     if start != total:
         raise FrameError(f"{total - start} bytes follow the last of the frame's {component_count} components")
-    return Frame(layout_of(byte_order, tuple(headers)), body, -HEADER.size)
+    return Frame(layout_of(byte_order, tuple(headers)), body)
 
 
 def _part(kind: int, size: int, count: int) -> ComponentLayout | None:

@@ -223,12 +223,9 @@ class Session:
         """Take bytes; the straight path from here to the outputs is calls, not tasks."""
         utime = now_utime()
         self._status.bytes_in += len(data)
-        frames: list[Frame] = []
-        for event in self._connection.receive(data):
-            if type(event) is Frame:
-                frames.append(event)
-            else:
-                self._on_event(event)
+        frames, events = self._connection.receive(data)
+        for event in events:
+            self._on_event(event)
         if self._connection.state is not self._seen:
             self._on_state()
         if frames:

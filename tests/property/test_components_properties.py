@@ -16,8 +16,8 @@ from gateway.rtc3d.components import (
     big_endian_content,
     build_component,
 )
-from gateway.rtc3d.frames import Frame, KnownLayouts, build_frame, byte_order_of, split_frame
-from tests.servers import packet
+from gateway.rtc3d.frame_reader import FrameReader
+from gateway.rtc3d.frames import Frame, build_frame, byte_order_of, split_frame
 from tests.strategies import damaged
 from tests.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME, ByteOrder
 
@@ -245,27 +245,23 @@ def test_any_bytes_have_a_byte_order_in_which_they_make_sense_or_give_a_frame_er
         assert found == expected or not makes_sense[expected]
 
 
-# Layouts -------------------------------------------------------------------------------------
-
-
 @settings(max_examples=300)
 @given(any_bodies, st.data(), orders)
-def test_a_layout_recognises_what_is_split_alike_and_nothing_else(
+def test_a_frame_is_read_alike_whatever_frames_came_before_it(
     body: bytes, data: st.DataObject, order: ByteOrder
 ) -> None:
-    split = split_or_none(body, order)
-    if split is None:
-        return
-    # Mostly a changed byte or two: in what may differ, or in what may not.
+    reader = FrameReader(order)
+    # Mostly a changed byte or two: in what may differ between frames of a layout, or in what may not.
     other = bytearray(body)
-    for _ in range(data.draw(st.integers(0, 2))):
+    for _ in range(data.draw(st.integers(0, 2)) if other else 0):
         other[data.draw(st.integers(0, len(other) - 1))] = data.draw(st.integers(0, 255))
-    layouts = KnownLayouts()
-    layouts.learn(split.layout)
-    found: list[Frame] = []
-    layouts.cut(packet(3, bytes(other)), 0, found)
-    expected = split_or_none(bytes(other), order)
-    if expected is None or expected.layout is not split.layout:
-        assert not found
-    else:
-        assert [frame.components for frame in found] == [expected.components]
+    for each in (body, bytes(other), body):
+        expected = split_or_none(each, order)
+        try:
+            read = reader.read(each)
+        except FrameError:
+            assert expected is None
+        else:
+            assert expected is not None
+            assert read.layout is expected.layout
+            assert read.components == expected.components

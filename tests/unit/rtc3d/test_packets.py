@@ -105,16 +105,6 @@ def test_a_body_stays_as_it_was_when_more_is_fed() -> None:
     assert packet.body == b"abcd"
 
 
-def test_an_unfinished_packet_can_be_taken_by_others() -> None:
-    reader = PacketReader()
-    reader.feed(PACKETS[1].packet + header(12, 3) + b"ab")
-    assert (reader.unfinished, reader.missing_bytes) == (header(12, 3) + b"ab", 2)
-    reader.skip_unfinished(2)
-    assert (reader.unfinished, reader.missing_bytes, reader.is_between_packets) == (b"", 0, True)
-    assert reader.offset == 20 + 12
-    assert reader.feed(PACKETS[1].packet) == [Packet(PACKETS[1].type, PACKETS[1].body)]
-
-
 # Bounds of the size field --------------------------------------------------------------------
 
 

@@ -1,8 +1,19 @@
 """Frames put together by hand, and what the codec makes of them."""
 
+import pytest
+
 from gateway.rtc3d.components import Component
 from gateway.rtc3d.frames import split_frame
-from tests.vectors import ByteOrder
+from tests.vectors import EMPTY_FRAME, FRAME_WITH_UNKNOWN, FULL_FRAME, ByteOrder
+
+bodies_of_both_orders = pytest.mark.parametrize(
+    ("body", "order"),
+    [
+        (frames[order], order)
+        for frames in (FULL_FRAME, FRAME_WITH_UNKNOWN, EMPTY_FRAME)
+        for order in ("big", "little")
+    ],
+)
 
 
 def frame(order: ByteOrder, *components: bytes, count: int | None = None) -> bytes:

@@ -1,0 +1,81 @@
+"""A frame that repeats the layout of an earlier one is read as any other frame is."""
+
+import struct
+
+import numpy as np
+import pytest
+
+from gateway.errors import FrameError
+from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, build_component
+from gateway.rtc3d.frame_reader import FrameReader
+from gateway.rtc3d.frames import split_frame
+from tests.unit.rtc3d.wire import bodies_of_both_orders, frame
+from tests.vectors import EMPTY_FRAME, FULL_FRAME, MARKERS, ByteOrder
+
+MARKERS_FRAME = frame("big", MARKERS.wire["big"])
+
+
+def reader_after(*bodies: bytes, order: ByteOrder = "big") -> FrameReader:
+    reader = FrameReader(order)
+    for body in bodies:
+        reader.read(body)
+    return reader
+
+
+@bodies_of_both_orders
+def test_the_first_and_the_next_frame_of_a_layout_are_read_alike(body: bytes, order: ByteOrder) -> None:
+    reader = FrameReader(order)
+    expected = split_frame(body, order)
+    for _ in range(2):
+        read = reader.read(bytes(bytearray(body)))
+        assert read.layout is expected.layout
+        assert read.components == expected.components
+        assert read.unknown_types == expected.unknown_types
+
+
+def test_numbers_times_and_items_may_differ() -> None:
+    wire = bytearray(MARKERS.wire["big"])
+    wire[8:20] = struct.pack(">iq", -7, 2**40)
+    wire[24:] = bytes(len(wire) - 24)
+    read = reader_after(MARKERS_FRAME).read(frame("big", bytes(wire)))
+    assert read.layout is split_frame(MARKERS_FRAME, "big").layout
+    assert read.number_and_time == (-7, 2**40)
+    assert read.contents == (bytes(wire[8:]),)
+
+
+# Component count, and the component's size, type and count of items.
+@pytest.mark.parametrize("offset", [3, 7, 11, 27])
+def test_a_frame_in_which_anything_else_differs_is_not_taken_for_the_same_layout(offset: int) -> None:
+    body = bytearray(MARKERS_FRAME)
+    body[offset] ^= 2
+    with pytest.raises(FrameError):
+        reader_after(MARKERS_FRAME).read(bytes(body))
+
+
+def test_two_layouts_of_the_same_size_are_told_apart() -> None:
+    bodies = [
+        frame("big", build_component(kind, 1, 1, np.zeros(count, ITEM_DTYPES[kind])))
+        for kind, count in ((ComponentType.MARKERS, 2), (ComponentType.TOOLS, 1))
+    ]
+    reader = FrameReader("big")
+    read = [reader.read(body).layout for body in bodies * 2]
+    assert read == [split_frame(body, "big").layout for body in bodies * 2]
+
+
+def test_any_number_of_layouts_may_follow_each_other() -> None:
+    bodies = [
+        frame("big", build_component(ComponentType.ANALOG, 1, 1, np.zeros(count, ">f4")))
+        for count in range(100)
+    ]
+    reader = reader_after(*bodies)
+    assert [reader.read(body).layout.parts[0].num_items for body in bodies] == list(range(100))
+
+
+def test_a_frame_in_the_other_byte_order_is_refused() -> None:
+    with pytest.raises(FrameError):
+        reader_after(FULL_FRAME["big"]).read(FULL_FRAME["little"])
+
+
+def test_a_frame_too_short_for_its_component_count_is_refused() -> None:
+    with pytest.raises(FrameError, match="too short"):
+        reader_after(EMPTY_FRAME["big"]).read(b"\0\0\0")
