@@ -1,16 +1,16 @@
-"""What the doctor finds, for tests: of servers on this machine, with Zenoh and LCM that do not leave it."""
+"""Running the doctor in tests: servers, Zenoh and LCM stay on this machine."""
 
 from typing import Any
 
 from gateway.config.settings import LcmSettings, Settings, SourceSettings, StreamSettings, ZenohSettings
-from gateway.doctor.examination import examine
-from gateway.doctor.finding import Finding, Result
+from gateway.doctor.all_checks import run_checks
+from gateway.findings import Finding, Result
 
 SECONDS = 0.3
 
 
 class Findings:
-    """What the doctor found, by subject and check."""
+    """The doctor's findings, by subject and check."""
 
     def __init__(self, findings: list[Finding]) -> None:
         self.all = findings
@@ -19,17 +19,17 @@ class Findings:
         [finding] = [each for each in self.all if (each.subject, each.check) == (subject, check)]
         return finding
 
-    def red(self, subject: str = "lab") -> list[str]:
-        return [each.check for each in self.all if each.subject == subject and each.result is Result.RED]
+    def failing(self, subject: str = "lab") -> list[str]:
+        return [each.check for each in self.all if each.subject == subject and each.result is Result.FAILING]
 
-    def reasons(self, *checks: str, subject: str = "lab") -> set[str]:
-        """Return why these were not tested."""
+    def not_tested(self, *checks: str, subject: str = "lab") -> set[str]:
+        """Return why these checks were not made."""
         findings = [self.of(check, subject) for check in checks]
         assert {finding.result for finding in findings} == {Result.NOT_TESTED}
         return {finding.found for finding in findings}
 
 
-async def found(
+async def run_doctor(
     *sources: SourceSettings,
     zenoh_settings: ZenohSettings | None = None,
     lcm: LcmSettings | None = None,
@@ -40,7 +40,7 @@ async def found(
         zenoh=zenoh_settings or ZenohSettings(enabled=False),
         lcm=lcm or LcmSettings(url="memq://"),
     )
-    return Findings([finding async for finding in examine(settings, "lab.yaml", seconds)])
+    return Findings([finding async for finding in run_checks(settings, "lab.yaml", seconds)])
 
 
 def lab(port: int, *streams: StreamSettings, **keys: Any) -> SourceSettings:

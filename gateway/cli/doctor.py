@@ -8,7 +8,7 @@ import uvloop
 from rich.console import Console
 
 from gateway.cli.options import ConfigOption, ServerOption, configuration_from_options
-from gateway.doctor.examination import examine, without_settings
+from gateway.doctor.all_checks import run_checks, run_checks_without_settings
 from gateway.doctor.report import Report
 from gateway.errors import ConfigError
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
@@ -30,23 +30,23 @@ def doctor(
     """
     set_up_log(LogLevel.ERROR, LogFormat.TEXT)  # the findings contain everything that is a warning
     report = Report(Console(quiet=as_json))
-    uvloop.run(_examine(report, config, server, seconds))
+    uvloop.run(_report_findings(report, config, server, seconds))
     if as_json:
         print(report.as_json())
-    if not report.is_good:
+    if not report.is_ok:
         raise typer.Exit(1)
 
 
-async def _examine(report: Report, config: Path | None, server: str | None, seconds: float) -> None:
+async def _report_findings(report: Report, config: Path | None, server: str | None, seconds: float) -> None:
     if config is None and server is None and _INSTALLED_CONFIG.exists():
         config = _INSTALLED_CONFIG
     try:
         settings = configuration_from_options(config, server).settings
     except ConfigError as error:
-        for finding in without_settings(error):
+        for finding in run_checks_without_settings(error):
             report.add(finding)
     else:
         origin = str(config or server or "environment")
-        async for finding in examine(settings, origin, seconds):
+        async for finding in run_checks(settings, origin, seconds):
             report.add(finding)
     report.end()

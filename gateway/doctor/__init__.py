@@ -1,1 +1,1 @@
-"""``rtc3d-gateway doctor``: looks layer by layer for what keeps data from flowing, and says what to do."""
+"""The doctor: checks every layer between a server and the subscribers, and says how to repair faults."""

@@ -1,9 +1,10 @@
-"""What is seen of one stream while the doctor watches it: rates, sizes, markers in view."""
+"""What the doctor observes of one stream: rates, message sizes, which markers and tools are in view."""
 
 import numpy as np
 import numpy.typing as npt
 
 from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.findings import MessageLoad
 from gateway.messages.splice import ITEMS_OFFSET
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import Frame
@@ -13,86 +14,92 @@ from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
 
 
-class ComponentSeen:
-    """One component's frames: how many, when, how large, and which of their items are in view."""
+class ObservedComponent:
+    """The frames of one component: how many, when, how large, and which of their items are in view."""
 
     def __init__(self) -> None:
-        self.frames = 0
-        self.message_bytes = 0
-        """The largest message that this component makes on Zenoh and LCM."""
+        self._frames = 0
+        self._largest_message_bytes = 0
         self._items = 0
         self._visible_items = 0
-        self._visible: npt.NDArray[np.bool_] = np.zeros(0, np.bool_)
+        self._was_visible: npt.NDArray[np.bool_] = np.zeros(0, np.bool_)
         self._timestamps_us: list[int] = []
         self._first_utime = self._last_utime = 0
 
     def add(self, component: Component, utime: int) -> None:
-        """Count one frame of this component, which came at ``utime``."""
+        """Count one frame with this component, which arrived at ``utime`` (µs since the Unix epoch)."""
         self._first_utime = self._first_utime or utime
         self._last_utime = utime
-        self.frames += 1
+        self._frames += 1
         self._timestamps_us.append(component.timestamp_us)
-        size = ITEMS_OFFSET + component.num_items * component.item_bytes
-        self.message_bytes = max(self.message_bytes, size)
+        message_bytes = ITEMS_OFFSET + component.num_items * component.item_bytes
+        self._largest_message_bytes = max(self._largest_message_bytes, message_bytes)
         if component.type in {ComponentType.MARKERS, ComponentType.TOOLS}:
-            self._look(component)
+            self._count_visible(component)
 
-    def _look(self, component: Component) -> None:
+    def _count_visible(self, component: Component) -> None:
         items = component.items()
-        missing = np.isnan(items["x"]) | np.isnan(items["y"]) | np.isnan(items["z"])  # any (field note 7)
-        visible = ~missing
+        # A NaN in any coordinate means missing (field note 7).
+        visible = ~(np.isnan(items["x"]) | np.isnan(items["y"]) | np.isnan(items["z"]))
         self._items += len(visible)
         self._visible_items += int(np.count_nonzero(visible))
-        if len(visible) != len(self._visible):
-            self._visible = np.zeros(len(visible), np.bool_)  # another layout: seen anew
-        self._visible |= visible
+        if len(visible) != len(self._was_visible):  # the layout has changed: start again
+            self._was_visible = np.zeros(len(visible), np.bool_)
+        self._was_visible |= visible
 
     @property
     def rate_hz(self) -> float:
-        """Frames per second, by the server's time stamps if they can be believed, else as they came.
+        """Frames per second, by the server's time stamps if they are plausible, else by arrival times.
 
-        Time stamps do not see the network, nor a pause of this program; but some servers' stand still,
-        jump, or are no microseconds (field note 11). 0 with fewer than two frames.
+        Time stamps are better because delays of the network or of this program do not affect them. But
+        the time stamps of some servers stand still, jump, or are not in microseconds (field note 11).
+        0 with fewer than two frames.
         """
-        gaps = self.frames - 1
+        gaps = self._frames - 1
         span_s = (self._last_utime - self._first_utime) / 1e6
-        came_hz = gaps / span_s if gaps > 0 and span_s > 0 else 0.0
+        arrival_hz = gaps / span_s if gaps > 0 and span_s > 0 else 0.0
         steps_us = np.diff(np.array(self._timestamps_us, np.int64))
         if gaps < 1 or bool(np.any(steps_us <= 0)):
-            return came_hz
-        stamped_hz = gaps * 1e6 / float(steps_us.sum())
-        return stamped_hz if not came_hz or 0.5 < stamped_hz / came_hz < 2 else came_hz
+            return arrival_hz
+        timestamp_hz = gaps * 1e6 / float(steps_us.sum())
+        is_plausible = not arrival_hz or 0.5 < timestamp_hz / arrival_hz < 2
+        return timestamp_hz if is_plausible else arrival_hz
+
+    @property
+    def message_load(self) -> MessageLoad:
+        """The messages that the gateway would publish for this component."""
+        return MessageLoad(self.rate_hz, self._largest_message_bytes)
 
     @property
     def visible_share(self) -> float | None:
-        """The share of markers or tools in view, over all frames; None without any."""
+        """The share of markers or tools in view, over all frames; None if there were no items."""
         return self._visible_items / self._items if self._items else None
 
     @property
-    def never_visible(self) -> list[int]:
-        """The indices of those that were in view in no frame."""
-        return [int(index) for index in np.flatnonzero(~self._visible)]
+    def never_visible_indices(self) -> list[int]:
+        """The indices of markers or tools that were in view in no frame."""
+        return [int(index) for index in np.flatnonzero(~self._was_visible)]
 
 
-class StreamWatch:
-    """One stream of a source, in a connection of its own; make it in a running event loop."""
+class ObservedStream:
+    """One stream of a source, on its own connection. Create it in a running event loop."""
 
     def __init__(self, source: SourceSettings, stream: StreamSettings) -> None:
-        self.stream = stream
-        self.components = " ".join(component.key for component in stream.components)
-        self.status = StreamStatus(self.components, name=f"{source.name} ({self.components})")
+        self.settings = stream
+        self.component_keys = " ".join(component.key for component in stream.components)
+        self.status = StreamStatus(self.component_keys, name=f"{source.name} ({self.component_keys})")
         self.parsed: ParsedParameters | None = None
-        self.seen: dict[ComponentType, ComponentSeen] = {}
-        handlers = Handlers(self._take, self._learn, lambda _content: None)
+        self.observed: dict[ComponentType, ObservedComponent] = {}
+        handlers = Handlers(self._on_frames, self._on_parameters, lambda _content: None)
         self.session = Session(source, stream, self.status, handlers)
-        self.negotiation = StreamControl(source, stream, self.status, self.session)
+        self.control = StreamControl(source, stream, self.status, self.session)
 
-    def _learn(self, _xml: bytes, parsed: ParsedParameters) -> None:
+    def _on_parameters(self, _xml: bytes, parsed: ParsedParameters) -> None:
         self.parsed = parsed
 
-    def _take(self, frames: list[Frame], utime: int, _now_s: float) -> None:
+    def _on_frames(self, frames: list[Frame], utime: int, _now_s: float) -> None:
         self.status.frames_in += len(frames)
         for frame in frames:
             for component in frame.components:
-                if component.type in self.stream.components:
-                    self.seen.setdefault(component.type, ComponentSeen()).add(component, utime)
+                if component.type in self.settings.components:
+                    self.observed.setdefault(component.type, ObservedComponent()).add(component, utime)

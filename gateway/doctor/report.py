@@ -1,4 +1,4 @@
-"""How findings are shown: in colours and columns for people, as JSON for programs."""
+"""The doctor's report: columns and colours for people, JSON for programs."""
 
 import json
 import textwrap
@@ -7,21 +7,21 @@ from typing import Final
 from rich.console import Console
 from rich.text import Text
 
-from gateway.doctor.finding import Finding, Result
+from gateway.findings import Finding, Result
 
 _MARKS: Final = {
-    Result.GREEN: ("ok", "bold green"),
-    Result.RED: ("FAIL", "bold red"),
+    Result.PASSING: ("ok", "bold green"),
+    Result.FAILING: ("FAIL", "bold red"),
     Result.NOT_TESTED: ("skip", "yellow"),
 }
 _INDENT: Final = " " * 20
-"""Where texts begin: behind the mark, in column 3, and the check's name, in column 9."""
+"""The indentation of texts, which follow the mark (column 3) and the name of the check (column 9)."""
 
 _MAX_WIDTH: Final = 100
 
 
 class Report:
-    """Prints findings as they come, each subject's below its name."""
+    """Prints each finding when it is added, under the name of its subject."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -29,7 +29,7 @@ class Report:
         self.findings: list[Finding] = []
 
     def add(self, finding: Finding) -> None:
-        """Print one finding."""
+        """Add and print one finding."""
         self.findings.append(finding)
         if finding.subject != self._subject:
             self._subject = finding.subject
@@ -45,26 +45,26 @@ class Report:
             self._print(Text(_INDENT + ("→ " if number == 0 else "  ") + line, "bold"))
 
     def end(self) -> None:
-        """Print how many of each there are."""
+        """Print how many checks passed, failed and were not tested."""
         counts = {result: sum(each.result is result for each in self.findings) for result in Result}
         text = (
-            f"{counts[Result.GREEN]} ok, {counts[Result.RED]} to put right, "
+            f"{counts[Result.PASSING]} ok, {counts[Result.FAILING]} failed, "
             f"{counts[Result.NOT_TESTED]} not tested"
         )
-        self._print(Text(text, "bold green" if self.is_good else "bold red"))
+        self._print(Text(text, "bold green" if self.is_ok else "bold red"))
 
     @property
-    def is_good(self) -> bool:
-        """Whether nothing is red."""
-        return all(finding.result is not Result.RED for finding in self.findings)
+    def is_ok(self) -> bool:
+        """Whether no check failed."""
+        return all(finding.result is not Result.FAILING for finding in self.findings)
 
     def as_json(self) -> str:
-        """Return one object: ok, and findings with subject, check, result, found and remedy."""
+        """Return a JSON object: ok, and findings with subject, check, result, found and remedy."""
         findings = [{**finding._asdict(), "result": finding.result.value} for finding in self.findings]
-        return json.dumps({"ok": self.is_good, "findings": findings}, indent=2, ensure_ascii=False)
+        return json.dumps({"ok": self.is_ok, "findings": findings}, indent=2, ensure_ascii=False)
 
     def _wrapped(self, text: str) -> list[str]:
-        """Return the lines of ``text``; paths and addresses stay whole, to be copied."""
+        """Wrap ``text`` into lines. Paths and addresses are not split, so that they can be copied."""
         width = max(20, min(self._console.width, _MAX_WIDTH) - len(_INDENT) - 2)
         return [
             line

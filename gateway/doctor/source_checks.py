@@ -1,4 +1,4 @@
-"""Looks at one source: its name, TCP, the protocol, parameters, frames, their rate, markers in view."""
+"""Checks of one source: host name, TCP, protocol, parameters, frames, rate, visibility."""
 
 import asyncio
 import ipaddress
@@ -7,153 +7,162 @@ from collections.abc import AsyncIterator
 from typing import Final
 
 from gateway.config.settings import SourceSettings
-from gateway.doctor.finding import Finding, Patient
-from gateway.doctor.frame_findings import VISIBLE, frames_finding, rate_finding, visibility_finding
-from gateway.doctor.observation import StreamWatch
+from gateway.doctor.frame_checks import COMPONENTS_WITH_VISIBILITY, check_frames, check_visibility
+from gateway.doctor.observation import ObservedStream
+from gateway.doctor.rate_check import check_rate
 from gateway.errors import ConnectError, LinkError, PacketError
+from gateway.findings import Finding, MessageLoad, Result, Subject
 from gateway.rtc3d.parameters import Parameters
 from gateway.stream.state import StreamInput
 
 CHECKS: Final = ("name", "TCP", "protocol", "parameters", "frames", "rate", "visibility")
-"""The layers, each of which needs those before it."""
+"""The checks in order. Each of the first three is a condition for all that follow."""
 
 _PORTS: Final = "3020 is First Principles, 3030 WaveFront"
 
 
-class SourceExamination:
-    """One source under examination; the streams that it saw are in ``watches`` afterwards."""
+class SourceChecks:
+    """The checks of one source. Use once; create it in a running event loop."""
 
     def __init__(self, source: SourceSettings, seconds: float) -> None:
         self._source = source
         self._seconds = seconds
-        self._patient = Patient(source.name)
+        self._subject = Subject(source.name)
         self._server = f"{source.host}:{source.port}"
-        self.watches: list[StreamWatch] = []
-
-    async def findings(self) -> AsyncIterator[Finding]:
-        """Yield what is found, layer by layer; what needs a layer that is red is not tested."""
-        checks = list(CHECKS)
-        for look in (self._name, self._tcp, self._protocol):
-            finding = await look()
-            yield finding
-            checks.remove(finding.check)
-            if finding.remedy:
-                for check in checks:
-                    yield self._patient.untested(check, f"it needs {finding.check}, which failed")
-                break
-        else:
-            yield self._parameters()
-            await asyncio.sleep(self._seconds)
-            for watch in self.watches:
-                yield frames_finding(self._patient, watch, self._announced)
-                yield rate_finding(self._patient, watch, self._announced)
-                if VISIBLE.intersection(watch.stream.components):
-                    yield visibility_finding(self._patient, watch, self._announced)
-        await asyncio.gather(*(watch.session.close() for watch in self.watches))
+        self._streams: list[ObservedStream] = []
 
     @property
-    def _announced(self) -> Parameters | None:
-        parsed = next((watch.parsed for watch in self.watches if watch.parsed is not None), None)
+    def message_loads(self) -> list[MessageLoad]:
+        """The messages that the observed frames make, one entry per component."""
+        return [component.message_load for stream in self._streams for component in stream.observed.values()]
+
+    async def run(self) -> AsyncIterator[Finding]:
+        """Yield the findings, layer by layer. After a failing layer, the others are not tested."""
+        remaining = list(CHECKS)
+        for check in (self._check_name, self._check_tcp, self._check_protocol):
+            finding = await check()
+            yield finding
+            remaining.remove(finding.check)
+            if finding.result is Result.FAILING:
+                for name in remaining:
+                    yield self._subject.not_tested(name, f"it needs {finding.check}, which failed")
+                break
+        else:
+            yield self._check_parameters()
+            await asyncio.sleep(self._seconds)
+            for stream in self._streams:
+                yield check_frames(self._subject, stream, self._parameters)
+                yield check_rate(self._subject, stream, self._parameters)
+                if COMPONENTS_WITH_VISIBILITY.intersection(stream.settings.components):
+                    yield check_visibility(self._subject, stream, self._parameters)
+        await asyncio.gather(*(stream.session.close() for stream in self._streams))
+
+    @property
+    def _parameters(self) -> Parameters | None:
+        """The server's parameters as received on the first stream that got any."""
+        parsed = next((stream.parsed for stream in self._streams if stream.parsed is not None), None)
         return None if parsed is None else parsed.parameters
 
-    async def _name(self) -> Finding:
+    async def _check_name(self) -> Finding:
         host = self._source.host
         try:
             ipaddress.ip_address(host)
         except ValueError:
             pass
         else:
-            return self._patient.good("name", f"{host} is an address")
+            return self._subject.passing("name", f"{host} is an IP address")
         loop = asyncio.get_running_loop()
         try:
             async with asyncio.timeout(self._source.connect_timeout_s):
                 found = await loop.getaddrinfo(host, self._source.port, type=socket.SOCK_STREAM)
-        except OSError as error:  # TimeoutError is one, without a text
+        except OSError as error:  # includes TimeoutError, which has no text
             reason = error.strerror or f"no answer within {self._source.connect_timeout_s:g} s"
-            return self._patient.bad(
+            return self._subject.failing(
                 "name",
-                f"the host name {host!r} is not known: {reason}",
-                "Correct the source's host, or add the name to DNS or /etc/hosts; an address needs neither.",
+                f"the host name {host!r} cannot be resolved: {reason}",
+                "Correct the source's host, add the name to DNS or /etc/hosts, or use an IP address.",
             )
         addresses = dict.fromkeys(str(address[0]) for *_, address in found)
-        return self._patient.good("name", f"{host} is {', '.join(addresses)}")
+        return self._subject.passing("name", f"{host} resolves to {', '.join(addresses)}")
 
-    async def _tcp(self) -> Finding:
-        self.watches = [StreamWatch(self._source, stream) for stream in self._source.streams]
+    async def _check_tcp(self) -> Finding:
+        self._streams = [ObservedStream(self._source, stream) for stream in self._source.streams]
         try:
-            for watch in self.watches:
-                await watch.session.connect()
+            for stream in self._streams:
+                await stream.session.connect()
         except ConnectError as error:
             found, _, question = str(error).partition("; ")
-            return self._patient.bad("TCP", found, f"{question[:1].upper()}{question[1:]}")
-        count = len(self.watches)
+            return self._subject.failing("TCP", found, f"{question[:1].upper()}{question[1:]}")
+        count = len(self._streams)
         connections = "a connection" if count == 1 else f"{count} connections, one per stream"
-        return self._patient.good("TCP", f"{self._server} accepts {connections}")
+        return self._subject.passing("TCP", f"{self._server} accepts {connections}")
 
-    async def _protocol(self) -> Finding:
-        for watch in self.watches:
+    async def _check_protocol(self) -> Finding:
+        for stream in self._streams:
             try:
-                await watch.negotiation.start()
+                await stream.control.start()
             except LinkError as error:
-                return self._no_protocol(error)
-            watch.status.move(StreamInput.READY, self._server)
-            if not watch.status.bytes_in:
-                return self._patient.bad(
+                return self._protocol_failure(stream, error)
+            stream.status.move(StreamInput.READY, self._server)
+            if not stream.status.bytes_in:
+                return self._subject.failing(
                     "protocol",
-                    f"{self._server} accepts a connection and then says nothing",
-                    f"Point host and port at the RT server ({_PORTS}); if they are right, restart it.",
+                    f"{self._server} accepts a connection but sends nothing",
+                    f"Correct the source's host and port ({_PORTS}). If they are correct, restart the RT "
+                    "server.",
                 )
-        refused = list(dict.fromkeys(text for watch in self.watches for text in watch.status.limitations))
-        if not refused:
-            return self._patient.good("protocol", "the server answers every command")
-        return self._patient.good(
-            "protocol", f"the server is an RT server; the gateway does without this: {'; '.join(refused)}"
+        limitations = dict.fromkeys(text for stream in self._streams for text in stream.status.limitations)
+        if not limitations:
+            return self._subject.passing("protocol", "the server accepts every command")
+        return self._subject.passing(
+            "protocol",
+            f"the server is an RT server; the gateway works around this: {'; '.join(limitations)}",
         )
 
-    def _no_protocol(self, error: LinkError) -> Finding:
-        text = str(error)
+    def _protocol_failure(self, stream: ObservedStream, error: LinkError) -> Finding:
         if isinstance(error.__cause__, PacketError):
             begin = error.__cause__.begin.decode("latin-1")
-            words = "".join(letter if letter.isprintable() else "·" for letter in begin)
-            return self._patient.bad(
+            text = "".join(letter if letter.isprintable() else "·" for letter in begin)
+            return self._subject.failing(
                 "protocol",
-                f"what answers at {self._server} is no RT server; it begins with {words!r}",
-                f"Point host and port at the RT server: {_PORTS}.",
+                f"the program at {self._server} is not an RT server; its first bytes are {text!r}",
+                f"Correct the source's host and port: {_PORTS}.",
             )
-        if "refuses to stream" in text:
-            return self._patient.bad(
+        if stream.session.is_open:  # the only error that leaves the connection open
+            return self._subject.failing(
                 "protocol",
-                f"{self._server} refuses to stream in every form that the protocol has",
-                "Switch on the real-time output in the server's settings.",
+                f"{self._server} refuses every form of the StreamFrames command",
+                "Enable the real-time output in the server's settings.",
             )
-        return self._patient.bad(
+        return self._subject.failing(
             "protocol",
-            text,
-            "Is this the RT server's port, and does it take one more client? End other programs that are "
-            f"connected, and look into the server's own messages ({_PORTS}).",
+            str(error),
+            f"Check that this is the RT server's port ({_PORTS}) and that the server accepts one more "
+            "client. Close other programs that are connected to it, and read the server's own messages.",
         )
 
-    def _parameters(self) -> Finding:
-        [first, *_] = self.watches
+    def _check_parameters(self) -> Finding:
+        [first, *_] = self._streams
         if first.parsed is not None:
             repaired = f" (repaired: {first.parsed.recovered[0]})" if first.parsed.recovered else ""
-            return self._patient.good("parameters", _told(first.parsed.parameters) + repaired)
-        reasons = [text for text in first.status.limitations if "SendParameters" in text]
-        if reasons:
-            return self._patient.untested(
-                "parameters", f"{reasons[0]}; names, units and announced rates are unknown"
+            return self._subject.passing("parameters", _summary(first.parsed.parameters) + repaired)
+        refusals = [text for text in first.status.limitations if "SendParameters" in text]
+        if refusals:
+            return self._subject.not_tested(
+                "parameters", f"{refusals[0]}; names, units and configured rates are unknown"
             )
-        unread = [text for text in first.status.limitations if text.startswith("no parameters: ")]
-        return self._patient.bad(
+        prefix = "no parameters: "
+        reasons = [text for text in first.status.limitations if text.startswith(prefix)]
+        return self._subject.failing(
             "parameters",
-            f"the server's XML cannot be read: {unread[0].removeprefix('no parameters: ')}",
-            "The gateway streams without names and units. Look for odd characters in the names of markers "
-            "and tools on the server, or update its software.",
+            f"the server's XML cannot be read: {reasons[0].removeprefix(prefix)}",
+            "The gateway publishes data without names and units. Look for unusual characters in the names of "
+            "markers and tools on the server, or update the server's software.",
         )
 
 
-def _told(parameters: Parameters) -> str:
-    """Return what the server announces, in a few words."""
+def _summary(parameters: Parameters) -> str:
+    """Return for example "24 markers, 4 tools"."""
     parts = []
     if parameters.markers is not None:
         parts.append(_count(len(parameters.markers.markers), "marker"))
@@ -164,9 +173,9 @@ def _told(parameters: Parameters) -> str:
     if parameters.force is not None:
         parts.append(_count(len(parameters.force.plates), "force plate"))
     if parameters.events is not None:
-        parts.append(_count(len(parameters.events.events), "kind") + " of events")
-    return ", ".join(parts) or "the server announces nothing"
+        parts.append(_count(len(parameters.events.events), "event type"))
+    return ", ".join(parts) or "the server's parameters are empty"
 
 
-def _count(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
+def _count(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"

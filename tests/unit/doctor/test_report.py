@@ -3,10 +3,10 @@ import json
 
 from rich.console import Console
 
-from gateway.doctor.finding import Finding, Patient, Result
 from gateway.doctor.report import Report
+from gateway.findings import Finding, Result, Subject
 
-LAB = Patient("lab")
+LAB = Subject("lab")
 
 
 def shown(*findings: Finding, width: int = 60, color: bool = False) -> str:
@@ -19,14 +19,14 @@ def shown(*findings: Finding, width: int = 60, color: bool = False) -> str:
     return out.getvalue()
 
 
-def test_findings_stand_below_their_subject_in_columns() -> None:
+def test_findings_are_printed_in_columns_below_their_subject() -> None:
     findings = (
-        LAB.good("name", "[bold]127.0.0.1[/] is an address"),
-        LAB.bad(
+        LAB.passing("name", "[bold]127.0.0.1[/] is an address"),
+        LAB.failing(
             "TCP", "connection refused by 192.0.2.20:3020 :smile:", "Is the RT server running, and is it?"
         ),
-        LAB.untested("protocol", "it needs TCP, which failed"),
-        Patient("zenoh").good("link", "open"),
+        LAB.not_tested("protocol", "it needs TCP, which failed"),
+        Subject("zenoh").passing("link", "open"),
     )
     assert shown(*findings) == (
         "lab\n"
@@ -37,14 +37,14 @@ def test_findings_stand_below_their_subject_in_columns() -> None:
         "  skip  protocol    not tested: it needs TCP, which failed\n"
         "zenoh\n"
         "  ok    link        open\n"
-        "2 ok, 1 to put right, 1 not tested\n"
+        "2 ok, 1 failed, 1 not tested\n"
     )
 
 
-def test_lines_of_their_own_stay_so_and_long_words_stay_whole() -> None:
+def test_line_breaks_are_kept_and_long_words_are_not_split() -> None:
     path = "/etc/rtc3d-gateway/a-very-long-name-of-a-file.yaml:1:2:"
     text = shown(
-        LAB.bad(
+        LAB.failing(
             "file",
             f"{path} wrong\nlab.yaml:3:4: wrong",
             "Correct them all, one after the other, and check again.",
@@ -59,22 +59,22 @@ def test_lines_of_their_own_stay_so_and_long_words_stay_whole() -> None:
     ]
 
 
-def test_a_narrow_terminal_still_gets_it_all() -> None:
-    assert "connection" in shown(LAB.good("TCP", "connection " * 3), width=10)
+def test_a_narrow_terminal_still_gets_the_text() -> None:
+    assert "connection" in shown(LAB.passing("TCP", "connection " * 3), width=10)
 
 
-def test_red_is_red_and_green_green() -> None:
-    text = shown(LAB.good("name", "x"), LAB.bad("TCP", "x", "y"), color=True)
+def test_failing_is_red_and_passing_is_green() -> None:
+    text = shown(LAB.passing("name", "x"), LAB.failing("TCP", "x", "y"), color=True)
     assert "\x1b[1;32mok" in text
     assert "\x1b[1;31mFAIL" in text
-    assert "\x1b[1;31m1 ok, 1 to put right, 0 not tested" in text
+    assert "\x1b[1;31m1 ok, 1 failed, 0 not tested" in text
 
 
-def test_json_has_everything() -> None:
+def test_json_has_every_field_of_every_finding() -> None:
     report = Report(Console(quiet=True))
-    report.add(LAB.good("name", "ü"))
+    report.add(LAB.passing("name", "ü"))
     assert json.loads(report.as_json())["ok"] is True
-    report.add(LAB.bad("TCP", "x", "y"))
+    report.add(LAB.failing("TCP", "x", "y"))
     assert json.loads(report.as_json()) == {
         "ok": False,
         "findings": [
@@ -84,8 +84,8 @@ def test_json_has_everything() -> None:
     }
 
 
-def test_what_was_not_tested_is_not_bad() -> None:
+def test_a_check_that_was_not_made_does_not_fail() -> None:
     report = Report(Console(quiet=True))
-    report.add(LAB.untested("name", "of it"))
-    assert report.is_good
-    assert report.findings == [Finding("lab", "name", Result.NOT_TESTED, "of it")]
+    report.add(LAB.not_tested("name", "no frames"))
+    assert report.is_ok
+    assert report.findings == [Finding("lab", "name", Result.NOT_TESTED, "no frames")]

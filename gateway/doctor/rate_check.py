@@ -1,0 +1,88 @@
+"""Check of the rate at which one stream's components arrive."""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+from gateway.doctor.described import described_rate_hz
+from gateway.doctor.observation import ObservedStream
+from gateway.findings import Finding, Subject
+from gateway.rtc3d.commands import Frequency, FrequencyDivisor
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import Parameters
+
+_MIN_SHARE: Final = 0.9
+"""A component that arrives at a smaller share of its expected rate is too slow."""
+
+_Rates = Mapping[ComponentType, float]
+"""Rates in Hz."""
+
+
+def check_rate(subject: Subject, stream: ObservedStream, parameters: Parameters | None) -> Finding:
+    """Check that each component arrives at the server's rate, or at the lower rate that is configured."""
+    rates_hz: _Rates = {
+        component: observed.rate_hz
+        for component, observed in stream.observed.items()
+        if component is not ComponentType.EVENT and observed.rate_hz > 0
+    }
+    if not rates_hz:
+        return subject.not_tested("rate", "too few frames to measure the rate")
+    expected_hz = {} if parameters is None else _expected_rates_hz(stream, parameters)
+    found = f"{', '.join(_text(component, rates_hz, expected_hz) for component in rates_hz)} Hz"
+    compared = [component for component in rates_hz if component in expected_hz]
+    if not compared:
+        return subject.not_tested("rate", f"{found}; the server's parameters have no rate to compare with")
+    slow = [component for component in compared if rates_hz[component] < _MIN_SHARE * expected_hz[component]]
+    if not slow:
+        return subject.passing("rate", found)
+    if _is_limited_by_others(slow, rates_hz, expected_hz):
+        names = " and ".join(component.key for component in slow)
+        return subject.failing(
+            "rate",
+            found,
+            f"A stream is as fast as its slowest component. Move {names} to a stream of their own, or "
+            "configure a lower rate for this stream.",
+        )
+    return subject.failing(
+        "rate",
+        found,
+        "The server or the network is too slow. Check the server's real-time processing rate and load, the "
+        "cable and the switch, or configure a lower rate for the stream.",
+    )
+
+
+def _text(component: ComponentType, rates_hz: _Rates, expected_hz: _Rates) -> str:
+    """Return for example "3d 100 of 200"."""
+    expected = f" of {_number(expected_hz[component])}" if component in expected_hz else ""
+    return f"{component.key} {_number(rates_hz[component])}{expected}"
+
+
+def _number(rate_hz: float) -> str:
+    return f"{rate_hz:.1f}".removesuffix(".0")
+
+
+def _is_limited_by_others(slow: Sequence[ComponentType], rates_hz: _Rates, expected_hz: _Rates) -> bool:
+    """Return whether the slow components arrive exactly as fast as a slower component of the stream."""
+    others_hz = [expected_hz[other] for other in rates_hz if other in expected_hz and other not in slow]
+    return bool(others_hz) and all(
+        _MIN_SHARE * min(others_hz) <= rates_hz[component] <= min(others_hz) / _MIN_SHARE
+        for component in slow
+    )
+
+
+def _expected_rates_hz(stream: ObservedStream, parameters: Parameters) -> dict[ComponentType, float]:
+    """Return the rate at which each component should arrive, where the parameters say a rate.
+
+    A divisor divides the rate of the stream, which is that of its slowest component (§5.3.5).
+    """
+    rates_hz = {
+        component: rate
+        for component in stream.observed
+        if (rate := described_rate_hz(parameters, component)) is not None and rate > 0
+    }
+    match stream.settings.rate:
+        case Frequency(hz):
+            return {component: min(rate, hz) for component, rate in rates_hz.items()}
+        case FrequencyDivisor(divisor):
+            return {component: min(rates_hz.values()) / divisor for component in rates_hz}
+        case _:
+            return rates_hz
