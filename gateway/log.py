@@ -1,81 +1,87 @@
-"""How the log is written: what goes on failing is told once loudly, and records say what they belong to."""
+"""Logging for long-running work: persistent failures are logged once, and records carry their context."""
 
 import logging
-import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
+from time import monotonic
 from typing import Final
 
 FIELDS: Final = ("source", "stream", "peer")
-"""What a record may say of itself besides its text: the journal's and JSON's fields."""
+"""The context that a record can carry besides its text: fields in the journal and in JSON."""
 
 HOLD_S: Final = 5.0
-"""For FailureLog: how long every message must have gone well for the failures of some to be over."""
+"""For FailureLog: how long all messages must succeed before intermittent failures count as over."""
 
 _fields: ContextVar[Mapping[str, str]] = ContextVar("log fields")
 
 
 @contextmanager
 def log_fields(**fields: str) -> Iterator[None]:
-    """Give every record of the block these of FIELDS, and of the tasks and callbacks that it starts.
+    """Add these of FIELDS to every record of the block, and of the tasks and callbacks that it starts.
 
-    So a connection's records carry them without every call having to name them: the event loop runs
-    callbacks in the context that they were registered in.
+    The event loop runs a callback in the context in which it was registered. So all records of a
+    connection carry the fields, and no call has to name them.
     """
-    token = _fields.set({**_fields.get({}), **fields})
+    token = _fields.set({**current_log_fields(), **fields})
     try:
         yield
     finally:
         _fields.reset(token)
 
 
-class FieldsFilter(logging.Filter):
-    """Puts the fields that are set by ``log_fields`` on each record, as its attributes; for handlers."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Add the fields; every record passes."""
-        record.__dict__.update(_fields.get({}))
-        return True
+def current_log_fields() -> Mapping[str, str]:
+    """Return the fields that records get here."""
+    return _fields.get({})
 
 
 class FailureLog:
-    """Logs whether one thing works: the first failure WARNING, its repeats DEBUG, success INFO.
+    """Logs whether one thing works: the first failure as WARNING, repeats as DEBUG, recovery as INFO.
 
-    ``subject`` begins every line: "lab", "lcm". What fails by turns, as messages do, is over only when
-    it has worked for ``hold_s``: one failure more within it is a repeat.
+    ``subject`` begins every line: "lab", "lcm". With ``hold_s``, an intermittent failure is over only after
+    ``hold_s`` without a failure: until then each failure counts as a repeat.
     """
 
     def __init__(self, logger: logging.Logger, subject: str, hold_s: float = 0.0) -> None:
         self._logger = logger
         self._subject = subject
         self._hold_s = hold_s
-        self._times = 0
+        self._failures = 0
         self._first_s = self._last_s = 0.0
-        self.failing = False
-        """Whether a failure was told that is not over."""
+
+    @property
+    def failing(self) -> bool:
+        """Whether a failure was logged and its recovery was not."""
+        return self._failures > 0
 
     def failed(self, text: str) -> None:
-        """Tell that it failed, ``text`` saying what happened and what to do."""
-        self.failing = True
-        self._times += 1
-        self._last_s = time.monotonic()
-        if self._times == 1:
+        """Log a failure; ``text`` says what happened and what to do."""
+        self._failures += 1
+        self._last_s = monotonic()
+        if self._failures == 1:
             self._first_s = self._last_s
             self._logger.warning("%s: %s", self._subject, text)
         else:
-            self._logger.debug("%s: %s (failure %d in a row)", self._subject, text, self._times)
+            self._logger.debug("%s: %s (failure %d in a row)", self._subject, text, self._failures)
 
     def recovered(self, text: str) -> None:
-        """Tell that it works, and if it had failed, for how long it had not.
+        """If it was failing, log that it works again, with the duration; within ``hold_s`` do nothing.
 
-        Within ``hold_s`` of the last failure nothing is told: call again while ``failing``.
+        Cheap while nothing fails, so it can be called after each success.
         """
-        if self._times:
-            now_s = time.monotonic()
-            if now_s - self._last_s < self._hold_s:
-                return
-            text = f"{text}, after {now_s - self._first_s:.1f} s and {self._times} failures"
-            self._times = 0
-            self.failing = False
-        self._logger.info("%s: %s", self._subject, text)
+        if not self._failures:
+            return
+        now_s = monotonic()
+        if now_s - self._last_s >= self._hold_s:
+            duration_s = now_s - self._first_s
+            self._logger.info(
+                "%s: %s, after %.1f s and %d failures", self._subject, text, duration_s, self._failures
+            )
+            self._failures = 0
+
+    def succeeded(self, text: str) -> None:
+        """Log that it works, in any case; if it was failing, do as ``recovered`` does."""
+        if self._failures:
+            self.recovered(text)
+        else:
+            self._logger.info("%s: %s", self._subject, text)

@@ -137,11 +137,11 @@ class Source:
 
         return Callbacks(
             publish=self.fan_out.publish,
-            parameters=on_parameters,
-            connected=lambda: self._start(self.desk.fill()),
-            restarted=self._ask_parameters_again,
-            file=self._on_file,
-            listened=lambda: self.fan_out.listened(wanted),
+            on_parameters=on_parameters,
+            on_connected=lambda: self._start(self.desk.fill()),
+            on_restart=self._ask_parameters_again,
+            on_file=self._on_file,
+            has_subscribers=lambda: self.fan_out.listened(wanted),
         )
 
     def _on_change(self, xml: bytes, parsed: ParsedParameters) -> None:
@@ -208,7 +208,7 @@ class Source:
         for supervisor in self.supervisors:
             if supervisor.session is not None:
                 try:
-                    supervisor.session.record(start=start)
+                    supervisor.session.control_recording(start=start)
                 except LinkError:
                     continue
                 return True

@@ -11,7 +11,7 @@ _LOGGERS: Final = {"logger", "_log"}
 _LOUD_METHODS: Final = {"warning", "error", "exception", "critical"}
 """Methods of loggers that log at WARNING and above; ``log`` may, too."""
 
-_WARNING_METHODS: Final = {"failed", "limit", "_limit"}
+_WARNING_METHODS: Final = {"failed", "add_limitation"}
 """Methods that log their argument as WARNING, at least the first time."""
 
 _LOGGED_CLASSES: Final = {

@@ -1,7 +1,6 @@
-"""Finds and masks the secrets in a configuration.
+"""What is secret in a configuration, and how it is kept out of sight.
 
-All secrets are in Zenoh's configuration: passwords, and private keys given as text. The path of a key
-file is not a secret.
+Zenoh's own keys hold the secrets there are: passwords, and private keys as text. Their paths are none.
 """
 
 import re
@@ -9,31 +8,29 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 MASK: Final = "***"
-"""The replacement for a secret."""
+"""What stands where a secret is."""
 
 _SECRET_KEY: Final = re.compile(r"(?:.*_)?(?:password|passphrase|secret|private_key_(?:pem|base64|raw))")
-_HIDDEN_BY_ZENOH: Final = "private"
-"""In a plugin's configuration, Zenoh hides the value of this key from its admin space."""
+# Zenoh keeps what is below this key, in a plugin's configuration, out of its admin space.
+_PRIVATE: Final = "private"
 
-# An endpoint may contain configuration: tls/lab:7447#connect_private_key_base64=…;….
+# An endpoint may carry configuration: tls/lab:7447#connect_private_key_base64=…;….
 _IN_ENDPOINT: Final = re.compile(r"((?:password|private_key_(?:raw|base64|pem))=)[^;\s\"'\])]+")
 _IN_URL: Final = re.compile(r"(://[^/\s:@]*:)[^/\s@]+(?=@)")
 _PEM: Final = re.compile(
     r"-----BEGIN [A-Z ]*PRIVATE KEY-----.*?(?:-----END [A-Z ]*PRIVATE KEY-----|$)", re.DOTALL
 )
 
-_Location = tuple[str | int, ...]
+_Steps = tuple[str | int, ...]
 
 
 def is_secret_key(key: object) -> bool:
-    """Return whether the value of ``key`` is always a secret."""
-    return isinstance(key, str) and (
-        key == _HIDDEN_BY_ZENOH or _SECRET_KEY.fullmatch(key.lower()) is not None
-    )
+    """Return whether the value of ``key`` is a secret, whatever it looks like."""
+    return isinstance(key, str) and (key == _PRIVATE or _SECRET_KEY.fullmatch(key.lower()) is not None)
 
 
-def find_secrets(value: Any, location: _Location = ()) -> Iterator[tuple[_Location, Any]]:
-    """Yield each secret in nested mappings and lists, with its location of keys and indices."""
+def find_secrets(value: Any, location: _Steps = ()) -> Iterator[tuple[_Steps, Any]]:
+    """Yield each secret in nested mappings and lists, with the keys and indices that lead to it."""
     match value:
         case Mapping():
             for key, item in value.items():
@@ -50,7 +47,7 @@ def find_secrets(value: Any, location: _Location = ()) -> Iterator[tuple[_Locati
 
 
 def file_key_for(key: object) -> str:
-    """Return the key that takes a file's path where ``key`` takes its content; "" if there is none."""
+    """Return the key that takes the path of what ``key`` takes as text: connect_private_key, …; or ""."""
     match str(key).rpartition("_"):
         case (stem, "_", "base64"):
             return stem
@@ -60,7 +57,7 @@ def file_key_for(key: object) -> str:
 
 
 def mask_secrets(value: Any) -> Any:
-    """Return a copy of nested mappings and lists in which MASK replaces every secret."""
+    """Return a copy of nested mappings and lists with MASK for every secret."""
     match value:
         case Mapping():
             return {
@@ -75,7 +72,7 @@ def mask_secrets(value: Any) -> Any:
 
 
 def mask_secrets_in_text(text: str) -> str:
-    """Return ``text`` with MASK for passwords in URLs, for keys in endpoints and for PEM blocks."""
+    """Return ``text`` with MASK for passwords in URLs, for keys in endpoints, and for keys as PEM."""
     text = _PEM.sub(MASK, text)
     text = _IN_ENDPOINT.sub(rf"\g<1>{MASK}", text)
     return _IN_URL.sub(rf"\g<1>{MASK}", text)

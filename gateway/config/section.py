@@ -1,4 +1,4 @@
-"""The base class of all parts of the configuration: immutable, with readable validation errors."""
+"""What every part of the configuration shares: it is frozen, and tells mistakes in words of ours."""
 
 import difflib
 from collections.abc import Iterable, Mapping
@@ -18,28 +18,28 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from gateway.config.secrets import mask_secrets_in_text
 
 UNKNOWN_KEY: Final = "unknown_key"
-"""The error type of an unknown key; all other errors concern a value or its absence."""
+"""The type of the error that is in a key itself; all others are in a value, or in its absence."""
 
-_INVALID_VALUE: Final = "invalid_value"
+_MISTAKE: Final = "mistake"
 
 
 class Section(BaseModel):
-    """A mapping of the configuration: unknown keys are errors, and instances are immutable."""
+    """A mapping of the configuration: no other keys than its own, and nothing changes later."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     @model_validator(mode="wrap")
     @classmethod
-    def _reword_errors(cls, value: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
-        """Replace pydantic's texts for a wrong type, unknown keys and missing keys."""
+    def _tell_mistakes_in_our_words(cls, value: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
         known = ", ".join(cls.model_fields)
         if not isinstance(value, Mapping | cls):
-            found = f"found {describe(value)}"
-            raise validation_error(f"{found}; expected a mapping with any of the keys {known}")
+            raise validation_error(
+                f"found {describe(value)}; expected a mapping with any of the keys {known}"
+            )
         try:
             return validate(value)
         except ValidationError as error:
-            errors = []
+            mistakes = []
             for details in error.errors(include_url=False):
                 location, kind, text = details["loc"], details["type"], details["msg"]
                 if kind == "extra_forbidden":
@@ -47,18 +47,17 @@ class Section(BaseModel):
                     text = f"unknown key{spelling_hint(location[-1], cls.model_fields)}; known keys: {known}"
                 elif kind == "missing":
                     text = "missing; this key is required"
-                errors.append(_error_details(text, location, kind))
-            raise ValidationError.from_exception_data(cls.__name__, errors) from None
+                mistakes.append(_line_error(text, location, kind))
+            raise ValidationError.from_exception_data(cls.__name__, mistakes) from None
 
 
 def validation_error(text: str, *location: str | int) -> ValidationError:
-    """Return the error for a validator to raise; ``location`` is relative to the validated value."""
-    details = _error_details(text, location, _INVALID_VALUE)
-    return ValidationError.from_exception_data("configuration", [details])
+    """Return the error for a validator to raise; ``location`` counts from the value it was given."""
+    return ValidationError.from_exception_data("configuration", [_line_error(text, location, _MISTAKE)])
 
 
 def expects(what: str) -> WrapValidator:
-    """Return an annotation that replaces a type's error by "found …; expected ``what``"."""
+    """Return an annotation: a value refused by the type beside it was found, and ``what`` is accepted."""
 
     def check(value: object, validate: ValidatorFunctionWrapHandler) -> object:
         try:
@@ -66,7 +65,7 @@ def expects(what: str) -> WrapValidator:
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             if first["loc"]:
-                raise  # the error of an item inside the value, which has its own text
+                raise  # of an item inside the value, told in words of its own
             unquoted = first["type"] == "string_type" and isinstance(value, bool | int | float)
             hint = " (use quotes to make it text)" if unquoted else ""
             raise validation_error(f"found {describe(value)}{hint}; expected {what}") from None
@@ -75,7 +74,7 @@ def expects(what: str) -> WrapValidator:
 
 
 def describe(value: object) -> str:
-    """Return ``value`` for use in a sentence: printable, on one line, bounded, without passwords."""
+    """Return what was found, fit for a sentence: printable, on one line, bounded, without passwords."""
     match value:
         case None:
             return "nothing"
@@ -98,13 +97,13 @@ def join_or(words: Iterable[str]) -> str:
 
 
 def spelling_hint(word: object, known: Iterable[str]) -> str:
-    """Return " (did you mean 'x'?)" if ``word`` is similar to ``x``, one of ``known``, else ""."""
+    """Return " (did you mean 'x'?)" if ``word`` is nearly ``x``, one of ``known``; else nothing."""
     near = difflib.get_close_matches(str(word).lower()[:60], known, n=1)
     return f" (did you mean {near[0]!r}?)" if near else ""
 
 
-def _error_details(text: str, location: tuple[str | int, ...], kind: str) -> InitErrorDetails:
-    # The text is an argument of the template, not the template: it may contain braces.
+def _line_error(text: str, location: tuple[str | int, ...], kind: str) -> InitErrorDetails:
+    # The text is an argument, not the template: braces in it are to stay.
     return InitErrorDetails(
         type=PydanticCustomError(kind, "{text}", {"text": text}), loc=location, input=None
     )

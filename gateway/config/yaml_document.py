@@ -1,4 +1,4 @@
-"""Reads YAML into plain values and keeps the position of each, for error messages and ``config show``."""
+"""YAML text to plain values, and the position of each: for errors, and to tell where a value came from."""
 
 import re
 from dataclasses import dataclass
@@ -10,25 +10,25 @@ from gateway.config.section import describe
 from gateway.errors import ConfigError
 
 MAX_VALUES: Final = 10_000
-"""How many values a document may have; values that an alias repeats count again."""
+"""How many values a text may hold; what an alias repeats counts again."""
 
 MAX_DEPTH: Final = 32
-"""How deep values may be nested."""
+"""How many levels of values may be nested."""
 
 MAX_NUMBER_LENGTH: Final = 40
 """How many characters a number may have."""
 
 Location = tuple[str | int, ...]
-"""The keys and indices that lead to a value, such as ("sources", 0, "port")."""
+"""The keys and indices that lead to a value: ("sources", 0, "port")."""
 
 _YAML: Final = "tag:yaml.org,2002:"
 
 
 class Position(NamedTuple):
-    """The position of a key or value in a file or in an environment variable.
+    """Where a key or value stands: in a file, or in what has no lines, such as an environment variable.
 
     ``origin`` is the file's path or the variable's name. ``line`` and ``column`` count from 1; both are
-    0 in a variable, which has no lines.
+    0 where there are none.
     """
 
     origin: str
@@ -40,17 +40,17 @@ class Position(NamedTuple):
 
     @property
     def without_column(self) -> str:
-        """FILE:LINE, or the name of the variable."""
+        """FILE:LINE, or the variable's name."""
         return f"{self.origin}:{self.line}" if self.line else self.origin
 
     def error(self, location: Location, text: str) -> ConfigError:
-        """Return an error whose text is this position, the key at ``location`` and ``text``."""
+        """Return the error with this position, the key that ``location`` leads to, and ``text``."""
         key = key_path(location)
         return ConfigError(f"{self}: {key}{': ' if key else ''}{text}")
 
 
 class _Loader(yaml.SafeLoader):
-    """A SafeLoader that limits nesting to MAX_DEPTH, because composing nodes is recursive."""
+    """Makes nodes as SafeLoader does, nested to MAX_DEPTH only: it recurses, and Python's stack ends."""
 
     _depth = 0
 
@@ -66,30 +66,30 @@ class _Loader(yaml.SafeLoader):
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """The values of one YAML document and the position of each value and key; all keys are text."""
+    """The values of one YAML document, mappings with keys of text, and the position of each value and key."""
 
     values: Any
     positions: dict[Location, Position]
     key_positions: dict[Location, Position]
 
     def nearest_position(self, location: Location) -> Position:
-        """Return the position of the value, or of the nearest parent if it is missing or a default."""
+        """Return where the value is; where it would belong if it is missing or a default."""
         while location not in self.positions:
             location = location[:-1]
         return self.positions[location]
 
 
 def read_yaml(text: str, origin: str, *, has_lines: bool = True) -> Document:
-    """Return the document in ``text``; an empty document has the value None and no positions.
+    """Return the document in ``text``; one that holds nothing at all has the value None and no positions.
 
-    ``origin`` is the origin of every position; without ``has_lines`` positions have no line and column.
-    Raises ConfigError with the position of the first error.
+    Raises ConfigError with the position of the first mistake. ``origin`` begins every position; without
+    ``has_lines`` it is all of it.
     """
     return _Reader(origin, has_lines).read(text)
 
 
 class _Reader:
-    """Reads one document of mappings, lists, texts, numbers, booleans and None."""
+    """Reads one document: mappings, lists, texts, numbers, truth values and None."""
 
     def __init__(self, origin: str, has_lines: bool) -> None:
         self._origin = origin
@@ -108,17 +108,17 @@ class _Reader:
         try:
             root = loader.get_single_node()
         except yaml.MarkedYAMLError as error:
-            raise self._syntax_error(error, loader.get_mark()) from None
-        except (ValueError, OverflowError):  # raised by chr() and int() in PyYAML
-            position = self._position_at(loader.get_mark())
+            raise self._not_yaml(error, loader.get_mark()) from None
+        except (ValueError, OverflowError):  # from chr() and int() within PyYAML
+            position = self._position_of(loader.get_mark())
             raise position.error((), "not YAML: a number here is out of range") from None
         values = None if root is None else self._value(root, ())
         return Document(values, self._positions, self._key_positions)
 
     def _value(self, node: yaml.Node, location: Location) -> object:
-        position = self._position_at(node.start_mark)
+        position = self._position_of(node.start_mark)
         self._values_left -= 1
-        if self._values_left < 0 or len(location) >= MAX_DEPTH:  # only aliases get here with this depth
+        if self._values_left < 0 or len(location) >= MAX_DEPTH:  # only aliases reach this depth
             limits = f"more than {MAX_VALUES} values or {MAX_DEPTH} levels"
             raise position.error((), f"{limits}, counting those that aliases repeat")
         self._positions[location] = position
@@ -127,8 +127,10 @@ class _Reader:
                 return self._mapping(node, location)
             case yaml.SequenceNode(), "seq":
                 return [self._value(item, (*location, index)) for index, item in enumerate(node.value)]
-            case yaml.ScalarNode(), "str" | "timestamp" | "value" | "merge":
-                # A timestamp is text, because a source may be named 2026-06-01.
+            case (
+                yaml.ScalarNode(),
+                "str" | "timestamp" | "value" | "merge",
+            ):  # a source may be named 2026-06-01
                 return self._text(node, location)
             case yaml.ScalarNode(), "bool" | "int" | "float":
                 return self._number(node, location)
@@ -139,14 +141,13 @@ class _Reader:
     def _mapping(self, node: yaml.MappingNode, location: Location) -> dict[str, object]:
         values: dict[str, object] = {}
         for key_node, value_node in node.value:
-            position = self._position_at(key_node.start_mark)
+            position = self._position_of(key_node.start_mark)
             if not isinstance(key_node, yaml.ScalarNode):
-                raise position.error(location, "found a list or mapping as a key; expected text")
+                raise position.error(location, "found a list or mapping as a key")
             key = self._text(key_node, location)
             here = (*location, key)
             if key in values:
-                first_line = self._key_positions[here].line
-                raise position.error(here, f"duplicate key, first used in line {first_line}")
+                raise position.error(here, f"the same key as in line {self._key_positions[here].line}")
             if key_node.tag == f"{_YAML}merge":
                 raise position.error(here, "merge keys are not supported; use an alias as the value of a key")
             self._key_positions[here] = position
@@ -157,28 +158,28 @@ class _Reader:
         if len(node.value) <= MAX_NUMBER_LENGTH:
             try:
                 return yaml.constructor.SafeConstructor().construct_object(node)
-            except (ValueError, LookupError):  # for example 0x_, or text with the tag !!int
+            except (ValueError, LookupError):  # such as 0x_, or a text that is tagged !!int or !!bool
                 pass
         text = f"found {describe(node.value)}; expected a number of at most {MAX_NUMBER_LENGTH} characters"
-        raise self._position_at(node.start_mark).error(location, text)
+        raise self._position_of(node.start_mark).error(location, text)
 
     def _text(self, node: yaml.ScalarNode, location: Location) -> str:
-        """Return a key or a text; raise ConfigError if an escape in it is half of a surrogate pair."""
+        """Return a key or a text; half a surrogate pair, which an escape can write, is none."""
         text: str = node.value
         if not is_encodable(text):
             found = f"found {describe(text)}; expected text that UTF-8 can encode"
-            raise self._position_at(node.start_mark).error(location, found)
+            raise self._position_of(node.start_mark).error(location, found)
         return text
 
-    def _syntax_error(self, error: yaml.MarkedYAMLError, end: yaml.Mark) -> ConfigError:
+    def _not_yaml(self, error: yaml.MarkedYAMLError, end: yaml.Mark) -> ConfigError:
         text = f"not YAML: {error.problem}"
         if error.context and error.context_mark:
             text = f"not YAML: {error.context} from line {error.context_mark.line + 1}: {error.problem}"
         if isinstance(error, yaml.scanner.ScannerError | yaml.parser.ParserError):
             text += "; check indentation, colons, quotes and brackets here"
-        return self._position_at(error.problem_mark or end).error((), text)
+        return self._position_of(error.problem_mark or end).error((), text)
 
-    def _position_at(self, mark: yaml.Mark) -> Position:
+    def _position_of(self, mark: yaml.Mark) -> Position:
         return self._position(mark.line + 1, mark.column + 1)
 
     def _position(self, line: int, column: int) -> Position:
@@ -186,7 +187,7 @@ class _Reader:
 
 
 def is_encodable(text: str) -> bool:
-    """Return whether UTF-8 can encode ``text``: it cannot if there is half of a surrogate pair."""
+    """Return whether ``text`` has no half of a surrogate pair, which cannot be printed or encoded."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -195,7 +196,7 @@ def is_encodable(text: str) -> bool:
 
 
 def key_path(location: Location) -> str:
-    """Return "sources[0].port" for ("sources", 0, "port")."""
+    """Return sources[0].port for ("sources", 0, "port")."""
     path = ""
     for step in location:
         if isinstance(step, int):
@@ -206,6 +207,6 @@ def key_path(location: Location) -> str:
 
 
 def line_and_column_after(text: str) -> tuple[int, int]:
-    """Return line and column, both from 1, of the character after ``text``."""
+    """Return line and column, both from 1, of what follows ``text``."""
     lines = text.split("\n")
     return len(lines), len(lines[-1]) + 1

@@ -9,7 +9,7 @@ from gateway.messages.splice import ITEMS_OFFSET
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters_xml import ParsedParameters
-from gateway.stream.session import Handlers, Session
+from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
 
@@ -90,15 +90,14 @@ class ObservedStream:
         self.status = StreamStatus(self.component_keys, name=f"{source.name} ({self.component_keys})")
         self.parsed: ParsedParameters | None = None
         self.observed: dict[ComponentType, ObservedComponent] = {}
-        handlers = Handlers(self._on_frames, self._on_parameters, lambda _content: None)
-        self.session = Session(source, stream, self.status, handlers)
-        self.control = StreamControl(source, stream, self.status, self.session)
+        self.session = Session(source, stream, self.status, self._on_frames, lambda _content: None)
+        self.control = StreamControl(source, stream, self.status, self.session, self._on_parameters)
 
     def _on_parameters(self, _xml: bytes, parsed: ParsedParameters) -> None:
         self.parsed = parsed
 
     def _on_frames(self, frames: list[Frame], utime: int, _now_s: float) -> None:
-        self.status.frames_in += len(frames)
+        self.status.frames_received(len(frames), utime)
         for frame in frames:
             for component in frame.components:
                 if component.type in self.settings.components:

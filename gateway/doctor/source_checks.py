@@ -13,7 +13,6 @@ from gateway.doctor.rate_check import check_rate
 from gateway.errors import ConnectError, LinkError, PacketError
 from gateway.findings import Finding, MessageLoad, Result, Subject
 from gateway.rtc3d.parameters import Parameters
-from gateway.stream.state import StreamInput
 
 CHECKS: Final = ("name", "TCP", "protocol", "parameters", "frames", "rate", "visibility")
 """The checks in order. Each of the first three is a condition for all that follow."""
@@ -103,7 +102,6 @@ class SourceChecks:
                 await stream.control.start()
             except LinkError as error:
                 return self._protocol_failure(stream, error)
-            stream.status.move(StreamInput.READY, self._server)
             if not stream.status.bytes_in:
                 return self._subject.failing(
                     "protocol",

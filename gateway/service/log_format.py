@@ -10,7 +10,7 @@ from enum import StrEnum
 from typing import Final
 
 from gateway.errors import ConfigError
-from gateway.log import FIELDS, FieldsFilter
+from gateway.log import FIELDS, current_log_fields
 
 
 class LogFormat(StrEnum):
@@ -43,13 +43,22 @@ _JOURNAL_PRIORITIES: Final = {
 _SYSLOG_IDENTIFIER: Final = "rtc3d-gateway"
 
 
+class ContextFilter(logging.Filter):
+    """Adds the fields that are set by ``log_fields`` to each record, as its attributes; for handlers."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Add the fields; every record passes."""
+        record.__dict__.update(current_log_fields())
+        return True
+
+
 def set_up_log(level: LogLevel, log_format: LogFormat = LogFormat.AUTO) -> None:
     """Send all log records to stderr or to the journal.
 
     Raises ConfigError if ``log_format`` is JOURNAL and cysystemd is not installed.
     """
     handler = _handler_for(log_format)
-    handler.addFilter(FieldsFilter())
+    handler.addFilter(ContextFilter())
     logging.basicConfig(level=level.upper(), handlers=[handler])
 
 

@@ -1,52 +1,56 @@
-"""What a stream is doing: every state and every change of it stand in one table, here."""
+"""The state of a stream, and the rule that derives it."""
 
 from enum import Enum
 from typing import Final
 
+from gateway.rtc3d.client_protocol import State
+
+
+class Phase(Enum):
+    """How far the present connection of a stream has come."""
+
+    WAITING = "waiting"  # no connection; the next try comes after a delay
+    CONNECTING = "connecting"
+    HANDSHAKING = "handshaking"
+    READY = "ready"
+    SILENT = "silent"  # a measurement runs and no frame comes: the connection is about to be closed
+
 
 class StreamState(Enum):
-    """The states, as logs and status name them."""
+    """The states of a stream, with the texts that logs, status messages and metrics show."""
 
     CONNECTING = "connecting"
     HANDSHAKING = "handshaking"
-    IDLE = "idle"  # connected, no frames asked for, or nothing said about them yet
+    IDLE = "idle"  # connected; frames are not requested, or neither a frame nor No Data has arrived yet
     NO_MEASUREMENT = "no measurement"
     STREAMING = "streaming"
-    STALLED = "stalled"  # a measurement should run, and nothing comes
+    STALLED = "stalled"  # a measurement runs and no frame comes
     WAITING = "waiting to reconnect"
 
 
-class StreamInput(Enum):
-    """What happens to a stream."""
-
-    DIAL = "connecting"
-    CONNECTED = "connected"
-    READY = "handshake done"
-    FRAME = "a frame came"
-    NO_DATA = "the server says that no measurement runs"
-    STOPPED = "stopped, because nobody listens"
-    SILENCE = "silence"
-    ENDED = "the connection ended"
-
-
-_S, _I = StreamState, StreamInput
-
-_TRANSITIONS: Final[dict[tuple[StreamState, StreamInput], StreamState]] = {
-    (_S.WAITING, _I.DIAL): _S.CONNECTING,
-    (_S.CONNECTING, _I.CONNECTED): _S.HANDSHAKING,
-    # A frame may come before StreamFrames is acknowledged (field note 3); then READY changes nothing.
-    (_S.HANDSHAKING, _I.READY): _S.IDLE,
-    **{(state, _I.FRAME): _S.STREAMING for state in (_S.HANDSHAKING, _S.IDLE, _S.NO_MEASUREMENT, _S.STALLED)},
-    **{
-        (state, _I.NO_DATA): _S.NO_MEASUREMENT
-        for state in (_S.HANDSHAKING, _S.IDLE, _S.STREAMING, _S.STALLED)
-    },
-    **{(state, _I.STOPPED): _S.IDLE for state in (_S.STREAMING, _S.NO_MEASUREMENT, _S.STALLED)},
-    (_S.STREAMING, _I.SILENCE): _S.STALLED,
-    **{(state, _I.ENDED): _S.WAITING for state in StreamState},
+_BY_PHASE: Final = {
+    Phase.WAITING: StreamState.WAITING,
+    Phase.CONNECTING: StreamState.CONNECTING,
+    Phase.HANDSHAKING: StreamState.HANDSHAKING,
+    Phase.READY: StreamState.IDLE,
+    Phase.SILENT: StreamState.STALLED,
 }
 
 
-def next_state(state: StreamState, happened: StreamInput) -> StreamState:
-    """Return the state after ``happened``; what the table does not have changes nothing."""
-    return _TRANSITIONS.get((state, happened), state)
+def stream_state(phase: Phase, protocol_state: State) -> StreamState:
+    """Return the state of a stream.
+
+    Two facts decide it, and each has one owner. ``phase`` says how far the connection has come;
+    session and supervisor know that. ``protocol_state`` says what the server sends; the ClientProtocol of
+    the connection knows that.
+
+    - While the connection can be used, what the server sends decides: frames, or No Data. The handshake
+      need not be done, because a frame may arrive before StreamFrames is acknowledged (field note 3).
+    - In all other cases the phase decides. A connection that is ready and receives neither is idle.
+    """
+    if phase in {Phase.HANDSHAKING, Phase.READY}:
+        if protocol_state is State.STREAMING:
+            return StreamState.STREAMING
+        if protocol_state is State.NO_MEASUREMENT:
+            return StreamState.NO_MEASUREMENT
+    return _BY_PHASE[phase]

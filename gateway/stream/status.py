@@ -1,4 +1,4 @@
-"""The status of one stream: its state, its counters and what went wrong."""
+"""The status of one stream: its state, its counters, and what went wrong."""
 
 import logging
 import time
@@ -8,30 +8,41 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.messages.host_time import now_utime
+from gateway.rtc3d.client_protocol import State
 from gateway.stream.clock import ServerClock
-from gateway.stream.state import StreamInput, StreamState, next_state
+from gateway.stream.state import Phase, StreamState, stream_state
 
 MAX_ERROR_LENGTH: Final = 500
-"""What is kept of an error's text: it may quote a server, and goes out with every status message."""
-
+"""Where the text of an error is cut: it may quote a server, and every status message carries it."""
 
 MAX_LIMITATIONS: Final = 20
-"""How many are kept of one connection, and how many of those told last are known as told."""
+"""How many limitations are kept of one connection, and how many logged ones are remembered."""
 
-_TRYING: Final = (StreamState.CONNECTING, StreamState.HANDSHAKING, StreamState.WAITING)
+_RECONNECTING: Final = (StreamState.CONNECTING, StreamState.HANDSHAKING, StreamState.WAITING)
+
+_PROTOCOL_EVENTS: Final = {
+    State.STREAMING: "a frame arrived",
+    State.NO_MEASUREMENT: "the server reports that no measurement runs",
+    State.IDLE: "the gateway stopped the frames",
+}
+"""What brought the protocol into a state, for the log."""
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass
 class StreamStatus:
-    """How one stream is; the session and the intake keep it up to date, the status reads it.
+    """The status of one stream, over all its connections.
 
-    ``name`` begins its log lines; ``on_state`` is called with each new state.
-    ``components`` is as configured, space-separated. ``drops`` counts what came and was not
-    published, by cause. ``limitations`` says what the present connection does without.
-    ``last_frame_utime`` is when the newest frame came, µs since the Unix epoch, 0 before the first.
-    ``tries`` counts the tries to connect since the last that ended in a handshake.
+    Only the methods of this class change it. Each of them is called when something happens and is named
+    after that; everybody else reads.
+
+    ``components`` is as configured, space-separated. ``name`` begins the stream's log lines. ``on_state`` is
+    called with each new state. ``clock`` keeps itself up to date: the ingest shows it every frame.
+    ``last_frame_utime`` is when the newest frame arrived, µs since the Unix epoch, 0 before the first.
+    ``tries`` counts the tries to connect since the last handshake that was completed. ``restarts`` counts
+    how often the server's time or frame numbers began again within a connection. ``drops`` counts what
+    arrived and was not published, by cause. ``limitations`` lists what the present connection lacks.
     """
 
     components: str
@@ -53,51 +64,122 @@ class StreamStatus:
     limitations: list[str] = field(default_factory=list)
     last_error: str = ""
     last_error_utime: int = 0
-    _told: deque[str] = field(default_factory=lambda: deque(maxlen=MAX_LIMITATIONS), init=False)
+    _phase: Phase = field(default=Phase.WAITING, init=False)
+    _logged_limitations: deque[str] = field(default_factory=lambda: deque(maxlen=MAX_LIMITATIONS), init=False)
 
-    def move(self, happened: StreamInput, cause: str) -> None:
-        """Change the state as the table has it, log the change with its cause, and tell of it."""
-        if happened is StreamInput.DIAL:
-            self.tries += 1
-        elif happened is StreamInput.READY:
-            self.tries = 0
-        before, self.state = self.state, next_state(self.state, happened)
-        if self.state is before:
-            return
-        # While a server is away, the tries come and go: the supervisor tells of them as one failure.
-        level = logging.DEBUG if self.state in _TRYING else logging.INFO
-        logger.log(
-            level, "%s: %s → %s: %s (%s)", self.name, before.value, self.state.value, happened.value, cause
-        )
-        self.on_state(self.state)
+    # The life of a connection: what session and supervisor report.
 
-    def begin_session(self) -> None:
-        """Count a new connection and forget what was agreed in the last one."""
+    def connecting(self, server: str) -> None:
+        """Count a try to connect."""
+        self.tries += 1
+        self._enter(Phase.CONNECTING, "connecting", server)
+
+    def connected(self, server: str) -> None:
+        """Count a new session and forget what was agreed in the last one."""
         self.session += 1
         self.limitations.clear()
         self.byte_order = self.rate = ""
+        self._enter(Phase.HANDSHAKING, "connected", server)
 
-    def limit(self, text: str) -> bool:
-        """Note what this connection does without; at most MAX_LIMITATIONS of them are kept.
+    def handshake_done(self, protocol_state: State, server: str) -> None:
+        """Note that the server agreed to stream; frames may have arrived before."""
+        self.tries = 0
+        self._phase = Phase.READY
+        self._update_state(protocol_state, "handshake done", server)
 
-        Returns whether it is news: not noted before, of an earlier connection neither.
+    def protocol_changed(self, protocol_state: State, byte_order: str, server: str) -> None:
+        """Note what the server sends now; ``byte_order`` is empty while that is unknown."""
+        self.byte_order = byte_order
+        self._update_state(protocol_state, _PROTOCOL_EVENTS.get(protocol_state, "frames requested"), server)
+
+    def silent(self, text: str) -> None:
+        """Note that no frames come although a measurement runs."""
+        self._enter(Phase.SILENT, "silence", text)
+
+    def disconnected(self, error: str) -> None:
+        """Note that the connection ended, or could not be made, and why."""
+        self.record_error(error)
+        self._enter(Phase.WAITING, "the connection ended", error)
+
+    def reconnecting(self) -> None:
+        """Count a connection that follows another one."""
+        self.reconnects += 1
+
+    # What arrives.
+
+    def bytes_received(self, count: int) -> None:
+        """Count the bytes of one read."""
+        self.bytes_in += count
+
+    def frames_received(self, count: int, utime: int) -> None:
+        """Count frames that arrived together at ``utime``, µs since the Unix epoch."""
+        self.frames_in += count
+        self.last_frame_utime = utime
+
+    def lag_measured(self, lag_s: float) -> None:
+        """Note how late the newest frame is."""
+        self.lag_s = lag_s
+
+    def server_restarted(self) -> None:
+        """Count that the server's time or frame numbers began again."""
+        self.restarts += 1
+
+    def frame_rejected(self, error: str) -> None:
+        """Count a frame that contradicts itself."""
+        self.drops["frame rejected"] += 1
+        self.record_error(error)
+
+    def frame_skipped(self) -> None:
+        """Count a frame of which only the events are published, because frames are late."""
+        self.drops["skipped while behind"] += 1
+
+    def unknown_components_skipped(self, count: int) -> None:
+        """Count components of one frame whose types §7.2 does not know."""
+        self.drops["unknown component"] += count
+
+    # What server and gateway agreed on.
+
+    def rate_agreed(self, rate: str) -> None:
+        """Note the rate at which the server streams; empty for its default, or while it does not stream."""
+        self.rate = rate
+
+    def add_limitation(self, text: str) -> None:
+        """Note something that the present connection does without; at most MAX_LIMITATIONS are kept.
+
+        Each text is logged as a WARNING once, and as DEBUG when a later connection has it, too.
         """
         if text in self.limitations or len(self.limitations) >= MAX_LIMITATIONS:
-            return False
+            return
         self.limitations.append(text)
-        if text in self._told:
-            return False
-        self._told.append(text)
-        return True
+        if text in self._logged_limitations:
+            logger.debug("%s: %s", self.name, text)
+            return
+        self._logged_limitations.append(text)
+        logger.warning("%s: %s", self.name, text)
 
-    def note_error(self, text: str) -> None:
-        """Keep ``text``, at most MAX_ERROR_LENGTH of it, as the last error, with the time."""
+    def record_error(self, text: str) -> None:
+        """Keep ``text``, cut to MAX_ERROR_LENGTH, as the last error, with the time."""
         self.last_error = text[:MAX_ERROR_LENGTH]
         self.last_error_utime = now_utime()
 
+    def _enter(self, phase: Phase, event: str, cause: str) -> None:
+        """Enter a phase in which nothing that the server sent before counts."""
+        self._phase = phase
+        self._update_state(State.IDLE, event, cause)
+
+    def _update_state(self, protocol_state: State, event: str, cause: str) -> None:
+        """Derive the state; if it changed, log the change with its cause and call ``on_state``."""
+        before, self.state = self.state, stream_state(self._phase, protocol_state)
+        if self.state is before:
+            return
+        # While a server is away, these states alternate: the supervisor logs that as one failure.
+        level = logging.DEBUG if self.state in _RECONNECTING else logging.INFO
+        logger.log(level, "%s: %s → %s: %s (%s)", self.name, before.value, self.state.value, event, cause)
+        self.on_state(self.state)
+
 
 class FrameRate:
-    """Frames per second between one call and the next."""
+    """Frames per second between one call of ``update`` and the next."""
 
     def __init__(self) -> None:
         self._frames = 0

@@ -1,4 +1,4 @@
-"""What can happen while a connection is being made."""
+"""What can go wrong while a connection is made."""
 
 import asyncio
 import socket
@@ -7,14 +7,15 @@ import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 import yaml
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.stream.session import Handlers, Session
+from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
+from gateway.stream.tcp import Connect, open_connection
 from tests.networks import zenoh_keys
 from tests.servers import Client, ScriptedServer
 from tests.waiting import wait_until
@@ -28,31 +29,23 @@ exec "$@"
 """Runs a command with another resolv.conf and nsswitch.conf."""
 
 
-def session_to(port: int) -> Session:
+def session_to(port: int, connect: Connect = open_connection) -> Session:
     source = SourceSettings(name="lab", host="127.0.0.1", port=port)
-    handlers = Handlers(lambda *_: None, lambda *_: None, lambda _: None)
-    return Session(source, StreamSettings(), StreamStatus("3d"), handlers)
+    return Session(
+        source, StreamSettings(), StreamStatus("3d"), lambda *_: None, lambda _: None, connect=connect
+    )
 
 
-class HastyLoop:
-    """A loop that calls back as soon as a connection is made, which is before anybody has it."""
+class CallingProtocol(asyncio.Protocol):
+    """A session's protocol that makes a call as soon as the connection is made, before ``connect`` has it."""
 
-    def __init__(self, made: Callable[[], object]) -> None:
-        self._loop = asyncio.get_running_loop()
-        self._made = made
-
-    async def create_connection(self, factory: Callable[[], Any], host: str, port: int) -> Any:
-        return await self._loop.create_connection(lambda: HastyProtocol(factory(), self._made), host, port)
-
-
-class HastyProtocol(asyncio.Protocol):
-    def __init__(self, session: Any, made: Callable[[], object]) -> None:
+    def __init__(self, session: Any, on_made: Callable[[], object]) -> None:
         self._session = session
-        self._made = made
+        self._on_made = on_made
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self._session.connection_made(transport)
-        self._made()
+        self._on_made()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._session.connection_lost(exc)
@@ -62,7 +55,7 @@ async def silent(client: Client) -> None:
     await client.commands(lambda _: None)
 
 
-async def test_commands_leave_at_once_and_a_vanished_server_is_noticed() -> None:
+async def test_the_connection_has_no_delay_and_keep_alive() -> None:
     async with ScriptedServer(silent) as server:
         session = session_to(server.port)
         await session.connect()
@@ -73,11 +66,13 @@ async def test_commands_leave_at_once_and_a_vanished_server_is_noticed() -> None
         await session.close()
 
 
-async def test_a_connection_given_up_in_the_moment_it_is_made_can_be_closed() -> None:
+async def test_a_connect_cancelled_at_the_moment_of_connecting_leaves_a_session_that_can_be_closed() -> None:
+    async def connect(source: SourceSettings, session: Any) -> asyncio.Transport:
+        return await open_connection(source, CallingProtocol(session, connecting.cancel))
+
     async with ScriptedServer(silent) as server:
-        session = session_to(server.port)
+        session = session_to(server.port, connect)
         connecting = asyncio.create_task(session.connect())
-        session._loop = cast(asyncio.AbstractEventLoop, HastyLoop(connecting.cancel))
         with pytest.raises(asyncio.CancelledError):
             await connecting
         assert not session.is_open
@@ -85,7 +80,7 @@ async def test_a_connection_given_up_in_the_moment_it_is_made_can_be_closed() ->
 
 
 class SlowNameServer:
-    """Answers each question only once two more have come, and then that it cannot tell."""
+    """Answers each question only after two more have arrived, and then with SERVFAIL."""
 
     def __init__(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -102,8 +97,8 @@ class SlowNameServer:
                 self._socket.sendto(question[:2] + b"\x81\x82" + question[4:], client)  # SERVFAIL
 
 
-def asking_this_machine(tmp_path: Path) -> list[str]:
-    """Return what begins a command that has a name server of this machine."""
+def with_own_nameserver(tmp_path: Path) -> list[str]:
+    """Return the beginning of a command that uses the name server of this test."""
     resolver, switch = tmp_path / "resolv.conf", tmp_path / "nsswitch.conf"
     resolver.write_text("nameserver 127.0.0.1\noptions timeout:1 attempts:1\n")
     switch.write_text("hosts: files dns\n")
@@ -111,7 +106,7 @@ def asking_this_machine(tmp_path: Path) -> list[str]:
 
 
 @pytest.mark.netns
-def test_a_name_server_that_answers_too_late_is_one_problem_and_not_two(tmp_path: Path) -> None:
+def test_late_answers_of_a_name_server_log_no_further_errors(tmp_path: Path) -> None:
     server = SlowNameServer()
     source = {
         "name": "lab",
@@ -127,7 +122,7 @@ def test_a_name_server_that_answers_too_late_is_one_problem_and_not_two(tmp_path
     }
     file = tmp_path / "gateway.json"
     file.write_text(yaml.safe_dump(configuration))
-    command = [*asking_this_machine(tmp_path), sys.executable, "-m", "gateway", "run", "--config", str(file)]
+    command = [*with_own_nameserver(tmp_path), sys.executable, "-m", "gateway", "run", "--config", str(file)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
             wait_until(lambda: len(server.questions) > 16)

@@ -129,7 +129,7 @@ async def test_a_server_that_knows_stream_frames_alone_streams() -> None:
 async def test_what_a_server_lacks_is_told_loudly_once_over_all_connections(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    caplog.set_level(logging.DEBUG, "gateway.stream.stream_control")
+    caplog.set_level(logging.DEBUG, "gateway.stream")
 
     async def script(client: Client) -> None:
         def answer(command: str) -> bytes:

@@ -28,9 +28,10 @@ from gateway.config.settings import (
 )
 from gateway.errors import OutputError
 from gateway.gateway import Gateway
-from gateway.log import FIELDS, FieldsFilter
+from gateway.log import FIELDS
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d_server.server import Simulator
+from gateway.service.log_format import ContextFilter
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.networks import free_port, zenoh_keys
@@ -348,7 +349,7 @@ async def test_stopping_the_gateway_frees_the_port() -> None:
 
 async def test_log_records_of_a_connection_have_its_fields(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    with caplog.filtering(FieldsFilter()):
+    with caplog.filtering(ContextFilter()):
         async with simulator() as server, running_lab(server.port) as lab:
             await lab.streaming()
             port = server.port
@@ -372,7 +373,7 @@ async def test_log_records_of_status_messages_have_the_source(
     output.error = OutputError("no router", cause="no router")
     sources = tuple(SourceSettings(name=name, host="127.0.0.1") for name in ("hall", "lab"))
     gateway = Gateway(Settings(sources=sources, metrics=MetricsSettings(enabled=False)), [output])
-    with caplog.filtering(FieldsFilter()):
+    with caplog.filtering(ContextFilter()):
         for source in gateway.sources:
             source.publish_status()
     logged = [(getattr(record, "source", ""), record.message) for record in caplog.records]

@@ -131,7 +131,7 @@ async def test_late_frames_make_the_gateway_ask_for_less_until_they_are_in_time(
 ) -> None:
     """The server's frames come in time for 3 s, and then 0.3 s late: its time stamps stay behind."""
     monkeypatch.setattr("gateway.stream.rate_control.FIRST_WAIT_S", 0.3)
-    caplog.set_level("INFO", "gateway.stream.supervisor")
+    caplog.set_level("INFO", "gateway.stream")
     server = Recorder()
     async with ScriptedServer(server.script) as listening, gateway_to(listening.port) as lab:
         await lab.until(lambda: server.count(START) == 1)
@@ -155,8 +155,8 @@ async def test_late_frames_make_the_gateway_ask_for_less_until_they_are_in_time(
         await stream_until(START, late_after_s=math.inf)
         await lab.until(lambda: lab.status.rate == "AllFrames")
         told = [(record.levelname, record.message) for record in caplog.records]
-    late, in_time = [(level, text) for level, text in told if "frames come" in text]
+    late, in_time = [(level, text) for level, text in told if "frames arrive" in text]
     assert late[0] == "WARNING"
     assert late[1].endswith(" ms late; asked the server for FrequencyDivisor:2")
     assert in_time[0] == "INFO"
-    assert "frames come in time; asked the server for AllFrames, after " in in_time[1]
+    assert "frames arrive in time; asked the server for AllFrames, after " in in_time[1]

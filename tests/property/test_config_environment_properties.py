@@ -22,7 +22,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def locations(value: Any, location: Location = ()) -> Iterator[tuple[Location, Any]]:
-    """Yield every value in nested mappings and lists except the root, with its location."""
+    """Yield every value in nested mappings and lists, the root aside, with what leads to it."""
     if location:
         yield location, value
     if isinstance(value, dict):
@@ -38,7 +38,7 @@ def as_text(value: object) -> str:
 
 
 @given(settings=SETTINGS, data=st.data())
-def test_a_variable_has_the_effect_of_the_same_value_in_the_file(
+def test_a_variable_does_what_the_same_value_in_the_file_does(
     file: Path, settings: Settings, data: st.DataObject
 ) -> None:
     values = settings.model_dump(mode="json")
@@ -57,7 +57,7 @@ def test_a_variable_has_the_effect_of_the_same_value_in_the_file(
 
 
 @given(settings=SETTINGS)
-def test_variables_can_express_every_configuration(settings: Settings) -> None:
+def test_variables_can_say_all_that_a_file_can(settings: Settings) -> None:
     values = settings.model_dump(mode="json")
     variables = {
         variable_name(location): as_text(value)
@@ -77,7 +77,7 @@ def test_variables_can_express_every_configuration(settings: Settings) -> None:
         max_size=4,
     )
 )
-def test_any_variables_give_settings_or_errors_with_a_position(file: Path, variables: dict[str, str]) -> None:
+def test_any_variables_give_settings_or_lines_with_a_place(file: Path, variables: dict[str, str]) -> None:
     file.write_text("sources: [{name: lab, host: lab}]", encoding="utf-8")
     environ = {VARIABLE_PREFIX + name: value for name, value in variables.items()}
     try:

@@ -24,10 +24,10 @@ from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from tests.strategies import damaged
 
 ROOT = Path(__file__).parents[2]
-# Without comments, so that the damage hits keys and values.
+# Without the comments, so that damage hits keys and values.
 GATEWAY_YAML = yaml.safe_dump(yaml.safe_load((ROOT / "config" / "gateway.yaml").read_text("utf-8"))).encode()
 
-# Parts of YAML files, and input that breaks YAML readers.
+# What YAML files are made of, and what trips their readers.
 PIECES = [
     *("sources", "name", "host", "streams", "components", "rate", "zenoh", "config", "lcm", "url", "enabled"),
     *(
@@ -76,14 +76,14 @@ RATES = st.one_of(
 
 @st.composite
 def streams(draw: st.DrawFn) -> tuple[StreamSettings, ...]:
-    """Return streams with disjoint components."""
+    """Return streams that share no component."""
     owners = draw(st.lists(st.integers(0, 4), min_size=5, max_size=5))
-    groups = [
+    parts = [
         tuple(component for component, owner in zip(WIRE_ORDER, owners, strict=True) if owner == stream)
         for stream in range(4)
     ]
-    named: list[tuple[ComponentType, ...]] = [group for group in groups if group] or [WIRE_ORDER]
-    return tuple(StreamSettings(components=group, rate=draw(RATES)) for group in named)
+    named: list[tuple[ComponentType, ...]] = [part for part in parts if part] or [WIRE_ORDER]
+    return tuple(StreamSettings(components=part, rate=draw(RATES)) for part in named)
 
 
 @st.composite
@@ -133,7 +133,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @given(settings=SETTINGS)
-def test_written_settings_are_read_back_unchanged(file: Path, settings: Settings) -> None:
+def test_what_is_written_is_read(file: Path, settings: Settings) -> None:
     file.write_text(yaml.safe_dump(settings.model_dump(mode="json")), encoding="utf-8")
     assert load(file) == settings
 
@@ -146,7 +146,7 @@ def test_written_settings_are_read_back_unchanged(file: Path, settings: Settings
         st.binary(),
     )
 )
-def test_any_file_gives_settings_or_errors_with_its_path(file: Path, content: bytes) -> None:
+def test_any_file_gives_settings_or_lines_with_its_path(file: Path, content: bytes) -> None:
     file.write_bytes(content)
     try:
         settings = load(file)
@@ -158,7 +158,7 @@ def test_any_file_gives_settings_or_errors_with_its_path(file: Path, content: by
 
 
 @given(first=st.from_regex(r"\A[ABab_-]{1,4}\Z"), second=st.from_regex(r"\A[ABab_-]{1,4}\Z"))
-def test_two_names_are_refused_exactly_if_they_share_channels(first: str, second: str) -> None:
+def test_names_are_refused_together_exactly_if_they_share_channels(first: str, second: str) -> None:
     sources = tuple(SourceSettings(name=name, host="lab") for name in (first, second))
     if topics.lcm_channel("MOCAP", first) == topics.lcm_channel("MOCAP", second):
         with pytest.raises(ValidationError, match="has the same LCM channels"):
@@ -168,7 +168,7 @@ def test_two_names_are_refused_exactly_if_they_share_channels(first: str, second
 
 
 @given(st.text(st.sampled_from("ab/*$#? @é\n\x07"), max_size=6) | st.text())
-def test_zenoh_accepts_every_valid_prefix(prefix: str) -> None:
+def test_zenoh_takes_every_prefix_that_is_accepted(prefix: str) -> None:
     try:
         TypeAdapter(KeyPrefix).validate_python(prefix)
     except ValidationError:

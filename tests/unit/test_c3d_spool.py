@@ -14,7 +14,7 @@ def spool_in(folder: Path, max_files: int = 100, max_bytes: int = 1_000_000) -> 
     return Spool(folder / "c3d", max_files, max_bytes)
 
 
-def test_a_file_is_stored_under_its_source_and_time(tmp_path: Path) -> None:
+def test_a_file_is_kept_whole_under_its_source_and_time(tmp_path: Path) -> None:
     spool = spool_in(tmp_path)
     path = spool.store("lab", b"content")
     assert re.fullmatch(r"lab-\d{8}T\d{6}\.\d{6}Z\.c3d", path.name)
@@ -23,14 +23,14 @@ def test_a_file_is_stored_under_its_source_and_time(tmp_path: Path) -> None:
     assert spool.newest("lab") == path
 
 
-def test_the_newest_file_is_the_one_stored_last(tmp_path: Path) -> None:
+def test_the_newest_is_the_one_stored_last(tmp_path: Path) -> None:
     spool = spool_in(tmp_path)
     *_, last = [spool.store("lab", content) for content in (b"1", b"2", b"3")]
     assert spool.newest("lab") == last
-    assert spool_in(tmp_path).newest("lab") == last  # also after a restart
+    assert spool_in(tmp_path).newest("lab") == last  # after a restart, too
 
 
-def test_sources_are_separate_even_if_one_name_is_a_prefix_of_another(tmp_path: Path) -> None:
+def test_sources_are_kept_apart_though_one_name_begins_another(tmp_path: Path) -> None:
     spool = spool_in(tmp_path)
     lab = spool.store("lab", b"lab")
     lab_2 = spool.store("lab-2", b"lab-2")
@@ -39,17 +39,17 @@ def test_sources_are_separate_even_if_one_name_is_a_prefix_of_another(tmp_path: 
     assert spool.newest("la") is None
 
 
-def test_without_a_folder_there_is_no_newest_file(tmp_path: Path) -> None:
+def test_without_a_folder_there_is_nothing(tmp_path: Path) -> None:
     assert spool_in(tmp_path).newest("lab") is None
 
 
-def test_the_oldest_files_beyond_max_files_are_deleted(tmp_path: Path) -> None:
+def test_the_oldest_file_goes_first_when_there_are_too_many(tmp_path: Path) -> None:
     spool = spool_in(tmp_path, max_files=3)
     paths = [spool.store(source, b"x") for source in ("lab", "hall", "lab", "hall", "attic")]
     assert sorted(spool.directory.iterdir()) == sorted(paths[2:])
 
 
-def test_the_oldest_files_beyond_max_bytes_are_deleted(tmp_path: Path) -> None:
+def test_the_oldest_file_goes_first_when_they_are_too_large(tmp_path: Path) -> None:
     spool = spool_in(tmp_path, max_bytes=10)
     paths = [spool.store("lab", bytes(size)) for size in (4, 3, 3, 1)]
     assert sorted(spool.directory.iterdir()) == paths[1:]
@@ -57,17 +57,15 @@ def test_the_oldest_files_beyond_max_bytes_are_deleted(tmp_path: Path) -> None:
     assert list(spool.directory.iterdir()) == [last]
 
 
-def test_a_file_larger_than_max_bytes_is_refused(tmp_path: Path) -> None:
+def test_a_file_larger_than_all_may_be_is_refused(tmp_path: Path) -> None:
     spool = spool_in(tmp_path, max_bytes=10)
     before = spool.store("lab", bytes(10))
-    with pytest.raises(
-        SpoolError, match=r"of 11 bytes from lab is too large to keep: spool\.max_bytes is 10"
-    ):
+    with pytest.raises(SpoolError, match=r"of 11 bytes from lab is not kept: spool\.max_bytes is 10"):
         spool.store("lab", bytes(11))
     assert list(spool.directory.iterdir()) == [before]
 
 
-def test_other_files_in_the_folder_stay_untouched(tmp_path: Path) -> None:
+def test_what_is_not_of_the_gateway_is_not_touched(tmp_path: Path) -> None:
     spool = spool_in(tmp_path, max_files=1, max_bytes=10)
     spool.directory.mkdir()
     others = [
@@ -81,7 +79,7 @@ def test_other_files_in_the_folder_stay_untouched(tmp_path: Path) -> None:
     assert spool.newest("lab") == kept
 
 
-def test_old_unfinished_files_are_deleted(tmp_path: Path) -> None:
+def test_what_a_killed_gateway_left_unfinished_is_cleared_away(tmp_path: Path) -> None:
     spool = spool_in(tmp_path)
     spool.directory.mkdir()
     old, new = spool.directory / "tmpold.c3d.part", spool.directory / "tmpnew.c3d.part"
@@ -93,13 +91,13 @@ def test_old_unfinished_files_are_deleted(tmp_path: Path) -> None:
     assert sorted(spool.directory.iterdir()) == sorted([kept, new])
 
 
-def test_a_folder_that_cannot_be_created_is_an_error(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
     (tmp_path / "c3d").write_text("a file where the folder should be")
     with pytest.raises(SpoolError, match=r"of 1 bytes from lab cannot be kept in .*/c3d: .*spool\.directory"):
         spool_in(tmp_path).store("lab", b"x")
 
 
-def test_a_failing_disk_leaves_no_partial_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_fails_leaves_no_half_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
@@ -110,7 +108,7 @@ def test_a_failing_disk_leaves_no_partial_file(tmp_path: Path, monkeypatch: pyte
     assert list(spool.directory.iterdir()) == []
 
 
-def test_an_old_file_that_cannot_be_deleted_is_logged_and_the_new_one_is_kept(
+def test_a_file_that_cannot_be_deleted_is_told_and_the_new_one_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     spool = spool_in(tmp_path, max_files=1)
@@ -122,10 +120,10 @@ def test_an_old_file_that_cannot_be_deleted_is_logged_and_the_new_one_is_kept(
     monkeypatch.setattr(Path, "unlink", refuse)
     new = spool.store("lab", b"new")
     assert sorted(spool.directory.iterdir()) == [old, new]
-    assert f"cannot delete the old file {old}: Operation not permitted" in caplog.text
+    assert f"{old} is old and cannot be deleted: Operation not permitted" in caplog.text
 
 
-def test_concurrent_threads_leave_exactly_max_files(tmp_path: Path) -> None:
+def test_threads_that_store_at_once_leave_as_many_files_as_may_be(tmp_path: Path) -> None:
     spool = spool_in(tmp_path, max_files=3)
     threads = [
         threading.Thread(target=lambda name=name: [spool.store(name, b"x") for _ in range(20)])

@@ -5,7 +5,8 @@ from collections.abc import Iterator
 
 import pytest
 
-from gateway.log import FIELDS, FailureLog, FieldsFilter, log_fields
+from gateway.log import FIELDS, FailureLog, log_fields
+from gateway.service.log_format import ContextFilter
 
 LOGGER = logging.getLogger("tests.failures")
 
@@ -24,7 +25,7 @@ def test_the_first_failure_is_a_warning_with_subject_and_text(caplog: pytest.Log
     assert caplog.record_tuples == [(LOGGER.name, logging.WARNING, "lab: no answer; check the cable")]
 
 
-def test_repeats_are_told_quietly_and_counted(caplog: pytest.LogCaptureFixture) -> None:
+def test_repeats_are_logged_as_debug_with_a_count(caplog: pytest.LogCaptureFixture) -> None:
     failures = FailureLog(LOGGER, "lab")
     for _ in range(3):
         failures.failed("no answer")
@@ -35,7 +36,9 @@ def test_repeats_are_told_quietly_and_counted(caplog: pytest.LogCaptureFixture) 
     ]
 
 
-def test_recovery_is_told_with_how_long_and_how_often_it_failed(caplog: pytest.LogCaptureFixture) -> None:
+def test_recovery_is_logged_with_the_duration_and_failure_count(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     failures = FailureLog(LOGGER, "lab")
     failures.failed("no answer")
     failures.failed("no answer")
@@ -44,14 +47,24 @@ def test_recovery_is_told_with_how_long_and_how_often_it_failed(caplog: pytest.L
     assert re.fullmatch(r"lab: streaming, after \d+\.\d s and 2 failures", caplog.messages[-1])
 
 
-def test_what_had_not_failed_is_told_without_a_count(caplog: pytest.LogCaptureFixture) -> None:
+def test_recovery_is_not_logged_if_nothing_failed(caplog: pytest.LogCaptureFixture) -> None:
     failures = FailureLog(LOGGER, "lab")
     failures.recovered("streaming")
     failures.failed("no answer")
     failures.recovered("streaming")
     failures.recovered("streaming")
+    assert levels(caplog) == [logging.WARNING, logging.INFO]
+
+
+def test_success_is_always_logged_and_ends_a_failure(caplog: pytest.LogCaptureFixture) -> None:
+    failures = FailureLog(LOGGER, "lab")
+    failures.succeeded("streaming")
+    failures.failed("no answer")
+    failures.succeeded("streaming")
+    failures.succeeded("streaming")
     assert levels(caplog) == [logging.INFO, logging.WARNING, logging.INFO, logging.INFO]
     assert caplog.messages[0] == caplog.messages[3] == "lab: streaming"
+    assert caplog.messages[2].startswith("lab: streaming, after ")
 
 
 def test_a_failure_after_recovery_is_a_warning_again(caplog: pytest.LogCaptureFixture) -> None:
@@ -62,31 +75,31 @@ def test_a_failure_after_recovery_is_a_warning_again(caplog: pytest.LogCaptureFi
     assert levels(caplog) == [logging.WARNING, logging.INFO] * 2
 
 
-def test_failing_is_what_was_told_last() -> None:
+def test_failing_is_true_from_failure_to_recovery() -> None:
     failures = FailureLog(LOGGER, "lab")
-    told = [failures.failing]
+    values = [failures.failing]
     failures.failed("no answer")
-    told.append(failures.failing)
+    values.append(failures.failing)
     failures.recovered("streaming")
-    told.append(failures.failing)
-    assert told == [False, True, False]
+    values.append(failures.failing)
+    assert values == [False, True, False]
 
 
-def test_what_fails_by_turns_is_over_once_it_has_worked_for_long_enough(
+def test_intermittent_failures_are_over_after_the_hold_time_without_one(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     now_s = 0.0
-    monkeypatch.setattr("gateway.log.time.monotonic", lambda: now_s)
+    monkeypatch.setattr("gateway.log.monotonic", lambda: now_s)
     failures = FailureLog(LOGGER, "lab", hold_s=5.0)
     for second in range(4):
         now_s = float(second)
         failures.failed("too large")
-        failures.recovered("messages go out")
+        failures.recovered("sending")
     assert levels(caplog) == [logging.WARNING, *[logging.DEBUG] * 3]
     assert failures.failing
     now_s = 8.0
-    failures.recovered("messages go out")
-    assert caplog.messages[-1] == "lab: messages go out, after 8.0 s and 4 failures"
+    failures.recovered("sending")
+    assert caplog.messages[-1] == "lab: sending, after 8.0 s and 4 failures"
     assert not failures.failing
 
 
@@ -104,9 +117,9 @@ class Collector(logging.Handler):
 
 @pytest.fixture
 def records() -> Iterator[list[logging.LogRecord]]:
-    """Collect what a handler with the filter is given."""
+    """Collect the records that a handler with the filter receives."""
     handler = Collector()
-    handler.addFilter(FieldsFilter())
+    handler.addFilter(ContextFilter())
     LOGGER.addHandler(handler)
     yield handler.records
     LOGGER.removeHandler(handler)
@@ -131,7 +144,7 @@ def test_records_have_the_fields_that_are_set_and_no_others(records: list[loggin
     ]
 
 
-async def test_tasks_and_callbacks_have_the_fields_of_where_they_were_started(
+async def test_tasks_and_callbacks_inherit_the_fields_of_the_code_that_starts_them(
     records: list[logging.LogRecord],
 ) -> None:
     async def run(source: str) -> None:
@@ -141,5 +154,5 @@ async def test_tasks_and_callbacks_have_the_fields_of_where_they_were_started(
             LOGGER.warning("task")
 
     await asyncio.gather(run("hall"), run("lab"))
-    told = [(fields(record)["source"], record.getMessage()) for record in records]
-    assert sorted(told) == [("hall", "callback"), ("hall", "task"), ("lab", "callback"), ("lab", "task")]
+    logged = [(fields(record)["source"], record.getMessage()) for record in records]
+    assert sorted(logged) == [("hall", "callback"), ("hall", "task"), ("lab", "callback"), ("lab", "task")]

@@ -106,7 +106,7 @@ class LcmOutput:
             self._retry_at_s = time.monotonic() + _RETRY_S
         else:
             self._problem = ""
-            self._opening.recovered(f"sending to {self.settings.effective_url}")
+            self._opening.succeeded(f"sending to {self.settings.effective_url}")
             for declare in self._declarations:
                 declare(self._lcm)
 

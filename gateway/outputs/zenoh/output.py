@@ -205,7 +205,7 @@ class ZenohOutput:
                 for declare in self._declarations:
                     declare(session)
             self._problem = ""
-            self._failures.recovered("the session is open")
+            self._failures.succeeded("the session is open")
             return
 
     def _on_transport(self, event: zenoh.TransportEvent) -> None:

@@ -32,15 +32,15 @@ def with_prefix(variables: dict[str, str]) -> dict[str, str]:
     return {f"RTC3D_GATEWAY__{name}": value for name, value in variables.items()}
 
 
-def errors_of(path: Path | None, **variables: str) -> list[str]:
-    """Return the lines of the error, with the file's name for its path and variables without prefix."""
+def refused(path: Path | None, **variables: str) -> list[str]:
+    """Return the lines of the error, the file as its last part only and the variables without prefix."""
     with pytest.raises(ConfigError) as caught:
         load(path, with_prefix(variables))
     text = str(caught.value).replace("RTC3D_GATEWAY__", "")
     return (text if path is None else text.replace(f"{path}:", f"{path.name}:")).splitlines()
 
 
-def test_a_variable_overrides_the_file(file: Path) -> None:
+def test_a_variable_stands_over_the_file(file: Path) -> None:
     variables = {"LCM__URL": "memq://", "SOURCES__0__HOST": "lab-pc", "SOURCES__0__PORT": "3030"}
     settings = load(file, with_prefix(variables))
     assert settings.lcm == LcmSettings(url="memq://")
@@ -48,7 +48,7 @@ def test_a_variable_overrides_the_file(file: Path) -> None:
     assert settings.sources[0].streams == load(file, {}).sources[0].streams
 
 
-def test_the_default_is_the_environment_of_the_process(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_processes_own_environment_counts(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RTC3D_GATEWAY__LCM__PREFIX", "HALL2")
     assert load(file).lcm.prefix == "HALL2"
     assert read_server("lab-pc", 3020).settings.lcm.prefix == "HALL2"
@@ -86,7 +86,7 @@ def test_values_are_yaml(
     assert found == expected
 
 
-def test_a_configuration_may_consist_of_variables_only() -> None:
+def test_variables_alone_are_a_configuration() -> None:
     variables = {
         "SOURCES__0__NAME": "a",
         "SOURCES__0__HOST": "lab-a",
@@ -110,12 +110,12 @@ def test_more_than_ten_items_keep_their_order() -> None:
     assert [source.name for source in settings.sources] == [f"s{n}" for n in range(12)]
 
 
-def test_a_mapping_is_set_before_its_keys(file: Path) -> None:
+def test_a_mapping_comes_before_its_keys(file: Path) -> None:
     variables = {"LCM__PREFIX": "A", "LCM": "{prefix: B, url: memq://}"}
     assert load(file, with_prefix(variables)).lcm == LcmSettings(prefix="A", url="memq://")
 
 
-def test_relative_paths_are_relative_to_the_files_folder(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_relative_paths_count_from_the_files_folder(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     zenoh_file = file.parent / "zenoh.json5"
     zenoh_file.write_text("{mode: 'client'}", encoding="utf-8")
     assert load(file, with_prefix({"ZENOH__CONFIG": "zenoh.json5"})).zenoh.config == zenoh_file
@@ -127,11 +127,11 @@ def test_relative_paths_are_relative_to_the_files_folder(file: Path, monkeypatch
 @pytest.mark.parametrize(
     "name", ["RTC3D_GATEWAY_SERVICE_HOST", "RTC3D_GATEWAY_PORT", "rtc3d_gateway__lcm__url", "LCM__URL"]
 )
-def test_other_variables_are_ignored(file: Path, name: str) -> None:
+def test_other_names_are_not_ours(file: Path, name: str) -> None:
     assert load(file, {name: "tcp://10.0.0.1:9464"}) == load(file, {})
 
 
-ERRORS: list[tuple[str, str, str]] = [
+MISTAKES: list[tuple[str, str, str]] = [
     (
         "LCM__ULR",
         "memq://",
@@ -180,41 +180,41 @@ ERRORS: list[tuple[str, str, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("name", "value", "error"), ERRORS, ids=[name for name, _, _ in ERRORS])
-def test_an_error_names_the_variable(file: Path, name: str, value: str, error: str) -> None:
-    [line] = errors_of(file, **{name: value})
+@pytest.mark.parametrize(("name", "value", "error"), MISTAKES, ids=[name for name, _, _ in MISTAKES])
+def test_a_mistake_is_told_with_the_variable(file: Path, name: str, value: str, error: str) -> None:
+    [line] = refused(file, **{name: value})
     assert line.startswith(error)
 
 
-def test_an_error_in_a_value_from_file_and_variables_names_both(file: Path) -> None:
-    [line] = errors_of(file, ZENOH__CONFIG__MODES="peer")
+def test_a_mistake_in_a_value_of_both_names_file_and_variables(file: Path) -> None:
+    [line] = refused(file, ZENOH__CONFIG__MODES="peer")
     assert line.endswith("(a part of it is from ZENOH__CONFIG__MODES)")
 
 
-def test_errors_in_the_file_come_first(file: Path) -> None:
+def test_mistakes_of_the_file_come_first(file: Path) -> None:
     file.write_text(FILE + "spool: {max_files: 0}\n", encoding="utf-8")
-    lines = errors_of(file, SPOOL__MAX_BYTES="0", LCM__PREFIX="Ä")
+    lines = refused(file, SPOOL__MAX_BYTES="0", LCM__PREFIX="Ä")
     assert [line.partition(": ")[0] for line in lines] == ["lab.yaml:8:20", "LCM__PREFIX", "SPOOL__MAX_BYTES"]
 
 
-def test_a_file_that_is_not_a_mapping_is_the_only_error(file: Path) -> None:
+def test_a_file_that_is_no_mapping_is_told_first(file: Path) -> None:
     file.write_text("[1]", encoding="utf-8")
-    [line] = errors_of(file, LCM__URL="memq://")
+    [line] = refused(file, LCM__URL="memq://")
     assert line.startswith("lab.yaml:1:1: found a list; expected a mapping")
 
 
-def test_an_environment_without_sources_is_an_error() -> None:
-    assert errors_of(None, LCM__URL="memq://") == [
+def test_no_sources_in_the_environment_are_told() -> None:
+    assert refused(None, LCM__URL="memq://") == [
         "environment: sources: missing; this key is required",
     ]
 
 
-def test_a_single_server_uses_the_defaults() -> None:
+def test_one_server_has_the_defaults() -> None:
     settings = read_server("::1", 3030, {}).settings
     assert settings == Settings(sources=(SourceSettings(name="lab", host="::1", port=3030),))
 
 
-def test_errors_in_the_server_option_are_reported() -> None:
+def test_one_servers_mistakes_are_told() -> None:
     with pytest.raises(ConfigError) as caught:
         read_server("two words", 0, {})
     assert str(caught.value).splitlines() == [
@@ -224,7 +224,7 @@ def test_errors_in_the_server_option_are_reported() -> None:
     ]
 
 
-def test_positions_say_where_each_value_comes_from(file: Path) -> None:
+def test_places_tell_where_each_value_is_from(file: Path) -> None:
     positions = read(file, with_prefix({"ZENOH__CONFIG": "{mode: client}"})).positions
     assert str(positions["sources", 0, "host"]) == f"{file}:3:11"
     assert str(positions["zenoh", "config", "mode"]) == "RTC3D_GATEWAY__ZENOH__CONFIG"
@@ -232,7 +232,7 @@ def test_positions_say_where_each_value_comes_from(file: Path) -> None:
     assert ("lcm",) not in positions
 
 
-def test_the_name_of_a_variable_is_the_path_of_its_key() -> None:
+def test_a_variables_name_is_its_keys_path() -> None:
     assert (
         variable_name(("sources", 0, "connect_timeout_s")) == "RTC3D_GATEWAY__SOURCES__0__CONNECT_TIMEOUT_S"
     )

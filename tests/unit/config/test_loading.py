@@ -24,19 +24,19 @@ def file(tmp_path: Path) -> Path:
 
 
 def lines_of(error: ConfigError, file: Path) -> list[str]:
-    """Return the lines of the error, with the file's name in place of its path."""
+    """Return the lines of the error's text, the path in each as its last part only."""
     return [line.replace(str(file), file.name) for line in str(error).splitlines()]
 
 
-def errors_of(file: Path, content: str | bytes) -> list[str]:
-    """Return the lines of the error for a file with ``content``."""
+def refused(file: Path, content: str | bytes) -> list[str]:
+    """Return the lines of the error that a file with ``content`` raises."""
     file.write_bytes(content.encode() if isinstance(content, str) else content)
     with pytest.raises(ConfigError) as caught:
         load(file)
     return lines_of(caught.value, file)
 
 
-def test_a_complete_configuration_is_loaded(file: Path) -> None:
+def test_the_issues_example(file: Path) -> None:
     file.write_text(
         """\
 sources:
@@ -72,7 +72,7 @@ def test_every_shipped_configuration_loads(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.json5")), ids=lambda path: path.name)
-def test_zenoh_accepts_every_shipped_zenoh_configuration(path: Path, file: Path) -> None:
+def test_every_shipped_zenoh_configuration_can_be_named(path: Path, file: Path) -> None:
     file.write_text(f"{SERVER}zenoh: {{config: {path}}}\n", encoding="utf-8")
     assert load(file).zenoh.config == path
 
@@ -86,7 +86,7 @@ def test_gateway_yaml_has_every_key_with_its_default() -> None:
     for section in sections:
         fields = type(section).model_fields
         assert section.model_fields_set == set(fields), (
-            f"{type(section).__name__} has keys that gateway.yaml lacks"
+            f"{type(section).__name__} has keys that are not there"
         )
         for key, field in fields.items():
             if not field.is_required():
@@ -107,8 +107,8 @@ def test_demo_yaml_stays_on_this_machine() -> None:
     assert settings.lcm == LcmSettings()
 
 
-ERRORS: list[tuple[str, str]] = [
-    # A line of YAML to append to SERVER, and the single line of the error.
+MISTAKES: list[tuple[str, str]] = [
+    # One line of YAML after SERVER, and the error's one line.
     (
         "    port: abc",
         "lab.yaml:4:11: sources[0].port: found 'abc'; expected a whole number from 1 to 65535",
@@ -159,9 +159,9 @@ ERRORS: list[tuple[str, str]] = [
     ),
     (
         "    name: lab-2",
-        "lab.yaml:4:5: sources[0].name: duplicate key, first used in line 2",
+        "lab.yaml:4:5: sources[0].name: the same key as in line 2",
     ),
-    ("? [a]\n: 1", "lab.yaml:4:3: found a list or mapping as a key; expected text"),
+    ("? [a]\n: 1", "lab.yaml:4:3: found a list or mapping as a key"),
     ("<<: {lcm: {}}", "lab.yaml:4:1: '<<': merge keys are not supported; use an alias as the value of a key"),
     ("lcm: !url memq", "lab.yaml:4:6: lcm: found the tag '!url'; expected a value without a tag"),
     (
@@ -203,12 +203,12 @@ ERRORS: list[tuple[str, str]] = [
 ]
 
 
-@pytest.mark.parametrize(("line", "error"), ERRORS, ids=[line[:30] for line, _ in ERRORS])
-def test_an_error_names_its_position(file: Path, line: str, error: str) -> None:
-    assert errors_of(file, f"{SERVER}{line}\n") == [error]
+@pytest.mark.parametrize(("line", "error"), MISTAKES, ids=[line[:30] for line, _ in MISTAKES])
+def test_a_mistake_is_told_with_its_place(file: Path, line: str, error: str) -> None:
+    assert refused(file, f"{SERVER}{line}\n") == [error]
 
 
-def test_all_errors_are_reported_in_the_order_of_the_file(file: Path) -> None:
+def test_all_mistakes_are_told_in_the_files_order(file: Path) -> None:
     text = """\
 lcm: {enable: true}
 zenoh: {prefix: /mocap}
@@ -216,7 +216,7 @@ sources:
   - host: two words
     port: 70000
 """
-    assert errors_of(file, text) == [
+    assert refused(file, text) == [
         "lab.yaml:1:7: lcm.enable: unknown key (did you mean 'enabled'?); "
         "known keys: enabled, prefix, url, queries_url, max_rate_hz, tool_poses",
         "lab.yaml:2:17: zenoh.prefix: found '/mocap'; expected a Zenoh key of at most 128 characters, "
@@ -228,16 +228,16 @@ sources:
     ]
 
 
-def test_an_error_in_an_alias_names_the_position_of_the_anchor(file: Path) -> None:
+def test_a_wrong_value_in_what_an_alias_repeats_is_told_where_it_stands(file: Path) -> None:
     text = """\
 sources:
   - {name: a, host: lab-a, reconnect: &patient {first_delay_s: 0}}
   - {name: b, host: lab-b, reconnect: *patient}
 """
-    error = "found 0; expected a number of seconds from 0.001 to 86400"
-    assert errors_of(file, text) == [
-        f"lab.yaml:2:64: sources[0].reconnect.first_delay_s: {error}",
-        f"lab.yaml:2:64: sources[1].reconnect.first_delay_s: {error}",
+    accepted = "found 0; expected a number of seconds from 0.001 to 86400"
+    assert refused(file, text) == [
+        f"lab.yaml:2:64: sources[0].reconnect.first_delay_s: {accepted}",
+        f"lab.yaml:2:64: sources[1].reconnect.first_delay_s: {accepted}",
     ]
 
 
@@ -253,38 +253,38 @@ sources:
     assert [source.reconnect.max_delay_s for source in load(file).sources] == [60.0, 60.0]
 
 
-def test_exponentially_growing_aliases_are_refused(file: Path) -> None:
+def test_aliases_that_grow_without_bound_are_refused(file: Path) -> None:
     rows = ["a0: &a0 [x, x, x, x, x, x, x, x, x, x]"]
     rows += [f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 10)}]" for n in range(1, 20)]
-    [line] = errors_of(file, "\n".join(rows))
+    [line] = refused(file, "\n".join(rows))
     assert line.endswith(": more than 10000 values or 32 levels, counting those that aliases repeat")
 
 
-def test_a_date_is_a_valid_name(file: Path) -> None:
+def test_a_date_is_a_name_like_any_other(file: Path) -> None:
     file.write_text("sources: [{name: 2026-06-01, host: lab}]", encoding="utf-8")
     assert load(file).sources[0].name == "2026-06-01"
 
 
-def test_a_byte_order_mark_is_ignored(file: Path) -> None:
+def test_a_byte_order_mark_is_no_mistake(file: Path) -> None:
     file.write_bytes(b"\xef\xbb\xbf" + SERVER.encode())
     assert load(file).sources[0].name == "lab"
 
 
 @pytest.mark.parametrize("content", ["", "# nothing yet\n"])
 def test_an_empty_file_is_refused(file: Path, content: str) -> None:
-    assert errors_of(file, content) == ["lab.yaml: empty; expected a mapping with at least the key sources"]
+    assert refused(file, content) == ["lab.yaml: empty; expected a mapping with at least the key sources"]
 
 
 @pytest.mark.parametrize(("content", "found"), [("[1]", "a list"), ("text", "'text'"), ("~", "nothing")])
-def test_a_file_that_is_not_a_mapping_is_refused(file: Path, content: str, found: str) -> None:
-    assert errors_of(file, content) == [
+def test_a_file_that_is_no_mapping_is_refused(file: Path, content: str, found: str) -> None:
+    assert refused(file, content) == [
         f"lab.yaml:1:1: found {found}; expected a mapping with any of the keys "
         "sources, spool, zenoh, lcm, metrics"
     ]
 
 
-def test_a_file_without_sources_is_refused(file: Path) -> None:
-    assert errors_of(file, "lcm: {}") == ["lab.yaml:1:1: sources: missing; this key is required"]
+def test_no_sources_are_a_mistake(file: Path) -> None:
+    assert refused(file, "lcm: {}") == ["lab.yaml:1:1: sources: missing; this key is required"]
 
 
 @pytest.mark.parametrize(
@@ -296,14 +296,14 @@ def test_a_file_without_sources_is_refused(file: Path) -> None:
     ],
 )
 def test_a_file_that_is_not_utf8_is_refused(file: Path, content: bytes, position: str) -> None:
-    assert errors_of(file, content) == [f"lab.yaml:{position}: found the byte 0xFC; expected text in UTF-8"]
+    assert refused(file, content) == [f"lab.yaml:{position}: found the byte 0xFC; expected text in UTF-8"]
 
 
-def test_a_file_that_is_too_large_is_refused(file: Path) -> None:
+def test_a_file_too_large_is_refused(file: Path) -> None:
     padding = "#" * (MAX_FILE_BYTES - len(SERVER))
     file.write_text(SERVER + padding, encoding="utf-8")
     assert load(file)
-    assert errors_of(file, SERVER + padding + "#") == ["lab.yaml: too large; the limit is 1048576 bytes"]
+    assert refused(file, SERVER + padding + "#") == ["lab.yaml: too large; the limit is 1048576 bytes"]
 
 
 def test_a_missing_file_and_a_folder_are_refused(file: Path) -> None:
@@ -320,9 +320,7 @@ def test_a_missing_file_and_a_folder_are_refused(file: Path) -> None:
     ]
 
 
-def test_the_path_of_zenohs_file_is_relative_to_the_configuration(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_zenohs_file_is_looked_for_beside_this_one(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file.write_text(f"{SERVER}zenoh: {{config: net/zenoh.json5}}\n", encoding="utf-8")
     zenoh_file = file.parent / "net" / "zenoh.json5"
     zenoh_file.parent.mkdir()
@@ -348,10 +346,10 @@ def test_the_path_of_zenohs_file_is_relative_to_the_configuration(
     ]
 
 
-def test_zenohs_multi_line_error_becomes_one_line(file: Path) -> None:
+def test_a_drawing_of_zenoh_is_put_on_one_line(file: Path) -> None:
     zenoh_file = file.parent / "zenoh.json5"
     zenoh_file.write_text("{mode: 'peer',,\n}", encoding="utf-8")
-    [line] = errors_of(file, f"{SERVER}zenoh: {{config: zenoh.json5}}\n")
+    [line] = refused(file, f"{SERVER}zenoh: {{config: zenoh.json5}}\n")
     assert line == (
         f"lab.yaml:4:17: zenoh.config: Zenoh refuses the file {zenoh_file}: "
         "line 1, column 15: expected identifier or string"

@@ -28,7 +28,7 @@ def file(tmp_path: Path) -> Path:
 
 
 SECRETS: list[tuple[dict[str, Any], dict[str, Any]]] = [
-    # Zenoh's keys, and the same with masked secrets.
+    # Zenoh's keys, and what may be seen of them.
     (
         {"transport": {"auth": {"usrpwd": {"user": "me", "password": "geheim"}}}},
         {"transport": {"auth": {"usrpwd": {"user": "me", "password": "***"}}}},
@@ -61,11 +61,11 @@ SECRETS: list[tuple[dict[str, Any], dict[str, Any]]] = [
 ]
 
 
-@pytest.mark.parametrize(("config", "masked"), SECRETS)
-def test_secrets_are_masked(config: dict[str, Any], masked: dict[str, Any]) -> None:
-    assert mask_secrets(config) == masked
+@pytest.mark.parametrize(("config", "seen"), SECRETS)
+def test_secrets_are_masked(config: dict[str, Any], seen: dict[str, Any]) -> None:
+    assert mask_secrets(config) == seen
     assert list(find_secrets(config))
-    assert mask_secrets(masked) == masked
+    assert mask_secrets(seen) == seen
 
 
 @pytest.mark.parametrize(
@@ -84,13 +84,13 @@ def test_secrets_are_masked(config: dict[str, Any], masked: dict[str, Any]) -> N
         },
     ],
 )
-def test_other_values_stay_unchanged(config: dict[str, Any]) -> None:
+def test_what_is_no_secret_stays(config: dict[str, Any]) -> None:
     assert mask_secrets(config) == config
     assert list(find_secrets(config)) == []
 
 
 @pytest.mark.parametrize(
-    ("config", "position", "remedy"),
+    ("config", "position", "accepted"),
     [
         (
             "{transport: {auth: {usrpwd: {user: me, password: geheim}}}}",
@@ -121,15 +121,15 @@ def test_other_values_stay_unchanged(config: dict[str, Any]) -> None:
         ),
     ],
 )
-def test_a_secret_in_the_file_is_refused(file: Path, config: str, position: str, remedy: str) -> None:
+def test_a_secret_in_the_file_is_refused(file: Path, config: str, position: str, accepted: str) -> None:
     file.write_text(f"{SERVER}zenoh: {{config: {config}}}\n", encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
         load(file, {})
     text = "found a secret, which does not belong in this file; use"
-    assert str(caught.value) == f"{file}:{position}: {text} {remedy}"
+    assert str(caught.value) == f"{file}:{position}: {text} {accepted}"
 
 
-def test_a_secret_is_reported_with_the_other_errors(file: Path) -> None:
+def test_a_secret_is_told_with_the_other_mistakes(file: Path) -> None:
     config = "{mode: clint, transport: {auth: {usrpwd: {password: geheim}}}}"
     file.write_text(f"lcm: 1\n{SERVER}zenoh: {{config: {config}}}\n", encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
@@ -144,7 +144,7 @@ def test_a_secret_is_reported_with_the_other_errors(file: Path) -> None:
 
 
 @pytest.mark.parametrize("password", ["geheim", "12345678", "null", "a: {b", "#x", " ", "*a", "'"])
-def test_a_password_from_the_environment_is_not_parsed_as_yaml(file: Path, password: str) -> None:
+def test_a_password_from_the_environment_is_text_as_it_stands(file: Path, password: str) -> None:
     file.write_text(f"{SERVER}zenoh: {{config: {{transport: {{auth: {{usrpwd: {{user: me}}}}}}}}}}\n")
     configuration = read(file, {PASSWORD: password})
     assert configuration.settings.model_dump()["zenoh"]["config"]["transport"]["auth"]["usrpwd"] == {
@@ -155,12 +155,12 @@ def test_a_password_from_the_environment_is_not_parsed_as_yaml(file: Path, passw
     assert f"password: '***' # {PASSWORD}" in shown
 
 
-def test_the_repr_of_settings_contains_no_password(file: Path) -> None:
+def test_settings_in_a_log_line_show_no_password(file: Path) -> None:
     file.write_text(f"{SERVER}zenoh: {{config: {{transport: {{auth: {{usrpwd: {{user: me}}}}}}}}}}\n")
     assert "geheim" not in repr(load(file, {PASSWORD: "geheim"}))
 
 
-def test_half_a_surrogate_pair_in_a_password_is_refused(file: Path) -> None:
+def test_half_a_character_in_a_password_is_refused(file: Path) -> None:
     file.write_text(SERVER, encoding="utf-8")
     with pytest.raises(ConfigError, match="found bytes that are not UTF-8; expected text"):
         load(file, {PASSWORD: "\udcff"})
@@ -169,13 +169,13 @@ def test_half_a_surrogate_pair_in_a_password_is_refused(file: Path) -> None:
 @pytest.mark.parametrize(
     "content",
     [
-        "{transport: {auth: {usrpwd: {user: 'u', password: 'geheim' xx}}}}",  # Zenoh quotes the line
-        "{transport: {auth: {usrpwd: {user: 'u', password: 4711}}}}",  # Zenoh quotes the value
+        "{transport: {auth: {usrpwd: {user: 'u', password: 'geheim' xx}}}}",  # the line is drawn
+        "{transport: {auth: {usrpwd: {user: 'u', password: 4711}}}}",  # the value is told
         "{transport: {auth: {usrpwd: 'geheim'}}}",
         "{connect: {endpoints: ['tls lab#connect_private_key_raw=geheim']}}",
     ],
 )
-def test_zenohs_errors_contain_no_secrets(file: Path, content: str) -> None:
+def test_zenohs_errors_quote_no_secrets(file: Path, content: str) -> None:
     (file.parent / "zenoh.json5").write_text(content, encoding="utf-8")
     file.write_text(f"{SERVER}zenoh: {{config: zenoh.json5}}\n", encoding="utf-8")
     with pytest.raises(ConfigError) as caught:
@@ -185,16 +185,16 @@ def test_zenohs_errors_contain_no_secrets(file: Path, content: str) -> None:
     assert "4711" not in str(caught.value)
 
 
-def test_zenohs_errors_keep_location_and_cause() -> None:
-    error = (
+def test_zenohs_reasons_keep_what_helps() -> None:
+    drawing = (
         " --> 2:7\n  |\n2 |  mode: 'geheim',,\n  |       ^---\n  |\n  = expected identifier\n at src/a.rs:1."
     )
-    assert zenoh_reason(ValueError(error)) == "line 2, column 7: expected identifier"
+    assert zenoh_reason(ValueError(drawing)) == "line 2, column 7: expected identifier"
     text = 'invalid type: string "ge\\"heim", expected a boolean at /x/y.rs:615.'
     assert zenoh_reason(ValueError(text)) == "invalid type: string, expected a boolean"
 
 
-def test_the_error_of_a_failed_link_masks_its_key(caplog: pytest.LogCaptureFixture, file: Path) -> None:
+def test_a_link_that_fails_is_told_without_its_key(caplog: pytest.LogCaptureFixture, file: Path) -> None:
     endpoint = f"tls/127.0.0.1:{free_port()}#connect_private_key_base64=geheim"
     file.write_text(SERVER + "zenoh: {config: {mode: client, scouting: {multicast: {enabled: false}}}}\n")
     settings = load(file, {"RTC3D_GATEWAY__ZENOH__CONFIG__CONNECT__ENDPOINTS": f"['{endpoint}']"})
@@ -209,6 +209,6 @@ def test_the_error_of_a_failed_link_masks_its_key(caplog: pytest.LogCaptureFixtu
         output.close()
 
 
-def test_a_text_without_secrets_stays_unchanged() -> None:
+def test_texts_without_secrets_stay() -> None:
     text = "tls/lab:7447#so_sndbuf=1, https://lab/a@b and a:b@c, password"
     assert mask_secrets_in_text(text) == text

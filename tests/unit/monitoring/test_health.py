@@ -83,7 +83,7 @@ async def test_the_problem_names_the_reason_and_what_to_check() -> None:
     set_state(lab.statuses[0], StreamState.CONNECTING, None)
     assert lab.problem() == "no frame so far: connecting to 192.0.2.20:3020"
     set_state(lab.statuses[0], StreamState.WAITING, 41.5)
-    lab.statuses[0].note_error("connection refused by 192.0.2.20:3020; is the RT server running?")
+    lab.statuses[0].record_error("connection refused by 192.0.2.20:3020; is the RT server running?")
     assert lab.problem() == (
         "no frame for 41.5 s (limit 3 s): connection refused by 192.0.2.20:3020; is the RT server running?"
     )

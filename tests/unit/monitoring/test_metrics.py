@@ -14,9 +14,10 @@ from gateway.gateway import Gateway
 from gateway.messages.stamp import Stamp
 from gateway.monitoring.loop_delay import LoopDelay
 from gateway.monitoring.metrics import metrics_page, metrics_registry
+from gateway.rtc3d.client_protocol import State
 from gateway.rtc3d.components import ComponentType, build_component
 from gateway.rtc3d.frames import build_frame, split_frame
-from gateway.stream.state import StreamInput, StreamState
+from gateway.stream.state import StreamState
 from tests.toy_output import ToyOutput
 
 STREAMS = (
@@ -81,8 +82,9 @@ async def test_every_stream_has_its_counters(lab: Lab) -> None:
 
 
 async def test_exactly_one_state_of_a_stream_is_1(lab: Lab) -> None:
-    for happened in (StreamInput.DIAL, StreamInput.CONNECTED, StreamInput.FRAME):
-        lab.markers.move(happened, "test")
+    lab.markers.connecting("server")
+    lab.markers.connected("server")
+    lab.markers.protocol_changed(State.STREAMING, "big", "server")
     states = {
         labels["state"]: value
         for labels, value in lab.samples("stream_state")
@@ -180,6 +182,6 @@ async def test_texts_from_the_network_add_no_series(lab: Lab) -> None:
         }
 
     before = names()
-    lab.markers.note_error("a text from a server")
-    lab.markers.limit("the server refused something")
+    lab.markers.record_error("a text from a server")
+    lab.markers.add_limitation("the server refused something")
     assert names() == before

@@ -5,8 +5,9 @@ import pytest
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.monitoring.status_line import output_lines, source_line
 from gateway.outputs.status import OutputHealth
+from gateway.rtc3d.client_protocol import State
 from gateway.rtc3d.components import ComponentType
-from gateway.stream.state import StreamInput, StreamState
+from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 
 LAB = SourceSettings(name="lab", host="192.0.2.9")
@@ -57,10 +58,11 @@ def test_only_outputs_that_cannot_send_have_a_line() -> None:
 
 def test_tries_are_counted_since_the_last_handshake() -> None:
     status = StreamStatus("3d")
-    for happened in (StreamInput.DIAL, StreamInput.ENDED, StreamInput.DIAL):
-        status.move(happened, "")
+    status.connecting("server")
+    status.disconnected("connection refused")
+    status.connecting("server")
     assert status.tries == 2
-    status.move(StreamInput.CONNECTED, "")
+    status.connected("server")
     assert status.tries == 2
-    status.move(StreamInput.READY, "")
+    status.handshake_done(State.ASKED, "server")
     assert status.tries == 0

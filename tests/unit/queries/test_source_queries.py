@@ -159,7 +159,7 @@ async def test_before_the_first_try_is_over_it_is_told_where_to() -> None:
 async def test_the_reason_the_age_and_the_remedy_are_told_while_there_is_no_connection() -> None:
     rig = Rig()
     rig.server.connected = False
-    rig.status.note_error("connection refused by 192.0.2.1:3020; is the RT server running?")
+    rig.status.record_error("connection refused by 192.0.2.1:3020; is the RT server running?")
     rig.status.last_error_utime -= 300_000_000
     problem, _, remedy = str(await rig.error(stale_ok=True)).partition("; ")
     assert re.fullmatch(

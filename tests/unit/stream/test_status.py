@@ -1,49 +1,119 @@
+import logging
 import time
 
+import pytest
+
 from gateway.messages.host_time import now_utime
+from gateway.rtc3d.client_protocol import State
+from gateway.stream.state import StreamState
 from gateway.stream.status import MAX_ERROR_LENGTH, MAX_LIMITATIONS, FrameRate, StreamStatus
 from tests.waiting import wait_until
+
+SERVER = "192.0.2.20:3020"
+
+
+def limited(status: StreamStatus, *texts: str) -> None:
+    for text in texts:
+        status.add_limitation(text)
+
+
+def warnings(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [record.message for record in caplog.records if record.levelno == logging.WARNING]
 
 
 def test_an_error_is_kept_with_its_time() -> None:
     status = StreamStatus("3d")
     before = now_utime()
-    status.note_error("connection refused")
+    status.record_error("connection refused")
     assert status.last_error == "connection refused"
     assert before <= status.last_error_utime <= now_utime()
 
 
-def test_of_a_long_error_the_beginning_is_kept() -> None:
+def test_only_the_beginning_of_a_long_error_is_kept() -> None:
     status = StreamStatus("3d")
-    status.note_error("refused: " + 20_000_000 * "x")
+    status.record_error("refused: " + 20_000_000 * "x")
     assert status.last_error.startswith("refused: xxx")
     assert len(status.last_error) == MAX_ERROR_LENGTH
 
 
-def test_a_rate_is_frames_by_the_time_since_the_last_look() -> None:
-    began_s = time.monotonic()
+def test_a_change_of_state_is_logged_with_source_states_and_cause(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    states: list[StreamState] = []
+    status = StreamStatus("3d", name="lab (3d)", on_state=states.append)
+    status.connecting(SERVER)
+    status.connected(SERVER)
+    status.handshake_done(State.ASKED, SERVER)
+    status.protocol_changed(State.STREAMING, "big", SERVER)
+    status.protocol_changed(State.NO_MEASUREMENT, "big", SERVER)
+    status.protocol_changed(State.IDLE, "big", SERVER)
+    status.protocol_changed(State.ASKED, "big", SERVER)  # still idle: logged once
+    status.silent("no frame for 3 s")
+    status.disconnected("closed by the server")
+    assert caplog.messages == [
+        f"lab (3d): waiting to reconnect → connecting: connecting ({SERVER})",
+        f"lab (3d): connecting → handshaking: connected ({SERVER})",
+        f"lab (3d): handshaking → idle: handshake done ({SERVER})",
+        f"lab (3d): idle → streaming: a frame arrived ({SERVER})",
+        f"lab (3d): streaming → no measurement: the server reports that no measurement runs ({SERVER})",
+        f"lab (3d): no measurement → idle: the gateway stopped the frames ({SERVER})",
+        "lab (3d): idle → stalled: silence (no frame for 3 s)",
+        "lab (3d): stalled → waiting to reconnect: the connection ended (closed by the server)",
+    ]
+    assert len(states) == 8
+    assert states[-1] is status.state
+
+
+def test_attempts_to_connect_are_logged_as_debug(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    status = StreamStatus("3d", name="lab (3d)")
+    status.connecting(SERVER)
+    status.connected(SERVER)
+    status.disconnected("closed by the server")
+    assert not caplog.messages
+    assert status.last_error == "closed by the server"
+
+
+def test_a_frame_may_arrive_before_the_handshake_is_done() -> None:
+    status = StreamStatus("3d")
+    status.connecting(SERVER)
+    status.connected(SERVER)
+    status.protocol_changed(State.STREAMING, "little", SERVER)
+    status.handshake_done(State.STREAMING, SERVER)
+    assert status.state is StreamState.STREAMING
+    assert status.byte_order == "little"
+
+
+def test_a_new_connection_counts_and_forgets_what_was_agreed() -> None:
+    status = StreamStatus("3d", session=4, byte_order="little", rate="AllFrames", limitations=["no names"])
+    status.connected(SERVER)
+    assert (status.session, status.byte_order, status.rate, status.limitations) == (5, "", "", [])
+
+
+def test_a_limitation_is_a_warning_once_over_all_connections(caplog: pytest.LogCaptureFixture) -> None:
+    status = StreamStatus("3d", name="lab (3d)")
+    status.connected(SERVER)
+    limited(status, "no Version", "no Version", "no XML")
+    assert warnings(caplog) == ["lab (3d): no Version", "lab (3d): no XML"]
+    status.connected(SERVER)
+    assert status.limitations == []
+    limited(status, "no XML", "no Version", "no names")
+    assert warnings(caplog)[2:] == ["lab (3d): no names"]
+    assert status.limitations == ["no XML", "no Version", "no names"]
+
+
+def test_limitations_are_bounded(caplog: pytest.LogCaptureFixture) -> None:
+    status = StreamStatus("3d")
+    limited(status, *(f"the server refused {number}" for number in range(100)))
+    assert len(status.limitations) == len(warnings(caplog)) == MAX_LIMITATIONS
+
+
+def test_the_frame_rate_is_frames_divided_by_the_time_since_the_last_update() -> None:
+    before_s = time.monotonic()
     rate = FrameRate()
-    made_s = time.monotonic()
-    wait_until(lambda: time.monotonic() > made_s)
+    created_s = time.monotonic()
+    wait_until(lambda: time.monotonic() > created_s)
     asked_s = time.monotonic()
     rate_hz = rate.update(100)
-    told_s = time.monotonic()
-    assert 100 / (told_s - began_s) <= rate_hz <= 100 / (asked_s - made_s)
+    after_s = time.monotonic()
+    assert 100 / (after_s - before_s) <= rate_hz <= 100 / (asked_s - created_s)
     assert rate.update(100) == 0.0
-
-
-def test_a_limitation_is_news_once_over_all_connections() -> None:
-    stream = StreamStatus("3d")
-    stream.begin_session()
-    assert [stream.limit(text) for text in ("no Version", "no Version", "no XML")] == [True, False, True]
-    stream.begin_session()
-    assert stream.limitations == []
-    assert [stream.limit(text) for text in ("no XML", "no Version", "no names")] == [False, False, True]
-    assert stream.limitations == ["no XML", "no Version", "no names"]
-
-
-def test_limitations_are_bounded() -> None:
-    stream = StreamStatus("3d")
-    news = [stream.limit(f"the server refused {number}") for number in range(100)]
-    assert news == [number < MAX_LIMITATIONS for number in range(100)]
-    assert len(stream.limitations) == MAX_LIMITATIONS

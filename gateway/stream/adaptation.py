@@ -1,0 +1,94 @@
+"""Adapts a running stream to the network and to its subscribers: its rate, and whether it runs."""
+
+import asyncio
+import logging
+from collections.abc import Callable, Coroutine
+from typing import Any, Final
+
+from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.errors import LinkError
+from gateway.log import FailureLog
+from gateway.stream.status import StreamStatus
+from gateway.stream.stream_control import StreamControl
+
+DEMAND_POLL_S: Final = 0.05
+"""How often an on-demand stream checks for subscribers. Polling cannot miss a notification."""
+
+logger = logging.getLogger(__name__)
+
+
+class Adaptation:
+    """Changes the stream of one session, in tasks of its own, until ``cancel``.
+
+    ``has_subscribers`` says whether the stream's components may have subscribers.
+    """
+
+    def __init__(
+        self,
+        source: SourceSettings,
+        stream: StreamSettings,
+        status: StreamStatus,
+        control: StreamControl,
+        has_subscribers: Callable[[], bool],
+    ) -> None:
+        self._source = source
+        self._stream = stream
+        self._status = status
+        self._control = control
+        self._has_subscribers = has_subscribers
+        self._lateness = FailureLog(logger, status.name)
+        self._tasks: set[asyncio.Task[None]] = set()
+
+    def start(self) -> None:
+        """Begin to follow the demand, if the stream is on demand; call it after the handshake."""
+        if self._stream.on_demand:
+            self._start_task(self._follow_demand())
+
+    def request_rate(self, halvings: int) -> None:
+        """Ask the server for the configured rate halved so many times; returns at once."""
+        self._start_task(self._change_rate(halvings))
+
+    def cancel(self) -> None:
+        """Cancel whatever is under way."""
+        for task in self._tasks:
+            task.cancel()
+
+    def _start_task(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.create_task(self._until_link_error(work))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _until_link_error(self, work: Coroutine[Any, Any, None]) -> None:
+        try:
+            await work
+        except LinkError as error:
+            logger.debug("%s: %s", self._status.name, error)  # the session ends and reports the reason
+
+    async def _change_rate(self, halvings: int) -> None:
+        lag_ms = 1000 * self._status.lag_s
+        await self._control.change_rate(halvings)
+        request = f"asked the server for {self._status.rate or 'its default rate'}"
+        if lag_ms > self._source.max_lag_ms:
+            self._lateness.failed(f"frames arrive {lag_ms:.0f} ms late; {request}")
+        elif halvings:
+            logger.debug("%s: frames arrive in time; %s", self._status.name, request)
+        else:
+            self._lateness.recovered(f"frames arrive in time; {request}")
+
+    async def _follow_demand(self) -> None:
+        """Stop the stream while it has no subscribers, and resume it within DEMAND_POLL_S of the first."""
+        loop = asyncio.get_running_loop()
+        last_subscribed_s = loop.time()
+        running = True
+        while True:
+            if self._has_subscribers():
+                last_subscribed_s = loop.time()
+                if not running:
+                    logger.info("%s: a subscriber appeared; streaming", self._status.name)
+                    await self._control.resume()
+                    running = True
+            elif running and loop.time() - last_subscribed_s >= self._stream.idle_after_s:
+                logger.info("%s: no subscribers; the stream is stopped", self._status.name)
+                await self._control.pause()
+                running = False
+            await asyncio.sleep(DEMAND_POLL_S)
