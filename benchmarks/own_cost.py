@@ -25,7 +25,7 @@ from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
 from gateway.outputs.memory import MemoryOutput
-from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.simulator import Simulator
 from gateway.stream.session import Session
 from gateway.stream.state import StreamState
 from tests.waiting import wait_until_async

@@ -34,7 +34,7 @@ from gateway.outputs.lcm.output import LcmOutput, open_lcm
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d_server.scene import Scene
-from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.simulator import Simulator
 
 SOURCE: Final = "demo"
 _SIDES: Final = ("zenoh", "lcm")

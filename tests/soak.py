@@ -27,9 +27,9 @@ from rich.console import Console
 from gateway import version_text
 from gateway.cli.subscribers import ZenohListener, key_pattern, open_zenoh
 from gateway.messages.decode import decode
-from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.faults.control import Faults
 from gateway.simulator.faults.kinds import KINDS
+from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.networks import free_port
 from tests.waiting import wait_until_async

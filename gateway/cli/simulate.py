@@ -21,16 +21,16 @@ from gateway.cli.options import (
     RateOption,
     ToolsOption,
 )
-from gateway.rtc3d_server.server import Simulator
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
 from gateway.simulator.c3d_scene import C3dScene
-from gateway.simulator.faults.kinds import list_of_kinds, parse_fault
+from gateway.simulator.faults.kinds import describe_kinds, parse_fault
 from gateway.simulator.scenario import Scenario, load_scenario
+from gateway.simulator.simulator import Simulator
 
 
 def _list_faults(wanted: bool) -> None:
     if wanted:
-        print(list_of_kinds())
+        print(describe_kinds())
         raise typer.Exit
 
 
@@ -88,7 +88,7 @@ def simulate(
         if _is_on_command_line(context, name.removesuffix("_hz"))
     }
     base = Scenario(faults=()) if scenario is None else load_scenario(scenario)
-    extended = base.extended(overrides, map(parse_fault, fault or ()), seed)
+    extended = base.with_overrides(overrides, map(parse_fault, fault or ()), seed)
     scene = extended.scene.build() if c3d is None else C3dScene(c3d)
     uvloop.run(_run_simulator(Simulator(scene, host=host, port=port, once=once), extended, seconds))
 

@@ -1,1 +1,1 @@
-"""An RT server for any scene: clients, commands, the rate rules of §5.3.5."""
+"""A library for RT servers: serves any scene to any number of clients, by the rate rules of §5.3.5."""

@@ -1,105 +1,132 @@
-"""One client's TCP connection to the simulator, and the count of what was sent on it."""
+"""One client's TCP connection."""
 
 import asyncio
 import logging
 import time
-from collections import Counter, deque
+from collections import deque
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Final, cast
+from typing import Final, Protocol, cast
 
 import gateway
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, PacketReader
 from gateway.rtc3d.parameters import General, Parameters
-from gateway.rtc3d_server.client_session import ClientSession, Server, error_packet
-from gateway.simulator.faults.line import Line
+from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks, error_packet
+from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
+from gateway.rtc3d_server.frame_builder import FrameBuilder
+from gateway.rtc3d_server.scene import Scene
+from gateway.rtc3d_server.sent_counts import SentCounts
 
-if TYPE_CHECKING:
-    from gateway.rtc3d_server.server import Simulator
-
-NAME: Final = "RTC3D simulator"
 MAX_COMMAND_BYTES: Final = 64 * 1024
 MAX_UNREAD_BYTES: Final = 4 * 1024 * 1024
-"""What is kept for a client that does not read; beyond it, frames for that client are dropped."""
+"""How much is kept for a client that does not read; beyond it, frames for that client are dropped."""
 
 _log = logging.getLogger(__name__)
 
 
-class SentCounts:
-    """Counts data frames and the components in them."""
+class ConnectionOwner(Protocol):
+    """What a connection needs from its server."""
 
-    def __init__(self) -> None:
-        self._frames: Counter[tuple[ComponentType, ...]] = Counter()
+    name: str
+    """The server's name in the General parameters."""
 
-    def add(self, components: tuple[ComponentType, ...]) -> None:
-        """Count one frame of these components."""
-        self._frames[components] += 1
-
-    @property
-    def frames(self) -> int:
-        """How many frames were counted."""
-        return self._frames.total()
+    sent_counts: SentCounts
+    """What was sent to all clients."""
 
     @property
-    def components(self) -> Counter[str]:
-        """How many of each component were in them, by the components' keys."""
-        counts: Counter[str] = Counter()
-        for components, frames in self._frames.items():
-            counts.update({component.key: frames for component in components})
-        return counts
+    def scene(self) -> Scene:
+        """The scene that is served."""
+        ...
+
+    def frame_builder(self, components: Sequence[ComponentType]) -> FrameBuilder:
+        """Return the frame builder of these components; none means all."""
+        ...
+
+    def elapsed_us(self) -> int | None:
+        """Return the measurement's time in µs; None while no measurement runs."""
+        ...
+
+    def frames_requested(self) -> int | None:
+        """Start a measurement that waits for the first request for frames; return ``elapsed_us``."""
+        ...
+
+    def connection_opened(self, connection: "ClientConnection") -> int:
+        """Keep a new connection; return its number."""
+        ...
+
+    def connection_closed(self, connection: "ClientConnection") -> None:
+        """Forget a connection that has ended."""
+        ...
+
+    def new_filter(self, connection: FilteredConnection) -> ConnectionFilter:
+        """Return the filter for a new connection."""
+        ...
+
+    def schedule(self) -> None:
+        """Set the timer again: the connection's ``due_us`` may have changed."""
+        ...
 
 
 class ClientConnection(asyncio.Protocol):
-    """One client's TCP connection: packets in to its Client, replies and due frames out.
+    """One client's TCP connection: packets in to its session, replies and due frames out.
 
-    Nagle's algorithm is off (§2.1): the loop does that for every TCP connection. Each packet is
-    written at once and alone, since common clients read one with one recv (field note 15). A client
-    that does not read is not read from either, and its frames are dropped.
+    Nagle's algorithm is off (§2.1): asyncio and uvloop switch it off for every TCP connection. Each
+    packet is written at once and by itself, because common clients read a packet with one recv
+    (field note 15). While a client does not read, the server does not read from it either, and
+    drops its frames.
     """
 
     transport: asyncio.Transport
-    number: int
-    """Which connection it is, from 1 since the server's start."""
+    filter: ConnectionFilter
+    """What bytes pass through in both directions."""
 
-    def __init__(self, simulator: "Simulator") -> None:
-        self._simulator = simulator
+    number: int
+    """Counts the connections since the server's start, from 1."""
+
+    def __init__(self, owner: ConnectionOwner) -> None:
+        self._owner = owner
         self._loop = asyncio.get_running_loop()
         self._reader = PacketReader(max_packet_bytes=MAX_COMMAND_BYTES, max_c3d_bytes=MAX_COMMAND_BYTES)
         self._inbox: deque[Packet] = deque()
         self._is_full = False  # MAX_UNREAD_BYTES wait for the client to read
         self._was_full = False
-        self._first_sent_s: float | None = None  # monotonic times of this session's first and newest frame
+        self._first_sent_s: float | None = None  # monotonic times of the first and the newest frame sent
         self._last_sent_s = 0.0
         self.closed: asyncio.Future[None] = self._loop.create_future()
-        self.counts = SentCounts()
-        """What was sent to this client so far."""
-        self.line: Line | None = None
-        """What changes this connection's bytes, while faults of it are on."""
-        self.client = ClientSession(Server(simulator.frames, self._parameters, simulator.measurement_us))
+        """Done once the connection has ended."""
+        self.sent_counts = SentCounts()
+        """What was sent to this client."""
+        self.session = ClientSession(
+            SessionCallbacks(owner.frame_builder, self._parameters, owner.frames_requested)
+        )
+
+    @property
+    def name(self) -> str:
+        """The client's address and port."""
+        return self.session.name
 
     @property
     def due_us(self) -> int | None:
         """When the next frame is due, in µs since the measurement's start; None if none is to be sent."""
-        return self.client.due_us if self._can_send() else None
+        return self.session.due_us if self._can_send() else None
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """See asyncio.Protocol."""
         self.transport = cast(asyncio.Transport, transport)
         self.transport.set_write_buffer_limits(high=MAX_UNREAD_BYTES)
-        peer = transport.get_extra_info("peername")
-        self.client.name = f"{peer[0]}:{peer[1]}"
-        self._simulator.admit(self)
-        _log.info("%s: connected, number %d", self.client.name, self.number)
-        if not self._simulator.is_listening:
-            self.transport.abort()  # accepted in the moment in which the server vanished
+        address, port = transport.get_extra_info("peername")[:2]
+        self.session.name = f"{address}:{port}"
+        self.filter = self._owner.new_filter(self)
+        self.number = self._owner.connection_opened(self)
+        _log.info("%s: connected, number %d", self.name, self.number)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """See asyncio.Protocol."""
-        _log.info("%s: disconnected%s", self.client.name, f" ({exc})" if exc else "")
+        _log.info("%s: disconnected%s", self.name, f" ({exc})" if exc else "")
         self._inbox.clear()
-        if self.line is not None:
-            self.line.close()
-        self._simulator.forget(self)
+        self.filter.connection_lost()
+        self._owner.connection_closed(self)
         self.closed.set_result(None)
 
     def pause_writing(self) -> None:
@@ -108,51 +135,52 @@ class ClientConnection(asyncio.Protocol):
         self.transport.pause_reading()
         _log.log(
             logging.DEBUG if self._was_full else logging.WARNING,
-            "%s does not read: %d MiB wait for it, and its frames are dropped until it does",
-            self.client.name,
+            "%s does not read: %d MiB wait for it; dropping its frames until it reads again",
+            self.name,
             MAX_UNREAD_BYTES >> 20,
         )
         self._was_full = True
 
     def resume_writing(self) -> None:
-        """Go on: the client reads again (asyncio.Protocol)."""
+        """Send and read again: the client reads (asyncio.Protocol)."""
         self._is_full = False
-        elapsed_us = self._simulator.elapsed_us()
+        elapsed_us = self._owner.elapsed_us()
         if elapsed_us is not None:
-            self.client.drop_due(elapsed_us)
-        _log.info(
-            "%s reads again; %d of its frames were dropped", self.client.name, self.client.frames_dropped
-        )
+            self.session.drop_due_frames(elapsed_us)
+        _log.info("%s reads again; %d of its frames were dropped", self.name, self.session.frames_dropped)
         self.resume_reading()
-        self._simulator.schedule()
-        self._work()
+        self._owner.schedule()
+        self._process_inbox()
 
     def resume_reading(self) -> None:
-        """Read again, unless the client does not read what it was sent, or is leaving."""
+        """Read from the socket again, unless the client does not read or the connection is closing."""
         if self._can_send():
             self.transport.resume_reading()
 
     def data_received(self, data: bytes) -> None:
         """See asyncio.Protocol."""
-        if self.line is None or not self.line.holds(data):
-            self.take(data)
+        self.filter.receive(data)
 
-    def take(self, data: bytes) -> None:
-        """Act on the next bytes that the client sent."""
+    def handle(self, data: bytes) -> None:
+        """Act on the next bytes from the client."""
         is_idle = not self._inbox
         self._inbox.extend(self._reader.feed(data))
         if is_idle:
-            self._work()
+            self._process_inbox()
 
-    def send_due(self, elapsed_us: int) -> None:
-        """Send the frames that are due by now, or drop them if the client does not read or is leaving."""
+    def answer(self, packet: Packet) -> list[bytes]:
+        """Obey a client's packet; return the replies, each one packet."""
+        return self.session.answer(packet)
+
+    def send_due_frames(self, elapsed_us: int) -> None:
+        """Send the frames that are due, or drop them if the client does not read or is leaving."""
         if not self._can_send():
-            self.client.drop_due(elapsed_us)
+            self.session.drop_due_frames(elapsed_us)
             return
-        for packet, components in self.client.due(elapsed_us):
+        for packet, components in self.session.due_frames(elapsed_us):
             self.send(packet)
-            self.counts.add(components)
-            self._simulator.counts.add(components)
+            self.sent_counts.add(components)
+            self._owner.sent_counts.add(components)
             self._last_sent_s = time.monotonic()
             if self._first_sent_s is None:
                 self._first_sent_s = self._last_sent_s
@@ -160,44 +188,39 @@ class ClientConnection(asyncio.Protocol):
                 break
 
     def send(self, packet: bytes) -> None:
-        """Send one packet, as the faults that are on for this client have it."""
-        if self.line is None:
-            self.write(packet)
-        else:
-            self.line.send(packet)
+        """Send one packet through the filter."""
+        self.filter.send(packet)
 
     def write(self, data: bytes) -> None:
-        """Send bytes as they are, with one send; everything that leaves for this client goes through here."""
+        """Write bytes to the socket with one send; nothing reaches the client in another way."""
         if not self.transport.is_closing():
             self.transport.write(data)
 
     def close(self) -> None:
         """Close the connection once everything has been sent; ``closed`` is done then."""
         self._inbox.clear()
-        if self.line is not None:
-            self.line.flush()
+        self.filter.flush()
         self.transport.close()
 
     def _can_send(self) -> bool:
         return not (self._is_full or self.transport.is_closing())
 
-    def _work(self) -> None:
-        """Answer one packet, the others in the loop's next rounds, so that no client holds up another."""
+    def _process_inbox(self) -> None:
+        """Answer one packet, and schedule the next for the loop's next turn: no client delays the others."""
         if not self._can_send():
             return
         if self._inbox:
-            command = self._inbox.popleft()
-            for reply in self.client.answer(command) if self.line is None else self.line.answer(command):
+            for reply in self.filter.answer(self._inbox.popleft()):
                 self.send(reply)
-            if self.client.said_bye:
+            if self.session.said_bye:
                 self.close()
                 return
-            elapsed_us = self._simulator.elapsed_us()
+            elapsed_us = self._owner.elapsed_us()
             if elapsed_us is not None:
-                self.send_due(elapsed_us)
-            self._simulator.schedule()
+                self.send_due_frames(elapsed_us)
+            self._owner.schedule()
         if self._inbox:
-            self._loop.call_soon(self._work)
+            self._loop.call_soon(self._process_inbox)
         elif self._reader.error is not None:
             size = self._reader.error.size
             self.send(
@@ -207,14 +230,14 @@ class ClientConnection(asyncio.Protocol):
 
     def _parameters(self) -> Parameters:
         address, port = self.transport.get_extra_info("sockname")[:2]
-        frames = self.counts.frames
+        frames = self.sent_counts.frames
         streaming_s = 0.0 if self._first_sent_s is None else self._last_sent_s - self._first_sent_s
         general = General(
-            name=NAME,
+            name=self._owner.name,
             version=gateway.__version__,
             address=address,
             port=port,
             frames_sent=frames,
             frames_per_s=round((frames - 1) / streaming_s, 2) if streaming_s > 0 else 0.0,
         )
-        return replace(self._simulator.scene.parameters, general=general)
+        return replace(self._owner.scene.parameters, general=general)

@@ -1,4 +1,4 @@
-"""A scene's data frames: which sample of each component belongs to which frame, and the packet's bytes."""
+"""Builds a scene's data frames: the sample of each component that a frame has, and the packet's bytes."""
 
 from collections.abc import Sequence
 from fractions import Fraction
@@ -12,8 +12,10 @@ from gateway.rtc3d.frames import build_frame
 from gateway.rtc3d.packets import PacketType, encode_packet
 from gateway.rtc3d_server.scene import NO_EVENTS, Scene
 
-_BLOCK_FRAMES: Final = 64  # asked of the scene at once: numpy's cost per call is shared by as many frames
-_KEPT_PACKETS: Final = 64  # so that clients with equal streams share one build
+_BLOCK_FRAMES: Final = (
+    64  # computed by the scene in one call, because a call of numpy costs much more than a value
+)
+_KEPT_PACKETS: Final = 64  # so that clients with equal streams share them
 _SECOND_US: Final = 1_000_000
 _FRAME_NUMBERS: Final = 2**31  # the field is a signed 32-bit integer
 
@@ -26,33 +28,35 @@ class DataPacket(NamedTuple):
 
 
 def exact_rate(rate_hz: float) -> Fraction:
-    """Return the rate as the fraction that was meant, such as 60000/1001 for 59.94006."""
+    """Return the fraction that a rounded rate stands for, such as 60000/1001 for 59.94006."""
     return Fraction(rate_hz).limit_denominator(1001)
 
 
 class FrameBuilder:
-    """Builds the frames of one choice of a scene's components.
+    """Builds the frames that have certain components of a scene.
 
-    Its frames are counted in ticks of ``rate``, that of the slowest measured component chosen
-    (§5.3.5), from 0 at the start of the measurement. In the frame of a tick each component has its
-    own newest sample of that time, and all have the time stamp of the tick. A FrameNumber is the
-    number of the component's own sample, from 1.
+    There is one frame for each tick of ``rate``, the rate of the slowest measured component in them
+    (§5.3.5); ticks are counted from 0 at the start of the measurement. A frame has the newest sample
+    of each component at its tick, and all components have the tick's time stamp. A FrameNumber is
+    the number of the component's own sample, from 1.
+
+    ``requested`` names the components as in a command: none means all. Components that the scene
+    lacks are left out. ``event_bytes`` is the size of an event: 24 as NDI's code writes events, or 16
+    as in §7.7 (field note 6).
     """
 
-    def __init__(self, scene: Scene, asked: Sequence[ComponentType], event_bytes: int = 24) -> None:
-        """``asked`` as in a command: none means all. What the scene lacks is left out.
-
-        ``event_bytes`` is 24 as NDI's code writes events, or 16 as §7.7 has them (field note 6).
-        """
-        chosen = [component for component in WIRE_ORDER if not asked or component in asked]
+    def __init__(self, scene: Scene, requested: Sequence[ComponentType], event_bytes: int = 24) -> None:
+        chosen = [component for component in WIRE_ORDER if not requested or component in requested]
         rates = {c: exact_rate(scene.rates_hz[c]) for c in chosen if c in scene.rates_hz}
         measurement_rate = exact_rate(scene.measurement_rate_hz)
         events = scene.parameters.events
         self._scene = scene
         self._event_bytes = event_bytes
         self.measured = tuple(rates)
+        """The components of each frame, events aside, in their order in it."""
         self.has_events = ComponentType.EVENT in chosen and events is not None and bool(events.events)
         self.rate = min(rates.values(), default=measurement_rate)
+        """Ticks per second."""
         self._samples_per_tick = [rates[component] / self.rate for component in self.measured]
         self._events_per_tick = measurement_rate / self.rate
         self._packet = lru_cache(_KEPT_PACKETS)(self._build_packet)
@@ -67,11 +71,11 @@ class FrameBuilder:
         return -(-(elapsed_us + 1) * self.rate.numerator // (_SECOND_US * self.rate.denominator))
 
     def events(self, start_us: int, stop_us: int) -> Items:
-        """Return the events of [start_us, stop_us), none if this choice is without events."""
+        """Return the events with time stamps in [start_us, stop_us); none if events were not requested."""
         return self._scene.events(start_us, stop_us) if self.has_events else NO_EVENTS
 
     def packet(self, byte_order: ByteOrder, tick: int, events: Items = NO_EVENTS) -> DataPacket:
-        """Return the frame of a tick; ``events`` become its event component unless there are none."""
+        """Return the frame of a tick; it has an event component if there are ``events``."""
         if not len(events):
             return self._packet(byte_order, tick)
         return self._build_packet(byte_order, tick, events)
@@ -89,7 +93,7 @@ class FrameBuilder:
             components = (*components, ComponentType.EVENT)
             number = _frame_number(tick, self._events_per_tick)
             parts.append(
-                build_component(ComponentType.EVENT, number, timestamp_us, self._sized(events), byte_order)
+                build_component(ComponentType.EVENT, number, timestamp_us, self._resized(events), byte_order)
             )
         packet = encode_packet(PacketType.DATA, build_frame(parts, byte_order))
         return DataPacket(packet, components)
@@ -103,14 +107,15 @@ class FrameBuilder:
             block.append(items.astype(items.dtype.newbyteorder(byte_order), copy=False))
         return block
 
-    def _sized(self, events: Items) -> Items:
+    def _resized(self, events: Items) -> Items:
+        """Return the events in the size that was configured."""
         if self._event_bytes == SHORT_EVENT.itemsize:
             return events[["id", "param1", "param2", "param3"]].astype(SHORT_EVENT)
         return events
 
 
 def time_us(tick: int, rate: Fraction) -> int:
-    """Return when a tick of ``rate`` is, in µs since the start of the measurement."""
+    """Return the time of a tick of ``rate`` in µs since the start of the measurement."""
     return tick * _SECOND_US * rate.denominator // rate.numerator
 
 

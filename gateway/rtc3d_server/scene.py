@@ -1,4 +1,4 @@
-"""What the simulator plays: the contract between a scene and the server."""
+"""The contract between a scene and the RT server that serves it."""
 
 from collections.abc import Mapping
 from typing import Final, Protocol
@@ -9,43 +9,43 @@ import numpy.typing as npt
 from gateway.rtc3d.components import LONG_EVENT, ComponentType, Items
 from gateway.rtc3d.parameters import Parameters
 
-Samples = npt.NDArray[np.int64]
+SampleNumbers = npt.NDArray[np.int64]
 """Numbers of samples of one component, shape (count,), counted from 0 at the start of the measurement."""
 
 NO_EVENTS: Final = np.zeros(0, LONG_EVENT)
 
 
 class Scene(Protocol):
-    """A measurement that the simulator plays, as a function of time alone.
+    """The content of a measurement: a function of time alone.
 
-    It never blocks, and the same question always has the same answer, so that all clients see one
-    scene however their streams differ.
+    Its methods never block, and return the same values whenever they are called with the same
+    arguments, so that all clients see one scene however much their streams differ.
     """
 
     @property
     def parameters(self) -> Parameters:
-        """All sections of §6 but General, which is the server's own."""
+        """All sections of §6 except General, which the server fills in."""
         ...
 
     @property
     def rates_hz(self) -> Mapping[ComponentType, float]:
-        """The rate of each measured component that the scene has; one without items is not in it."""
+        """The rate of each measured component of the scene; components without items are missing."""
         ...
 
     @property
     def measurement_rate_hz(self) -> float:
-        """The rate of real-time frames, which is also that of streams of nothing but events."""
+        """The rate of real-time frames, and of streams that have nothing but events."""
         ...
 
     @property
     def num_frames(self) -> int | None:
-        """How many frames at ``measurement_rate_hz`` one pass has; None if the scene has no end."""
+        """The number of frames in one pass, at ``measurement_rate_hz``; None if the scene has no end."""
         ...
 
-    def items(self, component: ComponentType, samples: Samples) -> Items:
+    def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
         """Return a measured component's items, shape (len(samples), number of items).
 
-        The dtype is that of ITEM_DTYPES. Samples past the end of a pass begin it again.
+        The dtype is that of ITEM_DTYPES. After the last sample of a pass the first one follows again.
         """
         ...
 

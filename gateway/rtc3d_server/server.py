@@ -1,32 +1,36 @@
-"""The simulator's server: listens, and keeps the measurement's time for all clients."""
+"""The RT server: accepts clients, and sends each of them its frames of one measurement."""
 
 import asyncio
 import logging
-import math
-import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Final, Self
 
 from gateway.errors import GatewayError
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d_server.client_connection import ClientConnection, SentCounts
-from gateway.rtc3d_server.frame_builder import FrameBuilder, exact_rate, time_us
+from gateway.rtc3d_server.client_connection import ClientConnection
+from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
+from gateway.rtc3d_server.frame_builder import FrameBuilder
+from gateway.rtc3d_server.measurement import Measurement
 from gateway.rtc3d_server.scene import Scene
-from gateway.simulator.faults.control import Faults
+from gateway.rtc3d_server.sent_counts import SentCounts
+from gateway.rtc3d_server.timers import call_after_us
 
-_CLOSING_S: Final = 1.0  # for clients to take what was sent before close() cuts them off
+_CLOSING_S: Final = 1.0  # how long close() waits for clients to read what was sent
 _log = logging.getLogger(__name__)
 
 
-class Simulator:
-    """An RT server that plays a scene on a TCP port.
+class RtServer:
+    """Serves a scene on a TCP port.
 
-    ``port`` 0 takes a free one; the attribute ``port`` has it after ``start``. ``event_bytes`` is 24
-    as NDI's code writes events, or 16 as §7.7 has them (field note 6). The measurement begins with
-    ``start``, or, with ``once``, with the first request for frames, and then ends after one pass of
-    the scene. Use it as an asynchronous context manager, or call ``start`` and ``close``.
+    With ``port`` 0 the system chooses a free port; the attribute ``port`` has it after ``start``.
+    ``event_bytes`` is the size of an event: 24 as NDI's code writes events, or 16 as in §7.7 (field
+    note 6). The measurement begins with ``start``; with ``once``, it begins with the first request
+    for frames and ends after one pass of the scene. ``name`` is the server's name in the General
+    parameters. ``new_filter`` makes the filter of each connection; the default changes nothing.
+
+    Use it as an asynchronous context manager, or call ``start`` and ``close``.
     """
 
     def __init__(
@@ -37,25 +41,28 @@ class Simulator:
         *,
         event_bytes: int = 24,
         once: bool = False,
+        name: str = "RTC3D server",
+        new_filter: Callable[[FilteredConnection], ConnectionFilter] = ConnectionFilter,
     ) -> None:
-        self.scene = scene
         self.host = host
         self.port = port
+        self.name = name
         self.connections: set[ClientConnection] = set()
-        self.counts = SentCounts()
-        """What was sent to all clients so far."""
-        self.faults = Faults(self)
-        """What goes wrong on purpose; nothing unless it is told to."""
-        self._accepted = 0  # connections since the server's start
-        self._dropped_before = 0  # by clients no longer connected
-        self._event_bytes = event_bytes
+        self.sent_counts = SentCounts()
+        """What was sent to all clients."""
+        self._new_filter = new_filter
+        self._measurement = Measurement(scene, event_bytes=event_bytes, once=once)
         self._once = once
-        self._builders: dict[frozenset[ComponentType], FrameBuilder] = {}
-        self._started_us: int | None = None  # monotonic time of the measurement's start
-        self._end_us: int | None = None  # of a measurement that is one pass of the scene
-        self._has_measured = False
+        self._starts_on_request = once  # the measurement, with the first request for frames
+        self._num_accepted = 0  # connections since the server's start
+        self._dropped_before = 0  # frames that clients missed whose connections have ended
         self._server: asyncio.Server | None = None
         self._timer: asyncio.TimerHandle | None = None
+
+    @property
+    def scene(self) -> Scene:
+        """The scene that is served."""
+        return self._measurement.scene
 
     @property
     def is_listening(self) -> bool:
@@ -64,41 +71,42 @@ class Simulator:
 
     @property
     def sent(self) -> Counter[str]:
-        """How many of each component were sent to all clients so far, by the components' keys."""
-        return self.counts.components
+        """The number of each component that was sent to all clients, by the components' keys."""
+        return self.sent_counts.components
 
     @property
     def frames_sent(self) -> int:
-        """How many frames were sent to all clients so far."""
-        return self.counts.frames
+        """The number of frames that were sent to all clients."""
+        return self.sent_counts.frames
 
     @property
     def frames_dropped(self) -> int:
-        """How many frames clients missed so far because they did not read or the server was late."""
-        return self._dropped_before + sum(c.client.frames_dropped for c in self.connections)
+        """The number of frames that clients missed because they did not read or the server was late."""
+        return self._dropped_before + sum(c.session.frames_dropped for c in self.connections)
+
+    # Life cycle -----------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Listen, and begin the measurement unless it waits for the first request.
+        """Listen, and start the measurement unless it waits for the first request.
 
-        Raises GatewayError if the address cannot be listened on.
+        Raises GatewayError if the server cannot listen on the address.
         """
         loop = asyncio.get_running_loop()
         try:
             self._server = await loop.create_server(lambda: ClientConnection(self), self.host, self.port)
         except OSError as error:
             raise GatewayError(
-                f"The simulator cannot listen on {self.host}, port {self.port}: {error.strerror or error}; "
-                "give it an address of this machine and a port that is free"
+                f"{self.name}: cannot listen on {self.host}, port {self.port}: {error.strerror or error}; "
+                "choose an address of this machine and a free port"
             ) from error
         self.port = self._server.sockets[0].getsockname()[1]
-        self._accepted = 0
-        self._has_measured = False
+        self._num_accepted = 0
+        self._starts_on_request = self._once
         if not self._once:
             self.start_measurement()
 
     async def close(self) -> None:
-        """End the faults and the measurement, close the connections, and stop listening."""
-        await self.faults.close()
+        """Stop the measurement, close the connections, and stop listening."""
         self.stop_measurement()
         if self._server is None:
             return
@@ -113,8 +121,11 @@ class Simulator:
         await self._server.wait_closed()
         self._server = None
 
-    def vanish(self) -> None:
-        """End as if the process died: nobody is told. ``start`` brings the server back, on the same port."""
+    def crash(self) -> None:
+        """End as if the process died, without a word to the clients.
+
+        ``start`` brings the server back, on the same port.
+        """
         for connection in list(self.connections):
             connection.transport.abort()
         self.stop_measurement()
@@ -134,99 +145,95 @@ class Simulator:
     ) -> None:
         await self.close()
 
+    # The measurement ------------------------------------------------------------------------
+
     def start_measurement(self) -> None:
-        """Begin a measurement, unless one runs: frame numbers and time stamps start anew, streams go on."""
-        if self._started_us is not None:
+        """Start a measurement, unless one runs.
+
+        Frame numbers and time stamps start again; clients' streams go on with the first frame.
+        """
+        if self._measurement.is_running:
             return
-        self._started_us = _now_us()
-        self._has_measured = True
-        if self._once and self.scene.num_frames is not None:
-            self._end_us = time_us(self.scene.num_frames, exact_rate(self.scene.measurement_rate_hz))
-        self._builders.clear()
+        self._measurement.start()
+        self._starts_on_request = False
         _log.info("Measurement started")
         for connection in self.connections:
-            connection.client.measurement_started()
+            connection.session.measurement_started()
         self.schedule()
 
     def stop_measurement(self) -> None:
-        """End the measurement, if one runs: clients that wait for frames get a No Data packet."""
-        if self._started_us is None:
+        """Stop the measurement, if one runs: clients that wait for frames get a No Data packet."""
+        if not self._measurement.is_running:
             return
-        self._started_us = None
+        self._measurement.stop()
         _log.info("Measurement stopped")
         for connection in list(self.connections):
-            for packet in connection.client.measurement_stopped():
+            for packet in connection.session.measurement_stopped():
                 connection.send(packet)
         self.schedule()
 
     def change_scene(self, scene: Scene) -> None:
-        """Play another scene from now on; a measurement that runs goes on with it, its time stamps too."""
-        self.scene = scene
-        self._builders.clear()
+        """Serve another scene from now on; a running measurement and its time stamps go on."""
+        self._measurement.change_scene(scene)
         for connection in self.connections:
-            connection.client.scene_changed()
+            connection.session.scene_changed()
         self.schedule()
 
     def elapsed_us(self) -> int | None:
         """Return the time since the measurement's start in µs, None if none runs."""
-        if self._started_us is None:
-            return None
-        elapsed_us = _now_us() - self._started_us
-        # what would be due at the end itself is the first frame of another pass
-        return elapsed_us if self._end_us is None else min(elapsed_us, self._end_us - 1)
+        return self._measurement.elapsed_us()
 
-    def measurement_us(self) -> int | None:
-        """Return ``elapsed_us`` to a client that wants frames; a pass that waits for that begins now."""
-        if self._once and not self._has_measured:
+    # For connections ------------------------------------------------------------------------
+
+    def frame_builder(self, components: Sequence[ComponentType]) -> FrameBuilder:
+        """See ConnectionOwner."""
+        return self._measurement.frame_builder(components)
+
+    def frames_requested(self) -> int | None:
+        """See ConnectionOwner."""
+        if self._starts_on_request:
             self.start_measurement()
             return 0
         return self.elapsed_us()
 
-    def frames(self, components: Sequence[ComponentType]) -> FrameBuilder:
-        """Return the builder, shared by all clients, of a choice of components."""
-        choice = frozenset(components)
-        if choice not in self._builders:
-            self._builders[choice] = FrameBuilder(self.scene, components, self._event_bytes)
-        return self._builders[choice]
+    def new_filter(self, connection: FilteredConnection) -> ConnectionFilter:
+        """See ConnectionOwner."""
+        return self._new_filter(connection)
 
-    def admit(self, connection: ClientConnection) -> None:
-        """Put a new connection on the list, and give it its number."""
-        self._accepted += 1
-        connection.number = self._accepted
+    def connection_opened(self, connection: ClientConnection) -> int:
+        """See ConnectionOwner."""
+        self._num_accepted += 1
         self.connections.add(connection)
-        self.faults.connected(connection)
+        if not self.is_listening:
+            connection.transport.abort()  # accepted at the moment of a crash
+        return self._num_accepted
 
-    def forget(self, connection: ClientConnection) -> None:
-        """Take a connection that has ended off the list."""
+    def connection_closed(self, connection: ClientConnection) -> None:
+        """See ConnectionOwner."""
         self.connections.discard(connection)
-        self._dropped_before += connection.client.frames_dropped
+        self._dropped_before += connection.session.frames_dropped
         self.schedule()
 
     def schedule(self) -> None:
-        """Set the timer to when the next frame is due to any client, or the pass ends."""
+        """Set the timer to the time at which the next frame is due to any client, or the measurement ends."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
-        if self._started_us is None:
+        elapsed_us = self.elapsed_us()
+        if elapsed_us is None:
             return
-        due = [self._end_us, *(connection.due_us for connection in self.connections)]
-        next_us = min((due_us for due_us in due if due_us is not None), default=None)
+        due_us = [self._measurement.last_us, *(connection.due_us for connection in self.connections)]
+        next_us = min((time_us for time_us in due_us if time_us is not None), default=None)
         if next_us is not None:
-            # uvloop rounds to whole milliseconds: up here, lest it wakes us again and again just before it.
-            wait_ms = math.ceil((self._started_us + next_us - _now_us()) / 1000)
-            self._timer = asyncio.get_running_loop().call_later(max(0, wait_ms) / 1000, self._send_due)
+            self._timer = call_after_us(next_us - elapsed_us, self._send_due_frames)
 
-    def _send_due(self) -> None:
+    def _send_due_frames(self) -> None:
         elapsed_us = self.elapsed_us()
         if elapsed_us is None:
             return
         for connection in list(self.connections):
-            connection.send_due(elapsed_us)
-        if self._end_us is not None and elapsed_us >= self._end_us - 1:
+            connection.send_due_frames(elapsed_us)
+        if elapsed_us == self._measurement.last_us:
             self.stop_measurement()
         else:
             self.schedule()
-
-
-def _now_us() -> int:
-    return time.monotonic_ns() // 1000

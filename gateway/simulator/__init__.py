@@ -1,1 +1,1 @@
-"""Scenes and faults for an RT server that stands in for the hardware."""
+"""The simulator: scenes for an RT server that stands in for the hardware, and faults."""

@@ -1,4 +1,4 @@
-"""A recording as a scene: points, analog channels and force plates of a C3D file, read with ezc3d."""
+"""A C3D recording as a scene: points, analog channels and force plates, read with ezc3d."""
 
 import logging
 from pathlib import Path
@@ -22,7 +22,7 @@ from gateway.rtc3d.parameters import (
     Plate,
     Point,
 )
-from gateway.rtc3d_server.scene import NO_EVENTS, Samples
+from gateway.rtc3d_server.scene import NO_EVENTS, SampleNumbers
 
 _FORCE_LABELS: Final = ("Force X", "Force Y", "Force Z", "Moment X", "Moment Y", "Moment Z")
 _INSTALL: Final = "pip install 'rtc3d-gateway[c3d]'"
@@ -30,31 +30,29 @@ _log = logging.getLogger(__name__)
 
 
 class C3dScene:
-    """The scene that a C3D file holds, from its first frame to its last and then again.
+    """The scene in a C3D file, repeated from its first frame after its last.
 
-    Every value is what ezc3d reads, as float32. A marker of which the file has any NaN, or a
-    residual of -1, is missing as §7.3 and field note 7 say. Markers and channels have the order of
+    Every value is the one that ezc3d reads, as float32. A marker with any NaN or with a residual of -1
+    is missing, in the bytes of §7.3 and field note 7. Markers and channels have the order of
     POINT:LABELS and ANALOG:LABELS.
     """
 
     def __init__(self, path: Path) -> None:
-        """Read the file, all of it. Raises TakeError if it cannot be played."""
+        """Read the whole file. Raises TakeError if it cannot be played."""
         content = _read(path)
         try:
             self._load(content)
         except (KeyError, IndexError, TypeError, ValueError) as error:
             raise TakeError(
-                f"{path} lacks what every C3D file has ({type(error).__name__}: {error}); "
-                "open it in the software that recorded it and export it once more"
+                f"{path} lacks required C3D data ({type(error).__name__}: {error}); "
+                "open it in the software that recorded it and export it again"
             ) from error
         if not self.rates_hz:
-            raise TakeError(f"{path} holds neither markers nor analog channels; choose another file")
+            raise TakeError(f"{path} has neither markers nor analog channels; choose another file")
         if min(*self.rates_hz.values(), self.measurement_rate_hz) <= 0:
-            raise TakeError(
-                f"{path} gives no rate for its data (POINT:RATE, ANALOG:RATE); export it once more"
-            )
+            raise TakeError(f"{path} has no rate for its data (POINT:RATE, ANALOG:RATE); export it again")
 
-    def items(self, component: ComponentType, samples: Samples) -> Items:
+    def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
         """See Scene."""
         items = self._items[component]
         return items.take(samples, axis=0, mode="wrap")
@@ -98,22 +96,22 @@ class C3dScene:
 
 
 def _read(path: Path) -> Any:
-    """Return what ezc3d reads from the file, force plates included if it knows their kind."""
+    """Return what ezc3d reads from the file, including force plates if it supports their type."""
     try:
         import ezc3d  # noqa: PLC0415 - an optional extra
     except ImportError as error:
-        raise TakeError(f"{path} cannot be played without ezc3d: {_INSTALL}") from error
-    if not path.is_file():  # ezc3d never returns from reading a folder
-        raise TakeError(f"{path} is no file; give the path of a C3D file")
+        raise TakeError(f"{path} cannot be played without ezc3d; install it: {_INSTALL}") from error
+    if not path.is_file():  # ezc3d never returns if it reads a folder
+        raise TakeError(f"{path} is not a file; give the path of a C3D file")
     try:
         return ezc3d.c3d(str(path), extract_forceplat_data=True)
-    except Exception as error:  # noqa: BLE001 - the C++ library documents no errors
-        _log.debug("%s: cannot be read with its force plates", path, exc_info=error)
+    except Exception as error:  # noqa: BLE001 - the C++ library does not document its errors
+        _log.debug("%s: cannot read its force plates", path, exc_info=error)
     try:
         content = ezc3d.c3d(str(path))
     except Exception as error:
         raise TakeError(f"{path} cannot be read as a C3D file ({error}); choose another file") from error
-    _log.warning("%s: ezc3d does not know this kind of force plates; playing the rest without them", path)
+    _log.warning("%s: ezc3d does not support this type of force plates; playing the file without them", path)
     return content
 
 
@@ -128,7 +126,7 @@ def _markers(points: npt.NDArray[np.float64], residuals: npt.NDArray[np.float64]
 
 
 def _forces(plates: list[Any]) -> Items:
-    """Return the Force items, shape (samples, plates), of ezc3d's plates: force and moment, (3, samples)."""
+    """Return the Force items, shape (samples, plates); ezc3d's plates have force and moment, (3, samples)."""
     dtype = ITEM_DTYPES[ComponentType.FORCE]
     if not plates:
         return np.empty((0, 0), dtype)
@@ -168,7 +166,7 @@ def _describe_analog(analog: Any, count: int, rate_hz: float) -> ParametersAnalo
 
 
 def _describe_plate(plate: Any, index: int, force_platform: Any, rate_hz: float) -> Plate:
-    """Return a plate's parameters; C3D knows no labels, excitation or gain of plates."""
+    """Return a plate's parameters; C3D has no labels, excitation or gain of plates."""
     units = [plate["unit_force"]] * 3 + [plate["unit_moment"]] * 3
     channels = np.reshape(force_platform["CHANNEL"]["value"], (-1, len(force_platform["TYPE"]["value"])))
     calibration = plate["cal_matrix"]
@@ -183,7 +181,7 @@ def _describe_plate(plate: Any, index: int, force_platform: Any, rate_hz: float)
             for number, (label, unit) in enumerate(zip(_FORCE_LABELS, units, strict=True), start=1)
         ),
         analog_channel_ids=tuple(str(channel) for channel in channels[:, index] if channel > 0),
-        # types of plates without a calibration matrix have one of zeros
+        # plate types without a calibration matrix have one of zeros
         calibration_matrix=tuple(tuple(map(float, row)) for row in calibration) if calibration.any() else (),
     )
 
@@ -200,7 +198,7 @@ def _number(group: Any, name: str) -> float:
 
 
 def _texts(group: Any, name: str) -> list[str]:
-    """Return a parameter's texts, those of its continuations included: LABELS, LABELS2, … (255 each)."""
+    """Return a parameter's texts, including its continuations: LABELS, LABELS2, … (255 texts each)."""
     texts: list[str] = []
     for part in (name, *(f"{name}{number}" for number in range(2, 100))):
         if part not in group:

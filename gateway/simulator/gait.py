@@ -1,4 +1,4 @@
-"""Force plates that somebody walks over."""
+"""Force plates that a person walks over."""
 
 from typing import Final
 
@@ -6,14 +6,14 @@ import numpy as np
 
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, Items
 from gateway.rtc3d.parameters import ForceChannel, ParametersForce, Plate, Point
-from gateway.rtc3d_server.scene import Samples
+from gateway.rtc3d_server.scene import SampleNumbers
 from gateway.simulator.noise import Noise
 
 _WIDTH_MM: Final = 400.0
 _LENGTH_MM: Final = 600.0
 _PITCH_MM: Final = 610.0  # from plate to plate in the direction of walking, +Y
 _STRIDE_S: Final = 1.2  # from one step to the next of the same foot
-_STANCE_S: Final = 0.72  # of which the foot is on the plate
+_STANCE_S: Final = 0.72  # how long the foot is on the plate in each stride
 _WEIGHT_N: Final = 800.0
 _NOISE_N: Final = 0.5
 _CHANNELS: Final = tuple(
@@ -33,10 +33,10 @@ _CHANNELS: Final = tuple(
 
 
 class ForcePlates:
-    """Plates in a row, each stepped on half a stride after the one before, once per stride.
+    """Plates in a row; a foot is on each of them once per stride, half a stride later than on the one before.
 
-    Forces (N) are what the plate does to the foot, +Z up. Moments (N·m) are about the centre of the
-    plate's surface, so that the centre of pressure there is x = -My / Fz, y = Mx / Fz, in metres.
+    Forces (N) are those of the plate on the foot, +Z up. Moments (N·m) are about the centre of the
+    plate's surface, so that the centre of pressure is x = -My / Fz, y = Mx / Fz, in metres from there.
     """
 
     def __init__(self, num_plates: int, rate_hz: float, rng: np.random.Generator) -> None:
@@ -45,16 +45,16 @@ class ForcePlates:
         self._noise = Noise(rng, num_plates * 3)
         self.parameters = ParametersForce(tuple(_plate(index, rate_hz) for index in range(num_plates)))
 
-    def forces(self, samples: Samples) -> Items:
+    def forces(self, samples: SampleNumbers) -> Items:
         """Return the Force items, shape (len(samples), plates)."""
         time_s = samples[:, None] / self._rate_hz - self._delay_s
-        stance = np.minimum(time_s % _STRIDE_S / _STANCE_S, 1.0)  # 0 heel strike … 1 toe off and after
+        stance = np.minimum(time_s % _STRIDE_S / _STANCE_S, 1.0)  # 0 at heel strike, 1 from toe off on
         step = np.sin(np.pi * stance)
         swing = np.sin(2 * np.pi * stance)
         force_n = _NOISE_N * self._noise(samples).reshape(*time_s.shape, 3)
         force_n[..., 0] += 0.04 * _WEIGHT_N * step
-        force_n[..., 1] -= 0.18 * _WEIGHT_N * swing  # braking, then pushing off
-        force_n[..., 2] += 1.17 * _WEIGHT_N * (step + 0.33 * np.sin(3 * np.pi * stance))  # two humps
+        force_n[..., 1] -= 0.18 * _WEIGHT_N * swing  # the foot brakes, then pushes off
+        force_n[..., 2] += 1.17 * _WEIGHT_N * (step + 0.33 * np.sin(3 * np.pi * stance))  # two peaks
         x_m = 0.01 * step
         y_m = -0.11 + 0.23 * stance  # from heel to toe
         values = np.empty((*time_s.shape, 6), ">f4")

@@ -1,11 +1,11 @@
-"""Measurement noise as a function of the sample's number."""
+"""Measurement noise that depends only on the sample's number."""
 
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from gateway.rtc3d_server.scene import Samples
+from gateway.rtc3d_server.scene import SampleNumbers
 
 Floats = npt.NDArray[np.floating[Any]]
 
@@ -14,17 +14,17 @@ _STRIDE: Final = 7919  # odd, so that a column reads the whole table before it r
 
 
 class Noise:
-    """Normally distributed noise of standard deviation 1 that is the same whenever a sample is asked for.
+    """Normally distributed noise of standard deviation 1, always the same for the same sample.
 
-    Each of ``width`` columns reads one table of random numbers from a place of its own: much
-    cheaper than a generator per sample, and repeated only after 65536 samples.
+    Each of ``width`` columns reads one table of random numbers from another position. That is much
+    cheaper than a generator per sample, and repeats only after 65536 samples.
     """
 
     def __init__(self, rng: np.random.Generator, width: int) -> None:
         self._table = rng.standard_normal(_TABLE_SIZE, dtype=np.float32)
         self._columns = rng.integers(0, _TABLE_SIZE, width)
 
-    def __call__(self, samples: Samples) -> Floats:
+    def __call__(self, samples: SampleNumbers) -> Floats:
         """Return the noise of each sample, shape (len(samples), width)."""
-        places: npt.NDArray[np.int64] = (samples[:, None] * _STRIDE + self._columns) & (_TABLE_SIZE - 1)
-        return self._table.take(places)
+        positions: npt.NDArray[np.int64] = (samples[:, None] * _STRIDE + self._columns) & (_TABLE_SIZE - 1)
+        return self._table.take(positions)

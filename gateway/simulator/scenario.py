@@ -1,4 +1,4 @@
-"""A scenario: the scene that the simulator plays and its faults, in a YAML file."""
+"""Scenario files: the simulator's scene and faults, in YAML."""
 
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -9,28 +9,29 @@ from pydantic import PlainValidator, SerializeAsAny
 from gateway.config.loading import load_as
 from gateway.config.section import Section, expects
 from gateway.simulator.faults.base import Fault
-from gateway.simulator.faults.kinds import fault_of
+from gateway.simulator.faults.kinds import validate_fault
 from gateway.simulator.scene_settings import SceneSettings, Seed
 
 _EXAMPLE: Final = "config/scenarios/bad-day.yaml"
 
 
 class Scenario(Section):
-    """What a scenario file holds."""
+    """The content of a scenario file."""
 
     scene: SceneSettings = SceneSettings()
     """The synthetic scene at the start."""
 
     faults: Annotated[
-        tuple[Annotated[SerializeAsAny[Fault], PlainValidator(fault_of)], ...], expects("a list of faults")
+        tuple[Annotated[SerializeAsAny[Fault], PlainValidator(validate_fault)], ...],
+        expects("a list of faults"),
     ]
-    """What goes wrong; see ``gateway.simulator.faults``."""
+    """The faults; see ``gateway.simulator.faults``."""
 
     seed: Seed = 1
-    """Chooses another course of everything that is random in the faults."""
+    """The seed of everything that is random in the faults."""
 
-    def extended(self, scene: Mapping[str, float], faults: Iterable[Fault], seed: int | None) -> Self:
-        """Return this scenario with other values in its scene, more faults, and the seed if one is given."""
+    def with_overrides(self, scene: Mapping[str, float], faults: Iterable[Fault], seed: int | None) -> Self:
+        """Return this scenario with changes to its scene, more faults, and another seed unless it is None."""
         return self.model_copy(
             update={
                 "scene": self.scene.model_copy(update=dict(scene)),
@@ -43,6 +44,6 @@ class Scenario(Section):
 def load_scenario(path: Path) -> Scenario:
     """Return the scenario in the YAML file at ``path``.
 
-    Raises ConfigError with one line per mistake: file, line, column, key, what is accepted.
+    Raises ConfigError with one line per mistake: file, line, column, key, and what was expected.
     """
     return load_as(Scenario, path, example=_EXAMPLE)

@@ -1,4 +1,4 @@
-"""A synthetic scene's sizes and rates as settings: a mapping of a scenario."""
+"""The sizes and rates of a synthetic scene, as a scenario gives them."""
 
 from dataclasses import replace
 from typing import Annotated, Self
@@ -23,40 +23,40 @@ class SceneSettings(Section):
     """A synthetic scene (``gateway.simulator.synthetic``)."""
 
     markers: Size = 24
-    """How many markers."""
+    """The number of markers."""
 
     tools: Size = 4
-    """How many 6D tools."""
+    """The number of 6D tools."""
 
     analog: Size = 16
-    """How many analog channels."""
+    """The number of analog channels."""
 
     plates: Size = 2
-    """How many force plates."""
+    """The number of force plates."""
 
     rate_hz: Rate = 200.0
-    """Samples per second of markers and tools."""
+    """SampleNumbers per second of markers and tools."""
 
     analog_rate_hz: Rate = 2000.0
-    """Samples per second of analog channels and force plates."""
+    """SampleNumbers per second of analog channels and force plates."""
 
     marker_label: Label = "Marker"
-    """What the markers' labels begin with, before their number."""
+    """The text before the number in the markers' labels."""
 
     seed: Seed = 1
-    """Chooses another scene of the same size."""
+    """Another seed gives another scene of the same size."""
 
-    def changed_by(self, changes: Self) -> Self:
-        """Return these settings with those that are given in ``changes``."""
+    def with_changes(self, changes: Self) -> Self:
+        """Return these settings with the values that ``changes`` sets."""
         return self.model_copy(update={name: getattr(changes, name) for name in changes.model_fields_set})
 
     def build(self) -> Scene:
         """Return the scene."""
         scene = SyntheticScene(**self.model_dump(exclude={"marker_label"}))
-        described = scene.parameters.markers
-        if described is not None:
+        parameters_3d = scene.parameters.markers
+        if parameters_3d is not None:
             markers = tuple(
-                replace(marker, label=f"{self.marker_label} {marker.id}") for marker in described.markers
+                replace(marker, label=f"{self.marker_label} {marker.id}") for marker in parameters_3d.markers
             )
-            scene.parameters = replace(scene.parameters, markers=replace(described, markers=markers))
+            scene.parameters = replace(scene.parameters, markers=replace(parameters_3d, markers=markers))
         return scene

@@ -1,4 +1,4 @@
-"""A scene made up from nothing: tools and markers in motion, sine waves, steps on plates, a button."""
+"""A synthetic scene: moving tools and markers, sine waves, steps on force plates, a button."""
 
 from collections.abc import Callable
 from typing import Final
@@ -19,13 +19,13 @@ from gateway.rtc3d.parameters import (
     ParametersEvents,
     Tool,
 )
-from gateway.rtc3d_server.scene import NO_EVENTS, Samples
+from gateway.rtc3d_server.scene import NO_EVENTS, SampleNumbers
 from gateway.simulator.bodies import RigidBodies
 from gateway.simulator.gait import ForcePlates
 from gateway.simulator.noise import Noise
 
 BUTTON_EVENT: Final = 0x123456
-"""The id of the only event, that of §6.6: param1 is the button's number, param2 1 pressed or 0 released."""
+"""The id of the only event, as in §6.6: param1 is the button's number, param2 1 (pressed) or 0 (released)."""
 
 _UNUSED: Final = -1  # 0xFFFFFFFF (§7.7)
 _BUTTONS: Final = 2  # pressed in turn
@@ -35,10 +35,10 @@ _RELEASED_US: Final = 800_000
 
 
 class SyntheticScene:
-    """A scene of any size, 0 of everything included, that goes on for ever and is the same each time.
+    """A scene of any size that never ends, always the same for the same arguments.
 
-    Rates are in Hz: ``rate_hz`` of markers and tools, ``analog_rate_hz`` of analog channels and
-    force plates. ``seed`` chooses another scene of the same size.
+    Any of the numbers can be 0. ``rate_hz`` is the rate of markers and tools, ``analog_rate_hz`` that of
+    analog channels and force plates. Another ``seed`` gives another scene of the same size.
     """
 
     num_frames: int | None = None
@@ -58,7 +58,7 @@ class SyntheticScene:
         bodies = RigidBodies(markers, tools, rate_hz, rng)
         channels = _AnalogSines(analog, analog_rate_hz, rng)
         force_plates = ForcePlates(plates, analog_rate_hz, rng)
-        sources: list[tuple[ComponentType, int, float, Callable[[Samples], Items]]] = [
+        sources: list[tuple[ComponentType, int, float, Callable[[SampleNumbers], Items]]] = [
             (ComponentType.MARKERS, markers, rate_hz, bodies.markers),
             (ComponentType.TOOLS, tools, rate_hz, bodies.tools),
             (ComponentType.ANALOG, analog, analog_rate_hz, channels.voltages),
@@ -88,12 +88,12 @@ class SyntheticScene:
             events=_EVENTS,
         )
 
-    def items(self, component: ComponentType, samples: Samples) -> Items:
+    def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
         """See Scene."""
         return self._items[component](samples)
 
     def events(self, start_us: int, stop_us: int) -> Items:
-        """See Scene. A button is pressed and let go again once a second."""
+        """See Scene. A button is pressed and released once a second."""
         first, stop = _events_before(start_us), _events_before(stop_us)
         if first >= stop:
             return NO_EVENTS
@@ -108,7 +108,7 @@ class SyntheticScene:
 
 
 class _AnalogSines:
-    """Channels with a sine wave of its own frequency each, in mV, and noise."""
+    """Channels that each have a sine wave of another frequency, in mV, and noise."""
 
     def __init__(self, num_channels: int, rate_hz: float, rng: np.random.Generator) -> None:
         self._rate_hz = rate_hz
@@ -122,7 +122,7 @@ class _AnalogSines:
             )
         )
 
-    def voltages(self, samples: Samples) -> Items:
+    def voltages(self, samples: SampleNumbers) -> Items:
         """Return the Analog items, shape (len(samples), channels), in mV."""
         angle = np.multiply.outer(samples / self._rate_hz, self._angular_rate)
         voltage_mv: Items = self._amplitude_mv * np.sin(angle) + 2.0 * self._noise(samples)
@@ -130,7 +130,7 @@ class _AnalogSines:
 
 
 def _events_before(time_us: int) -> int:
-    """Return how many button events have time stamps below ``time_us``."""
+    """Return the number of button events with time stamps below ``time_us``."""
     period, rest_us = divmod(max(time_us, 0), _PERIOD_US)
     return 2 * period + (rest_us > _PRESSED_US) + (rest_us > _RELEASED_US)
 

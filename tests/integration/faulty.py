@@ -1,10 +1,10 @@
-"""A simulator with faults and a client of it, and what both are like when all is well again."""
+"""A simulator with faults, a client of it, and the check that both have recovered."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
 from gateway.rtc3d_server.client_connection import ClientConnection
-from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.simulator import Simulator
 from tests.integration.raw_client import RawClient, connected, consecutive, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
@@ -24,19 +24,20 @@ async def playing(rate_hz: float = FAST_HZ) -> AsyncIterator[tuple[Simulator, Ra
         yield simulator, client
 
 
-def only(simulator: Simulator) -> ClientConnection:
+def only_connection(simulator: Simulator) -> ClientConnection:
     [connection] = simulator.connections
     return connection
 
 
 def waiting_bytes(simulator: Simulator) -> int:
-    return sum(c.line.waiting_bytes for c in simulator.connections if c.line is not None)
+    return sum(pipeline.waiting_bytes for pipeline in simulator.faults.connections)
 
 
-async def well(simulator: Simulator, client: RawClient) -> None:
-    """Clear all faults; then the connection is as if there had never been any."""
+async def clear_and_check(simulator: Simulator, client: RawClient) -> None:
+    """Clear all faults; then the connection behaves as if there had never been any."""
     await simulator.faults.clear()
-    assert only(simulator).line is None
+    assert simulator.faults.active_on(only_connection(simulator).number) == []
+    assert waiting_bytes(simulator) == 0
     client.send(command("StreamFrames Stop"), command("Version 1.0"))
     while (await client.reply()) != VERSION:
         pass

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 import yaml
 
-from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.networks import free_endpoint, free_port, zenoh_keys
 from tests.waiting import wait_until, wait_until_async

@@ -14,7 +14,7 @@ from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.findings import Result
 from gateway.rtc3d.commands import Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests import networks, servers
 from tests.findings import Findings, lab, run_doctor

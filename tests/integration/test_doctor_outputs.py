@@ -14,7 +14,7 @@ import pytest
 from gateway.config.settings import LcmSettings, ZenohSettings
 from gateway.doctor import clock_check, lcm_checks
 from gateway.findings import Finding, MessageLoad, Result
-from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests import networks
 from tests.findings import Findings, lab, run_doctor

@@ -12,7 +12,7 @@ import rtc3d
 from gateway.config.settings import StreamSettings
 from gateway.rtc3d.commands import FrequencyDivisor
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
-from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.labs import gateway_to

@@ -30,8 +30,8 @@ from gateway.errors import OutputError
 from gateway.gateway import Gateway
 from gateway.log import FIELDS
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d_server.server import Simulator
 from gateway.service.log_format import ContextFilter
+from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.networks import free_port, zenoh_keys

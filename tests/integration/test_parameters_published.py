@@ -12,7 +12,7 @@ from gateway.cli.subscribers import LcmListener
 from gateway.messages.decode import decode
 from gateway.outputs.lcm import queries as lcm_queries
 from gateway.outputs.lcm.output import open_lcm
-from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
 from tests.querying import LabServer, ask, asker_at, gateway_at, is_filled, parameters_of

@@ -7,7 +7,7 @@ from contextlib import asynccontextmanager
 import pytest
 
 from gateway.rtc3d_server.client_connection import MAX_UNREAD_BYTES
-from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.simulator import Simulator
 from tests.integration.raw_client import RawClient, connected, consecutive, until
 from tests.proxy import FuzzingProxy
 from tests.unit.rtc3d_server.counting_scene import CountingScene

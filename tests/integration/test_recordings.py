@@ -23,8 +23,8 @@ from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.rtc3d.components import BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.rtc3d_server.scene import Scene
-from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.c3d_scene import C3dScene
+from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.waiting import wait_until_async
 

@@ -24,7 +24,7 @@ from gateway.errors import ConfigError
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.lcm.output import open_lcm
-from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
 from tests.querying import LabServer, ask, ask_all, asker_at

@@ -10,7 +10,7 @@ import pytest
 from gateway.errors import GatewayError
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.rtc3d_server.client_connection import MAX_UNREAD_BYTES
-from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.integration.raw_client import TIMEOUT_S, connected, consecutive, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
@@ -154,7 +154,7 @@ async def test_a_recording_is_switched_on_without_a_reply() -> None:
         client.send(packet(DATA, event))
         assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
         [connection] = simulator.connections
-        assert connection.client.recording
+        assert connection.session.is_recording
 
 
 async def test_each_packet_is_sent_with_one_send() -> None:
@@ -202,7 +202,7 @@ async def test_a_client_that_does_not_read_delays_nobody_and_goes_on_when_it_rea
 
         silent.writer.transport.resume_reading()  # type: ignore[attr-defined] # as above
         assert (await silent.read())[0] == COMMAND
-        frames = await silent.frames(full.counts.frames + 50)
+        frames = await silent.frames(full.sent_counts.frames + 50)
         assert not consecutive(frames)
         events = [
             event[0] for parts in frames for part in parts if part.type == EVENT for event in part.items

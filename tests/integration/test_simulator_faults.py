@@ -9,9 +9,9 @@ import struct
 import pytest
 
 from gateway.rtc3d.parameters_xml import parse_parameters
-from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.faults.base import Fault
 from gateway.simulator.faults.kinds import KINDS
+from gateway.simulator.faults.momentary_faults import Garbage, Undersize
 from gateway.simulator.faults.reply_faults import (
     MissingAcknowledgements,
     ReplyText,
@@ -19,12 +19,11 @@ from gateway.simulator.faults.reply_faults import (
 from gateway.simulator.faults.server_faults import ChangeScene, NoMeasurement, Restart
 from gateway.simulator.faults.stream_faults import (
     Delay,
-    Garbage,
     HalfOpen,
-    Undersize,
 )
 from gateway.simulator.scene_settings import SceneSettings
-from tests.integration.faulty import FAST_HZ, NEVER_MS, VERSION, only, playing, well
+from gateway.simulator.simulator import Simulator
+from tests.integration.faulty import FAST_HZ, NEVER_MS, VERSION, clear_and_check, only_connection, playing
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
@@ -50,7 +49,7 @@ async def test_the_measurement_can_stop_and_start() -> None:
         assert simulator.elapsed_us() is None
         simulator.faults.end(second)
         assert numbers(await client.frames(5)) == [1, 2, 3, 4, 5]
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def num_markers(client: RawClient) -> int:
@@ -78,7 +77,7 @@ async def test_a_restarted_server_has_the_same_port_a_new_measurement_and_the_ne
             [[part]] = await again.frames(1)
             assert len(part.items) == 12
             assert part.timestamp_us == (part.frame_number - 1) * 2000
-            assert only(simulator).number == 1
+            assert only_connection(simulator).number == 1
 
 
 async def test_a_restarted_server_comes_back_by_itself_with_its_old_scene() -> None:
@@ -90,7 +89,7 @@ async def test_a_restarted_server_comes_back_by_itself_with_its_old_scene() -> N
         await until(lambda: simulator.is_listening)
         assert simulator.scene is scene
         async with connected(simulator) as again:
-            await well(simulator, again)
+            await clear_and_check(simulator, again)
 
 
 @pytest.mark.parametrize("rounds", range(6))
@@ -133,22 +132,22 @@ async def test_a_restarted_server_plays_its_recording_once_more() -> None:
 
 async def test_no_measurement_runs_after_a_restart_while_another_fault_says_so() -> None:
     async with playing() as (simulator, _):
-        run = simulator.faults.begin(NoMeasurement())
+        no_measurement = simulator.faults.begin(NoMeasurement())
         restart = simulator.faults.begin(Restart(away_s=600))
         simulator.faults.end(restart)
         await until(lambda: simulator.is_listening)
         async with connected(simulator) as again:
             await again.ask("StreamFrames 3D")
             assert await again.read() == (NO_DATA, b"")
-            simulator.faults.end(run)
+            simulator.faults.end(no_measurement)
             assert numbers(await again.frames(3)) == [1, 2, 3]
 
 
 async def test_a_measurement_does_not_start_while_the_server_is_away() -> None:
     async with playing() as (simulator, _):
-        run = simulator.faults.begin(NoMeasurement())
+        no_measurement = simulator.faults.begin(NoMeasurement())
         simulator.faults.begin(Restart(away_s=600))
-        simulator.faults.end(run)
+        simulator.faults.end(no_measurement)
         assert simulator.elapsed_us() is None
         await simulator.faults.clear()
         assert simulator.elapsed_us() is not None
@@ -182,15 +181,15 @@ async def test_the_scene_changes_in_mid_stream_and_back() -> None:
         await client.ask("StreamFrames 3D")
         frames = await client.frames(5)
         scene = SceneSettings(markers=7, rate_hz=FAST_HZ, marker_label="M")
-        run = simulator.faults.begin(ChangeScene(scene=scene))
+        change = simulator.faults.begin(ChangeScene(scene=scene))
         frames += await frames_up_to(client, num_markers=7)
         described = simulator.scene.parameters.markers
         assert described is not None
         assert [marker.label for marker in described.markers] == [f"M {k}" for k in range(1, 8)]
-        simulator.faults.end(run)
+        simulator.faults.end(change)
         frames += await frames_up_to(client, num_markers=2)
         assert consecutive(frames)
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_a_scene_keeps_what_does_not_change_of_the_scenarios() -> None:
@@ -241,13 +240,13 @@ async def test_a_connection_that_comes_later_has_the_fault_too() -> None:
 async def test_a_fault_ends_when_its_time_is_over(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "gateway.simulator")
     async with playing() as (simulator, client):
-        run = simulator.faults.begin(MissingAcknowledgements(for_s=0.01))
-        await run.is_over.wait()
+        fault = simulator.faults.begin(MissingAcknowledgements(for_s=0.01))
+        await fault.ended.wait()
         assert await client.ask("Version 1.0") == VERSION
-    told = [message for message in caplog.messages if message.startswith("Fault")]
-    assert told == [
+    messages = [message for message in caplog.messages if message.startswith("Fault")]
+    assert messages == [
         "Fault begins: missing_acknowledgements,for_s=0.01",
-        "Fault ends: missing_acknowledgements,for_s=0.01 (happened so far: 0)",
+        "Fault ends: missing_acknowledgements,for_s=0.01 (happened 0 times so far)",
     ]
 
 
@@ -266,7 +265,7 @@ async def test_planned_faults_come_as_often_as_they_may(caplog: pytest.LogCaptur
         assert await client.ask("Version 1.0") == (COMMAND, b"Version 1.0")
         assert await client.ask("Version 1.0") == (COMMAND, b"Version 1.0")
         assert await client.ask("Version 1.0") == VERSION
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
     assert caplog.messages.count("Fault: undersize,every_s=0.01,times=4") == 4
     assert "garbage" not in caplog.text
 
@@ -309,10 +308,3 @@ async def test_the_server_is_well_after_any_fault_and_all_of_them_before(kind: t
             assert await again.ask("Version 1.0") == VERSION
             await again.ask("StreamFrames 3D")
             assert consecutive(await again.frames(20))
-
-
-async def test_without_faults_nothing_stands_between_a_connection_and_its_transport() -> None:
-    async with playing() as (simulator, client):
-        await client.ask("StreamFrames 3D")
-        await client.frames(3)
-        assert only(simulator).line is None

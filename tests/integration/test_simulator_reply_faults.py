@@ -8,7 +8,6 @@ import pytest
 
 from gateway.errors import FrameError
 from gateway.rtc3d.frames import split_frame
-from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.faults.base import Fault
 from gateway.simulator.faults.frame_faults import (
     ConstantFrameNumbers,
@@ -29,7 +28,8 @@ from gateway.simulator.faults.reply_faults import (
     RefusedCommands,
     ReplyText,
 )
-from tests.integration.faulty import NEVER_MS, VERSION, only, playing, well
+from gateway.simulator.simulator import Simulator
+from tests.integration.faulty import NEVER_MS, VERSION, clear_and_check, only_connection, playing
 from tests.integration.raw_client import RawClient, consecutive, numbers
 from tests.unit.rtc3d_server.wire import (
     COMMAND,
@@ -55,7 +55,7 @@ async def test_a_refused_command_gets_an_error_packet_and_is_not_obeyed() -> Non
         assert text == b"Error-setbyteorder is refused"
         await client.ask("StreamFrames 3D")
         assert consecutive(await client.frames(3, "big"))
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_a_minimal_server_streams_all_the_same() -> None:
@@ -68,7 +68,7 @@ async def test_a_minimal_server_streams_all_the_same() -> None:
             b"OK-StreamFrames FrequencyDivisor:2",
         )
         assert np.diff(numbers(await client.frames(20))).tolist() == [2] * 19
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_acknowledgements_can_be_missing() -> None:
@@ -79,7 +79,7 @@ async def test_acknowledgements_can_be_missing() -> None:
         assert part.type == MARKERS
         assert await client.ask("SetByteOrder BigEndian") == (COMMAND, b"OK-SetByteOrder BigEndian")
         assert (await client.ask("Fly"))[0] == ERROR
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_acknowledgements_can_be_doubled() -> None:
@@ -88,7 +88,7 @@ async def test_acknowledgements_can_be_doubled() -> None:
         assert [await client.ask("Version 1.0"), await client.read(), await client.read()] == [VERSION] * 3
         assert (await client.ask("SendParameters"))[0] == XML
         assert (await client.ask("Fly"))[0] == ERROR
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_late_acknowledgements_are_overtaken_by_everything() -> None:
@@ -97,13 +97,13 @@ async def test_late_acknowledgements_are_overtaken_by_everything() -> None:
         client.send(command("Version 1.0"), command("StreamFrames 3D"), command("SendParameters General"))
         assert (await client.reply())[0] == XML
         await client.frames(10)
-        assert simulator.faults.on_line(only(simulator)) == []
+        assert simulator.faults.active_on(only_connection(simulator).number) == []
 
         await simulator.faults.clear()
 
         assert await client.reply() == VERSION
         assert await client.reply() == (COMMAND, b"OK-StreamFrames 3D")
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_late_acknowledgements_come_by_themselves() -> None:
@@ -120,7 +120,7 @@ async def test_frames_can_come_before_the_acknowledgement() -> None:
         before = await client.frames(3)
         assert await client.read() == (COMMAND, b"OK-StreamFrames 3D")
         assert consecutive([*before, *await client.frames(10)])
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_without_frames_no_data_comes_before_the_acknowledgement() -> None:
@@ -170,24 +170,24 @@ async def test_markers_and_tools_can_be_out_of_view() -> None:
             assert all(all(map(math.isnan, item[:3])) and item[3] == 999.0 for item in markers.items)
             assert all(map(math.isnan, tool.items[0]))
             assert channels.items[0][0] == channels.frame_number - 1
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_time_stamps_can_stand_still() -> None:
     async with playing() as (simulator, client):
         frames = await frames_with(simulator, client, FrozenTimestamps(), "3D")
-        [(run, _)] = simulator.faults.on_line(only(simulator))
-        assert {part.timestamp_us for [part] in frames} == {run.began_us}
-        assert run.began_us > 0
+        [(frozen, _)] = simulator.faults.active_on(only_connection(simulator).number)
+        assert {part.timestamp_us for [part] in frames} == {frozen.began_us}
+        assert frozen.began_us > 0
         assert consecutive(frames)
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_time_stamps_can_jump() -> None:
     async with playing() as (simulator, client):
         frames = await frames_with(simulator, client, JumpingTimestamps(jump_ms=-7000), "3D")
         assert all(part.timestamp_us == (part.frame_number - 1) * 1000 - 7_000_000 for [part] in frames)
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_frame_numbers_can_stand_still() -> None:
@@ -195,7 +195,7 @@ async def test_frame_numbers_can_stand_still() -> None:
         frames = await frames_with(simulator, client, ConstantFrameNumbers(frame_number=5), "3D")
         assert {part.frame_number for [part] in frames} == {5}
         assert np.diff([part.timestamp_us for [part] in frames]).tolist() == [1000] * 19
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_events_can_be_short() -> None:
@@ -207,7 +207,7 @@ async def test_events_can_be_short() -> None:
             assert packet_type == DATA
             [part] = frame_of(body, event_bytes=event_bytes)
             assert part.type == EVENT
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_a_byte_order_can_be_acknowledged_and_ignored() -> None:
@@ -231,7 +231,7 @@ async def test_a_component_of_unknown_type_comes_along() -> None:
         frame = split_frame(body, "big")
         assert frame.unknown_types == (1234,)
         assert len(frame.components) == 1
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_as_many_frames_contradict_themselves_as_asked_for() -> None:
@@ -244,4 +244,4 @@ async def test_as_many_frames_contradict_themselves_as_asked_for() -> None:
             with pytest.raises(FrameError):
                 split_frame(body, "big")
         assert numbers(await client.frames(1))[0] >= 4
-        await well(simulator, client)
+        await clear_and_check(simulator, client)

@@ -6,25 +6,30 @@ import numpy as np
 import pytest
 
 from gateway.rtc3d_server.client_connection import ClientConnection
-from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.faults.base import Fault
-from gateway.simulator.faults.line import MAX_WAITING_BYTES
+from gateway.simulator.faults.momentary_faults import Cut, Garbage, Oversize, Undersize
 from gateway.simulator.faults.reply_faults import (
     LateAcknowledgements,
 )
 from gateway.simulator.faults.stream_faults import (
-    Cut,
     Delay,
-    Garbage,
     HalfOpen,
     Jitter,
     Merge,
-    Oversize,
     SlowReader,
     Split,
-    Undersize,
 )
-from tests.integration.faulty import FAST_HZ, NEVER_MS, VERSION, only, playing, waiting_bytes, well
+from gateway.simulator.faults.write_queue import MAX_WAITING_BYTES
+from gateway.simulator.simulator import Simulator
+from tests.integration.faulty import (
+    FAST_HZ,
+    NEVER_MS,
+    VERSION,
+    clear_and_check,
+    only_connection,
+    playing,
+    waiting_bytes,
+)
 from tests.integration.raw_client import connected, consecutive, numbers, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
@@ -44,7 +49,7 @@ async def test_what_is_delayed_waits_and_keeps_its_order() -> None:
         client.send(command("Version 1.0"), command("Fly"), command("StreamFrames 3D"))
         await until(lambda: simulator.frames_sent > 5)
         assert waiting_bytes(simulator) > 5 * 60
-        assert only(simulator).transport.get_write_buffer_size() == 0
+        assert only_connection(simulator).transport.get_write_buffer_size() == 0
 
         await simulator.faults.clear()
 
@@ -52,30 +57,30 @@ async def test_what_is_delayed_waits_and_keeps_its_order() -> None:
         assert (await client.read())[0] == ERROR
         assert await client.read() == (COMMAND, b"OK-StreamFrames 3D")
         assert consecutive(await client.frames(20))
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_a_short_delay_loses_nothing() -> None:
     async with playing() as (simulator, client):
-        run = simulator.faults.begin(Delay(delay_ms=5))
+        delay = simulator.faults.begin(Delay(delay_ms=5))
         await client.ask("StreamFrames 3D")
         assert consecutive(await client.frames(50))
-        simulator.faults.end(run)
+        simulator.faults.end(delay)
         assert consecutive(await client.frames(50))
-        await until(lambda: only(simulator).line is None)
+        await until(lambda: waiting_bytes(simulator) == 0)
 
 
 async def test_jitter_split_and_merge_together_lose_and_swap_nothing() -> None:
     async with playing() as (simulator, client):
         faults = (Jitter(mean_ms=3), Split(pieces=5, pause_ms=0.1), Merge(window_ms=4), Delay(delay_ms=1))
-        runs = [simulator.faults.begin(fault) for fault in faults]
+        active_faults = [simulator.faults.begin(fault) for fault in faults]
         await client.ask("StreamFrames 3D")
         frames = await client.frames(200)
         assert consecutive(frames)
-        assert all(run.times > 200 for run in runs)
+        assert all(fault.times > 200 for fault in active_faults)
         await simulator.faults.clear()
         assert consecutive([*frames[-1:], *await client.frames(50)])
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_split_packets_come_in_several_segments() -> None:
@@ -93,7 +98,7 @@ async def test_merged_packets_come_in_one_segment() -> None:
         await client.ask("StreamFrames 3D")
         assert consecutive(await client.frames(200))
         assert client.segments_received() < 100
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_a_cut_comes_within_a_packet() -> None:
@@ -119,15 +124,15 @@ async def test_a_half_open_server_says_and_hears_nothing_and_lets_clients_connec
     async with playing() as (simulator, client):
         await client.ask("StreamFrames 3D")
         frames = await client.frames(5)
-        run = simulator.faults.begin(HalfOpen())
+        half_open = simulator.faults.begin(HalfOpen())
         async with connected(simulator) as other:
             other.send(command("Version 1.0"))
             client.send(command("SendParameters General"))
             await until(
                 lambda: waiting_bytes(simulator) == len(command("Version 1.0SendParameters General")) + 8
             )
-            await until(lambda: run.times > 50)
-            assert not only_of(simulator, 1).transport.is_reading()
+            await until(lambda: half_open.times > 50)
+            assert not connection_with(simulator, 1).transport.is_reading()
 
             await simulator.faults.clear()
 
@@ -138,10 +143,10 @@ async def test_a_half_open_server_says_and_hears_nothing_and_lets_clients_connec
         frames += await client.frames(5)
         assert np.diff(numbers(frames)).max() > 40
         await until(lambda: len(simulator.connections) == 1)
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
-def only_of(simulator: Simulator, number: int) -> ClientConnection:
+def connection_with(simulator: Simulator, number: int) -> ClientConnection:
     [connection] = [c for c in simulator.connections if c.number == number]
     return connection
 
@@ -152,12 +157,12 @@ async def test_a_slow_reader_answers_late_and_streams_on() -> None:
         simulator.faults.begin(SlowReader(bytes_per_s=0.1))
         client.send(command("Version 1.0"))
         await until(lambda: waiting_bytes(simulator) == len(command("Version 1.0")))
-        assert consecutive(await client.frames(only(simulator).counts.frames + 50))
+        assert consecutive(await client.frames(only_connection(simulator).sent_counts.frames + 50))
 
         await simulator.faults.clear()
 
         assert await client.reply() == VERSION
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_a_slow_reader_reads_in_the_end() -> None:
@@ -176,7 +181,7 @@ async def test_garbage_comes_between_two_packets_and_is_the_same_for_the_same_se
             simulator.faults.begin(Garbage(num_bytes=20))
             heard.append(await client.exactly(20))
             assert await client.ask("Version 1.0") == VERSION
-            await well(simulator, client)
+            await clear_and_check(simulator, client)
     assert heard[0] == heard[1] != heard[2]
 
 
@@ -193,7 +198,7 @@ async def test_a_header_can_announce_a_size_that_is_wrong(fault: Fault, size: in
     async with playing() as (simulator, client):
         simulator.faults.begin(fault)
         assert await client.exactly(8) == struct.pack(">II", size, DATA)
-        await well(simulator, client)
+        await clear_and_check(simulator, client)
 
 
 async def test_what_is_injected_waits_behind_what_is_late() -> None:
@@ -212,11 +217,11 @@ async def test_what_waits_has_a_limit(caplog: pytest.LogCaptureFixture) -> None:
     async with Simulator(scene) as simulator, connected(simulator) as client:
         simulator.faults.begin(Delay(delay_ms=NEVER_MS))
         client.send(command("StreamFrames 3D"))
-        await until(lambda: "packets are lost" in caplog.text)
+        await until(lambda: "dropping packets" in caplog.text)
         sent = simulator.frames_sent
         await until(lambda: simulator.frames_sent > sent + 50)
         assert MAX_WAITING_BYTES - 100_000 < waiting_bytes(simulator) <= MAX_WAITING_BYTES
-        assert caplog.text.count("packets are lost") == 1
+        assert caplog.text.count("dropping packets") == 1
 
 
 async def test_a_goodbye_is_answered_before_the_connection_ends_however_late_all_is() -> None:

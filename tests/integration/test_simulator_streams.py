@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from gateway.rtc3d_server.scene import Scene
-from gateway.rtc3d_server.server import Simulator
 from gateway.simulator.c3d_scene import C3dScene
+from gateway.simulator.simulator import Simulator
 from tests.integration.raw_client import connected, numbers
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (

@@ -7,7 +7,7 @@ from functools import partial
 import pytest
 
 from gateway.config.settings import StreamSettings
-from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.labs import gateway_to

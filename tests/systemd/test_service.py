@@ -13,7 +13,7 @@ import pytest
 
 from gateway.cli.subscribers import ZenohListener, key_pattern, open_zenoh
 from gateway.messages.decode import decode
-from gateway.rtc3d_server.server import Simulator
+from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.clones import ROOT
 from tests.networks import free_endpoint, free_port, zenoh_keys
@@ -232,7 +232,7 @@ async def test_stopping_says_bye_to_a_server_that_never_closes(service: Service)
         [connection] = simulated.connections
         await service.machine.run("systemctl", "stop", UNIT)
         assert commands[-1] == "Bye"
-        assert connection.client.said_bye
+        assert connection.session.said_bye
     assert await service.machine.show("Result") == "success"
     assert await service.machine.show("ExecMainStatus") == "0"
 

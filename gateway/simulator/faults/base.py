@@ -1,150 +1,160 @@
-"""What every fault has: when it happens, for how long, and what of the server it may change."""
+"""What all kinds of faults have in common: when they happen, for how long, and what they may change."""
 
 # ruff: noqa: ARG002 - hooks: not every kind needs every argument
 
-from __future__ import annotations
-
 import asyncio
-from collections.abc import Callable
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Final, NamedTuple, Self
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, Protocol, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
-from gateway.config.section import Section, expects, validation_error
-from gateway.rtc3d.packets import Packet, PacketType
-
-if TYPE_CHECKING:
-    from gateway.rtc3d_server.client_connection import ClientConnection
-    from gateway.rtc3d_server.server import Simulator
-    from gateway.simulator.faults.line import Line
-
-MAX_SECONDS: Final = 86400
-
-Seconds = Annotated[
-    float,
-    Field(strict=True, ge=0, le=MAX_SECONDS, allow_inf_nan=False),
-    expects(f"a number of seconds from 0 to {MAX_SECONDS}"),
-]
-Interval = Annotated[
-    float,
-    Field(strict=True, ge=0.01, le=MAX_SECONDS, allow_inf_nan=False),
-    expects(f"a number of seconds from 0.01 to {MAX_SECONDS}"),
-]
-Milliseconds = Annotated[
-    float,
-    Field(strict=True, gt=0, le=600_000, allow_inf_nan=False),
-    expects("a number of milliseconds above 0, up to 600000"),
-]
-Count = Annotated[int, Field(strict=True, ge=1, le=1_000_000), expects("a whole number from 1 to 1000000")]
+from gateway.config.section import Section, validation_error
+from gateway.rtc3d.packets import Packet
+from gateway.simulator.faults.outgoing import PendingWrite, Reply
+from gateway.simulator.faults.parameters import Count, Interval, Seconds, parameter_text
+from gateway.simulator.scene_settings import SceneSettings
 
 
-def type_of(packet: bytes) -> int:
-    """Return a packet's type (§4.2); -1 for bytes that are no packet."""
-    return int.from_bytes(packet[4:8], "big") if len(packet) >= 8 else -1
+class FaultyConnection(Protocol):
+    """What a momentary fault may do to a connection."""
+
+    @property
+    def number(self) -> int:
+        """Counts the connections since the server's start, from 1."""
+        ...
+
+    def send_unchanged(self, data: bytes) -> None:
+        """Send bytes that no fault changes, after everything that waits."""
+        ...
+
+    def disconnect(self, last_data: bytes, *, reset: bool) -> None:
+        """Write ``last_data`` before everything that waits, and end the connection by FIN or by RST."""
+        ...
 
 
-def is_acknowledgement(reply: bytes) -> bool:
-    """Return whether the packet says that a command succeeded: type 1 (field note 1)."""
-    return type_of(reply) == PacketType.COMMAND
+class FaultyServer(Protocol):
+    """What a fault may do to the server."""
+
+    @property
+    def connections(self) -> Sequence[FaultyConnection]:
+        """The clients' connections."""
+        ...
+
+    def elapsed_us(self) -> int | None:
+        """Return the measurement's time in µs; None while no measurement runs."""
+        ...
+
+    def stop_measurement(self) -> None:
+        """Stop the measurement, if one runs."""
+        ...
+
+    def start_measurement(self) -> None:
+        """Start a measurement, unless another fault prevents it."""
+        ...
+
+    def change_scene(self, changes: SceneSettings) -> Callable[[], None]:
+        """Serve the scenario's scene with changes; return a function that restores the scene before."""
+        ...
+
+    def crash(self) -> None:
+        """End as if the process died."""
+        ...
+
+    def restart(self) -> None:
+        """Listen again after a crash, unless another fault prevents it."""
+        ...
 
 
-class Chunk(NamedTuple):
-    """Bytes to be sent to a client: at first one packet, with one send."""
+class ActiveFault:
+    """A fault on one server: when it begins and ends, how often, and its random numbers.
 
-    when_s: float
-    """When they are to leave, on the monotonic clock in s, unless earlier ones leave later."""
-    data: bytes
-    joins: bool = False
-    """Whether they go into one send with those before them, if these leave now as well."""
+    It begins once, or again and again if the fault has ``every_s``.
+    """
 
-
-class Run:
-    """A fault at work on a simulator: begun once, or again and again if it has ``every_s``."""
-
-    def __init__(self, fault: Fault, simulator: Simulator, rng: np.random.Generator) -> None:
+    def __init__(self, fault: "Fault", server: FaultyServer, rng: np.random.Generator) -> None:
         self.fault = fault
-        self.simulator = simulator
-        # apart, so that when it begins does not depend on how many packets it changed
-        self.rng, self._plan = rng.spawn(2)
-        self.is_over = asyncio.Event()
+        self.server = server
+        # two generators, so that the times do not depend on how many packets the fault changed
+        self.rng, self._timing_rng = rng.spawn(2)
+        self.ended = asyncio.Event()
         self.times = 0
-        """How often it happened: packets, replies or reads that it changed; of other faults, beginnings."""
+        """How often it happened: packets, replies or reads that it changed; for other faults, beginnings."""
         self.variant = 0
-        """A number that is another at random each time the fault begins."""
+        """A random number that is another each time the fault begins."""
         self.began_us = 0
         """The measurement's time when the fault last began."""
         self._undo: Callable[[], None] | None = None
-        self._timer: asyncio.TimerHandle | None = None
+        self._end_timer: asyncio.TimerHandle | None = None
 
     @property
-    def is_spent(self) -> bool:
-        """Whether it happened as many times as it may."""
+    def is_exhausted(self) -> bool:
+        """Whether the fault happened as often as its ``times`` allows."""
         return self.fault.times is not None and self.times >= self.fault.times
 
-    def first_wait_s(self) -> float:
-        """Return how long after the start it begins."""
+    def first_delay_s(self) -> float:
+        """Return the time from the start to the first beginning."""
         if self.fault.at_s is not None or self.fault.every_s is None:
             return self.fault.at_s or 0.0
-        return self.next_wait_s(self.fault.every_s)
+        return self.random_interval_s(self.fault.every_s)
 
-    def next_wait_s(self, every_s: float) -> float:
-        """Return how long after a beginning it begins again."""
-        return every_s * float(self._plan.uniform(0.5, 1.5))
+    def random_interval_s(self, every_s: float) -> float:
+        """Return the time from one beginning to the next: ``every_s``, up to half more or less."""
+        return every_s * float(self._timing_rng.uniform(0.5, 1.5))
 
     def begin(self) -> None:
         """Begin the fault."""
-        self.is_over.clear()
-        self.variant = int(self._plan.integers(2**31))
-        self.began_us = self.simulator.elapsed_us() or 0
+        self.ended.clear()
+        self.variant = int(self._timing_rng.integers(2**31))
+        self.began_us = self.server.elapsed_us() or 0
         self._undo = self.fault.begin(self)
 
-    def end_after(self, seconds: float, end: Callable[[Run], None]) -> None:
-        """Have it ended in so many seconds, at once if they are 0."""
+    def end_after(self, seconds: float, end: Callable[["ActiveFault"], None]) -> None:
+        """Call ``end`` with this fault after so many seconds, at once after 0."""
         if seconds:
-            self._timer = asyncio.get_running_loop().call_later(seconds, end, self)
+            self._end_timer = asyncio.get_running_loop().call_later(seconds, end, self)
         else:
             end(self)
 
     def end(self) -> None:
         """End the fault."""
-        self.cancel()
+        self.cancel_end()
         if self._undo is not None:
             self._undo()
-        self.is_over.set()
+        self.ended.set()
 
-    def cancel(self) -> None:
-        """Take it that the fault does not end by itself."""
-        if self._timer is not None:
-            self._timer.cancel()
-            self._timer = None
+    def cancel_end(self) -> None:
+        """Cancel the automatic end."""
+        if self._end_timer is not None:
+            self._end_timer.cancel()
+            self._end_timer = None
 
 
 class Fault(Section):
-    """A kind's parameters, and when it happens. The same ``Fault`` can be begun any number of times.
+    """A kind of fault with its parameters and times; it can begin any number of times.
 
-    ``str`` gives it in the command line's form: ``delay,delay_ms=80,for_s=3``.
+    ``str`` returns it in the form of the command line: ``delay,delay_ms=80,for_s=3``.
     """
 
     kind: ClassVar[str]
-    """What the scenario and the command line call it."""
+    """The kind's name in scenarios and on the command line."""
 
     at_s: Seconds | None = None
     """Begin so many seconds after the start."""
 
     every_s: Interval | None = None
-    """Begin again and again, so many seconds apart, at random up to half more or less."""
+    """Begin repeatedly, so many seconds apart, up to half more or less at random."""
 
     times: Count | None = None
-    """Over for good once it happened so many times."""
+    """End for good after it happened so many times."""
 
     @property
     def lasts_s(self) -> float | None:
-        """How long it lasts once begun: 0 for a moment, None for until it is ended."""
+        """How long the fault lasts once it begins: 0 for a momentary one, None until it is ended."""
         return 0.0
 
-    def begin(self, run: Run) -> Callable[[], None] | None:
-        """Do what is to be done at the beginning; return what is to be done at the end."""
+    def begin(self, active: ActiveFault) -> Callable[[], None] | None:
+        """Begin; return a function that undoes it, or None if there is nothing to undo."""
         return None
 
     def __str__(self) -> str:
@@ -155,24 +165,24 @@ class ConnectionFault(Fault):
     """A fault of connections."""
 
     connection: Count | None = None
-    """Only the n-th connection since the server's start; without it, all."""
+    """Affect only the n-th connection since the server's start; by default, all."""
 
-    def covers(self, connection: ClientConnection) -> bool:
-        """Return whether this connection is meant."""
-        return self.connection in {None, connection.number}
+    def applies_to(self, number: int) -> bool:
+        """Return whether the fault affects the connection with this number."""
+        return self.connection in {None, number}
 
 
-class StrikeFault(ConnectionFault):
-    """A fault that happens to connections in a moment."""
+class MomentaryFault(ConnectionFault):
+    """A fault that happens to connections at one moment."""
 
-    def begin(self, run: Run) -> None:
-        """Strike every connection that is meant."""
-        for connection in list(run.simulator.connections):
-            if self.covers(connection):
-                self.strike(connection, run)
+    def begin(self, active: ActiveFault) -> None:
+        """Act on every affected connection."""
+        for connection in active.server.connections:
+            if self.applies_to(connection.number):
+                self.act_on(connection, active)
 
-    def strike(self, connection: ClientConnection, run: Run) -> None:
-        """Do it to one connection."""
+    def act_on(self, connection: FaultyConnection, active: ActiveFault) -> None:
+        """Act on one connection."""
         raise NotImplementedError
 
 
@@ -180,7 +190,7 @@ class LastingFault(Fault):
     """A fault that has an end."""
 
     for_s: Interval | None = None
-    """Last so many seconds; without it, until the end."""
+    """Last so many seconds; by default, until the simulator ends."""
 
     @model_validator(mode="after")
     def _ends_before_it_begins_again(self) -> Self:
@@ -194,47 +204,35 @@ class LastingFault(Fault):
         return self.for_s
 
 
-class LineFault(ConnectionFault, LastingFault):
-    """A fault of connections that lasts: it changes what passes through while it is on, new ones included.
+class LastingConnectionFault(ConnectionFault, LastingFault):
+    """A fault that changes what passes through connections, later ones included, until it ends.
 
     ``times`` counts what it changed: packets, replies or reads.
     """
 
-    def outgoing(self, chunks: list[Chunk], run: Run) -> list[Chunk]:
-        """Return what is to be sent instead of ``chunks``: one packet, as other faults may have left it."""
-        return chunks
+    def change_writes(self, writes: list[PendingWrite], active: ActiveFault) -> list[PendingWrite]:
+        """Return what to write instead of ``writes``: one packet, as the faults before have changed it."""
+        return writes
 
     def refusal(self, command: Packet) -> str | None:
-        """Return why the server does not obey a client's packet, None if it does."""
+        """Return why the server refuses a client's packet, None if it does not."""
         return None
 
-    def replies(self, command: Packet, replies: list[bytes], line: Line) -> list[bytes]:
-        """Return what is to be sent as the reply to ``command`` instead of ``replies``, each one packet."""
+    def change_replies(self, command: Packet, replies: list[Reply]) -> list[Reply]:
+        """Return the replies to a client's packet instead of ``replies``."""
         return replies
 
-    def reading_s(self, num_bytes: int) -> float:
+    def read_delay_s(self, num_bytes: int) -> float:
         """Return how long the server takes to read so many bytes; infinity for until the fault ends."""
         return 0.0
 
 
 def _assignments(values: dict[str, Any], prefix: str = "") -> list[str]:
-    """Return NAME=VALUE for each value, those of mappings as MAPPING.NAME=VALUE."""
+    """Return NAME=VALUE for each value, and MAPPING.NAME=VALUE for each value of a mapping."""
     texts: list[str] = []
     for name, value in values.items():
         if isinstance(value, dict):
             texts += _assignments(value, f"{prefix}{name}.")
         else:
-            texts.append(f"{prefix}{name}={as_given(value)}")
+            texts.append(f"{prefix}{name}={parameter_text(value)}")
     return texts
-
-
-def as_given(value: object) -> str:
-    """Return a parameter's value as the command line takes it."""
-    match value:
-        case bool():
-            return "true" if value else "false"
-        case float():
-            return f"{value:.12g}"
-        case tuple() | list():
-            return f"[{','.join(map(as_given, value))}]"
-    return str(value)

@@ -1,183 +1,196 @@
-"""Begins and ends a simulator's faults: now, or when a scenario says."""
-
-from __future__ import annotations
+"""Begins and ends the simulator's faults: at once, or when a scenario says so."""
 
 import asyncio
 import logging
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Final
+from collections.abc import Callable, Iterable
+from typing import Final
 
 import numpy as np
 
 from gateway.errors import GatewayError
-from gateway.simulator.faults.base import Fault, LineFault, Run, StrikeFault
+from gateway.rtc3d_server.connection_filter import FilteredConnection
+from gateway.rtc3d_server.server import RtServer
+from gateway.simulator.faults.base import ActiveFault, Fault, LastingConnectionFault, MomentaryFault
 from gateway.simulator.faults.kinds import KINDS
-from gateway.simulator.faults.line import Line
+from gateway.simulator.faults.pipeline import ActiveConnectionFaults, FaultPipeline
 from gateway.simulator.faults.server_faults import NoMeasurement, Restart
 from gateway.simulator.scene_settings import SceneSettings
 
-if TYPE_CHECKING:
-    from gateway.rtc3d_server.client_connection import ClientConnection
-    from gateway.rtc3d_server.server import Simulator
-
-_RETRY_S: Final = 1.0  # until the port is free again, if something else took it meanwhile
+_RETRY_S: Final = 1.0  # between attempts to listen on a port that another program has taken
 _ORDER: Final = {kind: place for place, kind in enumerate(KINDS.values())}
 _log = logging.getLogger(__name__)
 
 
 class Faults:
-    """A running simulator's faults. Each beginning and end is logged, in the command line's form.
+    """The faults of a running server.
 
-    What is random depends on the seed of the last ``play`` (1 before any) and on how many faults
-    were given since, not on time.
+    Each beginning and end is logged in the form of the command line. Everything random depends on the
+    seed of the last ``play`` (1 before any) and on the number of faults since then, not on time.
     """
 
-    def __init__(self, simulator: Simulator) -> None:
-        self._simulator = simulator
+    def __init__(self, server: RtServer) -> None:
+        self._server = server
         self.scene = SceneSettings()
-        """What the faults that bring another scene change."""
+        """The scenario's scene, which faults that change the scene start from."""
         self._seed = 1
-        self._given = 0
-        self._on: list[Run] = []  # in the order of KINDS
+        self._num_added = 0  # faults since the last ``play``
+        self._active: list[ActiveFault] = []  # in the order of KINDS
         self._playing: set[asyncio.Task[None]] = set()
-        self._coming_back: asyncio.Task[None] | None = None
+        self._restarting: asyncio.Task[None] | None = None
 
     @property
     def active(self) -> list[Fault]:
-        """The faults that are on, in the order in which they act."""
-        return [run.fault for run in self._on]
+        """The faults that are active, in the order in which they act."""
+        return [active.fault for active in self._active]
+
+    @property
+    def connections(self) -> list[FaultPipeline]:
+        """The pipelines of all connections."""
+        filters = [connection.filter for connection in self._server.connections]
+        return [pipeline for pipeline in filters if isinstance(pipeline, FaultPipeline)]
 
     def play(self, faults: Iterable[Fault], *, seed: int = 1, scene: SceneSettings | None = None) -> None:
-        """Begin each fault when it says, counted from now; ``scene`` is the one that is played."""
-        self._seed, self._given = seed, 0
+        """Begin each fault at its own time, counted from now; ``scene`` is the scenario's scene."""
+        self._seed, self._num_added = seed, 0
         self.scene = scene or self.scene
         for fault in faults:
-            task = asyncio.get_running_loop().create_task(self._play(self._new_run(fault)))
+            task = asyncio.get_running_loop().create_task(self._play(self._new_active_fault(fault)))
             self._playing.add(task)
             task.add_done_callback(self._playing.discard)
 
-    def begin(self, fault: Fault) -> Run:
-        """Begin a fault now, once, whatever its ``at_s`` and ``every_s``."""
-        run = self._new_run(fault)
-        self._begin(run)
-        return run
+    def begin(self, fault: Fault) -> ActiveFault:
+        """Begin a fault now and once, whatever its ``at_s`` and ``every_s``."""
+        active = self._new_active_fault(fault)
+        self._begin(active)
+        return active
 
-    def end(self, run: Run) -> None:
-        """End a fault, if it is on."""
-        if run not in self._on:
+    def end(self, active: ActiveFault) -> None:
+        """End a fault, if it is active."""
+        if active not in self._active:
             return
-        self._on.remove(run)
-        run.end()
-        for connection in self._simulator.connections:
-            if connection.line is not None:
-                connection.line.fault_ended()
-        if not isinstance(run.fault, StrikeFault):
-            _log.info("Fault ends: %s (happened so far: %d)", run.fault, run.times)
+        self._active.remove(active)
+        active.end()
+        for pipeline in self.connections:
+            pipeline.fault_ended()
+        if not isinstance(active.fault, MomentaryFault):
+            _log.info("Fault ends: %s (happened %d times so far)", active.fault, active.times)
 
     async def clear(self) -> None:
-        """Make the server well: when this returns, no fault is on or planned, and nothing waits."""
+        """End and forget all faults: when this returns, none is active or planned, and nothing waits."""
         await self._stop_playing()
-        for run in list(self._on):
-            self.end(run)
-        for connection in list(self._simulator.connections):
-            line = connection.line
-            if line is not None:
-                line.flush()
-                line.read()
-        if self._coming_back is not None:
-            await self._coming_back
+        for active in list(self._active):
+            self.end(active)
+        for pipeline in self.connections:
+            pipeline.flush()
+            pipeline.handle_unread()
+        if self._restarting is not None:
+            await self._restarting
 
     async def close(self) -> None:
-        """Drop all faults; a server that is away stays away."""
+        """Forget all faults without ending them; a server that has crashed does not come back."""
         await self._stop_playing()
-        for run in self._on:
-            run.cancel()
-        self._on.clear()
-        if self._coming_back is not None:
-            self._coming_back.cancel()
-            await asyncio.wait([self._coming_back])
+        for active in self._active:
+            active.cancel_end()
+        self._active.clear()
+        if self._restarting is not None:
+            self._restarting.cancel()
+            await asyncio.wait([self._restarting])
 
-    # What connections and lines call --------------------------------------------------------
+    # For connections ------------------------------------------------------------------------
 
-    def connected(self, connection: ClientConnection) -> None:
-        """Put a line into a connection if a fault that is on needs it."""
-        if connection.line is None and self.on_line(connection):
-            connection.line = Line(connection, self)
+    def new_pipeline(self, connection: FilteredConnection) -> FaultPipeline:
+        """Return the filter for a new connection."""
+        return FaultPipeline(connection, self.active_on, self._count)
 
-    def on_line(self, connection: ClientConnection) -> list[tuple[Run, LineFault]]:
-        """Return the faults that are on for what passes through a connection, in their order."""
+    def active_on(self, number: int) -> ActiveConnectionFaults:
+        """Return the faults that are active on the connection with this number, in their order."""
         return [
-            (run, run.fault)
-            for run in self._on
-            if isinstance(run.fault, LineFault) and run.fault.covers(connection)
+            (active, active.fault)
+            for active in self._active
+            if isinstance(active.fault, LastingConnectionFault) and active.fault.applies_to(number)
         ]
 
-    def acted(self, runs: Iterable[Run]) -> None:
-        """Count that faults happened, and end those that may not happen again."""
-        for run in runs:
-            run.times += 1
-            if run.is_spent:
-                self.end(run)
+    # For faults (FaultyServer) --------------------------------------------------------------
 
-    # What faults call -----------------------------------------------------------------------
+    def elapsed_us(self) -> int | None:
+        """See FaultyServer."""
+        return self._server.elapsed_us()
+
+    def stop_measurement(self) -> None:
+        """See FaultyServer."""
+        self._server.stop_measurement()
 
     def start_measurement(self) -> None:
-        """Start a measurement, unless another fault forbids it."""
-        if self._simulator.is_listening and not self._is_on(NoMeasurement):
-            self._simulator.start_measurement()
+        """See FaultyServer."""
+        if self._server.is_listening and not self._is_active(NoMeasurement):
+            self._server.start_measurement()
 
-    def come_back(self) -> None:
-        """Start the server again, unless another fault keeps it away."""
-        if self._coming_back is None or self._coming_back.done():
-            self._coming_back = asyncio.get_running_loop().create_task(self._come_back())
+    def change_scene(self, changes: SceneSettings) -> Callable[[], None]:
+        """See FaultyServer."""
+        before = self._server.scene
+        self._server.change_scene(self.scene.with_changes(changes).build())
+        return lambda: self._server.change_scene(before)
+
+    def crash(self) -> None:
+        """See FaultyServer."""
+        self._server.crash()
+
+    def restart(self) -> None:
+        """See FaultyServer."""
+        if self._restarting is None or self._restarting.done():
+            self._restarting = asyncio.get_running_loop().create_task(self._restart())
 
     # ----------------------------------------------------------------------------------------
 
-    def _new_run(self, fault: Fault) -> Run:
-        self._given += 1
-        return Run(fault, self._simulator, np.random.default_rng((self._seed, self._given)))
+    def _new_active_fault(self, fault: Fault) -> ActiveFault:
+        self._num_added += 1
+        return ActiveFault(fault, self, np.random.default_rng((self._seed, self._num_added)))
 
-    async def _play(self, run: Run) -> None:
+    async def _play(self, active: ActiveFault) -> None:
         loop = asyncio.get_running_loop()
         began_s = loop.time()
-        wait_s = run.first_wait_s()
+        delay_s = active.first_delay_s()
         while True:
-            await asyncio.sleep(began_s + wait_s - loop.time())
+            await asyncio.sleep(began_s + delay_s - loop.time())
             began_s = loop.time()
-            self._begin(run)
-            await run.is_over.wait()
-            if run.fault.every_s is None or run.is_spent:
+            self._begin(active)
+            await active.ended.wait()
+            if active.fault.every_s is None or active.is_exhausted:
                 return
-            wait_s = run.next_wait_s(run.fault.every_s)
+            delay_s = active.random_interval_s(active.fault.every_s)
 
-    def _begin(self, run: Run) -> None:
-        fault = run.fault
-        _log.info("Fault: %s" if isinstance(fault, StrikeFault) else "Fault begins: %s", fault)
-        self._on.append(run)
-        self._on.sort(key=lambda on: _ORDER[type(on.fault)])
-        run.begin()
-        if isinstance(fault, LineFault):
-            for connection in self._simulator.connections:
-                self.connected(connection)
-        else:
-            run.times += 1
+    def _begin(self, active: ActiveFault) -> None:
+        fault = active.fault
+        _log.info("Fault: %s" if isinstance(fault, MomentaryFault) else "Fault begins: %s", fault)
+        self._active.append(active)
+        self._active.sort(key=lambda active: _ORDER[type(active.fault)])
+        active.begin()
+        if not isinstance(fault, LastingConnectionFault):
+            active.times += 1
         if fault.lasts_s is not None:
-            run.end_after(fault.lasts_s, self.end)
+            active.end_after(fault.lasts_s, self.end)
 
-    def _is_on(self, kind: type[Fault]) -> bool:
+    def _count(self, changed_by: Iterable[ActiveFault]) -> None:
+        """Count that faults changed something, and end those that may not happen again."""
+        for active in changed_by:
+            active.times += 1
+            if active.is_exhausted:
+                self.end(active)
+
+    def _is_active(self, kind: type[Fault]) -> bool:
         return any(isinstance(fault, kind) for fault in self.active)
 
-    async def _come_back(self) -> None:
-        while not (self._simulator.is_listening or self._is_on(Restart)):
+    async def _restart(self) -> None:
+        while not (self._server.is_listening or self._is_active(Restart)):
             try:
-                await self._simulator.start()
+                await self._server.start()
             except GatewayError as error:
                 _log.error("%s", error)
                 await asyncio.sleep(_RETRY_S)
-        if self._is_on(Restart):
-            self._simulator.vanish()  # another one began meanwhile
-        elif self._is_on(NoMeasurement):
-            self._simulator.stop_measurement()
+        if self._is_active(Restart):
+            self._server.crash()  # another restart began meanwhile
+        elif self._is_active(NoMeasurement):
+            self._server.stop_measurement()
 
     async def _stop_playing(self) -> None:
         for task in self._playing:

@@ -1,4 +1,4 @@
-"""Faults of data frames (§7): values, time stamps, forms and sizes that are not as they should be."""
+"""Faults of data frames (§7): wrong values, time stamps, layouts and sizes."""
 
 # ruff: noqa: ARG002 - hooks: not every kind needs every argument
 
@@ -23,7 +23,8 @@ from gateway.rtc3d.components import (
 )
 from gateway.rtc3d.frames import build_frame, byte_order_of, split_frame
 from gateway.rtc3d.packets import HEADER, PacketType, encode_packet
-from gateway.simulator.faults.base import Chunk, LineFault, Run, type_of
+from gateway.simulator.faults.base import ActiveFault, LastingConnectionFault
+from gateway.simulator.faults.outgoing import PendingWrite, packet_type_of
 
 Share = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False), expects("a share from 0 to 1")]
 Jump = Annotated[
@@ -45,28 +46,28 @@ _HEADER: Final[dict[ByteOrder, struct.Struct]] = {
     "little": struct.Struct("<IIiq"),
 }
 _WRONG_BY: Final = 1000
-_OFFSETS: Final = {"components": 0, "size": 4, "items": 24}  # in a frame, of its and its first component's
+_OFFSETS: Final = {"components": 0, "size": 4, "items": 24}  # in a frame's body; the first component's fields
 
 
-class FrameFault(LineFault):
-    """A fault of data frames; other packets, and frames that another fault spoilt, pass as they are."""
+class FrameFault(LastingConnectionFault):
+    """A fault of data frames; other packets, and frames that another fault has damaged, do not change."""
 
-    def outgoing(self, chunks: list[Chunk], run: Run) -> list[Chunk]:
-        """See LineFault."""
-        return [chunk._replace(data=self._changed(chunk.data, run)) for chunk in chunks]
+    def change_writes(self, writes: list[PendingWrite], active: ActiveFault) -> list[PendingWrite]:
+        """See LastingConnectionFault."""
+        return [write._replace(data=self._change_packet(write.data, active)) for write in writes]
 
-    def _changed(self, packet: bytes, run: Run) -> bytes:
-        if type_of(packet) != PacketType.DATA:
+    def _change_packet(self, packet: bytes, active: ActiveFault) -> bytes:
+        if packet_type_of(packet) != PacketType.DATA:
             return packet
         body = packet[HEADER.size :]
         try:
             byte_order = byte_order_of(body, "big")
         except FrameError:
             return packet
-        return encode_packet(PacketType.DATA, self.frame(body, byte_order, run))
+        return encode_packet(PacketType.DATA, self.change_frame(body, byte_order, active))
 
-    def frame(self, body: bytes, byte_order: ByteOrder, run: Run) -> bytes:
-        """Return what is to be sent instead of a frame's body."""
+    def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
+        """Return the body of the frame to send instead of one with this body."""
         raise NotImplementedError
 
 
@@ -76,51 +77,53 @@ class Occlusion(FrameFault):
     kind: ClassVar[str] = "occlusion"
 
     markers: Share = 1.0
-    """Which share of the markers, others each time it begins."""
+    """The share of the markers; other ones each time the fault begins."""
 
     tools: Share = 1.0
-    """Which share of the tools."""
+    """The share of the tools."""
 
-    def frame(self, body: bytes, byte_order: ByteOrder, run: Run) -> bytes:
+    def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
 
         def hide(component: Component) -> bytes:
             items = component.items().copy()
             if component.type is ComponentType.MARKERS:
-                hidden = _chosen(self.markers, len(items), run.variant)
+                hidden = _choose(self.markers, len(items), active.variant)
                 items[hidden] = (MISSING, MISSING, MISSING, MISSING_RELIABILITY)
             elif component.type is ComponentType.TOOLS:
-                items[_chosen(self.tools, len(items), run.variant)] = (MISSING,) * 8
-            return _rebuilt(component, items=items)
+                items[_choose(self.tools, len(items), active.variant)] = (MISSING,) * 8
+            return _rebuild(component, items=items)
 
-        return _each(body, byte_order, hide)
+        return _change_each(body, byte_order, hide)
 
 
 class FrozenTimestamps(FrameFault):
-    """Time stamps stand still at when it began."""
+    """Time stamps stay at the time when the fault began."""
 
     kind: ClassVar[str] = "frozen_timestamps"
 
-    def frame(self, body: bytes, byte_order: ByteOrder, run: Run) -> bytes:
+    def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
-        return _each(body, byte_order, lambda component: _rebuilt(component, timestamp_us=run.began_us))
+        return _change_each(
+            body, byte_order, lambda component: _rebuild(component, timestamp_us=active.began_us)
+        )
 
 
 class JumpingTimestamps(FrameFault):
-    """Time stamps jump, and jump back at the end."""
+    """Time stamps jump, and jump back when the fault ends."""
 
     kind: ClassVar[str] = "jumping_timestamps"
 
     jump_ms: Jump = -5000.0
-    """How far, in ms; below 0 into the past."""
+    """The distance in milliseconds; a negative one is into the past."""
 
-    def frame(self, body: bytes, byte_order: ByteOrder, run: Run) -> bytes:
+    def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
         jump_us = round(self.jump_ms * 1000)
-        return _each(
+        return _change_each(
             body,
             byte_order,
-            lambda component: _rebuilt(component, timestamp_us=component.timestamp_us + jump_us),
+            lambda component: _rebuild(component, timestamp_us=component.timestamp_us + jump_us),
         )
 
 
@@ -133,35 +136,37 @@ class ConstantFrameNumbers(FrameFault):
     kind: ClassVar[str] = "constant_frame_numbers"
 
     frame_number: FrameNumber = 0
-    """Which."""
+    """The number."""
 
-    def frame(self, body: bytes, byte_order: ByteOrder, run: Run) -> bytes:
+    def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
-        return _each(body, byte_order, lambda part: _rebuilt(part, frame_number=self.frame_number))
+        return _change_each(
+            body, byte_order, lambda component: _rebuild(component, frame_number=self.frame_number)
+        )
 
 
 class ShortEvents(FrameFault):
-    """Events are of 16 bytes, as §7.7 has them, instead of NDI's 24.
+    """Events have 16 bytes as in §7.7, instead of NDI's 24.
 
     Field note 6.
     """
 
     kind: ClassVar[str] = "short_events"
 
-    def frame(self, body: bytes, byte_order: ByteOrder, run: Run) -> bytes:
+    def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
 
         def shorten(component: Component) -> bytes:
             items = component.items()
             if component.type is ComponentType.EVENT:
                 items = items[list(SHORT_EVENT.names or ())].astype(SHORT_EVENT)
-            return _rebuilt(component, items=items)
+            return _rebuild(component, items=items)
 
-        return _each(body, byte_order, shorten)
+        return _change_each(body, byte_order, shorten)
 
 
 class WrongByteOrder(FrameFault):
-    """Frames are in another byte order than was acknowledged.
+    """Frames have another byte order than the server acknowledged.
 
     Field note 4.
     """
@@ -169,29 +174,29 @@ class WrongByteOrder(FrameFault):
     kind: ClassVar[str] = "wrong_byte_order"
 
     byte_order: Annotated[Literal["big", "little", "other"], expects("big, little or other")] = "other"
-    """big or little, whatever the client asks for; other than it asked for."""
+    """big or little, whatever the client requests; other: not the one that it requests."""
 
-    def frame(self, body: bytes, byte_order: ByteOrder, run: Run) -> bytes:
+    def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
         if self.byte_order != "other":
             order: ByteOrder = self.byte_order
         else:
             order = "little" if byte_order == "big" else "big"
-        return _each(body, byte_order, lambda part: _rebuilt(part, byte_order=order), order)
+        return _change_each(body, byte_order, lambda component: _rebuild(component, byte_order=order), order)
 
 
 class UnknownComponent(FrameFault):
-    """Frames have one more component, of a type that §7.2 does not know."""
+    """Frames have one more component, of a type that is not in §7.2."""
 
     kind: ClassVar[str] = "unknown_component"
 
     component_type: UnknownType = 77
-    """Its type."""
+    """The type of the component."""
 
     data_bytes: DataBytes = 32
-    """How much data it has, all zeros."""
+    """The size of its data in bytes, which are all zero."""
 
-    def frame(self, body: bytes, byte_order: ByteOrder, run: Run) -> bytes:
+    def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
         (count,) = _COUNT[byte_order].unpack_from(body)
         header = _HEADER[byte_order]
@@ -200,19 +205,19 @@ class UnknownComponent(FrameFault):
 
 
 class WrongCounts(FrameFault):
-    """A frame's sizes and counts contradict each other."""
+    """The sizes and counts in a frame contradict each other."""
 
     kind: ClassVar[str] = "wrong_counts"
 
     field: Annotated[Literal["components", "size", "items"], expects("components, size or items")] = "items"
-    """Which is too large: the number of components, or the first component's size or number of items."""
+    """The field that is 1000 too large: the number of components, or the first one's size or items."""
 
-    def frame(self, body: bytes, byte_order: ByteOrder, run: Run) -> bytes:
+    def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
-        spoilt = bytearray(body)
-        (count,) = _COUNT[byte_order].unpack_from(spoilt, _OFFSETS[self.field])
-        _COUNT[byte_order].pack_into(spoilt, _OFFSETS[self.field], (count + _WRONG_BY) % 2**32)
-        return bytes(spoilt)
+        damaged = bytearray(body)
+        (count,) = _COUNT[byte_order].unpack_from(damaged, _OFFSETS[self.field])
+        _COUNT[byte_order].pack_into(damaged, _OFFSETS[self.field], (count + _WRONG_BY) % 2**32)
+        return bytes(damaged)
 
 
 FRAME_FAULTS: Final[tuple[type[FrameFault], ...]] = (
@@ -227,17 +232,18 @@ FRAME_FAULTS: Final[tuple[type[FrameFault], ...]] = (
 )
 
 
-def _each(
+def _change_each(
     body: bytes,
     byte_order: ByteOrder,
     change: Callable[[Component], bytes],
-    new_order: ByteOrder | None = None,
+    new_byte_order: ByteOrder | None = None,
 ) -> bytes:
+    """Return a frame's body with every component changed."""
     components = split_frame(body, byte_order).components
-    return build_frame([change(component) for component in components], new_order or byte_order)
+    return build_frame([change(component) for component in components], new_byte_order or byte_order)
 
 
-def _rebuilt(
+def _rebuild(
     component: Component,
     *,
     frame_number: int | None = None,
@@ -245,6 +251,7 @@ def _rebuilt(
     items: Items | None = None,
     byte_order: ByteOrder | None = None,
 ) -> bytes:
+    """Return a component's bytes with the values that are given instead of its own."""
     return build_component(
         component.type,
         component.frame_number if frame_number is None else frame_number,
@@ -254,7 +261,7 @@ def _rebuilt(
     )
 
 
-def _chosen(share: float, count: int, variant: int) -> Items:
-    """Return which of ``count`` items are meant, shape (⌈share · count⌉,), the same for one variant."""
+def _choose(share: float, count: int, variant: int) -> Items:
+    """Return the indices of a share of ``count`` items, shape (⌈share · count⌉,); ``variant`` is the seed."""
     order = np.random.default_rng(variant).permutation(count)
     return order[: int(np.ceil(share * count))]

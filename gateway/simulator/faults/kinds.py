@@ -1,4 +1,4 @@
-"""Every kind of fault by its name, and how a fault is read from a mapping or from the command line's form."""
+"""All kinds of faults by name, and the parsing of faults from mappings and from the command line."""
 
 import re
 from collections.abc import Iterator
@@ -9,28 +9,31 @@ from pydantic import BaseModel, ValidationError
 
 from gateway.config.section import describe, spelling_hint, validation_error
 from gateway.errors import ConfigError
-from gateway.simulator.faults.base import Fault, as_given
+from gateway.simulator.faults.base import Fault
 from gateway.simulator.faults.frame_faults import FRAME_FAULTS
+from gateway.simulator.faults.momentary_faults import MOMENTARY_FAULTS
+from gateway.simulator.faults.parameters import parameter_text
 from gateway.simulator.faults.reply_faults import REPLY_FAULTS
 from gateway.simulator.faults.server_faults import SERVER_FAULTS
 from gateway.simulator.faults.stream_faults import STREAM_FAULTS
 
 KINDS: Final[dict[str, type[Fault]]] = {
-    fault.kind: fault for fault in (*SERVER_FAULTS, *REPLY_FAULTS, *FRAME_FAULTS, *STREAM_FAULTS)
+    fault.kind: fault
+    for fault in (*SERVER_FAULTS, *REPLY_FAULTS, *FRAME_FAULTS, *STREAM_FAULTS, *MOMENTARY_FAULTS)
 }
-"""In the order in which they act on what passes through a connection."""
+"""In the order in which they act on the bytes of a connection."""
 
-COMMON: Final = {
+COMMON_PARAMETERS: Final = {
     "at_s": "begin so many seconds after the start; without it and every_s, at the start",
-    "every_s": "begin again and again, so many seconds apart, at random up to half more or less",
-    "for_s": "last so many seconds; without it, until the end",
-    "times": "over for good once it happened so often: packets or replies changed, else beginnings",
-    "connection": "only the n-th connection since the server's start; without it, all",
+    "every_s": "begin repeatedly, so many seconds apart, up to half more or less at random",
+    "for_s": "last so many seconds; without it, until the simulator ends",
+    "times": "end for good after so many packets, replies or reads changed; for other kinds, beginnings",
+    "connection": "affect only the n-th connection since the server's start; without it, all",
 }
-"""The parameters that many kinds have: what they do."""
+"""The parameters that many kinds have, and what they do."""
 
 _NAMES: Final = ", ".join(KINDS)
-_COMMAS: Final = re.compile(r",(?![^\[]*\])")  # those that are not in a list
+_COMMAS: Final = re.compile(r",(?![^\[]*\])")  # not those in a list
 
 
 def parse_fault(text: str) -> Fault:
@@ -54,7 +57,7 @@ def parse_fault(text: str) -> Fault:
             raise ConfigError(f"fault {text!r}: found {assignment!r}; expected NAME=VALUE, each name once")
         target[name] = _value(value)
     try:
-        return fault_of(values)
+        return validate_fault(values)
     except ValidationError as error:
         lines = []
         for details in error.errors(include_url=False):
@@ -63,8 +66,8 @@ def parse_fault(text: str) -> Fault:
         raise ConfigError("\n".join(lines)) from None
 
 
-def fault_of(value: object) -> Fault:
-    """Return the fault in a mapping: its kind under ``fault``, its parameters beside that.
+def validate_fault(value: object) -> Fault:
+    """Return the fault that a mapping describes: its kind under the key ``fault``, and its parameters.
 
     Raises ValidationError.
     """
@@ -80,31 +83,34 @@ def fault_of(value: object) -> Fault:
     raise validation_error(f"found {describe(value)}; expected a mapping with the key fault, one of {_NAMES}")
 
 
-def meaning_of(kind: type[Fault]) -> str:
-    """Return a sentence: what happens."""
+def summary_of(kind: type[Fault]) -> str:
+    """Return one sentence about what happens."""
     return (kind.__doc__ or "").partition("\n")[0]
 
 
 def parameters_of(kind: type[Fault]) -> Iterator[tuple[str, str, str]]:
-    """Give name, default and meaning of each parameter that is the kind's own; "" for no default."""
+    """Yield name, default ("" for none) and description of each parameter except the common ones."""
     for name, field in kind.model_fields.items():
-        if name not in COMMON:
+        if name not in COMMON_PARAMETERS:
             default = field.get_default()
-            shown_default = "" if field.is_required() or isinstance(default, BaseModel) else as_given(default)
-            yield name, shown_default, field.description or ""
+            has_text = not field.is_required() and not isinstance(default, BaseModel)
+            yield name, parameter_text(default) if has_text else "", field.description or ""
 
 
-def list_of_kinds() -> str:
-    """Return a text for a terminal: every kind, what it does, and its parameters."""
+def describe_kinds() -> str:
+    """Return a text for the terminal about every kind: what happens, and its parameters."""
     lines = []
     for name, kind in KINDS.items():
         common = [key for key in ("for_s", "connection") if key in kind.model_fields]
         lines.append(f"{name}{''.join(f' [{key}]' for key in common)}")
-        lines.append(f"    {meaning_of(kind)}")
+        lines.append(f"    {summary_of(kind)}")
         for key, default, text in parameters_of(kind):
             lines.append(f"    {key}{'=' if default else ''}{default}  {text}")
-    lines += ["", "Every kind has at_s, every_s and times, and the others where they stand beside its name:"]
-    lines += [f"    {key}  {text}" for key, text in COMMON.items()]
+    lines += [
+        "",
+        "Every kind has at_s, every_s and times; for_s and connection only where they follow its name:",
+    ]
+    lines += [f"    {key}  {text}" for key, text in COMMON_PARAMETERS.items()]
     return "\n".join(lines)
 
 

@@ -1,4 +1,4 @@
-"""Faults of the replies to commands: refused, doubled, missing, late, and worded otherwise."""
+"""Faults of the replies to commands: refused, doubled, missing, late, or with another text."""
 
 # ruff: noqa: ARG002 - hooks: not every kind needs every argument
 
@@ -9,52 +9,55 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from gateway.config.section import expects, join_or
 from gateway.rtc3d.packets import HEADER, Packet, PacketType, encode_packet, text_of
-from gateway.simulator.faults.base import Count, LineFault, Milliseconds, is_acknowledgement, type_of
-from gateway.simulator.faults.line import Line
+from gateway.simulator.faults.base import LastingConnectionFault
+from gateway.simulator.faults.outgoing import Reply, is_acknowledgement, packet_type_of
+from gateway.simulator.faults.parameters import Count, Milliseconds
 
-Verb = Literal["version", "setbyteorder", "sendparameters", "sendcurrentframe", "streamframes", "bye"]
-VERBS: Final[tuple[Verb, ...]] = get_args(Verb)
+CommandName = Literal["version", "setbyteorder", "sendparameters", "sendcurrentframe", "streamframes", "bye"]
+COMMAND_NAMES: Final[tuple[CommandName, ...]] = get_args(CommandName)
 
 _MINIMAL: Final = re.compile(r"streamframes( frequencydivisor:\S+| stop)?|sendcurrentframe")
 _OK: Final = b"OK-"
 _ERROR: Final = b"Error-"
 
 
-def _not_empty(verbs: tuple[Verb, ...]) -> tuple[Verb, ...]:
-    if not verbs:
+def _not_empty(names: tuple[CommandName, ...]) -> tuple[CommandName, ...]:
+    if not names:
         raise ValueError
-    return verbs
+    return names
 
 
-Verbs = Annotated[
-    tuple[Annotated[Verb, expects(join_or(VERBS))], ...],
+CommandNames = Annotated[
+    tuple[Annotated[CommandName, expects(join_or(COMMAND_NAMES))], ...],
     AfterValidator(_not_empty),
     BeforeValidator(lambda value: [value] if isinstance(value, str) else value),
-    expects("a command's first word in lower case, or a list of such"),
+    expects("the first word of a command in lower case, or a list of them"),
 ]
 Copies = Annotated[int, Field(strict=True, ge=2, le=100), expects("a whole number from 2 to 100")]
 
 
-def _verb(command: Packet) -> str:
+def _command_name(command: Packet) -> str:
+    """Return the first word of a command in lower case; "" for other packets."""
     words = text_of(command.body).lower().split() if command.type == PacketType.COMMAND else []
     return words[0] if words else ""
 
 
-class RefusedCommands(LineFault):
-    """Commands are answered with an error packet, and not obeyed."""
+class RefusedCommands(LastingConnectionFault):
+    """The server refuses commands with an error packet and does not obey them."""
 
     kind: ClassVar[str] = "refused_commands"
 
-    commands: Verbs = ("version",)
-    """Which."""
+    commands: CommandNames = ("version",)
+    """The commands that it refuses."""
 
     def refusal(self, command: Packet) -> str | None:
-        """See LineFault."""
-        return f"{_verb(command)} is refused" if _verb(command) in self.commands else None
+        """See LastingConnectionFault."""
+        name = _command_name(command)
+        return f"{name} is refused" if name in self.commands else None
 
 
-class MinimalServer(LineFault):
-    """All is refused but bare StreamFrames, its FrequencyDivisor:n and Stop, and bare SendCurrentFrame.
+class MinimalServer(LastingConnectionFault):
+    """The server refuses all but StreamFrames [FrequencyDivisor:n or Stop] and SendCurrentFrame.
 
     Field note 2.
     """
@@ -62,45 +65,45 @@ class MinimalServer(LineFault):
     kind: ClassVar[str] = "minimal_server"
 
     def refusal(self, command: Packet) -> str | None:
-        """See LineFault."""
+        """See LastingConnectionFault."""
         text = " ".join(text_of(command.body).lower().split())
         if command.type != PacketType.COMMAND or _MINIMAL.fullmatch(text):
             return None
-        return f"{_verb(command)} is not known in this form"
+        return f"{_command_name(command)} is not known in this form"
 
 
-class _AcknowledgementFault(LineFault):
-    """A fault of what says that a command succeeded."""
+class _AcknowledgementFault(LastingConnectionFault):
+    """A fault of the replies that report success."""
 
-    commands: Verbs = VERBS
-    """The replies to which commands."""
+    commands: CommandNames = COMMAND_NAMES
+    """The commands whose acknowledgements change."""
 
-    def replies(self, command: Packet, replies: list[bytes], line: Line) -> list[bytes]:
-        """See LineFault."""
-        if _verb(command) not in self.commands:
+    def change_replies(self, command: Packet, replies: list[Reply]) -> list[Reply]:
+        """See LastingConnectionFault."""
+        if _command_name(command) not in self.commands:
             return replies
-        changed: list[bytes] = []
+        changed: list[Reply] = []
         for reply in replies:
-            changed += self.acknowledgements(reply, line) if is_acknowledgement(reply) else [reply]
+            changed += self.change_acknowledgement(reply) if is_acknowledgement(reply.packet) else [reply]
         return changed
 
-    def acknowledgements(self, reply: bytes, line: Line) -> list[bytes]:
-        """Return what is sent at once instead of one acknowledgement."""
+    def change_acknowledgement(self, reply: Reply) -> list[Reply]:
+        """Return the replies to send instead of one acknowledgement."""
         raise NotImplementedError
 
 
 class MissingAcknowledgements(_AcknowledgementFault):
-    """Commands are obeyed, and not acknowledged."""
+    """The server obeys commands and does not acknowledge them."""
 
     kind: ClassVar[str] = "missing_acknowledgements"
 
-    def acknowledgements(self, reply: bytes, line: Line) -> list[bytes]:
+    def change_acknowledgement(self, reply: Reply) -> list[Reply]:
         """See _AcknowledgementFault."""
         return []
 
 
 class DoubledAcknowledgements(_AcknowledgementFault):
-    """Commands are acknowledged more than once.
+    """The server acknowledges commands more than once.
 
     Field note 3.
     """
@@ -108,29 +111,28 @@ class DoubledAcknowledgements(_AcknowledgementFault):
     kind: ClassVar[str] = "doubled_acknowledgements"
 
     copies: Copies = 2
-    """How often."""
+    """The number of acknowledgements."""
 
-    def acknowledgements(self, reply: bytes, line: Line) -> list[bytes]:
+    def change_acknowledgement(self, reply: Reply) -> list[Reply]:
         """See _AcknowledgementFault."""
         return [reply] * self.copies
 
 
 class LateAcknowledgements(_AcknowledgementFault):
-    """Acknowledgements come late; frames and other replies overtake them."""
+    """The server acknowledges commands late; frames and other replies overtake the acknowledgement."""
 
     kind: ClassVar[str] = "late_acknowledgements"
 
     delay_ms: Milliseconds = 500.0
-    """How late, in ms."""
+    """The delay in milliseconds."""
 
-    def acknowledgements(self, reply: bytes, line: Line) -> list[bytes]:
+    def change_acknowledgement(self, reply: Reply) -> list[Reply]:
         """See _AcknowledgementFault."""
-        line.hold_for(reply, self.delay_ms / 1000)
-        return []
+        return [reply._replace(delay_s=self.delay_ms / 1000)]
 
 
-class FramesFirst(LineFault):
-    """The first frames come before StreamFrames is acknowledged.
+class FramesFirst(LastingConnectionFault):
+    """The server sends the first frames before it acknowledges StreamFrames.
 
     Field note 3.
     """
@@ -138,19 +140,20 @@ class FramesFirst(LineFault):
     kind: ClassVar[str] = "frames_first"
 
     frames: Count = 3
-    """How many; No Data ends the wait."""
+    """The number of frames; after a No Data packet it acknowledges at once."""
 
-    def replies(self, command: Packet, replies: list[bytes], line: Line) -> list[bytes]:
-        """See LineFault."""
-        if _verb(command) != "streamframes" or text_of(command.body).lower().endswith("stop"):
+    def change_replies(self, command: Packet, replies: list[Reply]) -> list[Reply]:
+        """See LastingConnectionFault."""
+        if _command_name(command) != "streamframes" or text_of(command.body).lower().endswith("stop"):
             return replies
-        for reply in filter(is_acknowledgement, replies):
-            line.hold_for_frames(reply, self.frames)
-        return [reply for reply in replies if not is_acknowledgement(reply)]
+        return [
+            reply._replace(after_frames=self.frames) if is_acknowledgement(reply.packet) else reply
+            for reply in replies
+        ]
 
 
-class ReplyText(LineFault):
-    """Replies are worded as by servers that are not NDI's, errors as err-….
+class ReplyText(LastingConnectionFault):
+    """Replies have the text of servers that are not NDI's; errors begin with err-.
 
     Field note 1.
     """
@@ -158,24 +161,24 @@ class ReplyText(LineFault):
     kind: ClassVar[str] = "reply_text"
 
     form: Annotated[Literal["echo", "ok-verb"], expects("echo or ok-verb")] = "ok-verb"
-    """echo is the command as it was sent, ok-verb the likes of ok-streamframes."""
+    """echo repeats the command as it was sent; ok-verb is, for instance, ok-streamframes."""
 
-    def replies(self, command: Packet, replies: list[bytes], line: Line) -> list[bytes]:
-        """See LineFault."""
-        echo = text_of(command.body) if self.form == "echo" else f"ok-{_verb(command)}"
-        return [self._reworded(reply, echo) for reply in replies]
+    def change_replies(self, command: Packet, replies: list[Reply]) -> list[Reply]:
+        """See LastingConnectionFault."""
+        text = text_of(command.body) if self.form == "echo" else f"ok-{_command_name(command)}"
+        return [reply._replace(packet=self._reworded(reply.packet, text)) for reply in replies]
 
     @staticmethod
-    def _reworded(reply: bytes, acknowledgement: str) -> bytes:
-        text = reply[HEADER.size :]
-        if is_acknowledgement(reply) and text.startswith(_OK):
+    def _reworded(packet: bytes, acknowledgement: str) -> bytes:
+        text = packet[HEADER.size :]
+        if is_acknowledgement(packet) and text.startswith(_OK):
             return encode_packet(PacketType.COMMAND, acknowledgement.encode("latin-1"))
-        if type_of(reply) == PacketType.ERROR:
+        if packet_type_of(packet) == PacketType.ERROR:
             return encode_packet(PacketType.ERROR, b"err-" + text.removeprefix(_ERROR))
-        return reply
+        return packet
 
 
-REPLY_FAULTS: Final[tuple[type[LineFault], ...]] = (
+REPLY_FAULTS: Final[tuple[type[LastingConnectionFault], ...]] = (
     RefusedCommands,
     MinimalServer,
     MissingAcknowledgements,

@@ -4,7 +4,7 @@ import numpy as np
 
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, Items
 from gateway.rtc3d.parameters import EventDefinition, Marker, Parameters, Parameters3D, ParametersEvents
-from gateway.rtc3d_server.scene import Samples
+from gateway.rtc3d_server.scene import SampleNumbers
 
 EVENT_EVERY_US = 70_000
 
@@ -29,7 +29,7 @@ class CountingScene:
             events=ParametersEvents((EventDefinition("0x1", "Tick"),)),
         )
 
-    def items(self, component: ComponentType, samples: Samples) -> Items:
+    def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
         count = {ComponentType.MARKERS: self._num_markers, ComponentType.TOOLS: 1, ComponentType.ANALOG: 2}[
             component
         ]

@@ -1,45 +1,45 @@
-"""The protocol with one client of the simulator, at any time of the measurement."""
+"""A session of the RT server with one client, at any time of the measurement."""
 
 from collections.abc import Sequence
 
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import General
-from gateway.rtc3d_server.client_session import ClientSession, Server
+from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks
 from gateway.rtc3d_server.frame_builder import FrameBuilder
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import COMMAND, DATA, ByteOrder, Part, cut, frame_of
 
 
-class Session:
-    """A client of the counting scene, and the measurement's time, which stands still unless set."""
+class ScriptedClient:
+    """A client's session on the counting scene, and the measurement's time, which only the test changes."""
 
     def __init__(self, rate_hz: float = 100.0) -> None:
         self.scene = CountingScene(rate_hz)
         self.elapsed_us: int | None = 0
         general = General(name="server under test")
         parameters = self.scene.parameters
-        self.client = ClientSession(
-            Server(
-                frames=self._frames,
+        self.session = ClientSession(
+            SessionCallbacks(
+                frame_builder=self._frame_builder,
                 parameters=lambda: type(parameters)(general, parameters.markers, events=parameters.events),
-                measurement_us=lambda: self.elapsed_us,
+                frames_requested=lambda: self.elapsed_us,
             )
         )
 
-    def _frames(self, components: Sequence[ComponentType]) -> FrameBuilder:
+    def _frame_builder(self, components: Sequence[ComponentType]) -> FrameBuilder:
         return FrameBuilder(self.scene, components)
 
     def send(self, text: bytes | str, packet_type: int = COMMAND) -> list[tuple[int, bytes]]:
         body = text.encode() if isinstance(text, str) else text
-        return cut(b"".join(self.client.answer(Packet(packet_type, body))))
+        return cut(b"".join(self.session.answer(Packet(packet_type, body))))
 
     def frames_until(self, elapsed_us: int, byte_order: ByteOrder = "big") -> list[list[Part]]:
         self.elapsed_us = elapsed_us
-        packets = cut(b"".join(data.packet for data in self.client.due(elapsed_us)))
+        packets = cut(b"".join(frame.packet for frame in self.session.due_frames(elapsed_us)))
         assert all(packet_type == DATA for packet_type, _ in packets)
         return [frame_of(body, byte_order) for _, body in packets]
 
     def numbers_until(self, elapsed_us: int) -> list[int]:
-        """The frame numbers of each frame's first component."""
+        """Return the frame number of each frame's first component."""
         return [frame[0].frame_number for frame in self.frames_until(elapsed_us)]

@@ -1,13 +1,13 @@
 import pytest
 
 from gateway.rtc3d.parameters_xml import parse_parameters
-from tests.unit.rtc3d_server.scripted_client import Session
+from tests.unit.rtc3d_server.scripted_client import ScriptedClient
 from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, XML
 
 
 @pytest.fixture
-def session() -> Session:
-    return Session()
+def client() -> ScriptedClient:
+    return ScriptedClient()
 
 
 @pytest.mark.parametrize(
@@ -31,8 +31,10 @@ def session() -> Session:
         (b"SendCurrentFrame 3D 6D Analog Force Events ", b"OK-SendCurrentFrame 3D 6D Analog Force Events"),
     ],
 )
-def test_a_command_is_acknowledged_as_it_was_sent(session: Session, sent: bytes, acknowledged: bytes) -> None:
-    assert session.send(sent) == [(COMMAND, acknowledged)]
+def test_a_command_is_acknowledged_as_it_was_sent(
+    client: ScriptedClient, sent: bytes, acknowledged: bytes
+) -> None:
+    assert client.send(sent) == [(COMMAND, acknowledged)]
 
 
 @pytest.mark.parametrize(
@@ -45,8 +47,8 @@ def test_a_command_is_acknowledged_as_it_was_sent(session: Session, sent: bytes,
         (b"Bye now", b"Bye takes no parameter"),
     ],
 )
-def test_a_bad_command_gets_an_error_that_says_why(session: Session, sent: bytes, told: bytes) -> None:
-    [(packet_type, text)] = session.send(sent)
+def test_a_bad_command_gets_an_error_that_says_why(client: ScriptedClient, sent: bytes, told: bytes) -> None:
+    [(packet_type, text)] = client.send(sent)
 
     assert packet_type == ERROR
     assert text.startswith(b"Error-" + told)
@@ -56,24 +58,24 @@ def test_a_bad_command_gets_an_error_that_says_why(session: Session, sent: bytes
     "sent",
     [b"Play", b"StreamFrames Sometimes", b"StreamFrames Frequency:0", b"SendParameters 4D", b"\xff\xfe"],
 )
-def test_what_is_no_command_gets_an_error_in_ascii(session: Session, sent: bytes) -> None:
-    [(packet_type, text)] = session.send(sent)
+def test_what_is_no_command_gets_an_error_in_ascii(client: ScriptedClient, sent: bytes) -> None:
+    [(packet_type, text)] = client.send(sent)
 
     assert packet_type == ERROR
     assert text.isascii()
     assert text.startswith(b"Error-")
 
 
-def test_a_refused_command_changes_nothing(session: Session) -> None:
-    session.send("StreamFrames 3D")
-    session.send("StreamFrames FrequencyDivisor:0")
+def test_a_refused_command_changes_nothing(client: ScriptedClient) -> None:
+    client.send("StreamFrames 3D")
+    client.send("StreamFrames FrequencyDivisor:0")
 
-    assert session.numbers_until(20_000) == [1, 2, 3]
+    assert client.numbers_until(20_000) == [1, 2, 3]
 
 
 @pytest.mark.parametrize("packet_type", [0, 2, 4, 5, 6, 0xFFFFFFFF])
-def test_packets_that_only_servers_send_get_an_error(session: Session, packet_type: int) -> None:
-    [(reply_type, text)] = session.send(b"", packet_type)
+def test_packets_that_only_servers_send_get_an_error(client: ScriptedClient, packet_type: int) -> None:
+    [(reply_type, text)] = client.send(b"", packet_type)
 
     assert (reply_type, text) == (
         ERROR,
@@ -81,9 +83,9 @@ def test_packets_that_only_servers_send_get_an_error(session: Session, packet_ty
     )
 
 
-def test_bye_is_answered_as_ndis_client_expects(session: Session) -> None:
-    assert session.send("BYE\0") == [(COMMAND, b"bye")]
-    assert session.client.said_bye
+def test_bye_is_answered_as_ndis_client_expects(client: ScriptedClient) -> None:
+    assert client.send("BYE\0") == [(COMMAND, b"bye")]
+    assert client.session.said_bye
 
 
 # One event component of 48 bytes, frame number -1, time stamp 0, one event with id 1 (field note 16).
@@ -106,12 +108,12 @@ START_LITTLE = bytes.fromhex(
     ids=["big", "little"],
 )
 def test_wavefronts_recording_control_is_taken_without_a_reply(
-    session: Session, start: bytes, stop: bytes
+    client: ScriptedClient, start: bytes, stop: bytes
 ) -> None:
-    assert session.send(start, DATA) == []
-    assert session.client.recording
-    assert session.send(stop, DATA) == []
-    assert not session.client.recording
+    assert client.send(start, DATA) == []
+    assert client.session.is_recording
+    assert client.send(stop, DATA) == []
+    assert not client.session.is_recording
 
 
 @pytest.mark.parametrize(
@@ -126,28 +128,28 @@ def test_wavefronts_recording_control_is_taken_without_a_reply(
     ],
     ids=["nothing", "cut short", "frame 0", "frame 1", "event 2", "no component"],
 )
-def test_other_data_frames_from_a_client_get_an_error(session: Session, body: bytes) -> None:
-    [(packet_type, text)] = session.send(body, DATA)
+def test_other_data_frames_from_a_client_get_an_error(client: ScriptedClient, body: bytes) -> None:
+    [(packet_type, text)] = client.send(body, DATA)
 
     assert packet_type == ERROR
     assert b"data frame" in text
-    assert not session.client.recording
+    assert not client.session.is_recording
 
 
-def test_parameters_come_as_xml_with_the_sections_asked_for(session: Session) -> None:
-    [(packet_type, xml)] = session.send("SendParameters 3d General")
+def test_parameters_come_as_xml_with_the_sections_asked_for(client: ScriptedClient) -> None:
+    [(packet_type, xml)] = client.send("SendParameters 3d General")
 
     parameters = parse_parameters(xml).parameters
     assert packet_type == XML
     assert parameters.general is not None
     assert parameters.general.name == "server under test"
-    assert parameters.markers == session.scene.parameters.markers
+    assert parameters.markers == client.scene.parameters.markers
     assert parameters.events is None
 
 
 @pytest.mark.parametrize("sent", ["SendParameters", "SendParameters All\0"])
-def test_parameters_are_all_sent_by_default(session: Session, sent: str) -> None:
-    [(_, xml)] = session.send(sent)
+def test_parameters_are_all_sent_by_default(client: ScriptedClient, sent: str) -> None:
+    [(_, xml)] = client.send(sent)
 
     parameters = parse_parameters(xml).parameters
     assert None not in (parameters.general, parameters.markers, parameters.events)

@@ -5,25 +5,25 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.unit.rtc3d_server.scripted_client import Session
+from tests.unit.rtc3d_server.scripted_client import ScriptedClient
 from tests.unit.rtc3d_server.wire import ANALOG, COMMAND, EVENT, MARKERS, NO_DATA, TOOLS, Part, cut
 
 SECOND_US = 1_000_000
 
 
 @pytest.fixture
-def session() -> Session:
-    return Session()
+def client() -> ScriptedClient:
+    return ScriptedClient()
 
 
 # Streams ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("sent", ["StreamFrames", "StreamFrames AllFrames", "StreamFrames All"])
-def test_a_stream_has_all_components_in_every_frame_by_default(session: Session, sent: str) -> None:
-    session.send(sent)
+def test_a_stream_has_all_components_in_every_frame_by_default(client: ScriptedClient, sent: str) -> None:
+    client.send(sent)
 
-    frames = session.frames_until(60_000)
+    frames = client.frames_until(60_000)
 
     assert [[part.type for part in frame] for frame in frames] == [[MARKERS, TOOLS, ANALOG]] * 7
     assert [frame[0].frame_number for frame in frames] == [1, 2, 3, 4, 5, 6, 7]
@@ -31,48 +31,48 @@ def test_a_stream_has_all_components_in_every_frame_by_default(session: Session,
     assert [frame[2].timestamp_us for frame in frames] == list(range(0, 70_000, 10_000))
 
 
-def test_a_stream_of_a_fast_component_alone_has_its_rate(session: Session) -> None:
-    session.send("StreamFrames Analog")
+def test_a_stream_of_a_fast_component_alone_has_its_rate(client: ScriptedClient) -> None:
+    client.send("StreamFrames Analog")
 
-    assert session.numbers_until(99_999) == list(range(1, 101))
-
-
-def test_a_divisor_sends_every_nth_frame(session: Session) -> None:
-    session.send("StreamFrames FrequencyDivisor:4 3D")
-
-    assert session.numbers_until(200_000) == [1, 5, 9, 13, 17, 21]
+    assert client.numbers_until(99_999) == list(range(1, 101))
 
 
-def test_60_of_100_hz_is_every_other_frame_and_now_and_then_two_in_a_row(session: Session) -> None:
-    session.send("StreamFrames Frequency:60 3D")
+def test_a_divisor_sends_every_nth_frame(client: ScriptedClient) -> None:
+    client.send("StreamFrames FrequencyDivisor:4 3D")
 
-    numbers = session.numbers_until(SECOND_US - 1)
+    assert client.numbers_until(200_000) == [1, 5, 9, 13, 17, 21]
+
+
+def test_60_of_100_hz_is_every_other_frame_and_now_and_then_two_in_a_row(client: ScriptedClient) -> None:
+    client.send("StreamFrames Frequency:60 3D")
+
+    numbers = client.numbers_until(SECOND_US - 1)
 
     assert numbers[:7] == [1, 3, 5, 6, 8, 10, 11]
     assert len(numbers) == 60
 
 
 @pytest.mark.parametrize("frequency", ["100", "100.5", "2000"])
-def test_no_frequency_is_above_that_of_the_slowest_component(session: Session, frequency: str) -> None:
-    session.send(f"StreamFrames Frequency:{frequency} 3D Analog")
+def test_no_frequency_is_above_that_of_the_slowest_component(client: ScriptedClient, frequency: str) -> None:
+    client.send(f"StreamFrames Frequency:{frequency} 3D Analog")
 
-    assert session.numbers_until(50_000) == [1, 2, 3, 4, 5, 6]
+    assert client.numbers_until(50_000) == [1, 2, 3, 4, 5, 6]
 
 
 @given(rate_hz=st.integers(1, 2000), frequency_hz=st.floats(0.1, 2500), start=st.integers(0, 10**6))
 def test_any_frequency_is_exact_on_average_with_even_gaps(
     rate_hz: int, frequency_hz: float, start: int
 ) -> None:
-    session = Session(rate_hz)
-    session.elapsed_us = start
+    client = ScriptedClient(rate_hz)
+    client.elapsed_us = start
     text = f"{frequency_hz:.6f}"
-    session.send(f"StreamFrames Frequency:{text} 3D")
+    client.send(f"StreamFrames Frequency:{text} 3D")
     stride = max(1.0, rate_hz / float(text))
     numbers = []
     for _ in range(200):
-        due_us = session.client.due_us
+        due_us = client.session.due_us
         assert due_us is not None
-        numbers += session.numbers_until(due_us)
+        numbers += client.numbers_until(due_us)
 
     gaps = {after - before for before, after in pairwise(numbers)}
     assert gaps <= {math.floor(stride), math.ceil(stride)}
@@ -80,59 +80,59 @@ def test_any_frequency_is_exact_on_average_with_even_gaps(
     assert len(numbers) == 200
 
 
-def test_a_new_stream_replaces_the_old_one(session: Session) -> None:
-    session.send("StreamFrames 3D")
-    session.frames_until(20_000)
-    session.send("StreamFrames FrequencyDivisor:2 6D")
+def test_a_new_stream_replaces_the_old_one(client: ScriptedClient) -> None:
+    client.send("StreamFrames 3D")
+    client.frames_until(20_000)
+    client.send("StreamFrames FrequencyDivisor:2 6D")
 
-    frames = session.frames_until(60_000)
+    frames = client.frames_until(60_000)
 
     assert [(part.type, part.frame_number) for frame in frames for part in frame] == [(TOOLS, 4), (TOOLS, 6)]
 
 
-def test_stop_ends_the_stream_for_this_and_further_measurements(session: Session) -> None:
-    session.send("StreamFrames")
-    session.send("StreamFrames Stop")
+def test_stop_ends_the_stream_for_this_and_further_measurements(client: ScriptedClient) -> None:
+    client.send("StreamFrames")
+    client.send("StreamFrames Stop")
 
-    assert session.frames_until(50_000) == []
-    assert session.client.measurement_stopped() == []
-    session.client.measurement_started()
-    assert session.client.due_us is None
+    assert client.frames_until(50_000) == []
+    assert client.session.measurement_stopped() == []
+    client.session.measurement_started()
+    assert client.session.due_us is None
 
 
-def test_each_frame_has_the_byte_order_of_its_moment(session: Session) -> None:
-    session.send("StreamFrames 3D")
-    big = session.frames_until(0)
-    session.send("SetByteOrder LittleEndian")
-    little = session.frames_until(10_000, "little")
+def test_each_frame_has_the_byte_order_of_its_moment(client: ScriptedClient) -> None:
+    client.send("StreamFrames 3D")
+    big = client.frames_until(0)
+    client.send("SetByteOrder LittleEndian")
+    little = client.frames_until(10_000, "little")
 
     assert [frame[0].items[0][0] for frame in big + little] == [0, 1]
 
 
-def test_a_stream_of_what_the_scene_lacks_is_silent(session: Session) -> None:
-    session.send("StreamFrames Force")
+def test_a_stream_of_what_the_scene_lacks_is_silent(client: ScriptedClient) -> None:
+    client.send("StreamFrames Force")
 
-    assert session.frames_until(50_000) == []
+    assert client.frames_until(50_000) == []
 
 
-def test_late_frames_are_caught_up_with_for_a_second_and_then_dropped(session: Session) -> None:
-    session.send("StreamFrames 3D Events")
+def test_late_frames_are_caught_up_with_for_a_second_and_then_dropped(client: ScriptedClient) -> None:
+    client.send("StreamFrames 3D Events")
 
-    frames = session.frames_until(10 * SECOND_US)
+    frames = client.frames_until(10 * SECOND_US)
 
     numbers = [frame[0].frame_number for frame in frames]
     assert numbers == list(range(902, 1002))
-    assert session.client.frames_dropped == 901
+    assert client.session.frames_dropped == 901
     assert [event[0] for event in frames[0][1].items] == list(range(1, 129))  # those of the dropped frames
 
 
-def test_a_frame_that_is_not_taken_stays_due(session: Session) -> None:
-    session.send("StreamFrames 3D")
+def test_a_frame_that_is_not_taken_stays_due(client: ScriptedClient) -> None:
+    client.send("StreamFrames 3D")
 
-    next(session.client.due(50_000))
+    next(client.session.due_frames(50_000))
 
-    assert session.client.due_us == 10_000
-    assert session.numbers_until(20_000) == [2, 3]
+    assert client.session.due_us == 10_000
+    assert client.numbers_until(20_000) == [2, 3]
 
 
 # Events -------------------------------------------------------------------------------------
@@ -140,10 +140,12 @@ def test_a_frame_that_is_not_taken_stays_due(session: Session) -> None:
 
 @pytest.mark.parametrize("rate", ["AllFrames", "Frequency:7", "FrequencyDivisor:33"])
 @pytest.mark.parametrize("components", ["All", "3D Events", "Events", "Analog Event"])
-def test_every_event_is_sent_once_with_the_next_frame(session: Session, rate: str, components: str) -> None:
-    session.send(f"StreamFrames {rate} {components}")
+def test_every_event_is_sent_once_with_the_next_frame(
+    client: ScriptedClient, rate: str, components: str
+) -> None:
+    client.send(f"StreamFrames {rate} {components}")
     parts = [
-        part for t in range(0, 10 * SECOND_US, 500_000) for frame in session.frames_until(t) for part in frame
+        part for t in range(0, 10 * SECOND_US, 500_000) for frame in client.frames_until(t) for part in frame
     ]
     events = [part for part in parts if part.type == EVENT]
 
@@ -154,11 +156,11 @@ def test_every_event_is_sent_once_with_the_next_frame(session: Session, rate: st
     assert all(part.items for part in events)
 
 
-def test_events_before_the_stream_was_asked_for_are_not_sent(session: Session) -> None:
-    session.elapsed_us = 10 * SECOND_US
-    session.send("StreamFrames Events")
+def test_events_before_the_stream_was_asked_for_are_not_sent(client: ScriptedClient) -> None:
+    client.elapsed_us = 10 * SECOND_US
+    client.send("StreamFrames Events")
 
-    [[events]] = session.frames_until(10 * SECOND_US + 70_000)
+    [[events]] = client.frames_until(10 * SECOND_US + 70_000)
 
     assert [event[0] for event in events.items] == [143]
 
@@ -166,54 +168,54 @@ def test_events_before_the_stream_was_asked_for_are_not_sent(session: Session) -
 # SendCurrentFrame ---------------------------------------------------------------------------
 
 
-def test_the_current_frame_is_sent_at_once_if_it_is_new(session: Session) -> None:
-    session.elapsed_us = 123_456
-    session.send("SendCurrentFrame 3D")
+def test_the_current_frame_is_sent_at_once_if_it_is_new(client: ScriptedClient) -> None:
+    client.elapsed_us = 123_456
+    client.send("SendCurrentFrame 3D")
 
-    [[markers]] = session.frames_until(123_456)
+    [[markers]] = client.frames_until(123_456)
 
     assert (markers.frame_number, markers.timestamp_us) == (13, 120_000)
 
 
-def test_the_current_frame_waits_until_there_is_a_newer_one(session: Session) -> None:
-    session.elapsed_us = 123_456
-    session.send("SendCurrentFrame 3D")
-    session.frames_until(123_456)
-    session.send("SendCurrentFrame 3D")
+def test_the_current_frame_waits_until_there_is_a_newer_one(client: ScriptedClient) -> None:
+    client.elapsed_us = 123_456
+    client.send("SendCurrentFrame 3D")
+    client.frames_until(123_456)
+    client.send("SendCurrentFrame 3D")
 
-    assert session.frames_until(129_999) == []
-    assert session.client.due_us == 130_000
-    assert session.numbers_until(130_000) == [14]
-
-
-def test_requests_sent_together_are_all_answered_in_order(session: Session) -> None:
-    session.send("SendCurrentFrame 3D")
-    session.send("SendCurrentFrame 6D")
-
-    assert [frame[0].type for frame in session.frames_until(0)] == [MARKERS, TOOLS]
+    assert client.frames_until(129_999) == []
+    assert client.session.due_us == 130_000
+    assert client.numbers_until(130_000) == [14]
 
 
-def test_a_request_during_a_stream_is_answered_too(session: Session) -> None:
-    session.send("StreamFrames 3D")
-    session.frames_until(0)
-    session.send("SendCurrentFrame 3D")
+def test_requests_sent_together_are_all_answered_in_order(client: ScriptedClient) -> None:
+    client.send("SendCurrentFrame 3D")
+    client.send("SendCurrentFrame 6D")
 
-    assert session.frames_until(9_999) == []
-    assert session.numbers_until(10_000) == [2, 2]
+    assert [frame[0].type for frame in client.frames_until(0)] == [MARKERS, TOOLS]
 
 
-def test_the_current_frame_of_what_the_scene_lacks_is_empty(session: Session) -> None:
-    session.send("SendCurrentFrame Force")
+def test_a_request_during_a_stream_is_answered_too(client: ScriptedClient) -> None:
+    client.send("StreamFrames 3D")
+    client.frames_until(0)
+    client.send("SendCurrentFrame 3D")
 
-    assert session.frames_until(0) == [[]]
+    assert client.frames_until(9_999) == []
+    assert client.numbers_until(10_000) == [2, 2]
 
 
-def test_polling_gets_each_event_once(session: Session) -> None:
+def test_the_current_frame_of_what_the_scene_lacks_is_empty(client: ScriptedClient) -> None:
+    client.send("SendCurrentFrame Force")
+
+    assert client.frames_until(0) == [[]]
+
+
+def test_polling_gets_each_event_once(client: ScriptedClient) -> None:
     events = []
     for elapsed_us in range(0, SECOND_US, 50_000):
-        session.elapsed_us = elapsed_us
-        session.send("SendCurrentFrame Events")
-        [parts] = session.frames_until(elapsed_us)
+        client.elapsed_us = elapsed_us
+        client.send("SendCurrentFrame Events")
+        [parts] = client.frames_until(elapsed_us)
         events += [event[0] for part in parts for event in part.items]
 
     assert events == list(range(1, 14))
@@ -223,52 +225,54 @@ def test_polling_gets_each_event_once(session: Session) -> None:
 
 
 @pytest.mark.parametrize("sent", ["StreamFrames", "SendCurrentFrame 3D"])
-def test_without_a_measurement_requests_get_no_data(session: Session, sent: str) -> None:
-    session.elapsed_us = None
+def test_without_a_measurement_requests_get_no_data(client: ScriptedClient, sent: str) -> None:
+    client.elapsed_us = None
 
-    assert session.send(sent) == [(COMMAND, f"OK-{sent}".encode()), (NO_DATA, b"")]
-
-
-def test_the_end_of_a_measurement_is_told_to_those_who_wait_for_frames(session: Session) -> None:
-    assert session.client.measurement_stopped() == []
-    session.send("StreamFrames")
-    session.frames_until(0)
-    session.send("SendCurrentFrame")
-
-    assert cut(b"".join(session.client.measurement_stopped())) == [(NO_DATA, b""), (NO_DATA, b"")]
-    assert session.frames_until(50_000) == []
+    assert client.send(sent) == [(COMMAND, f"OK-{sent}".encode()), (NO_DATA, b"")]
 
 
-def test_a_stream_goes_on_from_the_first_frame_of_the_next_measurement(session: Session) -> None:
-    session.elapsed_us = None
-    session.send("StreamFrames 3D Events")
-    session.client.measurement_started()
+def test_the_end_of_a_measurement_is_told_to_those_who_wait_for_frames(client: ScriptedClient) -> None:
+    assert client.session.measurement_stopped() == []
+    client.send("StreamFrames")
+    client.frames_until(0)
+    client.send("SendCurrentFrame")
 
-    frames = session.frames_until(70_000)
+    assert cut(b"".join(client.session.measurement_stopped())) == [(NO_DATA, b""), (NO_DATA, b"")]
+    assert client.frames_until(50_000) == []
+
+
+def test_a_stream_goes_on_from_the_first_frame_of_the_next_measurement(client: ScriptedClient) -> None:
+    client.elapsed_us = None
+    client.send("StreamFrames 3D Events")
+    client.session.measurement_started()
+
+    frames = client.frames_until(70_000)
 
     assert [frame[0].frame_number for frame in frames] == [1, 2, 3, 4, 5, 6, 7, 8]
     assert frames[-1][1] == Part(EVENT, 8, 70_000, [(1, 70_000, -1, -1, -1)])
-    session.client.measurement_stopped()
-    session.client.measurement_started()
-    assert session.numbers_until(0) == [1]
+    client.session.measurement_stopped()
+    client.session.measurement_started()
+    assert client.numbers_until(0) == [1]
 
 
-def test_the_events_of_frames_dropped_at_the_start_of_a_measurement_are_not_lost(session: Session) -> None:
-    session.send("StreamFrames 3D Events")
-    session.client.measurement_started()
+def test_the_events_of_frames_dropped_at_the_start_of_a_measurement_are_not_lost(
+    client: ScriptedClient,
+) -> None:
+    client.send("StreamFrames 3D Events")
+    client.session.measurement_started()
 
-    frames = session.frames_until(3 * SECOND_US)
+    frames = client.frames_until(3 * SECOND_US)
 
     assert frames[0][0].frame_number == 202
     assert frames[0][1].items[0][:2] == (1, 70_000)
 
 
-def test_analog_frames_follow_their_own_numbers_after_a_restart(session: Session) -> None:
-    session.send("StreamFrames Analog")
-    session.frames_until(SECOND_US)
-    session.client.measurement_stopped()
-    session.client.measurement_started()
+def test_analog_frames_follow_their_own_numbers_after_a_restart(client: ScriptedClient) -> None:
+    client.send("StreamFrames Analog")
+    client.frames_until(SECOND_US)
+    client.session.measurement_stopped()
+    client.session.measurement_started()
 
-    frames = session.frames_until(2_000)
+    frames = client.frames_until(2_000)
 
     assert [(part.type, part.frame_number) for [part] in frames] == [(ANALOG, 1), (ANALOG, 2), (ANALOG, 3)]

@@ -54,7 +54,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def assert_equals_ezc3d(path: Path) -> None:
-    """Every value of the take is what ezc3d reads, as float32, in the file's order."""
+    """Compare every value of the take with what ezc3d reads, as float32, in the file's order."""
     take = C3dScene(path)
     read = ezc3d.c3d(str(path), extract_forceplat_data=True)["data"]
     points, residuals = read["points"][:3], read["meta_points"]["residuals"]
@@ -85,13 +85,13 @@ def test_a_marker_of_nan_or_of_residual_minus_one_is_missing(path: Path) -> None
     assert np.isnan(markers["x"]).sum() == 2
 
 
-def test_a_residual_of_minus_one_is_enough_where_ezc3d_keeps_the_position() -> None:
+def test_a_marker_with_a_position_and_a_residual_of_minus_one_is_missing() -> None:
     markers = _markers(np.ones((4, 2, 1)), np.array([[[0.5], [-1.0]]]))
 
     assert [item.tobytes() for item in markers[0]] == [bytes.fromhex("3F800000" * 3 + "3F000000"), MISSING]
 
 
-def test_components_have_their_own_rates(path: Path) -> None:
+def test_each_component_has_its_own_rate(path: Path) -> None:
     take = C3dScene(path)
 
     assert take.rates_hz == {
@@ -116,7 +116,7 @@ def test_the_take_begins_again_after_its_last_sample(path: Path) -> None:
         assert once.tobytes() == later.tobytes()
 
 
-def test_parameters_are_the_files(path: Path) -> None:
+def test_parameters_are_those_of_the_file(path: Path) -> None:
     described = C3dScene(path).parameters
 
     assert described.markers is not None
@@ -169,7 +169,7 @@ def test_a_recording_without_markers_plays_at_its_analog_rate(tmp_path: Path) ->
     assert (take.measurement_rate_hz, take.num_frames) == (1000.0, 50)
 
 
-def test_plates_of_an_unknown_kind_are_left_out_with_a_warning(
+def test_force_plates_of_an_unknown_type_are_left_out_with_a_warning(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     content = new_recording()
@@ -184,15 +184,12 @@ def test_plates_of_an_unknown_kind_are_left_out_with_a_warning(
     assert "force plates" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("content", "told"),
-    [(b"", "cannot be read as a C3D file"), (b"no C3D file\n" * 999, "cannot be read as a C3D file")],
-)
-def test_what_is_no_c3d_file_is_refused_by_its_name(tmp_path: Path, content: bytes, told: str) -> None:
+@pytest.mark.parametrize("content", [b"", b"no C3D file\n" * 999])
+def test_the_error_about_an_invalid_file_names_it(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "bad.c3d"
     path.write_bytes(content)
 
-    with pytest.raises(TakeError, match=told) as raised:
+    with pytest.raises(TakeError, match="cannot be read as a C3D file") as raised:
         C3dScene(path)
     assert str(path) in str(raised.value)
 
@@ -205,20 +202,20 @@ def test_a_file_cut_short_before_its_data_is_refused(path: Path, length: int) ->
         C3dScene(path)
 
 
-def test_of_a_file_cut_short_in_its_data_the_rest_is_played(path: Path) -> None:
+def test_a_file_cut_short_in_its_data_plays_up_to_there(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-600])
 
     assert C3dScene(path).num_frames == 4
 
 
 @pytest.mark.parametrize("name", ["nothing.c3d", "."])
-def test_a_path_that_is_no_file_is_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(TakeError, match="is no file"):
+def test_a_path_that_is_not_a_file_is_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(TakeError, match="is not a file"):
         C3dScene(tmp_path / name)
 
 
-def test_without_ezc3d_the_remedy_is_told(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "ezc3d", None)  # what an import of it then raises is ImportError
+def test_without_ezc3d_the_error_says_how_to_install_it(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ezc3d", None)  # then importing it raises ImportError
 
     with pytest.raises(TakeError, match=r"pip install 'rtc3d-gateway\[c3d\]'"):
         C3dScene(path)

@@ -1,4 +1,4 @@
-"""What each kind of fault makes of packets, by the specification's tables, and when it begins."""
+"""How each kind of fault changes packets, by the specification's tables, and when it begins."""
 
 import math
 import struct
@@ -11,8 +11,7 @@ from hypothesis import strategies as st
 from gateway.errors import ConfigError, FrameError
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet
-from gateway.rtc3d_server.server import Simulator
-from gateway.simulator.faults.base import Chunk, Fault, LineFault, Run
+from gateway.simulator.faults.base import ActiveFault, Fault, LastingConnectionFault
 from gateway.simulator.faults.frame_faults import (
     ConstantFrameNumbers,
     FrozenTimestamps,
@@ -23,19 +22,21 @@ from gateway.simulator.faults.frame_faults import (
     WrongByteOrder,
     WrongCounts,
 )
-from gateway.simulator.faults.kinds import KINDS, list_of_kinds, meaning_of, parse_fault
+from gateway.simulator.faults.kinds import KINDS, describe_kinds, parse_fault, summary_of
+from gateway.simulator.faults.outgoing import PendingWrite
 from gateway.simulator.faults.reply_faults import MinimalServer, RefusedCommands
 from gateway.simulator.faults.server_faults import Restart
 from gateway.simulator.faults.stream_faults import Delay, HalfOpen, Jitter, Merge, SlowReader, Split
 from gateway.simulator.scene_settings import SceneSettings
+from gateway.simulator.simulator import Simulator
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import COMMAND, DATA, MARKERS, TOOLS, ByteOrder, Part, cut, frame_of, packet
 
 MISSING = b"\xff" * 4
 
 
-def run_of(fault: Fault, seed: int = 1) -> Run:
-    return Run(fault, Simulator(CountingScene()), np.random.default_rng(seed))
+def active(fault: Fault, seed: int = 1) -> ActiveFault:
+    return ActiveFault(fault, Simulator(CountingScene()).faults, np.random.default_rng(seed))
 
 
 def markers(
@@ -52,15 +53,17 @@ def frame(*components: bytes, byte_order: ByteOrder = "big") -> bytes:
     return packet(DATA, struct.pack(sign + "I", len(components)) + b"".join(components))
 
 
-def sent(fault: LineFault, data: bytes, run: Run | None = None) -> list[Chunk]:
-    """What leaves instead of one packet at the time 100 s."""
-    return fault.outgoing([Chunk(100.0, data)], run or run_of(fault))
+def writes_for(
+    fault: LastingConnectionFault, packet: bytes, active_fault: ActiveFault | None = None
+) -> list[PendingWrite]:
+    """Return what is written instead of one packet that is due at 100 s."""
+    return fault.change_writes([PendingWrite(100.0, packet)], active_fault or active(fault))
 
 
-def changed(fault: LineFault, data: bytes, run: Run | None = None) -> bytes:
-    [chunk] = sent(fault, data, run)
-    assert (chunk.when_s, chunk.joins) == (100.0, False)
-    return chunk.data
+def changed(fault: LastingConnectionFault, packet: bytes, active_fault: ActiveFault | None = None) -> bytes:
+    [write] = writes_for(fault, packet, active_fault)
+    assert (write.due_s, write.joins_previous) == (100.0, False)
+    return write.data
 
 
 def parts_of(data: bytes, byte_order: ByteOrder = "big", event_bytes: int = 24) -> list[Part]:
@@ -73,7 +76,7 @@ def parts_of(data: bytes, byte_order: ByteOrder = "big", event_bytes: int = 24) 
 
 
 @pytest.mark.parametrize(("share", "hidden"), [(0.0, 0), (0.01, 1), (0.5, 4), (0.51, 5), (1.0, 8)])
-def test_occlusion_hides_a_share_of_the_markers_as_a_server_does(share: float, hidden: int) -> None:
+def test_occlusion_hides_a_share_of_the_markers(share: float, hidden: int) -> None:
     [part] = parts_of(changed(Occlusion(markers=share), frame(markers(count=8))))
 
     seen = [item for item in part.items if not math.isnan(item[0])]
@@ -96,20 +99,20 @@ def test_a_hidden_marker_and_a_hidden_tool_have_the_bits_of_the_field_notes() ->
 
 def test_occlusion_hides_the_same_markers_until_it_begins_again() -> None:
     fault = Occlusion(markers=0.5)
-    run = run_of(fault)
-    run.begin()
-    first, second = (changed(fault, frame(markers(count=100)), run) for _ in range(2))
-    run.begin()
-    third = changed(fault, frame(markers(count=100)), run)
+    occlusion = active(fault)
+    occlusion.begin()
+    first, second = (changed(fault, frame(markers(count=100)), occlusion) for _ in range(2))
+    occlusion.begin()
+    third = changed(fault, frame(markers(count=100)), occlusion)
 
     assert first == second
     assert first != third
 
 
-def test_frozen_time_stamps_are_the_time_at_which_the_fault_began() -> None:
-    run = run_of(FrozenTimestamps())
-    run.began_us = 1234
-    data = changed(FrozenTimestamps(), frame(markers(number=1), markers(number=2)), run)
+def test_frozen_time_stamps_are_the_time_when_the_fault_began() -> None:
+    frozen = active(FrozenTimestamps())
+    frozen.began_us = 1234
+    data = changed(FrozenTimestamps(), frame(markers(number=1), markers(number=2)), frozen)
     assert data == frame(markers(number=1, timestamp_us=1234), markers(number=2, timestamp_us=1234))
 
 
@@ -123,7 +126,7 @@ def test_frame_numbers_can_be_constant() -> None:
     assert changed(ConstantFrameNumbers(frame_number=-3), frame(markers())) == frame(markers(number=-3))
 
 
-def test_events_can_be_of_16_bytes() -> None:
+def test_events_can_have_16_bytes() -> None:
     header = struct.Struct(">IIiqI")
     long = header.pack(24 + 48, 5, 7, 9000, 2) + struct.pack(
         ">iqiiiiqiii", 1, 8000, 2, 3, 4, 5, 8500, 6, 7, 8
@@ -133,7 +136,7 @@ def test_events_can_be_of_16_bytes() -> None:
 
 
 @pytest.mark.parametrize(
-    ("order", "asked", "comes"),
+    ("order", "requested", "sent"),
     [
         ("big", "little", "big"),
         ("little", "little", "little"),
@@ -142,10 +145,10 @@ def test_events_can_be_of_16_bytes() -> None:
         ("other", "little", "big"),
     ],
 )
-def test_frames_can_be_in_another_byte_order(order: str, asked: ByteOrder, comes: ByteOrder) -> None:
+def test_frames_can_have_another_byte_order(order: str, requested: ByteOrder, sent: ByteOrder) -> None:
     fault = WrongByteOrder.model_validate({"byte_order": order})
-    data = changed(fault, frame(markers(asked), byte_order=asked))
-    assert data == frame(markers(comes), byte_order=comes)
+    data = changed(fault, frame(markers(requested), byte_order=requested))
+    assert data == frame(markers(sent), byte_order=sent)
 
 
 @pytest.mark.parametrize("byte_order", ["big", "little"])
@@ -162,7 +165,7 @@ def test_an_unknown_component_comes_last_with_a_header_like_any_other(byte_order
 
 @pytest.mark.parametrize("field", ["components", "size", "items"])
 @pytest.mark.parametrize("byte_order", ["big", "little"])
-def test_wrong_counts_make_no_frame_in_either_byte_order(field: str, byte_order: ByteOrder) -> None:
+def test_wrong_counts_are_invalid_in_either_byte_order(field: str, byte_order: ByteOrder) -> None:
     good = frame(markers(byte_order), markers(byte_order), byte_order=byte_order)
     [(_, body)] = cut(changed(WrongCounts.model_validate({"field": field}), good))
 
@@ -180,7 +183,9 @@ FRAME_KINDS = [kind for kind in KINDS.values() if kind.__module__.endswith("fram
     "data",
     [packet(COMMAND, b"OK-Version 1.0"), packet(4), packet(DATA, b"no frame"), packet(2, b"<x/>"), b"half"],
 )
-def test_faults_of_frames_leave_everything_else_as_it_is(kind: type[LineFault], data: bytes) -> None:
+def test_faults_of_frames_do_not_change_other_packets(
+    kind: type[LastingConnectionFault], data: bytes
+) -> None:
     assert changed(kind(), data) == data
 
 
@@ -188,22 +193,22 @@ def test_faults_of_frames_leave_everything_else_as_it_is(kind: type[LineFault], 
 
 
 @given(st.binary(min_size=1, max_size=60), st.integers(2, 70), st.integers(0, 2**32))
-def test_split_makes_pieces_of_all_bytes_in_their_order(data: bytes, pieces: int, seed: int) -> None:
+def test_split_writes_all_bytes_in_their_order_in_pieces(data: bytes, pieces: int, seed: int) -> None:
     fault = Split(pieces=pieces, pause_ms=2)
 
-    chunks = sent(fault, data, run_of(fault, seed))
+    writes = writes_for(fault, data, active(fault, seed))
 
-    assert b"".join(chunk.data for chunk in chunks) == data
-    assert len(chunks) == min(pieces, len(data))
-    assert all(chunk.data for chunk in chunks)
-    assert [chunk.when_s for chunk in chunks] == [100.0 + 0.002 * k for k in range(len(chunks))]
+    assert b"".join(write.data for write in writes) == data
+    assert len(writes) == min(pieces, len(data))
+    assert all(write.data for write in writes)
+    assert [write.due_s for write in writes] == [100.0 + 0.002 * k for k in range(len(writes))]
 
 
-def test_merge_puts_off_to_the_end_of_the_window() -> None:
+def test_merge_delays_writes_to_the_end_of_the_window() -> None:
     fault = Merge(window_ms=250)
-    whens_s = [100.01, 100.2, 100.25, 100.3]
-    chunks = [fault.outgoing([Chunk(when_s, b"x")], run_of(fault))[0] for when_s in whens_s]
-    assert [(chunk.when_s, chunk.joins) for chunk in chunks] == [
+    due_s = [100.01, 100.2, 100.25, 100.3]
+    writes = [fault.change_writes([PendingWrite(time_s, b"x")], active(fault))[0] for time_s in due_s]
+    assert [(write.due_s, write.joins_previous) for write in writes] == [
         (100.25, True),
         (100.25, True),
         (100.25, True),
@@ -212,26 +217,26 @@ def test_merge_puts_off_to_the_end_of_the_window() -> None:
 
 
 def test_delay_is_the_same_for_each_packet() -> None:
-    assert sent(Delay(delay_ms=80), b"x") == [Chunk(100.08, b"x")]
+    assert writes_for(Delay(delay_ms=80), b"x") == [PendingWrite(100.08, b"x")]
 
 
-def test_jitter_is_exponential_with_the_mean_asked_for() -> None:
+def test_jitter_is_exponential_with_the_configured_mean() -> None:
     fault = Jitter(mean_ms=5)
-    run = run_of(fault)
-    late_ms = np.array([(sent(fault, b"x", run)[0].when_s - 100) * 1000 for _ in range(4000)])
+    jitter = active(fault)
+    delay_ms = np.array([(writes_for(fault, b"x", jitter)[0].due_s - 100) * 1000 for _ in range(4000)])
 
-    assert late_ms.min() >= 0
-    assert late_ms.mean() == pytest.approx(5, rel=0.1)
-    assert np.mean(late_ms > 5) == pytest.approx(np.exp(-1), rel=0.1)
+    assert delay_ms.min() >= 0
+    assert delay_ms.mean() == pytest.approx(5, rel=0.1)
+    assert np.mean(delay_ms > 5) == pytest.approx(np.exp(-1), rel=0.1)
 
 
 def test_a_half_open_server_neither_writes_nor_reads() -> None:
-    assert sent(HalfOpen(), b"x") == []
-    assert HalfOpen().reading_s(1) == math.inf
+    assert writes_for(HalfOpen(), b"x") == []
+    assert HalfOpen().read_delay_s(1) == math.inf
 
 
-def test_a_slow_reader_takes_its_time_for_each_byte() -> None:
-    assert SlowReader(bytes_per_s=50).reading_s(20) == 0.4
+def test_a_slow_reader_needs_the_same_time_for_each_byte() -> None:
+    assert SlowReader(bytes_per_s=50).read_delay_s(20) == 0.4
 
 
 # Replies ------------------------------------------------------------------------------------
@@ -258,11 +263,11 @@ def test_a_slow_reader_takes_its_time_for_each_byte() -> None:
         ("", True),
     ],
 )
-def test_the_minimal_server_of_field_note_2(text: str, is_refused: bool) -> None:
+def test_a_minimal_server_accepts_only_the_commands_of_field_note_2(text: str, is_refused: bool) -> None:
     assert (MinimalServer().refusal(Packet(COMMAND, text.encode())) is not None) == is_refused
 
 
-def test_commands_are_refused_by_their_first_word() -> None:
+def test_refused_commands_are_recognised_by_their_first_word() -> None:
     fault = RefusedCommands(commands=("setbyteorder", "bye"))
     refused = {
         text: fault.refusal(Packet(COMMAND, text.encode()))
@@ -277,7 +282,7 @@ def test_commands_are_refused_by_their_first_word() -> None:
     }
 
 
-def test_what_is_no_command_is_not_refused() -> None:
+def test_packets_that_are_no_commands_are_not_refused() -> None:
     for fault in (MinimalServer(), RefusedCommands(commands=("version",))):
         assert fault.refusal(Packet(DATA, b"Version 1.0")) is None
 
@@ -285,38 +290,38 @@ def test_what_is_no_command_is_not_refused() -> None:
 # When ---------------------------------------------------------------------------------------
 
 
-def waits_s(fault: Fault, seed: int) -> list[float]:
-    run = run_of(fault, seed)
-    return [run.first_wait_s(), *(run.next_wait_s(fault.every_s or 0.0) for _ in range(200))]
+def delays_s(fault: Fault, seed: int) -> list[float]:
+    planned = active(fault, seed)
+    return [planned.first_delay_s(), *(planned.random_interval_s(fault.every_s or 0.0) for _ in range(200))]
 
 
-def test_a_repeated_fault_comes_at_random_half_more_or_less_apart_the_same_for_the_same_seed() -> None:
+def test_a_repeated_fault_begins_at_random_intervals_that_are_the_same_for_the_same_seed() -> None:
     fault = Delay(every_s=4, for_s=1)
-    first = waits_s(fault, 1)
+    first = delays_s(fault, 1)
 
-    assert all(2 <= wait_s <= 6 for wait_s in first)
+    assert all(2 <= delay_s <= 6 for delay_s in first)
     assert np.mean(first) == pytest.approx(4, rel=0.1)
-    assert first == waits_s(fault, 1)
-    assert first != waits_s(fault, 2)
+    assert first == delays_s(fault, 1)
+    assert first != delays_s(fault, 2)
 
 
-def test_the_plan_does_not_depend_on_how_much_was_changed() -> None:
+def test_the_times_of_a_fault_do_not_depend_on_how_many_packets_it_changed() -> None:
     fault = Jitter(every_s=4, for_s=1)
-    idle, busy = run_of(fault), run_of(fault)
+    idle, busy = active(fault), active(fault)
     for _ in range(10):
-        sent(fault, b"x", busy)
-    assert idle.first_wait_s() == busy.first_wait_s()
+        writes_for(fault, b"x", busy)
+    assert idle.first_delay_s() == busy.first_delay_s()
 
 
-def test_the_first_time_is_the_one_given_or_at_once() -> None:
-    assert run_of(Delay(at_s=3, every_s=5, for_s=1)).first_wait_s() == 3
-    assert run_of(Delay()).first_wait_s() == 0
+def test_a_fault_first_begins_at_its_time_or_at_once() -> None:
+    assert active(Delay(at_s=3, every_s=5, for_s=1)).first_delay_s() == 3
+    assert active(Delay()).first_delay_s() == 0
 
 
 # Names and the command line's form ----------------------------------------------------------
 
 
-def test_every_fault_of_the_issue_has_a_kind_that_needs_no_parameter() -> None:
+def test_no_kind_of_fault_needs_a_parameter() -> None:
     assert set(KINDS) == {
         *("delay", "jitter", "split", "merge", "cut", "half_open", "slow_reader", "garbage"),
         *("oversize", "undersize", "wrong_counts", "wrong_byte_order", "unknown_component"),
@@ -346,7 +351,7 @@ def test_every_fault_of_the_issue_has_a_kind_that_needs_no_parameter() -> None:
         ),
     ],
 )
-def test_a_fault_is_read_from_one_argument_and_written_the_same_way(text: str, fault: Fault) -> None:
+def test_a_fault_is_parsed_from_the_form_in_which_it_is_printed(text: str, fault: Fault) -> None:
     assert parse_fault(text) == fault
     assert parse_fault(str(fault)) == fault
 
@@ -377,20 +382,23 @@ def test_a_fault_is_read_from_one_argument_and_written_the_same_way(text: str, f
         ("restart,scene=3", "scene: found 3; expected a mapping with any of the keys markers, tools"),
         ("restart,scene=3,scene.markers=1", "scene has both a value and parts; expected only one of them"),
         ("restart,scene.markers=1.5", "scene.markers: found 1.5; expected a whole number from 0 to 10000"),
-        ("refused_commands,commands=[]", "commands: found an empty list; expected a command's first word"),
+        (
+            "refused_commands,commands=[]",
+            "commands: found an empty list; expected the first word of a command",
+        ),
         ("refused_commands,commands=[fly]", "commands.0: found 'fly'; expected version, setbyteorder"),
     ],
 )
-def test_a_mistake_is_told_in_a_sentence(text: str, expected: str) -> None:
+def test_an_invalid_fault_is_reported_in_a_sentence(text: str, expected: str) -> None:
     with pytest.raises(ConfigError, match=expected):
         parse_fault(text)
 
 
-def test_the_list_of_kinds_has_each_with_its_parameters() -> None:
-    text = list_of_kinds()
+def test_the_description_of_the_kinds_has_each_with_its_parameters() -> None:
+    text = describe_kinds()
     for name, kind in KINDS.items():
         assert f"\n{name}" in f"\n{text}"
-        assert f"    {meaning_of(kind)}" in text
+        assert f"    {summary_of(kind)}" in text
         for parameter in kind.model_fields:
             assert parameter in text
-    assert "delay_ms=100  How late, in ms." in text
+    assert "delay_ms=100  The delay in milliseconds." in text

@@ -1,4 +1,4 @@
-"""Scenario files, and the command line that plays them."""
+"""Scenario files, and the command that plays them."""
 
 import logging
 import re
@@ -10,9 +10,10 @@ from typer.testing import CliRunner, Result
 from gateway.cli.main import app
 from gateway.errors import ConfigError
 from gateway.rtc3d.components import ComponentType
-from gateway.simulator.faults.kinds import COMMON, KINDS, list_of_kinds, parameters_of
+from gateway.simulator.faults.kinds import COMMON_PARAMETERS, KINDS, describe_kinds, parameters_of
+from gateway.simulator.faults.momentary_faults import Cut
 from gateway.simulator.faults.server_faults import Restart
-from gateway.simulator.faults.stream_faults import Cut, Delay
+from gateway.simulator.faults.stream_faults import Delay
 from gateway.simulator.scenario import Scenario, load_scenario
 from gateway.simulator.scene_settings import SceneSettings
 
@@ -50,7 +51,7 @@ seed: 7
     )
 
 
-def test_only_the_faults_are_needed(file: Path) -> None:
+def test_a_scenario_needs_only_faults(file: Path) -> None:
     file.write_text("faults: [{fault: cut}]")
     assert load_scenario(file) == Scenario(scene=SceneSettings(), faults=(Cut(),), seed=1)
 
@@ -60,7 +61,7 @@ def test_every_shipped_scenario_loads(path: Path) -> None:
     assert load_scenario(path).faults
 
 
-def test_there_is_a_shipped_scenario() -> None:
+def test_one_scenario_is_shipped() -> None:
     assert [path.name for path in SCENARIOS] == ["bad-day.yaml"]
 
 
@@ -96,13 +97,13 @@ def test_there_is_a_shipped_scenario() -> None:
         ("", "empty; expected a mapping with at least the key faults"),
     ],
 )
-def test_a_mistake_is_told_with_its_place(file: Path, line: str, expected: str) -> None:
+def test_a_mistake_is_reported_with_its_place(file: Path, line: str, expected: str) -> None:
     file.write_text(line)
     with pytest.raises(ConfigError, match=rf"^{re.escape(f'{file}:')} ?{re.escape(expected)}"):
         load_scenario(file)
 
 
-def test_a_missing_file_is_told_with_an_example(file: Path) -> None:
+def test_the_error_about_a_missing_file_names_an_example(file: Path) -> None:
     with pytest.raises(ConfigError, match=r"No such file .*such as config/scenarios/bad-day\.yaml"):
         load_scenario(file)
 
@@ -123,11 +124,11 @@ def test_a_scene_has_the_sizes_rates_and_labels_of_its_settings() -> None:
     assert [marker.label for marker in scene.parameters.markers.markers] == ["M 1", "M 2", "M 3"]
 
 
-def test_changes_of_a_scene_are_those_that_are_given() -> None:
+def test_only_the_values_that_are_set_change_a_scene() -> None:
     base = SceneSettings(markers=3, tools=1, rate_hz=50)
-    # 24 markers are the default, but given here
-    assert base.changed_by(SceneSettings(markers=24)) == SceneSettings(markers=24, tools=1, rate_hz=50)
-    assert base.changed_by(SceneSettings()) == base
+    # 24 markers are the default, but set here
+    assert base.with_changes(SceneSettings(markers=24)) == SceneSettings(markers=24, tools=1, rate_hz=50)
+    assert base.with_changes(SceneSettings()) == base
 
 
 # The command line ---------------------------------------------------------------------------
@@ -152,17 +153,17 @@ def test_a_scenarios_faults_and_those_of_the_command_line_are_played(
 
 
 @pytest.mark.parametrize("arguments", [["--fault", "dely"], ["--scenario", "/nowhere.yaml"]])
-def test_a_wrong_fault_or_scenario_is_an_error_of_the_configuration(arguments: list[str]) -> None:
+def test_an_invalid_fault_or_scenario_is_a_configuration_error(arguments: list[str]) -> None:
     assert isinstance(simulate(*arguments).exception, ConfigError)
 
 
-def test_options_change_the_scenarios_scene() -> None:
+def test_options_override_the_scenarios_scene() -> None:
     scenario = Scenario(scene=SceneSettings(markers=3, tools=1), faults=(Cut(),), seed=5)
-    changed = scenario.extended({"markers": 9, "rate_hz": 50.0}, [Delay()], None)
+    changed = scenario.with_overrides({"markers": 9, "rate_hz": 50.0}, [Delay()], None)
     assert changed == Scenario(
         scene=SceneSettings(markers=9, tools=1, rate_hz=50), faults=(Cut(), Delay()), seed=5
     )
-    assert scenario.extended({}, [], 0).seed == 0
+    assert scenario.with_overrides({}, [], 0).seed == 0
 
 
 def test_the_defaults_of_options_and_scenarios_are_the_same() -> None:
@@ -173,9 +174,9 @@ def test_the_defaults_of_options_and_scenarios_are_the_same() -> None:
         assert re.search(rf"--{option}\s.*\[default: {value}\]", help_text), name
 
 
-def test_all_faults_can_be_listed() -> None:
+def test_the_command_lists_all_kinds_of_faults() -> None:
     result = CliRunner().invoke(app, ["simulate", "--list-faults"])
-    assert (result.exit_code, result.output) == (0, list_of_kinds() + "\n")
+    assert (result.exit_code, result.output) == (0, describe_kinds() + "\n")
 
 
 # The reference ------------------------------------------------------------------------------
@@ -183,7 +184,7 @@ def test_all_faults_can_be_listed() -> None:
 
 def test_the_reference_has_every_kind_with_its_parameters_and_defaults() -> None:
     rows = dict(re.findall(r"^\| `(\w+)` \| (.*) \|$", REFERENCE, re.MULTILINE))
-    assert set(KINDS) | set(COMMON) <= set(rows)
+    assert set(KINDS) | set(COMMON_PARAMETERS) <= set(rows)
     for name, kind in KINDS.items():
         for parameter, default, _ in parameters_of(kind):
             assert f"`{parameter}`" in rows[name], f"{name}: {parameter}"
@@ -191,7 +192,7 @@ def test_the_reference_has_every_kind_with_its_parameters_and_defaults() -> None
         assert ("for_s" in rows[name]) == ("for_s" in kind.model_fields), name
 
 
-def test_the_examples_of_the_reference_can_be_loaded(file: Path) -> None:
+def test_the_examples_of_the_reference_load(file: Path) -> None:
     examples = re.findall(r"^```yaml\n(.*?)^```$", REFERENCE, re.MULTILINE | re.DOTALL)
     assert examples
     for example in examples:

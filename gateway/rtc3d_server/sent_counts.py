@@ -1,0 +1,29 @@
+"""Counts of the data frames that were sent."""
+
+from collections import Counter
+
+from gateway.rtc3d.components import ComponentType
+
+
+class SentCounts:
+    """Counts data frames and the components in them."""
+
+    def __init__(self) -> None:
+        self._frames: Counter[tuple[ComponentType, ...]] = Counter()
+
+    def add(self, components: tuple[ComponentType, ...]) -> None:
+        """Count one frame that has these components."""
+        self._frames[components] += 1
+
+    @property
+    def frames(self) -> int:
+        """The number of frames."""
+        return self._frames.total()
+
+    @property
+    def components(self) -> Counter[str]:
+        """The number of each component, by the components' keys."""
+        counts: Counter[str] = Counter()
+        for components, frames in self._frames.items():
+            counts.update({component.key: frames for component in components})
+        return counts

@@ -1,0 +1,154 @@
+"""Passes one connection's bytes through the faults that are active."""
+
+import asyncio
+import math
+import socket
+import struct
+import time
+from collections.abc import Callable, Iterable
+
+from gateway.rtc3d.packets import Packet
+from gateway.rtc3d_server.client_session import error_packet
+from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
+from gateway.simulator.faults.base import ActiveFault, LastingConnectionFault
+from gateway.simulator.faults.held_replies import HeldReplies
+from gateway.simulator.faults.outgoing import PendingWrite, Reply
+from gateway.simulator.faults.write_queue import WriteQueue
+
+ActiveConnectionFaults = list[tuple[ActiveFault, LastingConnectionFault]]
+"""Each active fault with its ``fault``, in the order in which they act."""
+
+
+class FaultPipeline(ConnectionFilter):
+    """The filter of one connection: its bytes pass through the active faults in both directions.
+
+    Packets keep their order, however late faults send them. ``active_faults`` returns the faults that
+    are active on the connection with a number; ``count`` is called with those that changed something.
+    """
+
+    def __init__(
+        self,
+        connection: FilteredConnection,
+        active_faults: Callable[[int], ActiveConnectionFaults],
+        count: Callable[[Iterable[ActiveFault]], None],
+    ) -> None:
+        super().__init__(connection)
+        self._active_faults = active_faults
+        self._count = count
+        self._writes = WriteQueue(connection)
+        self._held_replies = HeldReplies(self.send)
+        self._unread = bytearray()
+        self._read_timer: asyncio.TimerHandle | None = None
+
+    @property
+    def number(self) -> int:
+        """Counts the connections since the server's start, from 1."""
+        return self.connection.number
+
+    @property
+    def waiting_bytes(self) -> int:
+        """The number of bytes that wait to be sent or to be read."""
+        return self._writes.waiting_bytes + self._held_replies.waiting_bytes + len(self._unread)
+
+    # For the connection ---------------------------------------------------------------------
+
+    def send(self, packet: bytes) -> None:
+        """Send one packet as the faults change it."""
+        active_faults = self._active_faults(self.number)
+        changed_by = []
+        if not active_faults and not self._writes.waiting_bytes:
+            self.connection.write(packet)
+        else:
+            writes = [PendingWrite(time.monotonic(), packet)]
+            for active, fault in active_faults:
+                changed = fault.change_writes(writes, active)
+                if changed != writes:
+                    changed_by.append(active)
+                writes = changed
+            self._writes.put(writes)
+        self._held_replies.packet_sent(packet)
+        self._count(changed_by)
+
+    def answer(self, packet: Packet) -> list[bytes]:
+        """Return the replies to a client's packet as the faults change them."""
+        active_faults = self._active_faults(self.number)
+        for active, fault in active_faults:
+            refusal = fault.refusal(packet)
+            if refusal is not None:
+                self._count([active])
+                return [error_packet(refusal)]
+        changed_by = []
+        replies = [Reply(reply) for reply in self.connection.answer(packet)]
+        for active, fault in active_faults:
+            changed = fault.change_replies(packet, replies)
+            if changed != replies:
+                changed_by.append(active)
+            for reply in changed:
+                if reply.is_held:
+                    self._held_replies.hold(reply)
+            replies = [reply for reply in changed if not reply.is_held]
+        self._count(changed_by)
+        return [reply.packet for reply in replies]
+
+    def receive(self, data: bytes) -> None:
+        """Handle bytes from the client, or keep them and stop reading if a fault delays them."""
+        delays_s = [
+            (active, fault.read_delay_s(len(data))) for active, fault in self._active_faults(self.number)
+        ]
+        delay_s = max((delay_s for _, delay_s in delays_s), default=0.0)
+        if not delay_s and not self._unread:
+            self.connection.handle(data)
+            return
+        self._unread += data
+        self.connection.transport.pause_reading()
+        if self._read_timer is None and math.isfinite(delay_s):
+            self._read_timer = asyncio.get_running_loop().call_later(delay_s, self.handle_unread)
+        self._count([active for active, its_delay_s in delays_s if its_delay_s])
+
+    def flush(self) -> None:
+        """Send at once everything that waits, in its order."""
+        self._held_replies.flush()
+        self._writes.flush()
+
+    def connection_lost(self) -> None:
+        """Discard everything that waits."""
+        if self._read_timer is not None:
+            self._read_timer.cancel()
+        self._writes.clear()
+        self._held_replies.clear()
+        self._unread.clear()
+
+    # For faults -----------------------------------------------------------------------------
+
+    def send_unchanged(self, data: bytes) -> None:
+        """See FaultyConnection."""
+        self._writes.put([PendingWrite(time.monotonic(), data)])
+
+    def disconnect(self, last_data: bytes, *, reset: bool) -> None:
+        """See FaultyConnection."""
+        self.connection.write(last_data)
+        if reset:
+            tcp = self.connection.transport.get_extra_info("socket")
+            tcp.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            self.connection.transport.abort()
+        else:
+            self.connection.transport.close()
+
+    def handle_unread(self) -> None:
+        """Handle at once the bytes that a fault delayed."""
+        if self._read_timer is not None:
+            self._read_timer.cancel()
+            self._read_timer = None
+        if self._unread:
+            data = bytes(self._unread)
+            self._unread.clear()
+            self.connection.resume_reading()
+            self.connection.handle(data)
+
+    def fault_ended(self) -> None:
+        """Handle the bytes that only the fault that ended has kept from being read."""
+        is_half_open = any(
+            math.isinf(fault.read_delay_s(len(self._unread))) for _, fault in self._active_faults(self.number)
+        )
+        if self._unread and self._read_timer is None and not is_half_open:
+            self.handle_unread()
