@@ -46,7 +46,7 @@ class Source:
         self.source = source
         self.spool = spool
         self.fan_out = fan_out
-        self.fan_out.on_layout = self._ask_parameters_again
+        self.fan_out.on_items_changed = self._ask_parameters_again
         session = 0 if before is None else max(status.session for status in before.statuses)
         self.statuses: list[StreamStatus] = [self._new_status(stream, session) for stream in source.streams]
         self.supervisors = [

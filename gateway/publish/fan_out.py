@@ -1,67 +1,82 @@
-"""From one source's frames to every output: splice each component once, hand it to all."""
+"""From one source's frames to every output."""
 
 import logging
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Sequence
+from functools import lru_cache
 from typing import Final
 
-from gateway.messages.splice import (
-    MESSAGE_TYPES,
-    content_timestamp_us,
-    has_lcm_form,
-    lcm_content,
-    splice_content,
-)
+from gateway.messages.splice import MESSAGE_TYPES, has_lcm_form, lcm_content
 from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import Output
 from gateway.outputs.status import OutputStatus
 from gateway.publish.routes import ComponentRoute, OutputRoute
 from gateway.publish.tool_poses import ToolPoses
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import ComponentLayout, Frame, Layout
+from gateway.rtc3d.frames import Frame, Layout
 from gateway.rtc3d.parameters import Parameters
 
 _MAX_PLANS: Final = 256
+"""How many plans are kept. The server chooses the layouts: every number of events makes another one."""
 
 logger = logging.getLogger(__name__)
 
 
-class _Fan:
-    """One component on its way to all outputs."""
+class _Component:
+    """What FanOut counts of one component: the frames that had it, and the newest message."""
 
-    __slots__ = ("component", "frames", "lanes", "newest")
-
-    def __init__(self, component: ComponentType) -> None:
-        self.component = component
-        self.lanes: list[ComponentRoute] = []
+    def __init__(self) -> None:
         self.frames = 0
         self.newest: bytes | None = None
 
 
+class _ComponentPlan:
+    """How to publish one component of a layout: its index in the frame, and its routes."""
+
+    def __init__(
+        self, component: _Component, index: int, has_lcm_form: bool, routes: list[ComponentRoute]
+    ) -> None:
+        self.component = component
+        self.routes = routes
+        self._index = index
+        self._has_lcm_form = has_lcm_form
+
+    def content(self, frame: Frame) -> bytes:
+        """Return the component's content in LCM form."""
+        if self._has_lcm_form:
+            return frame.content(self._index)
+        return lcm_content(frame.component(self._index))
+
+
 class _Plan:
-    """What is done with the ``wanted`` components of frames of one layout."""
+    """How to publish the ``wanted`` components of a layout; made once per layout, not for every frame.
+
+    ``tool_indices`` are the indices of components whose tools have messages of their own, and ``num_items``
+    the numbers of markers, tools, channels and plates.
+    """
 
     def __init__(
         self,
         layout: Layout,
         wanted: frozenset[ComponentType],
-        fans: Mapping[ComponentType, _Fan],
-        *,
-        with_tools: bool,
+        components: list[_ComponentPlan],
+        tool_indices: list[int],
     ) -> None:
-        self.layout, self.wanted = layout, wanted
-        parts = [(part.type, index) for index, part in enumerate(layout.parts) if part.type in wanted]
-        self.fans = [(fans[kind], index) for kind, index in parts]
-        """Of each component that is wanted, with its index in the frame."""
-        self.is_canonical = all(has_lcm_form(part, layout.byte_order) for part in layout.parts)
-        """Whether the contents go into messages as they come."""
-        self.tools = [index for kind, index in parts if with_tools and kind is ComponentType.TOOLS]
-        """Which components are tools with messages of their own."""
+        self.layout = layout
+        self.wanted = wanted
+        self.components = components
+        self.tool_indices = tool_indices
+        self.num_items = {
+            part.type: part.num_items
+            for part in layout.parts
+            if part.type in wanted and part.type is not ComponentType.EVENT
+        }
 
 
 class FanOut:
-    """Publishes what one source sends. ``tool_outputs`` are the names of outputs with a key per tool.
+    """Publishes the frames, status and clock of one source on every output.
 
-    ``on_layout`` is called when the number of markers, tools, channels or plates changes; it may be set anew.
+    ``tool_outputs`` are the names of the outputs that also get a message per tool. ``on_items_changed`` is
+    called when the number of markers, tools, channels or plates changes; it may be replaced.
     """
 
     def __init__(
@@ -69,152 +84,128 @@ class FanOut:
         source: str,
         outputs: Sequence[Output],
         tool_outputs: Collection[str] = (),
-        on_layout: Callable[[], None] = lambda: None,
+        on_items_changed: Callable[[], None] = lambda: None,
     ) -> None:
-        self._ways: list[OutputRoute] = []
-        self._last_ways: dict[str, OutputRoute] = {}  # by the output's name, those given up too
-        self._fans = {kind: _Fan(kind) for kind in MESSAGE_TYPES}
-        self._plans: dict[tuple[Layout, frozenset[ComponentType]], _Plan] = {}
-        self._plan: _Plan | None = None  # of the frame before
-        self._num_items: dict[ComponentType, int] = {}
-        self.on_layout = on_layout
-        self._flowing = False
-        self._tools = ToolPoses(source)
+        self.on_items_changed = on_items_changed
         self._source = source
+        self._components = {component: _Component() for component in MESSAGE_TYPES}
+        self._routes: list[OutputRoute] = []
+        self._last_routes: dict[str, OutputRoute] = {}  # by the output's name; closed ones too
+        self._tool_poses = ToolPoses(source)
+        self._plan_for = lru_cache(_MAX_PLANS)(self._new_plan)
+        self._plan: _Plan | None = None  # of the previous frame
+        self._num_items: dict[ComponentType, int] = {}
+        self._flowing = False
         self.use(outputs, tool_outputs)
 
     def use(self, outputs: Sequence[Output], tool_outputs: Collection[str] = ()) -> None:
-        """Publish on these outputs from now on. Those that were used before notice nothing.
+        """Publish on these outputs from now on; those already in use are not disturbed.
 
-        One in place of another of its name goes on with its numbers and counters.
+        An output that replaces another of the same name continues its sequence numbers and counters.
         """
-        before = {way.output.name: way for way in self._ways}
-        self._ways = []
-        for output in outputs:
-            way = before.pop(output.name, None)
-            if way is None or way.output is not output:
-                if way is not None:
-                    way.close()
-                way = OutputRoute(self._source, output, self._last_ways.get(output.name))
-                if self._flowing:
-                    output.show_flowing(self._source, True)
-            self._last_ways[output.name] = way
-            self._ways.append(way)
-        for kind, fan in self._fans.items():
-            fan.lanes = [way.lanes[kind] for way in self._ways]
-        self._tools.use([way for way in self._ways if way.output.name in tool_outputs])
-        self._plans.clear()
+        open_routes = {route.output: route for route in self._routes}
+        for output, route in open_routes.items():
+            if output not in outputs:
+                route.close()
+        self._routes = [open_routes.get(output) or self._open_route(output) for output in outputs]
+        self._tool_poses.use([route for route in self._routes if route.output.name in tool_outputs])
+        self._plan_for.cache_clear()
         self._plan = None
-        for way in before.values():
-            way.close()
+
+    def _open_route(self, output: Output) -> OutputRoute:
+        route = OutputRoute(self._source, output, self._last_routes.get(output.name))
+        self._last_routes[output.name] = route
+        if self._flowing:
+            output.show_flowing(self._source, True)
+        return route
 
     def close(self) -> None:
-        """Give up all that was declared on the outputs."""
+        """Close every route; nothing of the source stays declared on an output."""
         if self._flowing:
             self.show_flowing(False)
         self.use(())
 
     @property
     def frames(self) -> dict[ComponentType, int]:
-        """How many frames came to be published with each component, left out by an output or not."""
-        return {kind: fan.frames for kind, fan in self._fans.items()}
+        """How many frames with each component arrived here, including those the pacers left out."""
+        return {component: each.frames for component, each in self._components.items()}
 
     @property
     def newest(self) -> dict[ComponentType, bytes]:
         """The newest message of each component."""
-        return {kind: fan.newest for kind, fan in self._fans.items() if fan.newest is not None}
+        newest = {component: each.newest for component, each in self._components.items()}
+        return {component: message for component, message in newest.items() if message is not None}
 
     @property
     def outputs(self) -> list[tuple[Output, OutputStatus]]:
-        """Each output with what it did for this source."""
-        return [(way.output, way.status) for way in self._ways]
+        """Each output with its counters for this source."""
+        return [(route.output, route.status) for route in self._routes]
 
     def publish(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
-        """Publish the frame's components that are ``wanted``; never raises for an output's sake.
-
-        An output that paces a component leaves frames out; its messages are numbered by themselves.
-        """
-        # The inner loop of the gateway: attributes instead of dictionaries, and calls only to what sends.
-        plan = self._plan_of(frame.layout, wanted)
-        for fan, index in plan.fans:
-            content = frame.content(index) if plan.is_canonical else lcm_content(frame.component(index))
-            fan.frames += 1
-            message = b""
-            spliced = -1  # the number in it, if any
-            for lane in fan.lanes:
-                if lane.pacer is not None and not lane.pacer.due(
-                    content_timestamp_us(content) if stamp.has_clock else None, stamp.utime
-                ):
-                    continue
-                sequence = lane.sequence
-                if spliced != sequence:
-                    spliced = sequence
-                    message = splice_content(fan.component, content, stamp, sequence)
-                lane.sequence = sequence + 1
-                try:
-                    lane.publish(message)
-                except Exception as error:  # noqa: BLE001 - a defect in one output must not stop the others
-                    lane.num_failed += 1
-                    lane.way.failed(error)
-                else:
-                    lane.message_bytes += len(message)
-                    if lane.way.is_failing:
-                        lane.way.sent()
-            if spliced >= 0:
-                fan.newest = message
-        for index in plan.tools:
-            self._tools.publish(frame, index, stamp)
-
-    def _plan_of(self, layout: Layout, wanted: frozenset[ComponentType]) -> _Plan:
-        """Return what is done with frames of a layout, most often the same as with the frame before."""
+        """Publish the ``wanted`` components of a frame; an output that fails raises nothing here."""
+        # The inner loop of the gateway: benchmarks/own_cost.py measures it.
         plan = self._plan
-        if plan is None or plan.layout is not layout or plan.wanted is not wanted:
-            self._plan = plan = self._plans.get((layout, wanted)) or self._new_plan(layout, wanted)
-        return plan
+        if plan is None or plan.layout is not frame.layout or plan.wanted is not wanted:
+            self._plan = plan = self._plan_for(frame.layout, wanted)
+            self._check_item_counts(plan)
+        for planned in plan.components:
+            content = planned.content(frame)
+            planned.component.frames += 1
+            for route in planned.routes:
+                message = route.publish(content, stamp)
+                if message is not None:
+                    planned.component.newest = message
+        for index in plan.tool_indices:
+            self._tool_poses.publish(frame, index, stamp)
 
     def _new_plan(self, layout: Layout, wanted: frozenset[ComponentType]) -> _Plan:
-        """Return what is done with frames of a layout that is new, and tell if counts have changed."""
-        for part in layout.parts:
-            if part.type in wanted and part.type is not ComponentType.EVENT:
-                self._note_count(part)
-        if len(self._plans) >= _MAX_PLANS:
-            self._plans.clear()
-        plan = _Plan(layout, wanted, self._fans, with_tools=self._tools.is_used)
-        self._plans[layout, wanted] = plan
-        return plan
-
-    def _note_count(self, part: ComponentLayout) -> None:
-        before = self._num_items.get(part.type)
-        if part.num_items == before:
-            return
-        self._num_items[part.type] = part.num_items
-        self._plans.clear()  # so that the next layout with another count comes here again
-        if before is not None:
-            logger.info(
-                "%s: %s has %d items now, %d before", self._source, part.type.key, part.num_items, before
+        parts = [(index, part) for index, part in enumerate(layout.parts) if part.type in wanted]
+        components = [
+            _ComponentPlan(
+                self._components[part.type],
+                index,
+                has_lcm_form(part, layout.byte_order),
+                [route.components[part.type] for route in self._routes],
             )
-            self.on_layout()
+            for index, part in parts
+        ]
+        tools = [index for index, part in parts if part.type is ComponentType.TOOLS]
+        return _Plan(layout, wanted, components, tools if self._tool_poses.is_used else [])
+
+    def _check_item_counts(self, plan: _Plan) -> None:
+        """Log and report every component whose number of items is not the same as before."""
+        for component, num_items in plan.num_items.items():
+            before = self._num_items.get(component)
+            self._num_items[component] = num_items
+            if before is not None and before != num_items:
+                logger.info(
+                    "%s: number of items in %s changed from %d to %d",
+                    *(self._source, component.key, before, num_items),
+                )
+                self.on_items_changed()
 
     def listened(self, components: Collection[ComponentType]) -> bool:
-        """Return whether anybody may be listening to one of the components on one of the outputs."""
-        return any(lane.publisher.wanted for kind in components for lane in self._fans[kind].lanes)
+        """Return whether any output may have a subscriber to one of the components."""
+        return any(
+            route.components[component].publisher.wanted for route in self._routes for component in components
+        )
 
     def show_flowing(self, flowing: bool) -> None:
-        """Show on every output that can whether frames of the source flow."""
+        """Show on every output whether frames of the source flow."""
         self._flowing = flowing
-        for way in self._ways:
-            way.output.show_flowing(self._source, flowing)
+        for route in self._routes:
+            route.output.show_flowing(self._source, flowing)
 
     def publish_status(self, message: bytes) -> None:
         """Publish an encoded ``status_t``."""
-        for way in self._ways:
-            way.send(way.status_publisher, "status", message)
+        for route in self._routes:
+            route.status_route.send(message)
 
     def publish_clock(self, message: bytes) -> None:
         """Publish an encoded ``clock_t``."""
-        for way in self._ways:
-            way.send(way.clock_publisher, "clock", message)
+        for route in self._routes:
+            route.clock_route.send(message)
 
     def set_parameters(self, parameters: Parameters) -> None:
-        """Take the tools' labels (§6.3) and the unit of length (§6.2) for the messages per tool."""
-        self._tools.set_parameters(parameters)
+        """Set the labels (§6.3) and the unit of length (§6.2) of the messages per tool."""
+        self._tool_poses.set_parameters(parameters)

@@ -1,12 +1,17 @@
-"""One output as one source sees it: its publishers, what they sent, and what they could not."""
+"""Routes from one source to one output: publishers, sequence numbers, counters and failures."""
 
 import logging
+from collections import Counter
+from typing import Any
+
+import rtc3d
 
 from gateway.errors import OutputError
 from gateway.log import HOLD_S, FailureLog
-from gateway.messages.splice import MESSAGE_TYPES, lcm_type_name
+from gateway.messages.splice import MESSAGE_TYPES, content_timestamp_us, lcm_type_name, splice_content
+from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import Output, Publisher
+from gateway.outputs.contract import Output
 from gateway.outputs.status import OutputStatus
 from gateway.publish.pacing import Pacer
 from gateway.rtc3d.components import ComponentType
@@ -14,92 +19,120 @@ from gateway.rtc3d.components import ComponentType
 logger = logging.getLogger(__name__)
 
 
-class OutputRoute:
-    """One output as one source sees it; with ``before`` it goes on with the numbers of the one replaced."""
+class SentCounter:
+    """How many messages of one kind an output accepted from one source, and how many bytes they had."""
 
-    def __init__(self, source: str, output: Output, before: "OutputRoute | None" = None) -> None:
+    def __init__(self) -> None:
+        self.messages = 0
+        self.bytes = 0
+
+
+class OutputRoute:
+    """Everything one source publishes on one output.
+
+    With ``predecessor``, an earlier route to an output of the same name, it continues that route's sequence
+    numbers and counters.
+    """
+
+    def __init__(self, source: str, output: Output, predecessor: "OutputRoute | None" = None) -> None:
+        self.source = source
         self.output = output
-        self.lanes: dict[ComponentType, ComponentRoute] = {
-            kind: ComponentRoute(
-                self,
-                kind,
-                Topic(source, (kind.key,), lcm_type_name(message_type)),
-                None if before is None else before.lanes[kind],
-            )
-            for kind, message_type in MESSAGE_TYPES.items()
-        }
-        self.status_publisher = output.publisher(Topic(source, ("status",), "rtc3d.status_t"))
-        self.clock_publisher = output.publisher(Topic(source, ("clock",), "rtc3d.clock_t"))
-        self.is_failing = False
-        self._status: OutputStatus = OutputStatus(output.name) if before is None else before.status
+        self.sent: dict[str, SentCounter] = {} if predecessor is None else predecessor.sent
+        """By component key; "status", "clock" and "6d/tool" are counted as components of their own."""
+        self.drops: Counter[str] = Counter() if predecessor is None else predecessor.drops
+        """By cause."""
         self._failures = FailureLog(logger, f"{source} to {output.name}", HOLD_S)
-        self._source = source
+        self.components: dict[ComponentType, ComponentRoute] = {
+            component: ComponentRoute(
+                self, component, None if predecessor is None else predecessor.components[component]
+            )
+            for component in MESSAGE_TYPES
+        }
+        self.status_route = TopicRoute(self, ("status",), rtc3d.status_t, "status")
+        self.clock_route = TopicRoute(self, ("clock",), rtc3d.clock_t, "clock")
         output.announce(source)
 
     @property
     def status(self) -> OutputStatus:
-        """What was sent and what was not, up to now."""
-        for kind, lane in self.lanes.items():
-            if lane.sequence > lane.num_failed:
-                self._status.messages[kind.key] = lane.sequence - lane.num_failed
-                self._status.message_bytes[kind.key] = lane.message_bytes
-        return self._status
+        """What was sent so far, and the drops: the counter itself, to which others may add."""
+        sent = {name: counter for name, counter in self.sent.items() if counter.messages}
+        return OutputStatus(
+            self.output.name,
+            Counter({name: counter.messages for name, counter in sent.items()}),
+            self.drops,
+            Counter({name: counter.bytes for name, counter in sent.items()}),
+        )
+
+    def count_failure(self, error: Exception) -> None:
+        """Count and log a message that the output did not accept."""
+        cause = error.cause if isinstance(error, OutputError) else type(error).__name__
+        self.drops[cause] += 1
+        self._failures.failed(str(error) if isinstance(error, OutputError) else f"{cause}: {error}")
+
+    def count_success(self) -> None:
+        """End a failure that has been logged, if there is one."""
+        if self._failures.failing:
+            self._failures.recovered("sending again")
 
     def close(self) -> None:
-        """Give up everything that was declared on the output."""
-        for lane in self.lanes.values():
-            lane.publisher.close()
-        self.status_publisher.close()
-        self.clock_publisher.close()
-        self.output.withdraw(self._source)
-
-    def send(self, publisher: Publisher, name: str, message: bytes) -> None:
-        """Publish and count; what an output raises is its own affair, never the reader's."""
-        try:
-            publisher.publish(message)
-        except Exception as error:  # noqa: BLE001 - a defect in one output must not stop the others
-            self.failed(error)
-        else:
-            self._status.messages[name] += 1
-            self._status.message_bytes[name] += len(message)
-            if self.is_failing:
-                self.sent()
-
-    def drop(self, cause: str) -> None:
-        """Count a message that was not sent."""
-        self._status.drops[cause] += 1
-
-    def failed(self, error: Exception) -> None:
-        """Count and tell a message that the output did not take."""
-        cause = error.cause if isinstance(error, OutputError) else type(error).__name__
-        self.drop(cause)
-        self._failures.failed(str(error) if isinstance(error, OutputError) else f"{cause}: {error}")
-        self.is_failing = True
-
-    def sent(self) -> None:
-        """Tell, while ``is_failing``, that the output took a message."""
-        self._failures.recovered("messages go out")
-        self.is_failing = self._failures.failing
+        """Close the publishers and withdraw the source from the output."""
+        for route in (*self.components.values(), self.status_route, self.clock_route):
+            route.close()
+        self.output.withdraw(self.source)
 
 
-class ComponentRoute:
-    """One component on its way to one output: paced, and numbered by itself.
-
-    ``sequence`` is of the next message, ``num_failed`` of those before it the output did not take, and
-    ``message_bytes`` is the size of the others. The fan-out counts.
-    """
-
-    __slots__ = ("message_bytes", "num_failed", "pacer", "publish", "publisher", "sequence", "way")
+class TopicRoute:
+    """One topic on one output; its messages are counted under ``counted_as``."""
 
     def __init__(
-        self, way: OutputRoute, component: ComponentType, topic: Topic, before: "ComponentRoute | None"
+        self, output_route: OutputRoute, path: tuple[str, ...], message_type: type[Any], counted_as: str
     ) -> None:
-        self.way = way
-        self.publisher = way.output.publisher(topic)
-        self.publish = self.publisher.publish
-        max_rate_hz = way.output.max_rate_hz.get(component)
-        # Events are never skipped.
-        self.pacer = None if max_rate_hz is None or component is ComponentType.EVENT else Pacer(max_rate_hz)
-        self.sequence: int = 0 if before is None else before.sequence
-        self.num_failed: int = 0 if before is None else before.num_failed
-        self.message_bytes: int = 0 if before is None else before.message_bytes
+        topic = Topic(output_route.source, path, lcm_type_name(message_type))
+        self.publisher = output_route.output.publisher(topic)
+        self._output_route = output_route
+        self._sent = output_route.sent.setdefault(counted_as, SentCounter())
+
+    def send(self, message: bytes) -> None:
+        """Publish and count one message; never raises, because outputs must not disturb each other."""
+        try:
+            self.publisher.publish(message)
+        except Exception as error:  # noqa: BLE001 - a defect in one output must not stop the others
+            self._output_route.count_failure(error)
+        else:
+            self._sent.messages += 1
+            self._sent.bytes += len(message)
+            self._output_route.count_success()
+
+    def close(self) -> None:
+        """Close the publisher."""
+        self.publisher.close()
+
+
+class ComponentRoute(TopicRoute):
+    """One component on one output: paced, and with its own sequence numbers."""
+
+    def __init__(
+        self, output_route: OutputRoute, component: ComponentType, predecessor: "ComponentRoute | None"
+    ) -> None:
+        super().__init__(output_route, (component.key,), MESSAGE_TYPES[component], component.key)
+        max_rate_hz = output_route.output.max_rate_hz.get(component)
+        if component is ComponentType.EVENT:  # events are never skipped
+            max_rate_hz = None
+        self._component = component
+        self._pacer = None if max_rate_hz is None else Pacer(max_rate_hz)
+        self.sequence: int = 0 if predecessor is None else predecessor.sequence
+        """Of the next message."""
+
+    def publish(self, content: bytes, stamp: Stamp) -> bytes | None:
+        """Publish a content in LCM form unless the pacer leaves it out; return the message, if any.
+
+        A message that the output does not accept uses up its sequence number, so that the loss shows.
+        """
+        if self._pacer is not None:
+            timestamp_us = content_timestamp_us(content) if stamp.has_clock else None
+            if not self._pacer.due(timestamp_us, stamp.utime):
+                return None
+        message = splice_content(self._component, content, stamp, self.sequence)
+        self.sequence += 1
+        self.send(message)
+        return message

@@ -16,7 +16,7 @@ from gateway.monitoring.loop_delay import LoopDelay
 from gateway.monitoring.metrics import metrics_page, metrics_registry
 from gateway.rtc3d.client_protocol import State
 from gateway.rtc3d.components import ComponentType, build_component
-from gateway.rtc3d.frames import build_frame, split_frame
+from gateway.rtc3d.frames import Frame, build_frame, split_frame
 from gateway.stream.state import StreamState
 from tests.toy_output import ToyOutput
 
@@ -54,6 +54,12 @@ class Lab:
     def value(self, name: str, **labels: str) -> float:
         [value] = [value for found, value in self.samples(name) if found == labels]
         return value
+
+
+def analog_frame() -> Frame:
+    """Return a frame with one analog component of three channels."""
+    analog = build_component(ComponentType.ANALOG, 1, 1, np.zeros(3, ">f4"))
+    return split_frame(build_frame([analog]), "big")
 
 
 @pytest.fixture
@@ -122,24 +128,23 @@ async def test_drops_have_a_cause_and_common_causes_start_at_0(lab: Lab) -> None
 
 
 async def test_messages_and_bytes_are_counted_by_component_and_output(lab: Lab) -> None:
-    _, (toy, status) = lab.source.fan_out.outputs
-    status.messages.update({"3d": 4, "status": 1})
-    status.message_bytes.update({"3d": 400, "status": 50})
+    fan_out = lab.source.fan_out
+    for _ in range(4):
+        fan_out.publish(analog_frame(), Stamp(2, 1, 1), frozenset({ComponentType.ANALOG}))
+    fan_out.publish_status(bytes(50))
     for name, counted in (
-        ("messages_total", {"3d": 4, "status": 1}),
-        ("message_bytes_total", {"3d": 400, "status": 50}),
+        ("messages_total", {"analog": 4, "status": 1}),
+        ("message_bytes_total", {"analog": 4 * (52 + 3 * 4), "status": 50}),
     ):
         samples = {
-            labels["component"]: value for labels, value in lab.samples(name) if labels["output"] == toy.name
+            labels["component"]: value for labels, value in lab.samples(name) if labels["output"] == "toy"
         }
         assert samples == {"3d": 0, "6d": 0, "analog": 0} | counted
 
 
 async def test_frames_are_counted_by_configured_component(lab: Lab) -> None:
-    analog = build_component(ComponentType.ANALOG, 1, 1, np.zeros(3, ">f4"))
-    frame = split_frame(build_frame([analog]), "big")
     for _ in range(12):
-        lab.source.fan_out.publish(frame, Stamp(2, 1, 1), frozenset({ComponentType.ANALOG}))
+        lab.source.fan_out.publish(analog_frame(), Stamp(2, 1, 1), frozenset({ComponentType.ANALOG}))
     samples = {labels["component"]: value for labels, value in lab.samples("component_frames_total")}
     assert samples == {"3d": 0, "6d": 0, "analog": 12}
 

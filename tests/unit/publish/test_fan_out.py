@@ -59,7 +59,7 @@ def test_the_source_is_announced_on_every_output() -> None:
     assert [output.announced for output in outputs] == [["lab"], ["lab"]]
 
 
-def test_each_component_counts_for_itself_and_across_sessions(memory: MemoryOutput) -> None:
+def test_each_component_has_its_own_numbers_across_sessions(memory: MemoryOutput) -> None:
     fan_out = FanOut("lab", [memory])
     fan_out.publish(FULL, STAMP, ALL)
     fan_out.publish(FULL, STAMP, MARKERS)
@@ -72,7 +72,7 @@ def test_each_component_counts_for_itself_and_across_sessions(memory: MemoryOutp
     assert counted == {"3d": [(0, 1), (1, 1), (2, 2)], "analog": [(0, 1), (1, 2)]}
 
 
-def test_components_that_the_stream_does_not_want_are_not_published(memory: MemoryOutput) -> None:
+def test_components_that_are_not_wanted_are_not_published(memory: MemoryOutput) -> None:
     FanOut("lab", [memory]).publish(FULL, STAMP, frozenset({ComponentType.TOOLS, ComponentType.EVENT}))
     assert [topic.path for topic, _ in memory.messages] == [("6d",), ("event",)]
 
@@ -82,7 +82,7 @@ def test_an_empty_frame_publishes_nothing(memory: MemoryOutput) -> None:
     assert not memory.messages
 
 
-def test_the_newest_message_of_each_component_is_kept(memory: MemoryOutput) -> None:
+def test_the_newest_message_of_each_component_can_be_read(memory: MemoryOutput) -> None:
     fan_out = FanOut("lab", [memory])
     fan_out.publish(FULL, STAMP, ALL)
     fan_out.publish(FULL, STAMP, MARKERS)
@@ -90,7 +90,7 @@ def test_the_newest_message_of_each_component_is_kept(memory: MemoryOutput) -> N
     assert newest == {"3d": 1, "6d": 0, "analog": 0, "force": 0, "event": 0}
 
 
-def test_status_and_clock_messages_have_topics_of_their_own(memory: MemoryOutput) -> None:
+def test_status_and_clock_messages_have_their_own_topics(memory: MemoryOutput) -> None:
     fan_out = FanOut("lab", [memory])
     fan_out.publish(FULL, STAMP, ALL)
     fan_out.publish_status(b"status")
@@ -121,7 +121,7 @@ def test_frames_messages_and_bytes_are_counted_by_component(memory: MemoryOutput
     ("error", "cause"),
     [(OutputError("no router", cause="no router"), "no router"), (ValueError("a defect"), "ValueError")],
 )
-def test_an_output_that_raises_is_counted_and_stops_no_other(error: Exception, cause: str) -> None:
+def test_an_output_that_raises_is_counted_and_does_not_stop_others(error: Exception, cause: str) -> None:
     broken, good = ToyOutput("broken"), ToyOutput("good")
     broken.error = error
     fan_out = FanOut("lab", [broken, good])
@@ -137,7 +137,7 @@ def test_an_output_that_raises_is_counted_and_stops_no_other(error: Exception, c
     assert len(good.messages) == 11
 
 
-def test_a_message_refused_still_counts_so_that_the_gap_shows() -> None:
+def test_a_refused_message_uses_up_its_sequence_number() -> None:
     output = ToyOutput()
     fan_out = FanOut("lab", [output])
     for output.error in (None, OutputError("no router", cause="no router"), None):
@@ -146,7 +146,7 @@ def test_a_message_refused_still_counts_so_that_the_gap_shows() -> None:
 
 
 @pytest.mark.usefixtures("no_hold")
-def test_a_failing_output_is_told_once_loudly_then_quietly_and_when_it_is_over(
+def test_an_output_failure_is_logged_once_with_its_repeats_at_debug_and_its_end(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.DEBUG, "gateway.publish.routes")
@@ -159,10 +159,10 @@ def test_a_failing_output_is_told_once_loudly_then_quietly_and_when_it_is_over(
     assert (warning.levelno, warning.getMessage()) == (logging.WARNING, f"lab to toy: {lost}")
     assert [record.levelno for record in repeats] == [logging.DEBUG, logging.DEBUG]
     assert recovery.levelno == logging.INFO
-    assert "lab to toy: messages go out" in recovery.getMessage()
+    assert "lab to toy: sending again" in recovery.getMessage()
 
 
-def test_messages_that_fail_by_turns_are_one_failure(caplog: pytest.LogCaptureFixture) -> None:
+def test_messages_that_fail_now_and_then_are_one_failure(caplog: pytest.LogCaptureFixture) -> None:
     output = ToyOutput()
     fan_out = FanOut("lab", [output])
     for output.error in [OutputError("too large", cause="send failed"), None] * 5:
@@ -171,10 +171,10 @@ def test_messages_that_fail_by_turns_are_one_failure(caplog: pytest.LogCaptureFi
     assert fan_out.outputs[0][1].messages == {"3d": 5}
 
 
-# Pacing, layouts and listeners ---------------------------------------------------------------
+# Pacing, layouts and subscribers -------------------------------------------------------------
 
 
-def test_a_paced_component_is_numbered_by_itself_on_each_output() -> None:
+def test_a_paced_component_has_consecutive_numbers_on_each_output() -> None:
     paced, whole = ToyOutput("paced"), ToyOutput("whole")
     paced.max_rate_hz = {ComponentType.MARKERS: 50.0}
     fan_out = FanOut("lab", [paced, whole])
@@ -186,7 +186,7 @@ def test_a_paced_component_is_numbered_by_itself_on_each_output() -> None:
         assert sequences == list(range(count))
 
 
-def test_events_are_never_left_out_whatever_the_limit() -> None:
+def test_events_are_never_paced() -> None:
     output = ToyOutput()
     output.max_rate_hz = {ComponentType.EVENT: 0.001}
     fan_out = FanOut("lab", [output])
@@ -195,19 +195,52 @@ def test_events_are_never_left_out_whatever_the_limit() -> None:
     assert [decode(message).sequence for _, message in output.messages] == [0, 1, 2]
 
 
-def test_a_changed_number_of_markers_is_told_once() -> None:
+def test_a_changed_number_of_markers_is_reported_once() -> None:
     changes: list[int] = []
-    fan_out = FanOut("lab", [], on_layout=lambda: changes.append(1))
+    fan_out = FanOut("lab", [], on_items_changed=lambda: changes.append(1))
     for num_markers, expected in ((2, 0), (2, 0), (3, 1), (3, 1), (2, 2)):
         fan_out.publish(markers_frame(1, timestamp_us=0, num_markers=num_markers), STAMP, ALL)
         assert len(changes) == expected
 
 
-def test_somebody_listens_if_one_output_has_a_listener_to_one_component() -> None:
-    deaf, heard = ToyOutput("deaf"), ToyOutput("heard", "6d")
-    assert not FanOut("lab", [deaf]).listened(ALL)
-    assert FanOut("lab", [deaf, heard]).listened({ComponentType.MARKERS, ComponentType.TOOLS})
-    assert not FanOut("lab", [deaf, heard]).listened({ComponentType.MARKERS})
+def test_a_changed_number_of_markers_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gateway.publish.fan_out")
+    fan_out = FanOut("lab", [])
+    for num_markers in (2, 3):
+        fan_out.publish(markers_frame(1, timestamp_us=0, num_markers=num_markers), STAMP, ALL)
+    assert caplog.messages == ["lab: number of items in 3d changed from 2 to 3"]
+
+
+def test_streams_that_take_turns_with_their_components_change_nothing() -> None:
+    changes: list[int] = []
+    fan_out = FanOut("lab", [], on_items_changed=lambda: changes.append(1))
+    for _ in range(3):
+        fan_out.publish(markers_frame(1, timestamp_us=0, num_markers=2), STAMP, MARKERS)
+        fan_out.publish(FULL, STAMP, ALL - MARKERS)
+    assert not changes
+
+
+def test_the_number_of_events_is_not_a_change() -> None:
+    changes: list[int] = []
+    fan_out = FanOut("lab", [], on_items_changed=lambda: changes.append(1))
+    for num_events in range(3):
+        fan_out.publish(events_frame(num_events), STAMP, ALL)
+    assert not changes
+
+
+def test_the_number_of_remembered_layouts_is_bounded(memory: MemoryOutput) -> None:
+    fan_out = FanOut("lab", [memory])
+    for num_events in range(300):
+        fan_out.publish(events_frame(num_events), STAMP, ALL)
+    assert fan_out._plan_for.cache_info().currsize == 256
+    assert len(memory.messages) == 300
+
+
+def test_a_component_is_listened_to_if_one_output_has_a_subscriber() -> None:
+    without, with_tools = ToyOutput("without"), ToyOutput("with tools", "6d")
+    assert not FanOut("lab", [without]).listened(ALL)
+    assert FanOut("lab", [without, with_tools]).listened({ComponentType.MARKERS, ComponentType.TOOLS})
+    assert not FanOut("lab", [without, with_tools]).listened({ComponentType.MARKERS})
 
 
 def test_every_output_shows_whether_frames_flow() -> None:
@@ -222,3 +255,8 @@ def markers_frame(number: int, *, timestamp_us: int, num_markers: int) -> Frame:
     items = np.zeros(num_markers, ITEM_DTYPES[ComponentType.MARKERS])
     component = build_component(ComponentType.MARKERS, number, timestamp_us, items)
     return split_frame(build_frame([component]), "big")
+
+
+def events_frame(num_events: int) -> Frame:
+    items = np.zeros(num_events, ITEM_DTYPES[ComponentType.EVENT])
+    return split_frame(build_frame([build_component(ComponentType.EVENT, 1, 0, items)]), "big")

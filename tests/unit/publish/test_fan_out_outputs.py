@@ -1,4 +1,4 @@
-"""A fan-out whose outputs change while frames flow."""
+"""Changing the outputs of a fan-out while frames flow."""
 
 from gateway.messages.decode import decode
 from gateway.messages.stamp import Stamp
@@ -22,7 +22,7 @@ def sequences(output: ToyOutput, component: str) -> list[int]:
     return [decode(message).sequence for topic, message in output.messages if topic.path == (component,)]
 
 
-def test_an_output_that_stays_notices_nothing_of_another_that_is_replaced() -> None:
+def test_replacing_an_output_does_not_disturb_the_others() -> None:
     stays, before, after = ToyOutput("stays"), ToyOutput("side"), ToyOutput("side")
     fan_out = FanOut("lab", [stays, before])
     declared = list(stays.declared)
@@ -32,7 +32,7 @@ def test_an_output_that_stays_notices_nothing_of_another_that_is_replaced() -> N
     assert sequences(stays, "3d") == [0]
 
 
-def test_an_output_in_place_of_another_goes_on_with_its_numbers_and_counters() -> None:
+def test_a_replacement_continues_numbers_and_counters() -> None:
     before, after = ToyOutput("side"), ToyOutput("side")
     fan_out = FanOut("lab", [before])
     publish(fan_out)
@@ -42,9 +42,12 @@ def test_an_output_in_place_of_another_goes_on_with_its_numbers_and_counters() -
     [(output, status)] = fan_out.outputs
     assert output is after
     assert status.messages["3d"] == 2
+    assert status.message_bytes["3d"] == sum(
+        len(message) for topic, message in (*before.messages, *after.messages) if topic.path == ("3d",)
+    )
 
 
-def test_what_was_declared_on_an_output_is_given_up_with_it() -> None:
+def test_removing_an_output_closes_everything_declared_on_it() -> None:
     output = ToyOutput()
     fan_out = FanOut("lab", [output])
     declared = list(output.declared)
@@ -54,7 +57,7 @@ def test_what_was_declared_on_an_output_is_given_up_with_it() -> None:
     assert sorted(output.given_up) == sorted(declared)
 
 
-def test_an_output_that_comes_back_goes_on_with_its_numbers() -> None:
+def test_an_output_that_comes_back_continues_its_numbers() -> None:
     fan_out = FanOut("lab", [ToyOutput("side")])
     publish(fan_out)
     fan_out.use([])
@@ -64,7 +67,7 @@ def test_an_output_that_comes_back_goes_on_with_its_numbers() -> None:
     assert sequences(again, "3d") == [1]
 
 
-def test_a_new_output_is_shown_what_the_others_were() -> None:
+def test_a_new_output_shows_that_frames_flow() -> None:
     fan_out = FanOut("lab", [ToyOutput("one")])
     fan_out.show_flowing(True)
     new = ToyOutput("two")
@@ -72,7 +75,7 @@ def test_a_new_output_is_shown_what_the_others_were() -> None:
     assert (new.announced, new.flowing) == (["lab"], [True])
 
 
-def test_a_closed_fan_out_leaves_nothing_behind() -> None:
+def test_a_closed_fan_out_leaves_nothing_declared() -> None:
     output = ToyOutput("toy", "Probe")
     fan_out = FanOut("lab", [output], ["toy"])
     fan_out.set_parameters(PROBES)
@@ -82,7 +85,7 @@ def test_a_closed_fan_out_leaves_nothing_behind() -> None:
     assert (output.declared, output.announced, output.flowing) == ([], [], [True, False])
 
 
-def test_tools_keep_their_topics_on_an_output_that_stays() -> None:
+def test_tool_topics_stay_open_on_an_output_that_stays() -> None:
     stays, before, after = (ToyOutput(name, "Probe") for name in ("stays", "side", "side"))
     fan_out = FanOut("lab", [stays, before], ["stays", "side"])
     fan_out.set_parameters(PROBES)
@@ -95,7 +98,7 @@ def test_tools_keep_their_topics_on_an_output_that_stays() -> None:
     assert before.tool_names() == []
 
 
-def test_tools_lose_their_topics_where_they_are_switched_off() -> None:
+def test_tool_topics_are_closed_where_they_are_switched_off() -> None:
     output = ToyOutput("toy", "Probe")
     fan_out = FanOut("lab", [output], ["toy"])
     fan_out.set_parameters(PROBES)

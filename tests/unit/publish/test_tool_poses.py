@@ -19,7 +19,7 @@ IN_VIEW = (1.0, 0.0, 0.0, 0.0, 100.0, 200.0, 300.0, 0.5)
 
 
 def tools_frame(*poses: Sequence[float]) -> Frame:
-    """Return a frame with one 6D component: of each tool q0, qx, qy, qz, x, y, z, error."""
+    """Return a frame with one 6D component; each pose is q0, qx, qy, qz, x, y, z, error."""
     wire = struct.pack(">IIIiqI", 1, 24 + 32 * len(poses), 4, 7, 7000, len(poses))
     wire += struct.pack(f">{8 * len(poses)}f", *chain.from_iterable(poses))
     return split_frame(wire, "big")
@@ -34,7 +34,7 @@ def publish_tools(fan_out: FanOut, count: int) -> None:
     fan_out.publish(tools_frame(*[IN_VIEW] * count), STAMP, ALL)
 
 
-def test_tools_have_topics_where_switched_on_only() -> None:
+def test_tools_have_topics_only_where_switched_on() -> None:
     with_tools, without = ToyOutput("with", "Probe"), ToyOutput("without", "Probe")
     fan_out = FanOut("lab", [with_tools, without], ["with"])
     fan_out.set_parameters(parameters("Probe"))
@@ -44,7 +44,7 @@ def test_tools_have_topics_where_switched_on_only() -> None:
     assert without.tool_names() == []
 
 
-def test_a_pose_is_published_while_somebody_listens() -> None:
+def test_a_pose_is_published_while_it_has_a_subscriber() -> None:
     output = ToyOutput("toy", "Probe")
     fan_out = FanOut("lab", [output], ["toy"])
     fan_out.set_parameters(parameters("Probe", "Head"))
@@ -70,7 +70,7 @@ def test_a_pose_is_published_while_somebody_listens() -> None:
         ([500 * "x", 500 * "x"], [200 * "x", 198 * "x" + "_2"]),
     ],
 )
-def test_topics_carry_the_tools_labels(labels: list[str], names: list[str]) -> None:
+def test_topics_are_named_after_the_labels(labels: list[str], names: list[str]) -> None:
     output = ToyOutput()
     fan_out = FanOut("lab", [output], ["toy"])
     fan_out.set_parameters(parameters(*labels))
@@ -78,7 +78,7 @@ def test_topics_carry_the_tools_labels(labels: list[str], names: list[str]) -> N
     assert output.tool_names() == names
 
 
-def test_without_parameters_tools_are_numbered() -> None:
+def test_tools_without_parameters_are_numbered() -> None:
     output = ToyOutput()
     fan_out = FanOut("lab", [output], ["toy"])
     fan_out.set_parameters(Parameters())
@@ -86,7 +86,7 @@ def test_without_parameters_tools_are_numbered() -> None:
     assert output.tool_names() == ["tool 1", "tool 2"]
 
 
-def test_other_tools_replace_the_topics() -> None:
+def test_new_labels_replace_the_topics() -> None:
     output = ToyOutput()
     fan_out = FanOut("lab", [output], ["toy"])
     fan_out.set_parameters(parameters("Probe", "Head"))
@@ -96,7 +96,7 @@ def test_other_tools_replace_the_topics() -> None:
     assert output.tool_names() == ["Head", "Foot", "Hand"]
 
 
-def test_the_same_tools_again_keep_their_topics() -> None:
+def test_topics_stay_open_while_the_labels_stay() -> None:
     output = ToyOutput("toy", "Probe")
     fan_out = FanOut("lab", [output], ["toy"])
     for session in (1, 2):
@@ -107,7 +107,7 @@ def test_the_same_tools_again_keep_their_topics() -> None:
     assert output.given_up == []
 
 
-def test_a_tool_that_stays_among_others_goes_on_counting() -> None:
+def test_a_tool_that_keeps_its_label_continues_its_numbers() -> None:
     output = ToyOutput("toy", "Probe", "Head")
     fan_out = FanOut("lab", [output], ["toy"])
     for labels in (["Probe"], ["Head", "Probe"], ["Head", "Probe"]):
@@ -117,7 +117,7 @@ def test_a_tool_that_stays_among_others_goes_on_counting() -> None:
     assert [pose.sequence for pose in output.poses("Head")] == [0, 1]
 
 
-def test_a_count_that_goes_up_and_down_declares_no_topic_twice() -> None:
+def test_a_number_of_tools_that_goes_up_and_down_reopens_no_topic() -> None:
     output = ToyOutput("toy", "A", "B", "C")
     fan_out = FanOut("lab", [output], ["toy"])
     fan_out.set_parameters(parameters("A", "B", "C"))
@@ -129,7 +129,7 @@ def test_a_count_that_goes_up_and_down_declares_no_topic_twice() -> None:
     assert counted == {"A": [0, 1, 2, 3], "B": [0, 1, 2], "C": [0, 1]}
 
 
-def test_more_tools_than_any_lab_has_get_no_topics_and_are_counted(caplog: pytest.LogCaptureFixture) -> None:
+def test_too_many_tools_get_no_topics_and_are_counted(caplog: pytest.LogCaptureFixture) -> None:
     output = ToyOutput("toy", "tool 1")
     fan_out = FanOut("lab", [output], ["toy"])
     for _ in range(2):
@@ -145,7 +145,9 @@ def test_more_tools_than_any_lab_has_get_no_topics_and_are_counted(caplog: pytes
 @pytest.mark.parametrize(
     ("unit", "position_m"), [("mm", (0.1, 0.2, 0.3)), ("m", (100.0, 200.0, 300.0)), ("", (0.1, 0.2, 0.3))]
 )
-def test_poses_are_metres_whatever_the_servers_unit(unit: str, position_m: tuple[float, ...]) -> None:
+def test_poses_are_in_metres_whatever_the_unit_of_the_server(
+    unit: str, position_m: tuple[float, ...]
+) -> None:
     output = ToyOutput("toy", "Probe")
     fan_out = FanOut("lab", [output], ["toy"])
     fan_out.set_parameters(parameters("Probe", unit=unit))
@@ -153,7 +155,7 @@ def test_poses_are_metres_whatever_the_servers_unit(unit: str, position_m: tuple
     assert output.poses("Probe")[0].position_m == pytest.approx(position_m)
 
 
-def test_an_unknown_unit_is_told_and_no_robot_gets_a_guess(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unknown_unit_is_logged_and_no_pose_is_published(caplog: pytest.LogCaptureFixture) -> None:
     output = ToyOutput("toy", "Probe")
     fan_out = FanOut("lab", [output], ["toy"])
     fan_out.set_parameters(parameters("Probe", unit="furlong"))
@@ -163,6 +165,6 @@ def test_an_unknown_unit_is_told_and_no_robot_gets_a_guess(caplog: pytest.LogCap
     assert ["furlong" in record.getMessage() for record in caplog.records] == [True]
 
 
-def test_an_unknown_unit_is_nobodys_affair_without_topics_per_tool(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unknown_unit_is_not_logged_without_tool_poses(caplog: pytest.LogCaptureFixture) -> None:
     FanOut("lab", [ToyOutput()]).set_parameters(parameters("Probe", unit="furlong"))
     assert not caplog.records
