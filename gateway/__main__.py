@@ -1,4 +1,4 @@
-"""``python -m gateway``."""
+"""``python -m gateway`` runs the command line."""
 
 from gateway.cli.main import main
 

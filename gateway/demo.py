@@ -1,8 +1,8 @@
-"""``rtc3d-gateway demo``: simulator, gateway and a subscriber on each side, in one process.
+"""The demo: simulator, gateway, a Zenoh subscriber and an LCM subscriber in one process.
 
-Nothing leaves the machine: Zenoh on loopback TCP without scouting, LCM in memory (or multicast with
-``udpm``). The measurement starts when both subscribers hear the gateway and stops before they do, so
-every component sent can be accounted for.
+Nothing leaves the machine: Zenoh uses loopback TCP without scouting, LCM stays in memory (or uses
+multicast with ``udpm``). The measurement starts after both subscribers receive the gateway's status and
+stops before they do, so every component that was sent must arrive.
 """
 
 import asyncio
@@ -37,33 +37,33 @@ from gateway.rtc3d_server.scene import Scene
 from gateway.simulator.simulator import Simulator
 
 SOURCE: Final = "demo"
-_SIDES: Final = ("zenoh", "lcm")
-_READY_S: Final = 10.0
-_DRAIN_S: Final = 3.0
+_OUTPUTS: Final = ("zenoh", "lcm")
+_START_TIMEOUT_S: Final = 10.0
+_DRAIN_TIMEOUT_S: Final = 3.0
 _REFRESH_S: Final = 0.5
-_SHOWN: Final = 60
+_MESSAGE_WIDTH: Final = 60
 
 
 @dataclass
-class _Heard:
-    """What one subscriber received, by component; filled in its thread, read in the loop."""
+class _Received:
+    """Messages of one subscriber, by component. Its thread writes them, the event loop reads them."""
 
-    received: Counter[str] = field(default_factory=Counter)
+    count: Counter[str] = field(default_factory=Counter)
     newest: dict[str, bytes] = field(default_factory=dict)
 
-    def take(self, name: str, message: bytes) -> None:
-        """Count a message; ``name`` is mocap/demo/3d or MOCAP_DEMO_3D."""
+    def add(self, name: str, message: bytes) -> None:
+        """Count a message. ``name`` is a key or channel, such as mocap/demo/3d or MOCAP_DEMO_3D."""
         component = name.replace("_", "/").rsplit("/", 1)[-1].lower()
-        self.received[component] += 1
+        self.count[component] += 1
         self.newest[component] = message
 
 
 async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool) -> bool:
-    """Run for ``seconds`` showing rates and values; return whether everything sent was received.
+    """Show rates and values for ``seconds``; return whether every message sent was received.
 
-    Raises OutputError if Zenoh or LCM do not open on this machine.
+    Raises OutputError if Zenoh or LCM does not open on this machine.
     """
-    heard = {side: _Heard() for side in _SIDES}
+    received = {output: _Received() for output in _OUTPUTS}
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
     lcm_settings = LcmSettings(url=None if udpm else "memq://")
     subscriber_lcm = open_lcm(lcm_settings.effective_url)
@@ -72,25 +72,25 @@ async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool
         simulator.stop_measurement()
         settings = _settings(simulator.port, endpoint, lcm_settings)
         zenoh_output = ZenohOutput(settings.zenoh)
-        # memq:// reaches nobody but the same object, so gateway and subscriber share it.
+        # memq:// works only within one LCM object, so gateway and subscriber share it.
         lcm_output = LcmOutput(lcm_settings, None if udpm else subscriber_lcm)
         await stack.enter_async_context(_running(Gateway(settings, [zenoh_output, lcm_output])))
-        listener = LcmListener(subscriber_lcm, channel_pattern("MOCAP", SOURCE, None), heard["lcm"].take)
+        listener = LcmListener(subscriber_lcm, channel_pattern("MOCAP", SOURCE, None), received["lcm"].add)
         stack.callback(listener.close)
-        await _until(lambda: zenoh_output.session is not None, _READY_S, "Zenoh did not open")
+        await _until(lambda: zenoh_output.session is not None, _START_TIMEOUT_S, "Zenoh did not open")
         session = open_zenoh(endpoint)
         stack.callback(session.close)
-        ZenohListener(session, key_pattern("mocap", SOURCE, None), heard["zenoh"].take)
+        ZenohListener(session, key_pattern("mocap", SOURCE, None), received["zenoh"].add)
         await _until(
-            lambda: all(each.received["status"] for each in heard.values()),
-            _READY_S,
-            "the gateway's status did not come on both sides",
+            lambda: all(each.count["status"] for each in received.values()),
+            _START_TIMEOUT_S,
+            "the gateway's status did not arrive on both Zenoh and LCM",
         )
         simulator.start_measurement()
-        await _show(heard, seconds, console)
+        await _show(received, seconds, console)
         simulator.stop_measurement()
-        lost = await _settle(simulator, heard)
-    console.print(_report(simulator.sent, heard))
+        lost = await _count_missing(simulator, received)
+    console.print(_report(simulator.sent, received))
     console.print("[green]Nothing was lost.[/]" if not lost else f"[red]{lost} messages were lost.[/]")
     return not lost
 
@@ -107,15 +107,18 @@ async def _running(gateway: Gateway) -> AsyncIterator[None]:
 
 
 def _settings(port: int, endpoint: str, lcm_settings: LcmSettings) -> Settings:
-    slow = tuple(component for component in WIRE_ORDER if component is not ComponentType.ANALOG)
+    # Analog has a higher rate than the other components, which needs a separate stream (§5.3.5).
+    analog = StreamSettings(components=(ComponentType.ANALOG,))
+    others = StreamSettings(
+        components=tuple(component for component in WIRE_ORDER if component is not ComponentType.ANALOG)
+    )
     return Settings(
         sources=(
             SourceSettings(
                 name=SOURCE,
                 host="127.0.0.1",
                 port=port,
-                # Analog runs at its own, higher rate on a stream of its own (§5.3.5).
-                streams=(StreamSettings(components=slow), StreamSettings(components=(ComponentType.ANALOG,))),
+                streams=(others, analog),
             ),
         ),
         zenoh=ZenohSettings(
@@ -137,78 +140,78 @@ def _free_port() -> int:
 async def _until(condition: Callable[[], bool], timeout_s: float, failure: str) -> None:
     try:
         async with asyncio.timeout(timeout_s):
-            while not condition():  # noqa: ASYNC110 - the conditions change in other threads
+            while not condition():  # noqa: ASYNC110 - other threads change the conditions
                 await asyncio.sleep(0.02)
     except TimeoutError:
         raise OutputError(f"{failure} within {timeout_s:g} s", cause="demo") from None
 
 
-async def _show(heard: dict[str, _Heard], seconds: float, console: Console) -> None:
-    """Show the table live for ``seconds``; not where the output is no terminal."""
+async def _show(received: dict[str, _Received], seconds: float, console: Console) -> None:
+    """Wait for ``seconds``, and show the live table if the output is a terminal."""
     start_s = time.monotonic()
-    before: dict[str, Counter[str]] = {side: Counter() for side in _SIDES}
+    previous: dict[str, Counter[str]] = {output: Counter() for output in _OUTPUTS}
     with Live(console=console, auto_refresh=False, transient=True) as live:
         while (elapsed_s := time.monotonic() - start_s) < seconds:
             await asyncio.sleep(min(_REFRESH_S, seconds - elapsed_s))
             now_s = time.monotonic() - start_s
             rates = {
-                side: {
-                    key: (each.received[key] - before[side][key]) / (now_s - elapsed_s)
-                    for key in each.received
+                output: {
+                    component: (each.count[component] - previous[output][component]) / (now_s - elapsed_s)
+                    for component in each.count
                 }
-                for side, each in heard.items()
+                for output, each in received.items()
             }
-            before = {side: Counter(each.received) for side, each in heard.items()}
+            previous = {output: Counter(each.count) for output, each in received.items()}
             if console.is_terminal:
-                live.update(_table(heard, rates, now_s, seconds), refresh=True)
+                live.update(_table(received, rates, now_s, seconds), refresh=True)
 
 
-async def _settle(simulator: Simulator, heard: dict[str, _Heard]) -> int:
-    """Wait until what is under way has arrived; return how many messages are missing."""
+async def _count_missing(simulator: Simulator, received: dict[str, _Received]) -> int:
+    """Wait for messages that are still on their way; return how many are missing."""
 
     def missing() -> int:
         return sum(
-            max(0, sent - each.received[key])
-            for key, sent in simulator.sent.items()
-            for each in heard.values()
+            max(0, sent - each.count[component])
+            for component, sent in simulator.sent.items()
+            for each in received.values()
         )
 
     with contextlib.suppress(OutputError):
-        await _until(lambda: not missing(), _DRAIN_S, "messages are missing")
+        await _until(lambda: not missing(), _DRAIN_TIMEOUT_S, "messages are missing")
     return missing()
 
 
 def _table(
-    heard: dict[str, _Heard], rates: dict[str, dict[str, float]], now_s: float, seconds: float
+    received: dict[str, _Received], rates: dict[str, dict[str, float]], now_s: float, seconds: float
 ) -> Table:
     table = Table(title=f"RTC3D simulator → gateway → subscribers, {now_s:.0f} of {seconds:.0f} s")
     table.add_column("component")
-    for side in _SIDES:
-        table.add_column(f"{side} Hz", justify="right")
-    table.add_column("newest message", width=_SHOWN, no_wrap=True, overflow="ellipsis")
+    for output in _OUTPUTS:
+        table.add_column(f"{output} Hz", justify="right")
+    table.add_column("newest message", width=_MESSAGE_WIDTH, no_wrap=True, overflow="ellipsis")
     for component in WIRE_ORDER:
-        newest = heard["zenoh"].newest.get(component.key)
+        newest = received["zenoh"].newest.get(component.key)
         text = "" if newest is None else one_line(decode(newest))
         table.add_row(
             component.key,
-            *(f"{rates[side].get(component.key, 0.0):.1f}" for side in _SIDES),
+            *(f"{rates[output].get(component.key, 0.0):.1f}" for output in _OUTPUTS),
             text,
         )
     return table
 
 
-def _report(sent: Counter[str], heard: dict[str, _Heard]) -> Table:
-    table = Table(title="What was sent, received and lost")
+def _report(sent: Counter[str], received: dict[str, _Received]) -> Table:
+    table = Table(title="Messages sent, received and lost")
     for heading in (
         "component",
         "sent",
-        *(f"{side} {what}" for side in _SIDES for what in ("received", "lost")),
+        *(f"{output} {what}" for output in _OUTPUTS for what in ("received", "lost")),
     ):
         table.add_column(heading, justify="left" if heading == "component" else "right")
     for component in WIRE_ORDER:
         cells = []
-        for side in _SIDES:
-            received = heard[side].received[component.key]
-            cells += [str(received), str(sent[component.key] - received)]
+        for output in _OUTPUTS:
+            count = received[output].count[component.key]
+            cells += [str(count), str(sent[component.key] - count)]
         table.add_row(component.key, str(sent[component.key]), *cells)
     return table

@@ -233,7 +233,7 @@ def _events(section: ParametersEvents) -> tuple[str, Sequence[str], _Rows]:
         (event.id, event.label, event.description, tuple(map(_event_parameter, event.parameters)))
         for event in section.events
     ]
-    return f"events, {_count(section.events, 'kind')}", ("id", "label", "description", "parameters"), rows
+    return f"events, {_count(section.events, 'type')}", ("id", "label", "description", "parameters"), rows
 
 
 def _event_parameter(parameter: EventParameter) -> str:

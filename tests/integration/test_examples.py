@@ -1,4 +1,4 @@
-"""The examples, run as a reader would run them."""
+"""The example programs, run like a user runs them."""
 
 import os
 import re
@@ -25,7 +25,7 @@ PROGRAM = [sys.executable, "-m", "gateway"]
 
 @contextmanager
 def running(*command: str, ready: str) -> Iterator[subprocess.Popen[str]]:
-    """Run a program until the block ends; enters the block once ``ready`` stands in its output."""
+    """Run a program until the block ends. The block starts when ``ready`` appears in its output."""
     environment = {**os.environ, "LCM_DEFAULT_URL": LCM_URL}
     with subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -49,7 +49,7 @@ def free_port() -> int:
 
 @pytest.fixture(scope="module")
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """A simulator and a gateway, as two programs; gives the gateway's Zenoh endpoint."""
+    """The Zenoh endpoint of a gateway; it and its simulator run as separate programs."""
     port, endpoint = free_port(), f"tcp/127.0.0.1:{free_port()}"
     config = tmp_path_factory.mktemp("gateway") / "gateway.yaml"
     config.write_text(
@@ -66,14 +66,14 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 def printed_positions(text: str) -> list[tuple[int, list[float]]]:
-    """Return frame number and first position of each frame printed."""
+    """Return frame number and first position of each printed frame."""
     found = re.findall(
         r"frame (\d+):[^\n]*?(?:\n[^#\n]*?)?(-?\d+\.\d+),\s?(-?\d+\.\d+),\s?(-?\d+\.\d+)", text
     )
     return [(int(number), [float(value) for value in position]) for number, *position in found]
 
 
-def assert_of_the_scene(text: str, at_least: int) -> None:
+def assert_positions_match_the_scene(text: str, at_least: int) -> None:
     scene = SyntheticScene(markers=20, tools=4, analog=16, plates=2, rate_hz=100, analog_rate_hz=2000)
     printed = printed_positions(text)
     assert len(printed) >= at_least
@@ -83,7 +83,7 @@ def assert_of_the_scene(text: str, at_least: int) -> None:
         assert position == pytest.approx([first["x"], first["y"], first["z"]], abs=6e-4)
 
 
-def test_a_c_program_decodes_what_the_gateway_publishes(endpoint: str, tmp_path: Path) -> None:  # noqa: ARG001
+def test_the_c_example(endpoint: str, tmp_path: Path) -> None:  # noqa: ARG001
     if shutil.which("cc") is None or shutil.which("make") is None:
         pytest.skip("no C compiler here (cc, make)")
     build = subprocess.run(
@@ -93,14 +93,14 @@ def test_a_c_program_decodes_what_the_gateway_publishes(endpoint: str, tmp_path:
     assert build.returncode == 0, build.stderr
     with running(str(tmp_path / "subscriber"), "LAB", "20", ready="listening") as program:
         text = program.communicate(timeout=30)[0]
-    assert_of_the_scene(text.replace(" missing", ""), 15)
+    assert_positions_match_the_scene(text.replace(" missing", ""), 15)
     assert program.returncode == 0
 
 
 def test_the_python_lcm_example(endpoint: str) -> None:  # noqa: ARG001
     command = [sys.executable, str(ROOT / "examples/subscriber_lcm.py"), "LAB", "20"]
     with running(*command, ready="listening") as program:
-        assert_of_the_scene(program.communicate(timeout=30)[0], 15)
+        assert_positions_match_the_scene(program.communicate(timeout=30)[0], 15)
 
 
 def test_the_python_zenoh_example(endpoint: str) -> None:
@@ -113,4 +113,4 @@ def test_the_python_zenoh_example(endpoint: str) -> None:
         "20",
     ]
     with running(*command, ready="listening") as program:
-        assert_of_the_scene(program.communicate(timeout=30)[0], 15)
+        assert_positions_match_the_scene(program.communicate(timeout=30)[0], 15)

@@ -1,4 +1,4 @@
-"""``rtc3d-gateway params`` and ``echo``, run as a user runs them, against a gateway that is a program too."""
+"""``rtc3d-gateway params`` and ``echo`` as separate programs, with gateways in this process."""
 
 import asyncio
 import json
@@ -23,23 +23,23 @@ from tests.waiting import wait_until_async
 pytestmark = pytest.mark.netns
 
 
-class Done(NamedTuple):
+class Completed(NamedTuple):
     status: int
-    out: str
-    problem: str
+    stdout: str
+    stderr: str
 
 
-async def run(*arguments: str) -> Done:
-    """Run the program in a process of its own while this one's loop goes on."""
+async def run(*arguments: str) -> Completed:
+    """Run the program in its own process; the event loop of this one keeps running."""
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "gateway", *arguments),
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         env={**os.environ, "COLUMNS": "200"},
     )
-    out, problem = await process.communicate()
+    stdout, stderr = await process.communicate()
     assert process.returncode is not None
-    return Done(process.returncode, out.decode(), problem.decode())
+    return Completed(process.returncode, stdout.decode(), stderr.decode())
 
 
 class Lab(NamedTuple):
@@ -47,9 +47,9 @@ class Lab(NamedTuple):
     endpoint: str
     url: str
 
-    def on(self, side: str) -> list[str]:
-        """Return the options with which the command reaches this gateway on a side."""
-        # Without a source's name, who is there on LCM is waited for, which takes its time.
+    def options(self, side: str) -> list[str]:
+        """Return the options with which the command reaches this gateway on Zenoh or LCM."""
+        # Without --source, the command first waits for status messages on LCM, which takes 2.5 s.
         lcm = ["--lcm", "--url", self.url, "--source", "lab"]
         return lcm if side == "lcm" else ["--connect", self.endpoint]
 
@@ -80,19 +80,19 @@ sides = pytest.mark.parametrize("side", ["zenoh", "lcm"])
 @sides
 async def test_a_table_is_printed_by_default(side: str) -> None:
     async with lab(LabServer("Left knee")) as at:
-        done = await run("params", *at.on(side))
-    assert (done.status, done.problem) == (0, "")
+        done = await run("params", *at.options(side))
+    assert (done.status, done.stderr) == (0, "")
     for text in ("lab: general", "lab: 3D, 1 marker, 100 Hz, mm", "Left knee", "lab: parameters are "):
-        assert text in done.out
+        assert text in done.stdout
 
 
 @sides
 async def test_sections_are_shown_as_json(side: str) -> None:
     async with lab() as at:
         at.server.sections["3d force"] = at.server.xml
-        done = await run("params", "3d", "force", "--json", *at.on(side))
-    assert (done.status, done.problem) == (0, "")
-    source = json.loads(done.out)["lab"]
+        done = await run("params", "3d", "force", "--json", *at.options(side))
+    assert (done.status, done.stderr) == (0, "")
+    source = json.loads(done.stdout)["lab"]
     assert source["age_s"] >= 0
     assert list(source["parameters"]) == ["3d", "force"]
     assert source["parameters"]["3d"]["markers"][0]["label"].lower() == "marker 1"
@@ -100,31 +100,33 @@ async def test_sections_are_shown_as_json(side: str) -> None:
 
 @sides
 @pytest.mark.parametrize("section", ["force", "events"])
-async def test_the_specifications_malformed_xml_is_printed_word_for_word(side: str, section: str) -> None:
+async def test_the_malformed_xml_of_the_specification_is_printed_unchanged(side: str, section: str) -> None:
     async with lab() as at:
-        done = await run("params", section, "--xml", *at.on(side))
-    assert (done.status, done.problem) == (0, "")
-    assert done.out == spec_xml(section).decode().rstrip() + "\n"
+        done = await run("params", section, "--xml", *at.options(side))
+    assert (done.status, done.stderr) == (0, "")
+    assert done.stdout == spec_xml(section).decode().rstrip() + "\n"
 
 
 @sides
 async def test_fresh_asks_the_server(side: str) -> None:
     async with lab() as at:
-        asked = at.server.count("SendParameters")
-        assert (await run("params", "--xml", *at.on(side))).out.encode().rstrip() == at.server.xml.rstrip()
-        assert at.server.count("SendParameters") == asked
-        at.server.xml = at.server.xml.replace(b"Marker 1", b"Marker of now")
-        assert "Marker of now" in (await run("params", "--xml", "--fresh", *at.on(side))).out
-        assert at.server.count("SendParameters") > asked
+        requests = at.server.count("SendParameters")
+        assert (
+            await run("params", "--xml", *at.options(side))
+        ).stdout.encode().rstrip() == at.server.xml.rstrip()
+        assert at.server.count("SendParameters") == requests
+        at.server.xml = at.server.xml.replace(b"Marker 1", b"Renamed marker")
+        assert "Renamed marker" in (await run("params", "--xml", "--fresh", *at.options(side))).stdout
+        assert at.server.count("SendParameters") > requests
 
 
 @sides
 async def test_no_gateway_is_status_3(side: str) -> None:
     options = ["--connect", free_endpoint()] if side == "zenoh" else ["--lcm", "--url", lcm_url()]
     done = await run("params", *options)
-    assert (done.status, done.out) == (3, "")
-    assert "gateway" in done.problem
-    assert done.problem.count("\n") == 1
+    assert (done.status, done.stdout) == (3, "")
+    assert "gateway" in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 async def test_a_router_without_a_gateway_is_status_3() -> None:
@@ -135,62 +137,62 @@ async def test_a_router_without_a_gateway_is_status_3() -> None:
     finally:
         router.close()
     assert done.status == 3
-    assert done.problem.startswith("no gateway found on Zenoh (mocap/*/alive); check that it is running")
+    assert done.stderr.startswith("no gateway found on Zenoh (mocap/*/alive); check that it is running")
 
 
 @sides
-async def test_a_source_that_nobody_serves_is_status_3(side: str) -> None:
+async def test_a_source_that_no_gateway_serves_is_status_3(side: str) -> None:
     async with lab() as at:
-        done = await run("params", "--timeout", "0.5", *at.on(side), "--source", "hall")
+        done = await run("params", "--timeout", "0.5", *at.options(side), "--source", "hall")
     assert done.status == 3
     expected = (
         "no gateway serves source 'hall'; sources found: lab"
         if side == "zenoh"
         else "no gateway heard on LCM (MOCAP_HALL"
     )
-    assert done.problem.startswith(expected)
+    assert done.stderr.startswith(expected)
 
 
 @sides
-async def test_a_gateway_of_another_prefix_is_none(side: str) -> None:
+async def test_a_gateway_with_another_prefix_is_not_found(side: str) -> None:
     async with lab() as at:
-        done = await run("params", "--prefix", "other", "--timeout", "0.5", *at.on(side))
+        done = await run("params", "--prefix", "other", "--timeout", "0.5", *at.options(side))
     assert done.status == 3
 
 
 @sides
-async def test_a_gateway_without_its_server_is_status_4_with_the_reason(side: str) -> None:
+async def test_a_gateway_without_its_server_is_status_4(side: str) -> None:
     async with lab_without_server() as (port, at):
-        done = await run("params", "3d", *at.on(side))
-    assert (done.status, done.out) == (4, "")
-    assert done.problem.startswith(f"source 'lab' has no connection: refused by 127.0.0.1:{port}, tried ")
+        done = await run("params", "3d", *at.options(side))
+    assert (done.status, done.stdout) == (4, "")
+    assert done.stderr.startswith(f"source 'lab' has no connection: refused by 127.0.0.1:{port}, tried ")
 
 
 @sides
 async def test_a_server_that_does_not_answer_is_status_5(side: str) -> None:
     async with lab(reply_timeout_s=0.3) as at:
         at.server.silent = ("SendParameters",)
-        done = await run("params", "--fresh", *at.on(side))
+        done = await run("params", "--fresh", *at.options(side))
     assert done.status == 5
-    assert "did not answer SendParameters within 0.3 s" in done.problem
+    assert "did not answer SendParameters within 0.3 s" in done.stderr
 
 
 @sides
 async def test_a_gateway_that_does_not_answer_in_time_is_status_5(side: str) -> None:
     async with lab(reply_timeout_s=20.0, query_timeout_s=20.0) as at:
         at.server.silent = ("SendParameters",)
-        done = await run("params", "--fresh", "--timeout", "0.2", *at.on(side))
+        done = await run("params", "--fresh", "--timeout", "0.2", *at.options(side))
     assert done.status == 5
-    assert "within 0.2 s although a gateway is running" in done.problem
+    assert "within 0.2 s although a gateway is running" in done.stderr
 
 
 @sides
 async def test_a_server_that_does_not_know_the_command_is_status_1(side: str) -> None:
     async with lab() as at:
         at.server.refused = ("SendParameters",)
-        done = await run("params", "--fresh", *at.on(side))
+        done = await run("params", "--fresh", *at.options(side))
     assert done.status == 1
-    assert "the server does not know SendParameters, or refuses it: err-unknown command" in done.problem
+    assert "the server does not know SendParameters, or refuses it: err-unknown command" in done.stderr
 
 
 @pytest.mark.parametrize(
@@ -205,11 +207,11 @@ async def test_a_server_that_does_not_know_the_command_is_status_1(side: str) ->
 )
 async def test_a_wrong_command_line_is_status_2(arguments: list[str], text: str) -> None:
     done = await run("params", *arguments)
-    assert (done.status, done.out) == (2, "")
-    assert text in " ".join(done.problem.replace("│", " ").split())
+    assert (done.status, done.stdout) == (2, "")
+    assert text in " ".join(done.stderr.replace("│", " ").split())
 
 
-async def test_every_source_is_shown_and_one_without_a_server_does_not_hide_the_others() -> None:
+async def test_a_source_without_a_server_does_not_hide_other_sources() -> None:
     endpoint, server = free_endpoint(), LabServer()
     router = open_zenoh("router", listen=endpoint)
     try:
@@ -222,12 +224,12 @@ async def test_every_source_is_shown_and_one_without_a_server_does_not_hide_the_
             done = await run("params", "3d", "--json", "--connect", endpoint)
     finally:
         router.close()
-    assert list(json.loads(done.out)) == ["lab"]
+    assert list(json.loads(done.stdout)) == ["lab"]
     assert done.status == 4
-    assert done.problem.startswith("source 'hall' has no connection")
+    assert done.stderr.startswith("source 'hall' has no connection")
 
 
-async def test_gateways_that_serve_sources_of_one_name_are_both_shown() -> None:
+async def test_sources_of_the_same_name_on_two_gateways_are_both_shown() -> None:
     endpoint, first, second = free_endpoint(), LabServer("of the first"), LabServer("of the second")
     router = open_zenoh("router", listen=endpoint)
     try:
@@ -243,9 +245,9 @@ async def test_gateways_that_serve_sources_of_one_name_are_both_shown() -> None:
     finally:
         router.close()
     assert done.status == 0
-    told = json.loads(done.out)
-    assert list(told) == ["lab", "lab_2"]
-    labels = {source["parameters"]["3d"]["markers"][0]["label"] for source in told.values()}
+    sources = json.loads(done.stdout)
+    assert list(sources) == ["lab", "lab_2"]
+    labels = {source["parameters"]["3d"]["markers"][0]["label"] for source in sources.values()}
     assert labels == {"of the first", "of the second"}
 
 
@@ -260,16 +262,16 @@ async def test_several_sources_are_found_on_lcm() -> None:
         await is_filled(one, first)
         await is_filled(other, second)
         done = await run("params", "--json", "--lcm", "--url", url)
-    assert (done.status, done.problem) == (0, "")
+    assert (done.status, done.stderr) == (0, "")
     labels = {
         name: source["parameters"]["3d"]["markers"][0]["label"]
-        for name, source in json.loads(done.out).items()
+        for name, source in json.loads(done.stdout).items()
     }
     assert labels == {"lab": "of the first", "hall-2": "of the second"}
 
 
-async def test_a_gateway_that_is_just_coming_back_is_asked_again() -> None:
-    """The first query finds nobody, as around a reconnection; a later one does."""
+async def test_a_query_without_a_reply_is_repeated() -> None:
+    """The first queries get no reply, as during a reconnection; the third one does."""
     endpoint = free_endpoint()
     session = open_zenoh("peer", listen=endpoint)
     queries: list[zenoh.Query] = []
@@ -287,12 +289,12 @@ async def test_a_gateway_that_is_just_coming_back_is_asked_again() -> None:
     finally:
         token.undeclare()
         session.close()
-    assert (done.status, done.problem) == (0, "")
-    assert json.loads(done.out)["lab"]["age_s"] == 3.5
+    assert (done.status, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["lab"]["age_s"] == 3.5
     assert len(queries) == 3
 
 
-async def test_echo_prints_parameters_that_are_told(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_echo_prints_published_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lcm_queries, "REPEAT_S", 0.05)
     async with lab() as at:
         echo = asyncio.create_task(
@@ -313,6 +315,6 @@ async def test_echo_prints_parameters_that_are_told(monkeypatch: pytest.MonkeyPa
         )
         on_zenoh = await echo
     size = len(at.server.xml)
-    assert on_zenoh.out.startswith(f"mocap/lab/parameters {size} bytes of XML: 1 marker, 0 tools")
-    assert "session 1: " in lcm.out
-    assert f"{size} bytes of XML: 1 marker, 0 tools" in lcm.out
+    assert on_zenoh.stdout.startswith(f"mocap/lab/parameters {size} bytes of XML: 1 marker, 0 tools")
+    assert "session 1: " in lcm.stdout
+    assert f"{size} bytes of XML: 1 marker, 0 tools" in lcm.stdout

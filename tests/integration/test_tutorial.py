@@ -1,4 +1,4 @@
-"""The tutorial, typed as it stands, in order: each command in its terminal, with the output that it shows."""
+"""Types every command of the tutorial into its terminal, in order, and compares output with the page."""
 
 import os
 import re
@@ -18,21 +18,21 @@ from tests.documents import ROOT, Block, blocks
 pytestmark = pytest.mark.netns
 
 STEPS: Final = blocks("docs/tutorial.md")
-STAYING: Final = ("rtc3d-gateway simulate", "rtc3d-gateway run")
-"""Commands that end with the tutorial."""
+LONG_RUNNING: Final = ("rtc3d-gateway simulate", "rtc3d-gateway run")
+"""Commands that run until the end of the tutorial."""
 
-PATIENCE_S: Final = 60
+TIMEOUT_S: Final = 60
 NUMBER: Final = re.compile(r"-?\d+(?:\\\.\d+)?")
 
 
 def pattern(line: str) -> str:
-    """Return what matches the printed line, whatever its numbers are; white space and ``…`` match any."""
+    """Return a pattern for a printed line in which numbers, white space and ``…`` may differ."""
     escaped = re.escape(" ".join(line.split())).replace(r"\ ", r"\s+").replace(re.escape("…"), ".*")
     return NUMBER.sub(r"-?\\d+(?:\\.\\d+)?", escaped.replace(r"\-", "-"))
 
 
 class Terminal:
-    """A shell's window, in which one command runs at a time; what it printed is in ``text``."""
+    """A terminal in which one command runs at a time. ``text`` is its output so far."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -40,8 +40,8 @@ class Terminal:
         self.text = ""
 
     def type(self, command: str) -> None:
-        """Start a command, with the virtual environment that ``source .venv/bin/activate`` gives."""
-        assert self._process is None, "the command before has not ended"
+        """Start a command in the virtual environment that the page activates."""
+        assert self._process is None, "the previous command is still running"
         self.text = ""
         self._process = subprocess.Popen(
             ["bash", "-c", f"source .venv/bin/activate && exec {command}"],
@@ -52,29 +52,29 @@ class Terminal:
         )
 
     def shows(self, lines: list[str]) -> bool:
-        """Return whether these lines stand in what is printed, in this order."""
+        """Return whether the output contains these lines in this order."""
         patterns = [pattern(line) for line in lines if line != "…"]
         return re.search(r"\s*?\n(?:.*\n)*?\s*".join(patterns), self.text) is not None
 
     def wait_for(self, lines: list[str]) -> None:
-        """Read on until these lines are shown; raises AssertionError if they are not in time."""
+        """Read until the output contains these lines; raises AssertionError if they do not appear in time."""
         assert self._process is not None
         assert self._process.stdout is not None
-        deadline_s = time.monotonic() + PATIENCE_S
+        deadline_s = time.monotonic() + TIMEOUT_S
         while not self.shows(lines):
             assert select.select([self._process.stdout], [], [], deadline_s - time.monotonic())[0], self.text
-            some = os.read(self._process.stdout.fileno(), 65536)
-            assert some, f"ended without {lines}:\n{self.text}"
-            self.text += some.decode()
+            data = os.read(self._process.stdout.fileno(), 65536)
+            assert data, f"ended without {lines}:\n{self.text}"
+            self.text += data.decode()
 
     def end(self, number: signal.Signals | None = None) -> int:
-        """Wait for the command's end, which ``number`` may bring about; return its exit status."""
+        """Send signal ``number`` to the command if given, wait for its end, and return its exit status."""
         assert self._process is not None
         process, self._process = self._process, None
         if number is not None:
             process.send_signal(number)
         try:
-            rest, _ = process.communicate(timeout=PATIENCE_S)
+            rest, _ = process.communicate(timeout=TIMEOUT_S)
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()
@@ -89,7 +89,7 @@ class Terminal:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A copy of the repository, as far as the tutorial goes, with what ``make`` has installed."""
+    """A folder that looks like the repository after ``make demo`` has installed the gateway."""
     for path in ROOT.iterdir():
         if not path.name.startswith("."):
             (tmp_path / path.name).symlink_to(path)
@@ -101,41 +101,42 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def terminals(folder: Path) -> Iterator[dict[str, Terminal]]:
-    made = {name: Terminal(folder) for name in ("terminal 1", "terminal 2", "terminal 3")}
-    yield made
-    for terminal in made.values():
+    terminals = {name: Terminal(folder) for name in ("terminal 1", "terminal 2", "terminal 3")}
+    yield terminals
+    for terminal in terminals.values():
         if terminal.is_busy:
             terminal.end(signal.SIGKILL)
 
 
 def output_after(step: int) -> list[str]:
-    """Return the lines that the page shows next, if it shows the command's output."""
-    following: list[Block] = STEPS[step + 1 : step + 2]
-    return following[0].text.splitlines() if following and following[0].language == "text" else []
+    """Return the output that the page shows for the command; [] if it shows none."""
+    next_blocks: list[Block] = STEPS[step + 1 : step + 2]
+    is_output = next_blocks and next_blocks[0].language == "text"
+    return next_blocks[0].text.splitlines() if is_output else []
 
 
-def test_the_tutorial_as_it_stands(folder: Path, terminals: dict[str, Terminal]) -> None:
-    typed = []
+def test_every_command_prints_what_the_page_shows(folder: Path, terminals: dict[str, Terminal]) -> None:
+    commands = []
     for step, block in enumerate(STEPS):
         if block.language in {"yaml", "python"}:
             (folder / block.title).write_text(block.text)
         elif block.language == "sh" and block.title:
             command = block.text.strip()
-            assert "\n" not in command, "one command a block: its output follows"
+            assert "\n" not in command, "a block must hold one command, because its output follows"
             terminal = terminals[block.title]
             terminal.type(command)
-            typed.append(command)
-            if command.startswith(STAYING):
+            commands.append(command)
+            if command.startswith(LONG_RUNNING):
                 terminal.wait_for(output_after(step))
             else:
                 assert terminal.end() == 0, f"{block.place}:\n{terminal.text}"
                 assert terminal.shows(output_after(step)), f"{block.place} printed:\n{terminal.text}"
-    assert len(typed) > 8
+    assert len(commands) > 8
     for name in ("terminal 2", "terminal 1"):
         assert terminals[name].end(signal.SIGINT) == 0, terminals[name].text
 
 
-def test_lines_that_differ_are_not_taken_for_the_same() -> None:
+def test_lines_match_if_only_their_numbers_differ() -> None:
     terminal = Terminal(Path())
     terminal.text = "frame 12: 23 of 24 markers in view\nframe 13: 24 of 24 markers in view\n"
     assert terminal.shows(["frame 1: 2 of 3 markers in view", "…"])

@@ -57,7 +57,7 @@ def cells(text: str) -> list[list[str]]:
         ),
         (
             "events",
-            "lab: events, 1 kind",
+            "lab: events, 1 type",
             [
                 ["0x123456", "Button", "Button action", "1 int Button id number"],
                 ["", "", "", "2 int ON/OFF state (1 ON, 0 OFF)"],
