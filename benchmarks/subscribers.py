@@ -15,7 +15,7 @@ import zenoh
 
 from gateway.messages.splice import CONTENT_OFFSET
 from gateway.rtc3d.commands import StreamFrames
-from gateway.rtc3d.components import BY_KEY
+from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.rtc3d.packets import HEADER, PacketType, encode_packet
 
 LCM_BUFFER_BYTES: Final = 4_000_000
@@ -68,7 +68,7 @@ class Heard:
         return frames * components - sum(len(wanted.intersection(each)) for each in self.numbers.values())
 
 
-_COMPONENTS: Final = frozenset(BY_KEY) | frozenset(map(str.upper, BY_KEY))
+_COMPONENTS: Final = frozenset(COMPONENTS_BY_KEY) | frozenset(map(str.upper, COMPONENTS_BY_KEY))
 
 
 def subscribe(wanted: Subscription) -> Generator[Any, str, None]:

@@ -20,7 +20,8 @@ from gateway.config.settings import (
     ZenohSettings,
 )
 from gateway.gateway import Gateway
-from gateway.rtc3d.commands import SECTIONS, SendParameters, parse_command
+from gateway.rtc3d.commands import SendParameters, parse_command
+from gateway.rtc3d.parameters import SECTIONS
 from tests.networks import free_endpoint, free_port, open_zenoh, zenoh_keys
 from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
 from tests.spec_parameters import in_root, spec_xml

@@ -2,15 +2,14 @@
 
 import os
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
 from gateway.config.environment import VARIABLE_PREFIX
 from gateway.config.loading import Configuration, read, read_server
+from gateway.rtc3d.ports import FIRST_PRINCIPLES_PORT
 from gateway.service.log_format import LogFormat, LogLevel
-
-DEFAULT_PORT: Final = 3020
 
 ConfigOption = Annotated[
     Path | None,
@@ -81,7 +80,7 @@ def _host_and_port(server: str) -> tuple[str, int]:
     else:
         host, port = server, ""
     if not port:
-        return host, DEFAULT_PORT
+        return host, FIRST_PRINCIPLES_PORT
     if not (port.isdecimal() and 0 < int(port) < 65536):
         raise typer.BadParameter(f"{server!r}: the port must be a number from 1 to 65535")
     return host, int(port)

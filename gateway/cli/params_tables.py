@@ -11,8 +11,9 @@ from rich.text import Text
 
 from gateway.cli.asking import ParametersReply
 from gateway.errors import ParametersError, QueryError
-from gateway.queries.answers import SECTION_FIELDS, parameters_json
+from gateway.queries.answers import parameters_json
 from gateway.rtc3d.parameters import (
+    SECTIONS,
     EventParameter,
     General,
     Parameters,
@@ -71,9 +72,8 @@ def _merge(parameters: Parameters, reply: ParametersReply, problems: list[QueryE
     except ParametersError as error:
         problems.append(QueryError(f"{name}: {error}; use --xml to see it", code="unreadable"))
         return parameters
-    sections = reply.sections or tuple(SECTION_FIELDS)
-    fields = {SECTION_FIELDS[section]: getattr(parsed, SECTION_FIELDS[section]) for section in sections}
-    missing = [section for section in reply.sections if fields[SECTION_FIELDS[section]] is None]
+    fields = {SECTIONS[key].field: SECTIONS[key].of(parsed) for key in reply.sections or SECTIONS}
+    missing = [key for key in reply.sections if fields[SECTIONS[key].field] is None]
     if missing:
         text = f"{name}: the server's reply has no section {', '.join(missing)}"
         problems.append(QueryError(text, code="nothing-yet"))

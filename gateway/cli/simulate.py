@@ -10,7 +10,6 @@ import typer
 import uvloop
 
 from gateway.cli.options import (
-    DEFAULT_PORT,
     AnalogOption,
     AnalogRateOption,
     C3dOption,
@@ -21,6 +20,7 @@ from gateway.cli.options import (
     RateOption,
     ToolsOption,
 )
+from gateway.rtc3d.ports import FIRST_PRINCIPLES_PORT
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.faults.kinds import describe_kinds, parse_fault
@@ -39,7 +39,7 @@ def simulate(
     host: Annotated[str, typer.Option(help="The address to listen on.")] = "127.0.0.1",
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="The port to listen on; 0 picks a free one.")
-    ] = DEFAULT_PORT,
+    ] = FIRST_PRINCIPLES_PORT,
     seconds: Annotated[
         float | None, typer.Option(min=0, help="Stop after this time; the default is to run until Ctrl-C.")
     ] = None,

@@ -38,6 +38,7 @@ from gateway.config.values import (
 from gateway.rtc3d.commands import AllFrames, Frequency
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.packets import DEFAULT_MAX_C3D_BYTES, DEFAULT_MAX_PACKET_BYTES
+from gateway.rtc3d.ports import FIRST_PRINCIPLES_PORT
 
 DEFAULT_LCM_URL: Final = "udpm://239.255.76.67:7667?ttl=0"
 """LCM's own default, which stays on this host."""
@@ -90,7 +91,7 @@ class SourceSettings(Section):
     host: Host
     """The server's name or address."""
 
-    port: Port = 3020
+    port: Port = FIRST_PRINCIPLES_PORT
     """The server's TCP port: 3020 for First Principles, 3030 for WaveFront."""
 
     byte_order: ServerByteOrder = "big"

@@ -13,7 +13,7 @@ from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, Typ
 from gateway.config.secrets import mask_secrets_in_text
 from gateway.config.section import Section, describe, expects, join_or, spelling_hint, validation_error
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
-from gateway.rtc3d.components import BY_KEY, WIRE_ORDER, ByteOrder, ComponentType
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ByteOrder, ComponentType
 
 LCM_PROVIDERS: Final = ("udpm", "mpudpm", "memq", "tcpq", "file")
 """The URL schemes that the lcm package knows."""
@@ -180,8 +180,8 @@ def _component(item: object, index: int) -> ComponentType:
             return item
         case "all":
             raise validation_error("found 'all' beside other components; expected [all] alone", index)
-        case str() if item in BY_KEY:
-            return BY_KEY[item]
+        case str() if item in COMPONENTS_BY_KEY:
+            return COMPONENTS_BY_KEY[item]
     meant = spelling_hint(item, _COMPONENT_KEYS)
     raise validation_error(f"found {describe(item)}{meant}; expected {join_or(_COMPONENT_KEYS)}", index)
 
@@ -268,10 +268,10 @@ def _max_rates(value: object) -> dict[ComponentType, float]:
         raise validation_error(f"found {describe(value)}; expected a mapping such as {{3d: 60}}, or {{}}")
     rates = {}
     for key, rate in value.items():
-        if key not in BY_KEY and not isinstance(key, ComponentType):
+        if key not in COMPONENTS_BY_KEY and not isinstance(key, ComponentType):
             meant = spelling_hint(key, _COMPONENT_KEYS)
             raise validation_error(f"found {describe(key)}{meant}; expected {join_or(_COMPONENT_KEYS)}")
-        component = key if isinstance(key, ComponentType) else BY_KEY[key]
+        component = key if isinstance(key, ComponentType) else COMPONENTS_BY_KEY[key]
         rates[component] = _RATES.validate_python({component.key: rate})[component.key]
     return rates
 

@@ -13,9 +13,8 @@ _MIN_VISIBLE: Final = 0.5
 """If a smaller share of the markers or of the tools is in view, the check fails."""
 
 _MAX_NAMES: Final = 5
-_NOUNS: Final = {ComponentType.MARKERS: "markers", ComponentType.TOOLS: "tools"}
 
-COMPONENTS_WITH_VISIBILITY: Final = frozenset(_NOUNS)
+COMPONENTS_WITH_VISIBILITY: Final = (ComponentType.MARKERS, ComponentType.TOOLS)
 """The components whose items can be out of view."""
 
 
@@ -82,13 +81,14 @@ def check_visibility(subject: Subject, stream: ObservedStream, parameters: Param
     """Check that at least half of the markers and half of the tools are in view."""
     shares = {
         component: share
-        for component in _NOUNS
+        for component in COMPONENTS_WITH_VISIBILITY
         if component in stream.observed and (share := stream.observed[component].visible_share) is not None
     }
     if not shares:
         return subject.not_tested("visibility", "no markers or tools arrived")
     texts = ", ".join(
-        f"{_NOUNS[component]} {share:.0%}{_never_visible(stream.observed[component], component, parameters)}"
+        f"{component.item_noun} {share:.0%}"
+        f"{_never_visible(stream.observed[component], component, parameters)}"
         for component, share in shares.items()
     )
     found = f"in view: {texts}"

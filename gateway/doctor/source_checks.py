@@ -13,11 +13,12 @@ from gateway.doctor.rate_check import check_rate
 from gateway.errors import ConnectError, LinkError, PacketError
 from gateway.findings import Finding, MessageLoad, Result, Subject
 from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.ports import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 
 CHECKS: Final = ("name", "TCP", "protocol", "parameters", "frames", "rate", "visibility")
 """The checks in order. Each of the first three is a condition for all that follow."""
 
-_PORTS: Final = "3020 is First Principles, 3030 WaveFront"
+_PORTS: Final = f"{FIRST_PRINCIPLES_PORT} is First Principles, {WAVEFRONT_PORT} WaveFront"
 
 
 class SourceChecks:
@@ -52,7 +53,7 @@ class SourceChecks:
             for stream in self._streams:
                 yield check_frames(self._subject, stream, self._parameters)
                 yield check_rate(self._subject, stream, self._parameters)
-                if COMPONENTS_WITH_VISIBILITY.intersection(stream.settings.components):
+                if set(COMPONENTS_WITH_VISIBILITY).intersection(stream.settings.components):
                     yield check_visibility(self._subject, stream, self._parameters)
         await asyncio.gather(*(stream.session.close() for stream in self._streams))
 

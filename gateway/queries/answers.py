@@ -9,9 +9,8 @@ import rtc3d
 
 from gateway.errors import QueryError
 from gateway.messages.decode import decode, message_type, to_json
-from gateway.rtc3d.commands import SECTIONS
-from gateway.rtc3d.components import BY_KEY, WIRE_ORDER, ComponentType
-from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ComponentType
+from gateway.rtc3d.parameters import SECTIONS, Parameters
 
 XML: Final = "application/xml"
 JSON: Final = "application/json"
@@ -24,16 +23,6 @@ Parts = tuple[str, ...]
 
 SCHEMA_TYPES: Final = tuple(name for name in vars(rtc3d) if name.endswith("_t"))
 """The message types, and the types that they consist of."""
-
-SECTION_FIELDS: Final = {
-    "general": "general",
-    "3d": "markers",
-    "6d": "tools",
-    "analog": "analog",
-    "force": "force",
-    "events": "events",
-}
-"""The field of Parameters that holds each of SECTIONS."""
 
 _OPTIONS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     "parameters": {"format": ("xml", "json"), "fresh": ("true", "false"), "stale": ("ok",)},
@@ -152,8 +141,8 @@ def _kind_and_name(parts: Parts, components: Collection[ComponentType]) -> tuple
             return "parameters", section
         case ("parameters", section):
             raise QueryError(unknown_section(section))
-        case (key,) if key in BY_KEY:
-            if BY_KEY[key] not in components:
+        case (key,) if key in COMPONENTS_BY_KEY:
+            if COMPONENTS_BY_KEY[key] not in components:
                 configured = ", ".join(component.key for component in WIRE_ORDER if component in components)
                 raise QueryError(
                     f"component {key!r} is not configured for this source; accepted: {configured}"
@@ -201,7 +190,7 @@ def parameters_json(parameters: Parameters, section: str) -> bytes | None:
 
     None if ``section`` is not among them.
     """
-    values = {name: getattr(parameters, field) for name, field in SECTION_FIELDS.items()}
+    values = {key: section.of(parameters) for key, section in SECTIONS.items()}
     if section:
         return None if values[section] is None else json_bytes(to_json(values[section]))
     return json_bytes({name: to_json(value) for name, value in values.items() if value is not None})

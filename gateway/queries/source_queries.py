@@ -31,10 +31,11 @@ from gateway.queries.answers import (
     schema_answer,
 )
 from gateway.queries.parameter_cache import Known, Sections, known_from
-from gateway.rtc3d.commands import SECTIONS, Command, SendCurrentFrame, SendParameters
-from gateway.rtc3d.components import BY_KEY, Component, ComponentType
+from gateway.rtc3d.commands import Command, SendCurrentFrame, SendParameters
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, Component, ComponentType
 from gateway.rtc3d.frames import byte_order_of, split_frame
 from gateway.rtc3d.packets import Packet, PacketType
+from gateway.rtc3d.parameters import SECTIONS
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
@@ -234,7 +235,7 @@ class SourceQueries:
         return Answer(known.json, JSON, attachment | {"recovered": list(known.parsed.recovered)})
 
     async def _component(self, question: Question) -> Answer:
-        kind = BY_KEY[question.name]
+        kind = COMPONENTS_BY_KEY[question.name]
         stream = next(stream for stream in self._streams if kind in stream.components)
         session = stream.status.session
         if stream.ask() is None:

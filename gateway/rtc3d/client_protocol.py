@@ -21,7 +21,6 @@ import numpy as np
 
 from gateway.errors import ClosedError, FrameError, LinkError, PacketError, ParametersError, ServerError
 from gateway.rtc3d.commands import (
-    SECTIONS,
     Bye,
     Command,
     SendCurrentFrame,
@@ -44,7 +43,7 @@ from gateway.rtc3d.packets import (
     encode_packet,
     text_of,
 )
-from gateway.rtc3d.parameters import sections_of
+from gateway.rtc3d.parameters import SECTIONS, sections_of
 from gateway.rtc3d.parameters_xml import parse_parameters
 
 

@@ -6,32 +6,15 @@ from dataclasses import dataclass
 from typing import Final, TypeVar
 
 from gateway.errors import CommandError
-from gateway.rtc3d.components import ByteOrder, ComponentType
+from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.packets import text_of
+from gateway.rtc3d.parameters import SECTIONS
 
-COMPONENT_WORDS: Final = {
-    ComponentType.MARKERS: "3D",
-    ComponentType.TOOLS: "6D",
-    ComponentType.ANALOG: "Analog",
-    ComponentType.FORCE: "Force",
-    ComponentType.EVENT: "Events",
-}
-"""The components' names in commands (§5.3.5), in the order in which they are sent."""
-
-SECTIONS: Final = ("general", "3d", "6d", "analog", "force", "events")
-"""The parameter sections of §6, as configuration, keys and commands of ours name them."""
-
-_SECTION_WORDS: Final = {
-    "general": "General",
-    "3d": "3D",
-    "6d": "6D",
-    "analog": "Analog",
-    "force": "Force",
-    "events": "Events",
-}
 # "Event" is an alias that some clients use.
-_COMPONENTS: Final = {word: kind for kind, word in COMPONENT_WORDS.items()} | {"Event": ComponentType.EVENT}
-_SECTIONS: Final = {word: name for name, word in _SECTION_WORDS.items()} | {"Event": "events"}
+_COMPONENTS: Final = {component.command_word: component for component in WIRE_ORDER} | {
+    "Event": ComponentType.EVENT
+}
+_SECTIONS: Final = {section.command_word: key for key, section in SECTIONS.items()} | {"Event": "events"}
 _KNOWN_COMMANDS: Final = (
     "known are Version, SetByteOrder, SendParameters, SendCurrentFrame, StreamFrames, Bye"
 )
@@ -93,12 +76,12 @@ class SetByteOrder:
 
 @dataclass(frozen=True, slots=True)
 class SendParameters:
-    """§5.3.3. ``sections`` are of SECTIONS; none means all."""
+    """§5.3.3. ``sections`` are keys of SECTIONS; none means all."""
 
     sections: tuple[str, ...] = ()
 
     def __str__(self) -> str:
-        return " ".join(["SendParameters", *(_SECTION_WORDS[name] for name in self.sections)])
+        return " ".join(["SendParameters", *(SECTIONS[key].command_word for key in self.sections)])
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +128,7 @@ Command = Version | SetByteOrder | SendParameters | SendCurrentFrame | StreamFra
 def _component_words(components: Iterable[ComponentType]) -> list[str]:
     # No components means All by §5.3.4 and §5.3.5; servers that know no component names accept the
     # bare command (field note 2), so it is left bare.
-    return [COMPONENT_WORDS[component] for component in components]
+    return [component.command_word for component in components]
 
 
 def encode_command(command: Command) -> bytes:

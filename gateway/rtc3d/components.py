@@ -11,8 +11,16 @@ ByteOrder = Literal["big", "little"]
 Items: TypeAlias = npt.NDArray[Any]
 
 
+class _Names(NamedTuple):
+    """What one component is called in different places."""
+
+    key: str
+    command_word: str
+    item_noun: str
+
+
 class ComponentType(IntEnum):
-    """The component types of §7.2. ``key`` is the name used in keys, channels and configuration."""
+    """The component types of §7.2; ``_NAMES`` below has their names."""
 
     MARKERS = 1
     ANALOG = 2
@@ -22,27 +30,32 @@ class ComponentType(IntEnum):
 
     @property
     def key(self) -> str:
-        """3d, analog, force, 6d or event."""
-        return _KEYS[self]
+        """The name in the gateway's keys, channels and configuration: 3d, 6d, analog, force or event."""
+        return _NAMES[self].key
+
+    @property
+    def command_word(self) -> str:
+        """The name in commands (§5.3.5): 3D, 6D, Analog, Force or Events."""
+        return _NAMES[self].command_word
+
+    @property
+    def item_noun(self) -> str:
+        """What the items are called: markers, tools, channels, plates or events."""
+        return _NAMES[self].item_noun
 
 
-_KEYS: Final = {
-    ComponentType.MARKERS: "3d",
-    ComponentType.ANALOG: "analog",
-    ComponentType.FORCE: "force",
-    ComponentType.TOOLS: "6d",
-    ComponentType.EVENT: "event",
+_NAMES: Final = {
+    ComponentType.MARKERS: _Names("3d", "3D", "markers"),
+    ComponentType.TOOLS: _Names("6d", "6D", "tools"),
+    ComponentType.ANALOG: _Names("analog", "Analog", "channels"),
+    ComponentType.FORCE: _Names("force", "Force", "plates"),
+    ComponentType.EVENT: _Names("event", "Events", "events"),
 }
-BY_KEY: Final = {key: component for component, key in _KEYS.items()}
 
-WIRE_ORDER: Final = (
-    ComponentType.MARKERS,
-    ComponentType.TOOLS,
-    ComponentType.ANALOG,
-    ComponentType.FORCE,
-    ComponentType.EVENT,
-)
-"""The order in which servers put components into a frame (field note 5)."""
+WIRE_ORDER: Final = tuple(_NAMES)
+"""All components, in the order in which servers put them into a frame (field note 5)."""
+
+COMPONENTS_BY_KEY: Final = {component.key: component for component in WIRE_ORDER}
 
 MISSING: Final = np.uint32(0xFFFFFFFF).view(np.float32)
 """A float of a missing marker or tool: all 32 bits set, a negative quiet NaN (§7.3, field note 7)."""

@@ -6,6 +6,7 @@ numbering starts from anything (field note 9), and an event's id may be hexadeci
 
 from dataclasses import dataclass
 from math import nan
+from typing import Any, Final, NamedTuple
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +162,7 @@ class ParametersEvents:
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """What one XML reply held; a section that it lacked is None. The sections are named as in SECTIONS."""
+    """What one XML reply held; a section that it lacked is None. SECTIONS below lists the sections."""
 
     general: General | None = None
     markers: Parameters3D | None = None
@@ -171,14 +172,30 @@ class Parameters:
     events: ParametersEvents | None = None
 
 
+class Section(NamedTuple):
+    """The names of one section of the parameters."""
+
+    command_word: str
+    """The name in SendParameters (§5.3.3)."""
+    field: str
+    """The field of Parameters."""
+
+    def of(self, parameters: Parameters) -> Any:
+        """Return this section of ``parameters``, for example a Parameters3D; None if it is absent."""
+        return getattr(parameters, self.field)
+
+
+SECTIONS: Final = {
+    "general": Section("General", "general"),
+    "3d": Section("3D", "markers"),
+    "6d": Section("6D", "tools"),
+    "analog": Section("Analog", "analog"),
+    "force": Section("Force", "force"),
+    "events": Section("Events", "events"),
+}
+"""The sections of §6 by the names that they have in the gateway's keys, messages and commands."""
+
+
 def sections_of(parameters: Parameters) -> frozenset[str]:
-    """Return the names, as in SECTIONS, of the sections that ``parameters`` holds."""
-    sections = {
-        "general": parameters.general,
-        "3d": parameters.markers,
-        "6d": parameters.tools,
-        "analog": parameters.analog,
-        "force": parameters.force,
-        "events": parameters.events,
-    }
-    return frozenset(name for name, section in sections.items() if section is not None)
+    """Return the keys in SECTIONS of the sections that ``parameters`` has."""
+    return frozenset(key for key, section in SECTIONS.items() if section.of(parameters) is not None)

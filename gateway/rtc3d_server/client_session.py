@@ -25,7 +25,7 @@ from gateway.rtc3d.commands import (
 from gateway.rtc3d.components import ByteOrder, ComponentType
 from gateway.rtc3d.frames import byte_order_of, split_frame
 from gateway.rtc3d.packets import Packet, PacketType, encode_packet, text_of
-from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters import SECTIONS, Parameters
 from gateway.rtc3d.parameters_xml import build_parameters
 from gateway.rtc3d_server.frame_builder import DataPacket, FrameBuilder
 
@@ -34,14 +34,6 @@ NO_DATA: Final = encode_packet(PacketType.NO_DATA)
 MAX_LATE_US: Final = 1_000_000
 """Frames of a stream that are later than this are dropped; the others are still sent."""
 
-_PARAMETER_FIELDS: Final = {
-    "general": "general",
-    "3d": "markers",
-    "6d": "tools",
-    "analog": "analog",
-    "force": "force",
-    "events": "events",
-}
 _log = logging.getLogger(__name__)
 
 
@@ -219,7 +211,7 @@ class ClientSession:
         parameters = self._callbacks.parameters()
         if not sections:
             return parameters
-        omitted = {field: None for section, field in _PARAMETER_FIELDS.items() if section not in sections}
+        omitted = {section.field: None for key, section in SECTIONS.items() if key not in sections}
         return replace(parameters, **omitted)
 
     def _request_frames(self, command: SendCurrentFrame | StreamFrames) -> list[bytes]:

@@ -15,7 +15,7 @@ from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.lcm.output import open_lcm
 from gateway.outputs.lcm.queries import MAX_PENDING, MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES, LcmQueries
-from gateway.rtc3d.commands import SECTIONS
+from gateway.rtc3d.parameters import SECTIONS
 from tests.networks import free_port, lcm_url
 from tests.querying import LabServer, gateway_at, is_filled
 from tests.servers import ScriptedServer
@@ -157,7 +157,7 @@ async def test_several_sections_are_asked_for_at_once() -> None:
         assert (await peer.ask(1, ["force", "3d", "3d"])).xml.encode() == both
         assert server.commands[-1] == "SendParameters 3D Force"
         asked = server.count("SendParameters")
-        assert (await peer.ask(2, SECTIONS)).xml.encode() == server.xml  # all there are is all
+        assert (await peer.ask(2, list(SECTIONS))).xml.encode() == server.xml  # all there are is all
         assert (await peer.ask(3, ["3d", "force"])).xml.encode() == both
         assert server.count("SendParameters") == asked
 

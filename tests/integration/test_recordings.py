@@ -21,7 +21,7 @@ from gateway.messages.splice import ITEMS_OFFSET
 from gateway.outputs.contract import Output
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.zenoh.output import ZenohOutput
-from gateway.rtc3d.components import BY_KEY, ITEM_DTYPES, ComponentType
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.rtc3d_server.scene import Scene
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.simulator import Simulator
@@ -119,7 +119,7 @@ def assert_equal_to_file(messages: list[bytes], component: str, expected: Bits) 
     seen = set()
     for message in messages:
         number = int.from_bytes(message[36:40], "big", signed=True) - 1
-        items = np.frombuffer(message, ITEM_DTYPES[BY_KEY[component]], offset=ITEMS_OFFSET)
+        items = np.frombuffer(message, ITEM_DTYPES[COMPONENTS_BY_KEY[component]], offset=ITEMS_OFFSET)
         bits = items.view(">u4").reshape(len(items), -1)[:, : expected.shape[2]]
         np.testing.assert_array_equal(bits, expected[number % len(expected)])
         seen.add(number % len(expected))

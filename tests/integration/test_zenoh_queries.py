@@ -7,7 +7,7 @@ import pytest
 import zenoh
 
 from gateway.messages.decode import to_json
-from gateway.rtc3d.commands import SECTIONS
+from gateway.rtc3d.parameters import SECTIONS
 from tests.networks import free_endpoint
 from tests.querying import LabServer, ask, asker_at, gateway_at, is_filled, lab, lab_without_server
 from tests.servers import ScriptedServer

@@ -6,8 +6,8 @@ import pytest
 
 from gateway.config.settings import StreamSettings
 from gateway.queries.answers import SCHEMA_TYPES
-from gateway.rtc3d.commands import SECTIONS
 from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import SECTIONS
 from tests.networks import free_endpoint, open_zenoh
 from tests.querying import LabServer, ask, ask_all, asker_at, gateway_at, is_filled, lab, lab_without_server
 from tests.servers import ScriptedServer, packet

@@ -5,7 +5,6 @@ from hypothesis import strategies as st
 
 from gateway.errors import CommandError
 from gateway.rtc3d.commands import (
-    SECTIONS,
     AllFrames,
     Bye,
     Command,
@@ -21,11 +20,12 @@ from gateway.rtc3d.commands import (
     parse_command,
 )
 from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import SECTIONS
 from tests.strategies import damaged
 
 digits = st.text(string.digits, min_size=1, max_size=4)
 component_lists = st.lists(st.sampled_from(ComponentType), unique=True).map(tuple)
-section_lists = st.lists(st.sampled_from(SECTIONS), unique=True).map(tuple)
+section_lists = st.lists(st.sampled_from(list(SECTIONS)), unique=True).map(tuple)
 # A frequency's text has at most nine digits before the point and six after it.
 frequencies = st.integers(1, 10**15 - 1).map(lambda millionths: Frequency(millionths / 1e6))
 divisors = st.integers(1, 10**9 - 1).map(FrequencyDivisor)

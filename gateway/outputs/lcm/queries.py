@@ -24,7 +24,7 @@ from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.output import open_lcm
 from gateway.queries.answers import unknown_section
 from gateway.queries.source_queries import SourceQueries
-from gateway.rtc3d.commands import SECTIONS
+from gateway.rtc3d.parameters import SECTIONS
 
 MAX_PENDING: Final = 64
 """How many requests are worked on at once; more are dropped and counted."""
@@ -228,7 +228,7 @@ def _sections(request: Any) -> tuple[str, ...]:
     if unknown:
         raise QueryError(unknown_section(min(unknown)))
     asked = tuple(section for section in SECTIONS if section in request.sections)
-    return () if asked == SECTIONS else asked
+    return () if asked == tuple(SECTIONS) else asked
 
 
 def _text(xml: bytes) -> str:

@@ -8,7 +8,7 @@ import pytest
 from gateway.cli.asking import ParametersReply, Sections
 from gateway.cli.params_tables import OutputFormat, write_replies
 from gateway.messages.decode import to_json
-from gateway.rtc3d.commands import SECTIONS
+from gateway.rtc3d.parameters import SECTIONS
 from tests.spec_parameters import ALL, in_root, spec_body, spec_xml
 
 EVERYTHING = in_root(*(spec_body(section).decode() for section in ("general", "3d", "6d", "analog")))

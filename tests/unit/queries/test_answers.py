@@ -10,7 +10,6 @@ from gateway.messages.stamp import Stamp
 from gateway.queries.answers import (
     JSON,
     SCHEMA_TYPES,
-    SECTION_FIELDS,
     TEXT,
     Question,
     accepted_keys,
@@ -21,7 +20,6 @@ from gateway.queries.answers import (
     parse_questions,
     schema_answer,
 )
-from gateway.rtc3d.commands import SECTIONS
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import General, Parameters, ParametersForce, Plate, Point
@@ -161,8 +159,3 @@ def test_numbers_that_a_plate_lacks_are_null_in_json() -> None:
     [value] = json.loads(written)["plates"]
     assert value["corners"] == [{"x": 1.0, "y": None, "z": None, "unit": "mm"}]
     assert value["calibration_matrix"] == [[2.0, None]]
-
-
-def test_every_section_has_its_field() -> None:
-    assert tuple(SECTION_FIELDS) == SECTIONS
-    assert set(SECTION_FIELDS.values()) == set(Parameters.__dataclass_fields__)

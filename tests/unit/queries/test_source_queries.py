@@ -9,7 +9,7 @@ import pytest
 
 from gateway.errors import ClosedError, ReplyTimeoutError, ServerError
 from gateway.queries.source_queries import LONG_XML_BYTES
-from gateway.rtc3d.commands import SECTIONS
+from gateway.rtc3d.parameters import SECTIONS
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from tests.unit.queries.rig import Rig, xml_of
 from tests.waiting import wait_until_async

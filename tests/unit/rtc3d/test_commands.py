@@ -2,8 +2,6 @@ import pytest
 
 from gateway.errors import CommandError
 from gateway.rtc3d.commands import (
-    COMPONENT_WORDS,
-    SECTIONS,
     AllFrames,
     Bye,
     Command,
@@ -18,7 +16,7 @@ from gateway.rtc3d.commands import (
     encode_command,
     parse_command,
 )
-from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.rtc3d.components import ComponentType
 
 MARKERS, ANALOG, FORCE = ComponentType.MARKERS, ComponentType.ANALOG, ComponentType.FORCE
 TOOLS, EVENT = ComponentType.TOOLS, ComponentType.EVENT
@@ -77,12 +75,6 @@ def error_text(body: bytes) -> str:
     assert text.isprintable()
     assert len(text) < 300
     return text
-
-
-def test_components_are_named_and_ordered_as_documented() -> None:
-    assert COMPONENT_WORDS == {MARKERS: "3D", TOOLS: "6D", ANALOG: "Analog", FORCE: "Force", EVENT: "Events"}
-    assert tuple(COMPONENT_WORDS) == WIRE_ORDER
-    assert SECTIONS == ("general", "3d", "6d", "analog", "force", "events")
 
 
 @each_text

@@ -5,7 +5,7 @@ import numpy.typing as npt
 import pytest
 
 from gateway.rtc3d.components import (
-    BY_KEY,
+    COMPONENTS_BY_KEY,
     ITEM_DTYPES,
     MISSING,
     MISSING_RELIABILITY,
@@ -62,13 +62,18 @@ def test_types_are_numbered_and_named_as_documented() -> None:
         "6d": 4,
         "event": 5,
     }
-    assert {key: kind.value for key, kind in BY_KEY.items()} == {
+    assert {key: kind.value for key, kind in COMPONENTS_BY_KEY.items()} == {
         "3d": 1,
         "analog": 2,
         "force": 3,
         "6d": 4,
         "event": 5,
     }
+
+
+def test_components_have_the_names_of_section_5_3_5_in_commands() -> None:
+    words = {kind.value: kind.command_word for kind in ComponentType}
+    assert words == {1: "3D", 2: "Analog", 3: "Force", 4: "6D", 5: "Events"}
 
 
 def test_wire_order_is_3d_6d_analog_force_event() -> None:
