@@ -48,7 +48,7 @@ PACKETS: Final = (
         """),
     ),
     PacketVector(
-        "command, the example of §5.1",
+        "command, the example of section 5.1",
         1,
         b"Version 1.0\0",
         _hex("""

@@ -156,6 +156,18 @@ def test_infinity_is_null_in_json() -> None:
             "outputs: zenoh ok; lcm no multicast: ip route add",
         ),
     ],
+    ids=[
+        "markers",
+        "tools",
+        "analog",
+        "force",
+        "events",
+        "pose",
+        "pose out of view",
+        "clock",
+        "status while streaming",
+        "status while waiting",
+    ],
 )
 def test_one_line_shows_what_matters_first(message: bytes, line: str) -> None:
     assert one_line(decode(message)) == line

@@ -88,9 +88,7 @@ def test_reads_each_command(command: Command, text: str) -> None:
     assert parse_command(text.encode("ascii")) == command
 
 
-@pytest.mark.parametrize(
-    "end", [b"\0", b"\n", b"\r\n", b" ", b"   ", b" \0", b"\n\0", b"\0\n", b" \r\n\0\0"], ids=repr
-)
+@pytest.mark.parametrize("end", [b"\0", b"\n", b"\r\n", b" ", b"   ", b" \0", b"\n\0", b"\0\n", b" \r\n\0\0"])
 @each_text
 def test_reads_each_command_whatever_ends_it(command: Command, text: str, end: bytes) -> None:
     assert parse_command(text.encode("ascii") + end) == command
@@ -148,7 +146,7 @@ def test_an_unknown_command_is_told_the_known_ones(body: bytes) -> None:
         assert word in text
 
 
-@pytest.mark.parametrize("body", [b"", b"\0", b"\n", b"   ", b" \r\n\0\0"], ids=repr)
+@pytest.mark.parametrize("body", [b"", b"\0", b"\n", b"   ", b" \r\n\0\0"])
 def test_an_empty_command_is_told_the_known_ones(body: bytes) -> None:
     text = error_text(body)
     assert "empty" in text.lower()
