@@ -1,1 +1,1 @@
-"""What a running gateway shows: metrics, health, HTTP pages, a status line."""
+"""Monitoring of a running gateway: metrics, health, HTTP pages and the status line."""

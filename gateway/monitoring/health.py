@@ -52,7 +52,7 @@ def _output_health(output: Output) -> dict[str, str]:
 
 def _stream_problem(source: Source, stream: StreamSettings, status: StreamStatus, age_s: float | None) -> str:
     """Return what is wrong with a stream and what to check; "" if it has frames or needs none."""
-    max_age_s = source.source.stall_timeout_s
+    host, max_age_s = source.source.host, source.source.stall_timeout_s
     if age_s is not None and age_s < max_age_s:
         return ""
     silence = "no frame so far" if age_s is None else f"no frame for {age_s:.1f} s (limit {max_age_s:g} s)"
@@ -64,8 +64,6 @@ def _stream_problem(source: Source, stream: StreamSettings, status: StreamStatus
         case StreamState.IDLE if stream.on_demand and not source.fan_out.listened(stream.components):
             return ""
         case StreamState.IDLE:
-            return (
-                f"{silence}: {source.source.host} is connected but sends nothing; is a measurement running?"
-            )
-    reason = status.last_error or f"connecting to {source.source.host}:{source.source.port}"
+            return f"{silence}: {host} is connected but sends nothing; is a measurement running?"
+    reason = status.last_error or f"connecting to {host}:{source.source.port}"
     return f"{silence}: {reason}"

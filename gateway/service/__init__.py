@@ -1,1 +1,1 @@
-"""The daemon: signals, reload, systemd, log formats."""
+"""The daemon: signals, reload, systemd notifications and logging."""

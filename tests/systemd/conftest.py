@@ -1,4 +1,4 @@
-"""One machine for all tests here, with the gateway installed; and its service, anew for each."""
+"""Fixtures: one machine with the gateway installed, and for each test its service."""
 
 import shutil
 import subprocess
@@ -10,13 +10,13 @@ import uvloop
 from tests.clones import ROOT, clone_into, files_in
 from tests.networks import free_endpoint
 from tests.systemd.machine import CLONE, DROP_INS, Machine, Service
-from tests.systemd.page import typed
+from tests.systemd.page import commands
 
 
 @pytest.fixture(scope="session")
 def machine() -> Iterator[Machine]:
-    """A machine on which ``make install`` has been run from a clean copy of this repository."""
-    # It lives as long as cat does, which ends with this process's end of the pipe, however that ends.
+    """Return a machine on which ``make install`` has run from a clean copy of this repository."""
+    # The machine runs until cat ends, which happens when this process closes the pipe or dies.
     command = ["tests/systemd/with-systemd", "sh", "-c", "echo $MACHINE; exec cat"]
     with subprocess.Popen(
         command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
@@ -25,14 +25,14 @@ def machine() -> Iterator[Machine]:
         booted = Machine(int(process.stdout.readline()))
         clone_into(booted.path(CLONE))
         before = files_in(booted.path(CLONE))
-        booted.said_installing = uvloop.run(booted.type(typed("Install", 1))).text
+        booted.install_output = uvloop.run(booted.run_shell(commands("Install", 1))).text
         booted.left_in_clone = files_in(booted.path(CLONE)) - before
         yield booted
 
 
 @pytest.fixture
 async def service(machine: Machine) -> AsyncIterator[Service]:
-    """The service, not configured and not started; it is stopped afterwards, and changed back."""
+    """Return the service, not configured and not started; it is stopped and restored afterwards."""
     yield Service(machine, free_endpoint())
     await machine.run("systemctl", "stop", "rtc3d-gateway*.service")
     await machine.run("systemctl", "reset-failed")

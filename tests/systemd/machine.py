@@ -1,4 +1,4 @@
-"""A machine to install the gateway on: a systemd in namespaces of its own, with this run's network."""
+"""A machine for tests of installing: systemd in namespaces of its own, with the network of the test run."""
 
 import asyncio
 import json
@@ -21,30 +21,30 @@ _PATH: Final = "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin:/sbin:/bin"
 
 
 class Outcome(NamedTuple):
-    """How a command ended, and all that it printed."""
+    """The exit status of a command and its output, standard error included."""
 
     status: int
     text: str
 
 
 class Machine:
-    """A running one, as ``with-systemd`` boots it; ``process_1`` is its process 1, seen from here."""
+    """A machine that ``with-systemd`` has booted; ``process_1`` is the outer number of its process 1."""
 
     def __init__(self, process_1: int) -> None:
         self._process_1 = process_1
         self._files = Path(f"/proc/{process_1}/root")
         self.left_in_clone: set[str] = set()
-        """What installing made in the clone."""
-        self.said_installing = ""
+        """The files that installing created in the clone."""
+        self.install_output = ""
 
     def path(self, path: str) -> Path:
-        """Return where a file of the machine is, seen from here."""
+        """Return the outer path of a file of the machine."""
         return self._files / path.removeprefix("/")
 
     async def run(
         self, *command: str, check: bool = True, environment: Mapping[str, str] | None = None
     ) -> Outcome:
-        """Run a command in the machine, as root, and return how it ended."""
+        """Run a command in the machine as root."""
         namespaces = ("--pid", "--mount", "--uts", "--ipc", "--cgroup")
         process = await asyncio.create_subprocess_exec(
             *("nsenter", f"--target={self._process_1}", *namespaces, "--", *command),
@@ -58,58 +58,65 @@ class Machine:
         assert not check or outcome.status == 0, f"{' '.join(command)}: {outcome.text}"
         return outcome
 
-    async def type(self, commands: str, check: bool = True) -> Outcome:
-        """Have a shell run ``commands`` in the clone at CLONE; pip takes what is downloaded already."""
+    async def run_shell(self, commands: str, check: bool = True) -> Outcome:
+        """Run ``commands`` with a shell in CLONE; pip installs from the wheelhouse only."""
         environment = pip_environment(_REPOSITORY / WHEELHOUSE.relative_to(ROOT)) | {"PYTHON": SYSTEM_PYTHON}
         script = f"cd {CLONE}\n{commands}"
         return await self.run("sh", "-c", script, check=check, environment=environment)
 
     async def files(self) -> dict[str, str]:
-        """Return all files and folders that somebody could change, with size and time of change.
+        """Return size and modification time of all files in the writable folders, by path.
 
-        What systemd writes for itself is left out; the rest of the machine cannot be written to.
+        Folders have neither. The files that systemd writes for itself are left out.
         """
-        places = ("/dev/shm", "/etc", "/home", "/opt", "/root", "/run", "/tmp", "/usr/local", "/var")
-        own = ("/run/systemd", "/run/log", "/run/overlay", "/run/repository", "/var/lib/systemd", CLONE)
-        skipped = [part for path in own for part in ("-path", path, "-prune", "-o")]
-        # Of a folder the name alone: its time changes with what is in it, which is listed itself.
+        writable = ("/dev/shm", "/etc", "/home", "/opt", "/root", "/run", "/tmp", "/usr/local", "/var")
+        of_systemd = (
+            "/run/systemd",
+            "/run/log",
+            "/run/overlay",
+            "/run/repository",
+            "/var/lib/systemd",
+            CLONE,
+        )
+        skipped = [part for path in of_systemd for part in ("-path", path, "-prune", "-o")]
+        # Not for folders: their time changes with their contents, which are listed themselves.
         each = ("-type", "d", "-printf", r"%p\t\n", "-o", "-printf", r"%p\t%s %T@\n")
-        listed = await self.run("find", *places, *skipped, *each)
+        listed = await self.run("find", *writable, *skipped, *each)
         return dict(line.rsplit("\t", 1) for line in listed.text.splitlines())
 
     async def show(self, name: str, unit: str = UNIT) -> str:
         """Return a property of a unit."""
         return (await self.run("systemctl", "show", "--value", "--property", name, unit)).text.strip()
 
-    async def until(self, name: str, wanted: str, unit: str = UNIT, timeout_s: float = 15) -> str:
-        """Wait until a property of a unit has ``wanted`` in it, and return the property."""
+    async def wait_for(self, name: str, wanted: str, unit: str = UNIT, timeout_s: float = 15) -> str:
+        """Wait until a property of a unit contains ``wanted``, and return the property."""
         value = ""
         try:
             async with asyncio.timeout(timeout_s):
-                while wanted not in (value := await self.show(name, unit)):  # noqa: ASYNC110 - systemd is asked
+                while wanted not in (value := await self.show(name, unit)):  # noqa: ASYNC110 - systemd has no event for it
                     await asyncio.sleep(0.02)
         except TimeoutError:
             raise AssertionError(f"{name} of {unit} is {value!r}, without {wanted!r}") from None
         return value
 
     async def journal(self, unit: str = UNIT) -> list[dict[str, Any]]:
-        """Return the journal's entries about the unit's present or last run."""
-        run = await self.show("InvocationID", unit)
-        matches = (f"_SYSTEMD_INVOCATION_ID={run}", "+", f"INVOCATION_ID={run}")
+        """Return the journal entries of the unit's current or last run."""
+        invocation = await self.show("InvocationID", unit)
+        matches = (f"_SYSTEMD_INVOCATION_ID={invocation}", "+", f"INVOCATION_ID={invocation}")
         text = (await self.run("journalctl", "--output=json", "--all", *matches)).text
         return [json.loads(line) for line in text.splitlines()]
 
 
 class Service:
-    """The service of one configuration, running in the machine."""
+    """The service for one configuration in the machine."""
 
     def __init__(self, machine: Machine, endpoint: str) -> None:
         self.machine = machine
         self.endpoint = endpoint
-        """Where Zenoh listens."""
+        """The endpoint on which Zenoh listens."""
 
     def configure(self, sources: Mapping[str, int], **sections: Any) -> None:
-        """Write a configuration: sources by name with their ports; other sections beside or over these."""
+        """Write a configuration with these ports of sources by name; ``sections`` are added or replaced."""
         reconnect = {"first_delay_s": 0.05, "max_delay_s": 0.1}
         configuration = {
             "sources": [
@@ -123,7 +130,7 @@ class Service:
         self.machine.path(CONFIG).write_text(yaml.safe_dump(configuration | sections))
 
     async def drop_in(self, *lines: str) -> None:
-        """Change the unit as ``systemctl edit`` does, with lines of its section [Service]."""
+        """Add lines to the section [Service] of the unit, as ``systemctl edit`` does."""
         folder = self.machine.path(DROP_INS)
         folder.mkdir(parents=True)
         (folder / "test.conf").write_text("\n".join(("[Service]", *lines)))
@@ -133,12 +140,12 @@ class Service:
         await self.machine.run("systemctl", "start", UNIT)
 
     async def reload(self) -> Outcome:
-        """Return how ``systemctl reload`` ended."""
+        """Run ``systemctl reload``."""
         return await self.machine.run("systemctl", "reload", UNIT, check=False)
 
-    async def says(self, text: str) -> None:
-        """Wait until the line in ``systemctl status`` has ``text`` in it."""
-        await self.machine.until("StatusText", text)
+    async def wait_for_status(self, text: str) -> None:
+        """Wait until the status line of ``systemctl status`` contains ``text``."""
+        await self.machine.wait_for("StatusText", text)
 
     async def main_pid(self) -> str:
         return await self.machine.show("MainPID")

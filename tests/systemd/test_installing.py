@@ -1,4 +1,4 @@
-"""What docs/how-to/service.md has people type, on a machine that may be changed."""
+"""Installing with the commands of docs/how-to/service.md, on a disposable machine."""
 
 import json
 import shutil
@@ -8,7 +8,7 @@ import pytest
 from tests.clones import skip_if_plain
 from tests.networks import free_port, zenoh_keys
 from tests.systemd.machine import CONFIG, UNIT, Machine, Service
-from tests.systemd.page import exposure, typed
+from tests.systemd.page import commands, exposure
 
 pytestmark = [pytest.mark.systemd, pytest.mark.wheelhouse, pytest.mark.netns]
 
@@ -22,7 +22,7 @@ INSTANCE = "rtc3d-gateway@hall-2.service"
 WITHOUT_COMPILER = "export CC=no-such-compiler\n"
 
 
-async def test_the_program_runs_from_its_own_environment(machine: Machine) -> None:
+async def test_the_program_runs_from_its_virtual_environment(machine: Machine) -> None:
     assert machine.path(PROGRAM).is_symlink()
     assert (await machine.run(PROGRAM, "--version")).text.startswith("rtc3d-gateway ")
     await machine.run(PROGRAM, "check", CONFIG)
@@ -31,8 +31,8 @@ async def test_the_program_runs_from_its_own_environment(machine: Machine) -> No
     assert location.text.startswith(f"{VENV}/lib")
 
 
-async def test_the_program_is_compiled_where_there_is_a_compiler(machine: Machine) -> None:
-    skip_if_plain(machine.said_installing)
+async def test_the_program_is_compiled_if_there_is_a_compiler(machine: Machine) -> None:
+    skip_if_plain(machine.install_output)
     assert (await machine.run(PROGRAM, "--version")).text.endswith(" (compiled)\n")
 
 
@@ -40,14 +40,14 @@ def test_installing_leaves_nothing_in_the_clone(machine: Machine) -> None:
     assert machine.left_in_clone == set()
 
 
-@pytest.mark.skipif(shutil.which("apt-get") is None, reason="the page is about Debian's packages")
-async def test_the_packages_that_installing_takes_exist(machine: Machine) -> None:
-    packages = typed("Install").partition("apt-get install ")[2].split()
+@pytest.mark.skipif(shutil.which("apt-get") is None, reason="the page names Debian packages")
+async def test_the_packages_that_the_page_names_exist(machine: Machine) -> None:
+    packages = commands("Install").partition("apt-get install ")[2].split()
     assert packages
     await machine.run("apt-get", "install", "--simulate", *packages)
 
 
-def test_the_configuration_comes_with_the_schema_that_its_first_line_names(machine: Machine) -> None:
+def test_the_schema_in_the_configurations_first_line_is_installed(machine: Machine) -> None:
     first_line = machine.path(CONFIG).read_text().partition("\n")[0]
     assert first_line == "# yaml-language-server: $schema=gateway.schema.json"
     assert json.loads(machine.path(SCHEMA).read_text())["properties"]["sources"]
@@ -55,60 +55,60 @@ def test_the_configuration_comes_with_the_schema_that_its_first_line_names(machi
 
 
 @pytest.mark.parametrize("unit", [UNIT, "rtc3d-gateway@two.service"])
-async def test_the_units_are_sound_and_locked_up(machine: Machine, unit: str) -> None:
+async def test_the_units_are_valid_and_sandboxed(machine: Machine, unit: str) -> None:
     assert (await machine.run("systemd-analyze", "verify", unit)).text == ""
     await machine.run("systemd-analyze", "security", "--threshold=20", unit)  # 2.0; fails above
 
 
-async def test_what_is_secret_is_for_the_service_and_root_alone(machine: Machine) -> None:
+async def test_only_the_service_and_root_can_read_the_secrets_folder(machine: Machine) -> None:
     secrets = machine.path("/etc/rtc3d-gateway/secrets")
     group = (await machine.run("stat", "--format=%U:%G", "/etc/rtc3d-gateway/secrets")).text.strip()
     assert group == "root:rtc3d-gateway"
     assert secrets.stat().st_mode & 0o7777 == 0o750
 
 
-async def test_the_page_tells_how_locked_up_the_service_is(machine: Machine) -> None:
+async def test_the_page_has_the_current_exposure_level(machine: Machine) -> None:
     figure, version = exposure()
     if not (here := (await machine.run("systemctl", "--version")).text).startswith(f"systemd {version} "):
-        pytest.skip(f"the page's figure is of systemd {version}; this is {here.splitlines()[0]}")
-    text = (await machine.type(typed("What systemd does for it"))).text
+        pytest.skip(f"the page's figure is for systemd {version}; this is {here.splitlines()[0]}")
+    text = (await machine.run_shell(commands("What systemd does for it"))).text
     assert f"exposure level for {UNIT}: {figure} " in text
 
 
-async def test_the_page_leads_to_a_service_that_waits_for_its_server(service: Service) -> None:
+async def test_the_pages_commands_start_a_service_that_waits_for_its_server(service: Service) -> None:
     machine, away = service.machine, free_port()
     service.configure({"lab": away})
-    assert "good" in (await machine.type(typed("Name the server"))).text
-    started = (await machine.type(typed("Start"))).text
+    assert "valid; 1 source: lab" in (await machine.run_shell(commands("Name the server"))).text
+    started = (await machine.run_shell(commands("Start"))).text
     assert "active (running)" in started
     assert 'Status: "lab: ' in started
     assert await machine.show("UnitFileState") == "enabled"
-    await service.says(f"lab: waiting for 127.0.0.1:{away}, ")
-    assert f"127.0.0.1:{away}" in (await machine.type(typed("See what happened"))).text
+    await service.wait_for_status(f"lab: waiting for 127.0.0.1:{away}, ")
+    assert f"127.0.0.1:{away}" in (await machine.run_shell(commands("See what happened"))).text
     other = free_port()
     service.configure({"lab": other})
-    await machine.type(typed("Change the configuration"))
-    await service.says(f"lab: waiting for 127.0.0.1:{other}, ")
+    await machine.run_shell(commands("Change the configuration"))
+    await service.wait_for_status(f"lab: waiting for 127.0.0.1:{other}, ")
 
 
-async def test_the_page_leads_to_a_second_instance(service: Service) -> None:
+async def test_the_pages_commands_start_a_second_instance(service: Service) -> None:
     service.configure({"lab": free_port()})
-    await service.machine.type(typed("Several instances"))
-    await service.machine.until("StatusText", "lab: waiting for", INSTANCE)
+    await service.machine.run_shell(commands("Several instances"))
+    await service.machine.wait_for("StatusText", "lab: waiting for", INSTANCE)
     assert await service.machine.show("UnitFileState", INSTANCE) == "enabled"
 
 
-async def test_a_secret_reaches_the_gateway_and_nobody_else(service: Service) -> None:
+async def test_a_secret_reaches_the_gateway_only(service: Service) -> None:
     machine = service.machine
-    await machine.type(typed("Secrets"))
+    await machine.run_shell(commands("Secrets"))
     assert (await machine.run("stat", "--format=%a %U:%G", SECRETS)).text == "640 root:rtc3d-gateway\n"
-    [line] = [line for line in typed("Secrets", 1).splitlines() if line.startswith("RTC3D_GATEWAY__")]
+    [line] = [line for line in commands("Secrets", 1).splitlines() if line.startswith("RTC3D_GATEWAY__")]
     zenoh = zenoh_keys("peer", listen=service.endpoint) | {"transport": {"auth": {"usrpwd": {"user": "me"}}}}
     service.configure({"lab": free_port()}, zenoh={"config": zenoh})
     machine.path(SECRETS).write_text(line.replace("…", "open-sesame"))
     try:
         await service.start()
-        await service.says("lab: waiting for")
+        await service.wait_for_status("lab: waiting for")
         environment = machine.path(f"/proc/{await service.main_pid()}/environ").read_text()
         assert line.replace("…", "open-sesame") in environment.split("\0")
         assert "open-sesame" not in (await machine.run("systemctl", "show", UNIT)).text
@@ -117,15 +117,15 @@ async def test_a_secret_reaches_the_gateway_and_nobody_else(service: Service) ->
         machine.path(SECRETS).unlink()
 
 
-async def test_upgrading_and_removing_leave_the_configuration(machine: Machine) -> None:
+async def test_upgrading_and_removing_keep_the_configuration(machine: Machine) -> None:
     mine = "sources: [{name: mine, host: 192.0.2.20}]\n"
     machine.path(CONFIG).write_text(mine)
-    await machine.run("cp", "--archive", "--link", VENV, "/opt/kept")  # so that installing again is short
-    await machine.type(WITHOUT_COMPILER + typed("Upgrade"))
+    await machine.run("cp", "--archive", "--link", VENV, "/opt/kept")  # so that installing again is fast
+    await machine.run_shell(WITHOUT_COMPILER + commands("Upgrade"))
     assert "compiled" not in (await machine.run(PROGRAM, "--version")).text
     assert machine.path(CONFIG).read_text() == mine
     await machine.run("systemctl", "enable", UNIT, INSTANCE)
-    await machine.type(typed("Remove"))
+    await machine.run_shell(commands("Remove"))
     try:
         for path in (
             PROGRAM,
@@ -141,7 +141,7 @@ async def test_upgrading_and_removing_leave_the_configuration(machine: Machine) 
     finally:
         await machine.run("mkdir", "--parents", PREFIX)
         await machine.run("cp", "--archive", "--link", "/opt/kept", VENV)
-        await machine.type(WITHOUT_COMPILER + typed("Install", 1))
+        await machine.run_shell(WITHOUT_COMPILER + commands("Install", 1))
         await machine.run("rm", "-r", VENV)
         await machine.run("mv", "/opt/kept", VENV)
     assert machine.path(CONFIG).read_text() == mine
