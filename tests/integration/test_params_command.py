@@ -111,12 +111,12 @@ async def test_the_malformed_xml_of_the_specification_is_printed_unchanged(side:
 async def test_fresh_asks_the_server(side: str) -> None:
     async with lab() as at:
         requests = at.server.count("SendParameters")
-        assert (
-            await run("params", "--xml", *at.options(side))
-        ).stdout.encode().rstrip() == at.server.xml.rstrip()
+        cached = await run("params", "--xml", *at.options(side))
+        assert cached.stdout.encode().rstrip() == at.server.xml.rstrip()
         assert at.server.count("SendParameters") == requests
         at.server.xml = at.server.xml.replace(b"Marker 1", b"Renamed marker")
-        assert "Renamed marker" in (await run("params", "--xml", "--fresh", *at.options(side))).stdout
+        fresh = await run("params", "--xml", "--fresh", *at.options(side))
+        assert "Renamed marker" in fresh.stdout
         assert at.server.count("SendParameters") > requests
 
 
