@@ -29,7 +29,8 @@ from gateway.config.settings import (
 )
 from gateway.errors import OutputError
 from gateway.gateway import Gateway
-from gateway.messages.decode import decode, one_line
+from gateway.messages.decode import decode
+from gateway.messages.summary import summarise
 from gateway.outputs.lcm.output import LcmOutput, open_lcm
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
@@ -191,7 +192,7 @@ def _table(
     table.add_column("newest message", width=_MESSAGE_WIDTH, no_wrap=True, overflow="ellipsis")
     for component in WIRE_ORDER:
         newest = received["zenoh"].newest.get(component.key)
-        text = "" if newest is None else one_line(decode(newest))
+        text = "" if newest is None else summarise(decode(newest))
         table.add_row(
             component.key,
             *(f"{rates[output].get(component.key, 0.0):.1f}" for output in _OUTPUTS),

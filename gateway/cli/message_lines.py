@@ -4,7 +4,8 @@ import json
 from typing import Any
 
 from gateway.errors import ProtocolError
-from gateway.messages.decode import decode, one_line, to_json, xml_text
+from gateway.messages.decode import decode, to_json
+from gateway.messages.summary import summarise, summarise_xml
 
 
 def json_line(name: str, message: bytes) -> str:
@@ -25,11 +26,11 @@ def json_line(name: str, message: bytes) -> str:
 def text_line(name: str, message: bytes) -> str:
     """Return a line for people: ``name`` (the key or channel) and a summary of the message."""
     try:
-        line = f"{name} {one_line(decode(message))}"
+        line = f"{name} {summarise(decode(message))}"
     except ProtocolError as error:
         match _xml_or_json(message):
             case bytes() as xml:
-                line = f"{name} {xml_text(xml)}"
+                line = f"{name} {summarise_xml(xml)}"
             case dict() as json_object:
                 line = f"{name} " + ", ".join(f"{key} {value}" for key, value in json_object.items())
             case _:

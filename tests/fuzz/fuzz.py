@@ -19,9 +19,10 @@ import atheris
 with atheris.instrument_imports(include=["gateway"]):
     from gateway.config.loading import load
     from gateway.errors import CommandError, ConfigError, FrameError, ParametersError, ProtocolError
-    from gateway.messages.decode import decode, one_line, to_json
+    from gateway.messages.decode import decode, to_json
     from gateway.messages.splice import splice
     from gateway.messages.stamp import Stamp
+    from gateway.messages.summary import summarise
     from gateway.rtc3d.client_protocol import ClientProtocol, State
     from gateway.rtc3d.commands import SendParameters, StreamFrames, Version, parse_command
     from gateway.rtc3d.frames import byte_order_of, split_frame
@@ -55,7 +56,7 @@ def frames(data: bytes) -> None:
     for component in frame.components:
         message = splice(component, STAMP, 7)
         decoded = decode(message)
-        one_line(decoded)
+        summarise(decoded)
         to_json(decoded)
         assert len(component.items()) == component.num_items
 
@@ -109,7 +110,7 @@ def configuration(data: bytes) -> None:
 def messages(data: bytes) -> None:
     """Bytes from LCM or Zenoh are one of our messages, or refused."""
     with contextlib.suppress(ProtocolError):
-        one_line(decode(data))
+        summarise(decode(data))
 
 
 TARGETS: dict[str, Callable[[bytes], None]] = {

@@ -5,9 +5,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.errors import ProtocolError
-from gateway.messages.decode import decode, one_line, to_json
+from gateway.messages.decode import decode, to_json
 from gateway.messages.splice import splice
 from gateway.messages.stamp import Stamp
+from gateway.messages.summary import summarise
 from gateway.messages.tool_pose import tool_poses
 from gateway.outputs.status import OutputHealth, OutputStatus
 from gateway.publish.status_messages import clock_message, status_message
@@ -39,8 +40,8 @@ valid = st.sampled_from(
 
 
 @given(damaged(valid) | st.binary(max_size=100))
-def test_whatever_decodes_can_be_shown_and_nothing_else_than_protocol_errors_escapes(message: bytes) -> None:
+def test_damaged_messages_raise_only_protocol_errors_and_decoded_ones_can_be_shown(message: bytes) -> None:
     with contextlib.suppress(ProtocolError):
         decoded = decode(message)
-        assert one_line(decoded)
+        assert summarise(decoded)
         assert json.dumps(to_json(decoded), allow_nan=False)

@@ -72,7 +72,7 @@ def reply(error: str = "") -> bytes:
         (
             "MOCAP_LAB_PARAMETERS_REQUEST",
             request(),
-            "MOCAP_LAB_PARAMETERS_REQUEST request 7 of 'viewer': 3d 6d, fresh",
+            "MOCAP_LAB_PARAMETERS_REQUEST request 7 from 'viewer': 3d 6d, fresh",
         ),
         (
             "MOCAP_LAB_PARAMETERS_REPLY",
@@ -95,8 +95,8 @@ def test_a_line_summarises_a_message(name: str, message: bytes, line: str) -> No
     "message", [b"", b"12345678 of something else", b"[1]", b"[" * 100_000, b"{", b"\xff{"]
 )
 def test_a_message_of_another_program_is_printed_as_an_error(message: bytes) -> None:
-    assert "are no message of this gateway" in printed("mocap/lab/parameters", message)
-    assert "are no message" in json.loads(printed("mocap/lab/parameters", message, as_json=True))["error"]
+    assert "are not a message of this gateway" in printed("mocap/lab/parameters", message)
+    assert "are not a message" in json.loads(printed("mocap/lab/parameters", message, as_json=True))["error"]
 
 
 def test_json_has_xml_as_text() -> None:

@@ -9,7 +9,7 @@ from gateway.messages.splice import CONTENT_OFFSET, ITEMS_OFFSET, MESSAGE_TYPES,
 from gateway.messages.stamp import Stamp
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
-from tests.unit.messages.received import received
+from tests.unit.messages.samples import received
 from tests.vectors import (
     ANALOG,
     COMPONENTS,

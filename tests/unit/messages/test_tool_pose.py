@@ -10,7 +10,7 @@ from gateway.messages.stamp import Stamp
 from gateway.messages.tool_pose import metres_per_unit, tool_poses
 from gateway.rtc3d.components import Component
 from gateway.rtc3d.frames import split_frame
-from tests.unit.messages.received import received
+from tests.unit.messages.samples import received
 from tests.vectors import ALL_ONES, TOOLS, ByteOrder
 
 STAMP = Stamp(utime=1_700_000_000_000_001, capture_utime=1_700_000_000_000_000, session=3)

@@ -1,0 +1,127 @@
+"""Messages in one line of text, for people."""
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, Final
+
+import rtc3d
+
+from gateway.errors import ParametersError
+from gateway.rtc3d.parameters_xml import parse_parameters
+
+_MAX_SHOWN: Final = 4
+"""How many channels, plates or events a line shows."""
+
+
+def summarise(message: Any) -> str:
+    """Return a decoded LCM message in one line: what a person wants to see first."""
+    match message:
+        case rtc3d.status_t():
+            return _status(message)
+        case rtc3d.clock_t():
+            return f"#{message.sequence} {_clock(message.clock)} ({message.components})"
+        case rtc3d.parameters_t():
+            return f"#{message.sequence} session {message.session}: {summarise_xml(message.xml.encode())}"
+        case rtc3d.parameters_request_t():
+            sections = " ".join(message.sections) or "all"
+            fresh = ", fresh" if message.fresh else ""
+            return f"request {message.request_id} from {message.requester!r}: {sections}{fresh}"
+        case rtc3d.parameters_reply_t():
+            text = message.error or f"{summarise_xml(message.xml.encode())}, {message.age_s:.1f} s old"
+            return f"reply {message.request_id} to {message.requester!r}: {text}"
+    frame = f"#{message.sequence} frame {message.frame_number} at {message.timestamp / 1e6:.4f} s"
+    return f"{frame}: {_frame_content(message)}"
+
+
+def summarise_xml(xml: bytes) -> str:
+    """Return in a few words what a server's XML contains (§6)."""
+    size = f"{len(xml)} bytes of XML"
+    try:
+        parameters = parse_parameters(xml).parameters
+    except ParametersError:
+        return f"{size} that cannot be read as parameters"
+    sections = (
+        ("marker", parameters.markers, "markers"),
+        ("tool", parameters.tools, "tools"),
+        ("analog channel", parameters.analog, "channels"),
+        ("force plate", parameters.force, "plates"),
+        ("event", parameters.events, "events"),
+    )
+    texts = []
+    for name, section, items in sections:
+        if section is not None:
+            count = len(getattr(section, items))
+            texts.append(f"{count} {name}{'' if count == 1 else 's'}")
+    return f"{size}: {', '.join(texts) or 'no markers, tools, channels, plates or events'}"
+
+
+def _frame_content(message: Any) -> str:
+    match message:
+        case rtc3d.tool_pose_t(visible=False):
+            text = "out of view"
+        case rtc3d.tool_pose_t():
+            position, orientation = _vector(message.position_m), _vector(message.orientation_xyzw)
+            text = f"position {position} m, orientation xyzw {orientation}"
+        case rtc3d.markers_t():
+            text = f"{message.num_markers} markers, {_visibility(message.markers)}"
+        case rtc3d.tools_t():
+            text = f"{message.num_tools} tools, {_visibility(message.tools)}"
+        case rtc3d.analog_t():
+            text = f"{message.num_channels} channels, voltages {_first(message.voltages, _number, ', ')}"
+        case rtc3d.forces_t():
+            text = f"{message.num_plates} plates, forces {_first(message.plates, _force, '; ')}"
+        case _:
+            text = f"{message.num_events} events: {_first(message.events, _event, '; ')}"
+    return text
+
+
+def _visibility(items: Sequence[Any]) -> str:
+    visible = [(item.x, item.y, item.z) for item in items if not math.isnan(item.x)]
+    first = f", first visible at {_vector(visible[0])}" if visible else ""
+    return f"{len(items) - len(visible)} missing{first}"
+
+
+def _first(items: Sequence[Any], text: Callable[[Any], str], separator: str) -> str:
+    """Return the first _MAX_SHOWN items as text, and "…" for the others."""
+    texts = [text(item) for item in items[:_MAX_SHOWN]]
+    if len(items) > _MAX_SHOWN:
+        texts.append("…")
+    return separator.join(texts)
+
+
+def _force(plate: Any) -> str:
+    return _vector((plate.fx, plate.fy, plate.fz))
+
+
+def _event(event: Any) -> str:
+    return f"id {event.id:#x} ({event.param1}, {event.param2}, {event.param3})"
+
+
+def _vector(values: Sequence[float]) -> str:
+    return "(" + ", ".join(map(_number, values)) + ")"
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}"
+
+
+def _clock(clock: Any) -> str:
+    if not clock.has_clock:
+        return "the server's time stamps cannot be used as a clock"
+    return f"offset {clock.offset_us} µs, drift {clock.drift_ppm:.1f} ppm, ± {clock.uncertainty_us:.0f} µs"
+
+
+def _status(status: Any) -> str:
+    streams = "; ".join(map(_stream, status.streams))
+    outputs = "; ".join(
+        f"{output.name} {'ok' if output.connected else output.problem}" for output in status.outputs
+    )
+    return f"#{status.sequence} {status.source} at {status.server}: {streams}; outputs: {outputs}"
+
+
+def _stream(stream: Any) -> str:
+    error = f", last error: {stream.last_error}" if stream.last_error else ""
+    return (
+        f"[{stream.components}] {stream.state} {stream.frame_rate_hz:.1f} Hz, "
+        f"{stream.frames_in} frames, {stream.reconnects} reconnects{error}"
+    )

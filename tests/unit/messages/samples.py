@@ -1,0 +1,64 @@
+"""Components as the gateway receives them, and a message of every type."""
+
+from typing import Any
+
+import rtc3d
+
+from gateway.messages.splice import splice
+from gateway.messages.stamp import Stamp
+from gateway.messages.tool_pose import tool_poses
+from gateway.outputs.status import OutputHealth, OutputStatus
+from gateway.publish.status_messages import clock_message, status_message
+from gateway.rtc3d.components import Component
+from gateway.rtc3d.frames import split_frame
+from gateway.stream.status import StreamStatus
+from tests.vectors import TOOLS, ByteOrder, ComponentVector
+
+STAMP = Stamp(utime=2_000, capture_utime=1_000, session=3)
+
+
+def received(vector: ComponentVector, order: ByteOrder = "big") -> Component:
+    """Return the vector's component, split from a frame in this byte order."""
+    (component,) = split_frame((1).to_bytes(4, order) + vector.wire[order], order).components
+    return component
+
+
+def component_message(vector: ComponentVector) -> bytes:
+    """Return the message of the vector's component, number 41."""
+    return splice(received(vector), STAMP, 41)
+
+
+def tool_pose_messages() -> list[bytes]:
+    """Return the poses of a visible and a missing tool, numbers 41 and 42."""
+    return tool_poses(received(TOOLS), STAMP, [41, 42])
+
+
+def status_of(**stream: Any) -> bytes:
+    """Return a status message of one stream with these counters, and of two outputs."""
+    outputs = [
+        (OutputStatus("zenoh"), OutputHealth(True)),
+        (OutputStatus("lcm"), OutputHealth(False, "no multicast: ip route add")),
+    ]
+    streams = [(StreamStatus("3d 6d", **stream), 59.96)]
+    message = status_message(
+        source="lab", server="192.0.2.20:3020", sequence=17, streams=streams, outputs=outputs
+    )
+    return bytes(message.encode())
+
+
+def unknown_clock() -> bytes:
+    """Return the clock message of a server without a clock."""
+    encoded: bytes = clock_message(3, 17, StreamStatus("3d 6d")).encode()
+    return encoded
+
+
+def parameter_messages() -> list[bytes]:
+    """Return the parameters, a request and a reply, as on LCM."""
+    parameters, request, reply = (
+        rtc3d.parameters_t(),
+        rtc3d.parameters_request_t(),
+        rtc3d.parameters_reply_t(),
+    )
+    parameters.xml = reply.xml = "<RT_Parameters/>"
+    request.requester = reply.requester = "viewer"
+    return [parameters.encode(), request.encode(), reply.encode()]

@@ -1,0 +1,71 @@
+import pytest
+import rtc3d
+
+from gateway.messages.decode import decode
+from gateway.messages.summary import summarise
+from gateway.stream.state import StreamState
+from tests.unit.messages.samples import component_message, status_of, tool_pose_messages, unknown_clock
+from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS
+
+
+@pytest.mark.parametrize(
+    ("message", "line"),
+    [
+        (
+            component_message(MARKERS),
+            "#41 frame 16909060 at 4328.7194 s: 2 markers, 1 missing, first visible at (1, -2.5, 1000)",
+        ),
+        (
+            component_message(TOOLS),
+            "#41 frame 4 at 0.0075 s: 2 tools, 1 missing, first visible at (100, -200, 1600)",
+        ),
+        (component_message(ANALOG), "#41 frame 2 at 0.0025 s: 3 channels, voltages 0.1, -1.5e+04, 0"),
+        (component_message(FORCE), "#41 frame 3 at 0.0050 s: 2 plates, forces (1.5, -0.75, 800); (4, 5, 6)"),
+        (
+            component_message(LONG_EVENTS),
+            "#41 frame 6 at 0.0125 s: 2 events: id 0x123456 (7, 1, -1); id 0x2 (1065353216, -1, -1)",
+        ),
+        (
+            tool_pose_messages()[0],
+            "#41 frame 4 at 0.0075 s: position (0.1, -0.2, 1.6) m, orientation xyzw (-0.4, 0.4, 0.2, 0.8)",
+        ),
+        (tool_pose_messages()[1], "#42 frame 4 at 0.0075 s: out of view"),
+        (unknown_clock(), "#17 the server's time stamps cannot be used as a clock (3d 6d)"),
+        (
+            status_of(state=StreamState.STREAMING, frames_in=600, reconnects=1, last_error="gone"),
+            "#17 lab at 192.0.2.20:3020: "
+            "[3d 6d] streaming 60.0 Hz, 600 frames, 1 reconnects, last error: gone; "
+            "outputs: zenoh ok; lcm no multicast: ip route add",
+        ),
+        (
+            status_of(),
+            "#17 lab at 192.0.2.20:3020: [3d 6d] waiting to reconnect 60.0 Hz, 0 frames, 0 reconnects; "
+            "outputs: zenoh ok; lcm no multicast: ip route add",
+        ),
+    ],
+    ids=[
+        "markers",
+        "tools",
+        "analog",
+        "force",
+        "events",
+        "pose",
+        "pose out of view",
+        "clock",
+        "status while streaming",
+        "status while waiting",
+    ],
+)
+def test_a_summary_shows_what_matters_first(message: bytes, line: str) -> None:
+    assert summarise(decode(message)) == line
+
+
+def test_a_summary_without_visible_markers_has_no_position() -> None:
+    message = rtc3d.markers_t()
+    assert summarise(message).endswith("0 markers, 0 missing")
+
+
+def test_a_summary_shows_four_channels_at_most() -> None:
+    message = rtc3d.analog_t()
+    message.num_channels, message.voltages = 5, [1.0, 2.0, 3.0, 4.0, 5.0]
+    assert summarise(message).endswith("5 channels, voltages 1, 2, 3, 4, …")
