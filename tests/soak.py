@@ -1,9 +1,9 @@
-"""Random faults for a long time, and a report: what was sent, received and lost, and the memory.
+"""Run random faults for a long time, and report what was sent, received and lost, and the memory.
 
     make soak SOAK_MINUTES=30
 
-The gateway is a process of its own, so that its memory is its own; the simulator and a subscriber are
-here. Every round one fault is begun and ended again, then data must flow.
+The gateway is another process, so that its memory can be measured; the simulator and a subscriber are
+in this one. Each round begins and ends one fault; then data must flow again.
 """
 
 import argparse
@@ -40,11 +40,11 @@ BACKOFF_S: Final = 0.5
 STALL_S: Final = 1.0
 RECOVERY_LIMIT_S: Final = 30.0
 BEGIN, END = "<!-- soak: begin -->", "<!-- soak: end -->"
-"""What the report stands between in its file."""
+"""The lines around the report in its file."""
 
 
-class Heard:
-    """What the subscriber received; filled in Zenoh's thread."""
+class ReceivedMessages:
+    """Counts of the messages that the subscriber received; Zenoh's thread calls ``count``."""
 
     def __init__(self) -> None:
         self.received: Counter[str] = Counter()
@@ -54,15 +54,15 @@ class Heard:
         self.status: Any = None
         self._sequence: dict[str, int] = {}
 
-    def take(self, key: str, message: bytes) -> None:
+    def count(self, key: str, message: bytes) -> None:
         component = key.rsplit("/", 1)[-1]
         if component in COMPONENTS or component == "status":
             try:
                 decoded = decode(message)
-            except Exception:  # noqa: BLE001 - counted: a malformed message is what is looked for
+            except Exception:  # noqa: BLE001 - any error means a malformed message, which is counted
                 self.malformed += 1
                 return
-            # The first may have any number: the gateway does not wait for this subscriber.
+            # The first sequence can be any: the gateway does not wait for this subscriber.
             expected = self._sequence.get(component, decoded.sequence - 1) + 1
             if decoded.sequence < expected:
                 self.repeated += 1
@@ -80,13 +80,13 @@ class Soak:
         self.minutes = minutes
         self.seed = seed
         self.random = random.Random(seed)
-        self.heard = Heard()
+        self.messages = ReceivedMessages()
         self.rounds: list[tuple[str, float | None]] = []
         self.memory_kib: list[int] = []
         self.sent: Counter[str] = Counter()
 
     async def run(self, console: Console) -> None:
-        """Run for ``minutes``, with a line of progress every round."""
+        """Run for ``minutes`` and print a line after each round."""
         endpoint = f"tcp/127.0.0.1:{free_port()}"
         scene = SyntheticScene(
             markers=20, tools=3, analog=8, plates=1, rate_hz=RATE_HZ, analog_rate_hz=RATE_HZ
@@ -106,11 +106,11 @@ class Soak:
 
     async def _run(self, simulator: Simulator, pid: int, endpoint: str, console: Console) -> None:
         session = await _open(endpoint)
-        ZenohListener(session, key_pattern("mocap", "lab", None), self.heard.take)
+        ZenohListener(session, key_pattern("mocap", "lab", None), self.messages.count)
         faults = simulator.faults
         end_s = time.monotonic() + 60 * self.minutes
         try:
-            await wait_until_async(lambda: self.heard.received["3d"] > RATE_HZ, 20)
+            await wait_until_async(lambda: self.messages.received["3d"] > RATE_HZ, 20)
             self.memory_kib.append(_memory_kib(pid))
             while time.monotonic() < end_s:
                 await self._round(faults)
@@ -122,7 +122,7 @@ class Soak:
                 left_s = max(0.0, end_s - time.monotonic())
                 console.print(
                     f"{left_s:6.0f} s left, round {len(self.rounds):4}: {kind:24} {recovered}; "
-                    f"{self.heard.received['3d']} frames, {self.memory_kib[-1] / 1024:.1f} MiB"
+                    f"{self.messages.received['3d']} frames, {self.memory_kib[-1] / 1024:.1f} MiB"
                 )
             simulator.stop_measurement()
             await asyncio.sleep(2)
@@ -136,19 +136,19 @@ class Soak:
         faults.begin(KINDS[kind].model_validate({}))
         await asyncio.sleep(self.random.uniform(0.3, 3.0))
         await faults.clear()
-        before = self.heard.received["3d"]
-        well_s = time.monotonic()
+        before = self.messages.received["3d"]
+        cleared_s = time.monotonic()
         try:
-            # More than a handful: the last of the bad time may still be under way.
-            await wait_until_async(lambda: self.heard.received["3d"] > before + 20, RECOVERY_LIMIT_S)
+            # Frames sent during the fault may still be in transit.
+            await wait_until_async(lambda: self.messages.received["3d"] > before + 20, RECOVERY_LIMIT_S)
         except AssertionError:
             self.rounds.append((kind, None))
         else:
-            self.rounds.append((kind, time.monotonic() - well_s))
+            self.rounds.append((kind, time.monotonic() - cleared_s))
 
     def report(self) -> str:
         """Return the report for docs/reliability.md."""
-        heard, status = self.heard, self.heard.status
+        messages, status = self.messages, self.messages.status
         stream = status.streams[0]
         start_kib, end_kib = self.memory_kib[0], self.memory_kib[-1]
         lines = [
@@ -164,8 +164,8 @@ class Soak:
             f"| rounds | {len(self.rounds)} |",
             f"| rounds after which data did not flow again | {sum(r is None for _, r in self.rounds)} |",
             f"| reconnects | {stream.reconnects} |",
-            f"| messages that were malformed | {heard.malformed} |",
-            f"| messages published twice | {heard.repeated} |",
+            f"| messages that were malformed | {messages.malformed} |",
+            f"| messages published twice | {messages.repeated} |",
             f"| memory at the start, MiB | {start_kib / 1024:.1f} |",
             f"| memory at the end, MiB | {end_kib / 1024:.1f} |",
             f"| memory at most, MiB | {max(self.memory_kib) / 1024:.1f} |",
@@ -177,8 +177,8 @@ class Soak:
             "| component | sent | received | lost | gaps |",
             "|---|--:|--:|--:|--:|",
             *(
-                f"| {key} | {self.sent[key]} | {heard.received[key]} | "
-                f"{self.sent[key] - heard.received[key]} | {heard.gaps[key]} |"
+                f"| {key} | {self.sent[key]} | {messages.received[key]} | "
+                f"{self.sent[key] - messages.received[key]} | {messages.gaps[key]} |"
                 for key in COMPONENTS
             ),
             "",
@@ -231,7 +231,7 @@ async def _open(endpoint: str) -> Any:
     for _ in range(100):
         try:
             return await asyncio.to_thread(open_zenoh, endpoint)
-        except Exception:  # noqa: BLE001 - not there yet
+        except Exception:  # noqa: BLE001 - the gateway does not listen yet
             await asyncio.sleep(0.1)
     raise SystemExit(f"no gateway at {endpoint}")
 
@@ -247,7 +247,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--minutes", type=float, default=30)
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--report", type=Path, help="put the report into this file; else it is printed")
+    parser.add_argument("--report", type=Path, help="the file to put the report into; by default, print it")
     options = parser.parse_args()
     soak = Soak(options.minutes, options.seed)
     uvloop.run(soak.run(Console()))
@@ -259,7 +259,7 @@ def main() -> None:
     else:
         print(soak.report())
     if any(recovery_s is None for _, recovery_s in soak.rounds):
-        sys.exit("not every fault was recovered from")
+        sys.exit("after some faults, data did not flow again")
 
 
 if __name__ == "__main__":

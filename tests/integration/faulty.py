@@ -7,10 +7,7 @@ from gateway.rtc3d_server.client_connection import ClientConnection
 from gateway.simulator.simulator import Simulator
 from tests.integration.raw_client import RawClient, connected, consecutive, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import (
-    COMMAND,
-    command,
-)
+from tests.unit.rtc3d_server.wire import COMMAND, command
 
 FAST_HZ = 1000.0
 NEVER_MS = 600_000

@@ -1,4 +1,4 @@
-"""An RTC3D client made of nothing but a socket, and what it makes of frames."""
+"""An RTC3D client that is nothing but a socket, and helpers for its frames."""
 
 import asyncio
 import socket
@@ -8,19 +8,13 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Protocol
 
-from tests.unit.rtc3d_server.wire import (
-    DATA,
-    ByteOrder,
-    Part,
-    command,
-    frame_of,
-)
+from tests.unit.rtc3d_server.wire import DATA, ByteOrder, Part, command, frame_of
 
 TIMEOUT_S = 20.0
 
 
 class RawClient:
-    """A client made of nothing but a socket."""
+    """A client that is nothing but a socket."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader = reader
@@ -30,7 +24,7 @@ class RawClient:
         self.writer.write(b"".join(packets))
 
     async def read(self) -> tuple[int, bytes]:
-        """The next packet's type and body."""
+        """Return the next packet's type and body."""
         async with asyncio.timeout(TIMEOUT_S):
             size, packet_type = struct.unpack(">II", await self.reader.readexactly(8))
             return packet_type, await self.reader.readexactly(size - 8)
@@ -48,7 +42,7 @@ class RawClient:
         return frames
 
     async def reply(self) -> tuple[int, bytes]:
-        """The next packet that is no data frame; frames before it are thrown away."""
+        """Return the next packet that is no data frame; discard the frames before it."""
         async with asyncio.timeout(TIMEOUT_S):
             while (packet := await self.read())[0] == DATA:
                 pass
@@ -59,12 +53,12 @@ class RawClient:
             return await self.reader.readexactly(num_bytes)
 
     async def rest(self) -> bytes:
-        """What still comes until the server closes the connection."""
+        """Return all bytes until the server closes the connection."""
         async with asyncio.timeout(TIMEOUT_S):
             return await self.reader.read()
 
     def segments_received(self) -> int:
-        """How many TCP segments with data came; at least one for each send, as Nagle is off."""
+        """Return the number of TCP segments with data; at least one for each send, because Nagle is off."""
         data_segs_in = 152  # in struct tcp_info of linux/tcp.h
         info = self.writer.get_extra_info("socket").getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, 256)
         return int.from_bytes(info[data_segs_in : data_segs_in + 4], sys.byteorder)
@@ -85,7 +79,7 @@ async def connected(server: Listening) -> AsyncIterator[RawClient]:
 
 async def until(condition: Callable[[], bool]) -> None:
     async with asyncio.timeout(TIMEOUT_S):
-        while not condition():  # noqa: ASYNC110 - what is waited for here has no event
+        while not condition():  # noqa: ASYNC110 - the conditions have no event to wait for
             await asyncio.sleep(0.005)
 
 

@@ -23,7 +23,7 @@ from tests.waiting import wait_until_async
 
 _Result = TypeVar("_Result")
 
-LINGERING = 20  # frames of the bad time that may still be under way when it ends
+LINGERING = 20  # frames sent during a fault that may still be in transit when it ends
 
 
 def scene() -> SyntheticScene:
@@ -31,7 +31,7 @@ def scene() -> SyntheticScene:
 
 
 def assert_well_formed(lab: Running) -> None:
-    """Every message decodes, and none came twice: sequences grow by one without a gap."""
+    """Check that every message decodes and none came twice: sequences grow by one without a gap."""
     for component in ("3d", "6d", "analog", "force", "event"):
         messages = lab.messages(component)  # decodes each
         if messages:
@@ -47,7 +47,7 @@ def _more_reconnects(lab: Running, than: int) -> bool:
 
 
 async def flows_again(lab: Running) -> None:
-    """Wait for more frames than may have been under way; the limit is generous, CI is slow."""
+    """Wait for more frames than may have been in transit; the limit is generous because CI is slow."""
     before = lab.status.frames_in
     await wait_until_async(lambda: lab.status.frames_in > before + LINGERING, 20)
 
@@ -56,11 +56,11 @@ async def flows_again(lab: Running) -> None:
 async def test_after_each_fault_data_flows_again(kind: str) -> None:
     async with Simulator(scene(), port=free_port()) as simulator, gateway_to(simulator.port) as lab:
         await lab.heard("3d", 20)
-        run = simulator.faults.begin(KINDS[kind].model_validate({}))
-        # Long enough for the fault to bite: it happened, or the gateway noticed something.
+        fault = simulator.faults.begin(KINDS[kind].model_validate({}))
+        # Wait until the fault has an effect: it changed something, or the gateway noticed it.
         frames = simulator.frames_sent
         await wait_until_async(
-            lambda: run.times or lab.status.last_error or simulator.frames_sent > frames + 100, 10
+            lambda: fault.times or lab.status.last_error or simulator.frames_sent > frames + 100, 10
         )
         await simulator.faults.clear()
         await flows_again(lab)
@@ -68,7 +68,7 @@ async def test_after_each_fault_data_flows_again(kind: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("kind", "named"),
+    ("kind", "message"),
     [
         ("oversize", "packet size"),
         ("undersize", "packet size"),
@@ -78,16 +78,16 @@ async def test_after_each_fault_data_flows_again(kind: str) -> None:
         ("wrong_counts", "frame rejected"),
     ],
 )
-async def test_the_last_error_names_the_fault(kind: str, named: str) -> None:
+async def test_the_last_error_names_the_fault(kind: str, message: str) -> None:
     async with Simulator(scene(), port=free_port()) as simulator, gateway_to(simulator.port) as lab:
         await lab.heard("3d", 20)
         simulator.faults.begin(KINDS[kind].model_validate({}))
-        await wait_until_async(lambda: named in lab.status.last_error, 15)
+        await wait_until_async(lambda: message in lab.status.last_error, 15)
         await simulator.faults.clear()
         await flows_again(lab)
 
 
-async def test_a_proxy_that_cuts_in_the_middle_of_packets_loses_no_more_than_what_was_under_way() -> None:
+async def test_connections_cut_within_packets_lose_only_the_frames_in_transit() -> None:
     async with (
         Simulator(scene()) as simulator,
         FuzzingProxy(simulator.port) as proxy,
@@ -106,7 +106,7 @@ async def test_a_proxy_that_cuts_in_the_middle_of_packets_loses_no_more_than_wha
 class ManyFaults(RuleBasedStateMachine):
     """Faults of the server and of the network between it and the gateway, in any order, several at once.
 
-    The loop with simulator, proxy and gateway runs in a thread of its own; rules act in it.
+    The event loop of simulator, proxy and gateway has its own thread; the rules act in it.
     """
 
     def __init__(self) -> None:
@@ -127,16 +127,16 @@ class ManyFaults(RuleBasedStateMachine):
         await self.lab.heard("3d")
 
     @rule(kind=st.sampled_from(sorted(KINDS)))
-    def something_goes_wrong_with_the_server(self, kind: str) -> None:
+    def begin_a_fault_of_the_server(self, kind: str) -> None:
         async def begin() -> None:
             self.simulator.faults.begin(KINDS[kind].model_validate({}))
 
         self._in_loop(begin())
 
-    @rule(trouble=st.sampled_from(["cut", "cut_after", "stall", "corrupt", "split", "slow"]))
-    def something_goes_wrong_with_the_network(self, trouble: str) -> None:
+    @rule(fault=st.sampled_from(["cut", "cut_after", "stall", "corrupt", "split", "slow"]))
+    def begin_a_fault_of_the_network(self, fault: str) -> None:
         async def begin() -> None:
-            match trouble:
+            match fault:
                 case "cut":
                     self.proxy.cut(reset=True)
                 case "cut_after":
@@ -153,8 +153,8 @@ class ManyFaults(RuleBasedStateMachine):
         self._in_loop(begin())
 
     @rule(frames=st.integers(1, 60))
-    def time_passes(self, frames: int) -> None:
-        async def passes() -> None:
+    def wait_for_frames(self, frames: int) -> None:
+        async def wait() -> None:
             sent = self.simulator.frames_sent + self.lab.status.reconnects
             await wait_until_async(
                 lambda: (
@@ -164,20 +164,20 @@ class ManyFaults(RuleBasedStateMachine):
                 5,
             )
 
-        self._in_loop(passes())
+        self._in_loop(wait())
 
     @rule()
-    def all_is_well_again(self) -> None:
-        async def well() -> None:
+    def recover(self) -> None:
+        async def clear() -> None:
             self.proxy.clear()
             await self.simulator.faults.clear()
             await flows_again(self.lab)
 
-        self._in_loop(well())
+        self._in_loop(clear())
 
     def teardown(self) -> None:
         try:
-            self.all_is_well_again()
+            self.recover()
             self._in_loop(self._check())
         finally:
             self._in_loop(self._stack.aclose())

@@ -41,7 +41,7 @@ Received = dict[str, list[bytes]]
 
 
 class Lab:
-    """A simulator, a gateway, and what a subscriber on each side received, by component."""
+    """A simulator, a gateway, and the messages that a subscriber on each side received, by component."""
 
     def __init__(self, simulator: Simulator) -> None:
         self.simulator = simulator
@@ -54,7 +54,7 @@ class Lab:
 
 @asynccontextmanager
 async def lab(scene: Scene, *streams: StreamSettings) -> AsyncIterator[Lab]:
-    """Run all of it; the measurement begins once both subscribers hear the gateway."""
+    """Run simulator, gateway and subscribers; start the measurement once both subscribers receive."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     async with Simulator(scene) as simulator:
@@ -99,7 +99,7 @@ def take_path(name: str) -> Path:
 
 
 def expected_bits(path: Path) -> dict[str, Bits]:
-    """Return what ezc3d reads of a file, as float32 bits, shape (samples, items, values)."""
+    """Return the values that ezc3d reads from a file, as float32 bits, shape (samples, items, values)."""
     content = ezc3d.c3d(str(path), extract_forceplat_data=True)
     points = content["data"]["points"][:3].transpose(2, 1, 0).astype(np.float32)
     bits = points.view(np.uint32).reshape(points.shape).copy()
@@ -115,7 +115,7 @@ def expected_bits(path: Path) -> dict[str, Bits]:
 
 
 def assert_equal_to_file(messages: list[bytes], component: str, expected: Bits) -> None:
-    """Every value of every message is the file's; frames are numbered from 1 and the take loops."""
+    """Compare every value of every message with the file; frames are numbered from 1 and the take loops."""
     seen = set()
     for message in messages:
         number = int.from_bytes(message[36:40], "big", signed=True) - 1
@@ -131,7 +131,9 @@ def assert_equal_to_file(messages: list[bytes], component: str, expected: Bits) 
     ("name", "frames", "components"),
     [("qualisys.c3d", 340, ["3d", "analog", "force"]), ("optotrak.c3d", 29, ["3d"])],
 )
-async def test_every_value_that_arrives_is_the_files(name: str, frames: int, components: list[str]) -> None:
+async def test_every_value_that_arrives_is_the_one_in_the_file(
+    name: str, frames: int, components: list[str]
+) -> None:
     path = take_path(name)
     expected = expected_bits(path)
     async with lab(C3dScene(path), OTHERS, ANALOG) as running:
@@ -153,14 +155,14 @@ async def test_nothing_is_lost_in_ten_seconds_with_analog_at_2000_hz() -> None:
         sent = running.simulator.sent
         assert sent["3d"] >= 1990
 
-        def all_there() -> bool:
+        def all_received() -> bool:
             return all(
                 len(side[key]) >= count
                 for side in (running.zenoh, running.lcm)
                 for key, count in sent.items()
             )
 
-        await running.until(all_there)
+        await running.until(all_received)
     for side in (running.zenoh, running.lcm):
         for component, count in sent.items():
             sequences = [int.from_bytes(message[24:32], "big") for message in side[component]]

@@ -1,4 +1,4 @@
-"""The simulator as its clients see it: bytes packed here by hand, over TCP, read as they come."""
+"""The simulator from a client's side: packets made by hand, over TCP."""
 
 import asyncio
 import logging
@@ -40,7 +40,7 @@ FAST_HZ = 1000.0
 # The protocol -------------------------------------------------------------------------------
 
 
-async def test_a_client_that_does_all_in_the_order_of_the_specification() -> None:
+async def test_a_client_can_follow_the_order_of_the_specification() -> None:
     async with Simulator(SyntheticScene(rate_hz=FAST_HZ)) as simulator, connected(simulator) as client:
         assert await client.ask("Version 1.0\0") == (COMMAND, b"OK-Version 1.0")
         assert await client.ask("SetByteOrder BigEndian") == (COMMAND, b"OK-SetByteOrder BigEndian")
@@ -63,7 +63,7 @@ async def test_a_client_that_does_all_in_the_order_of_the_specification() -> Non
         assert cut(await client.rest())[-1] == (COMMAND, b"bye")
 
 
-async def test_ndis_client_asks_for_little_endian_first_and_for_events_in_the_current_frame() -> None:
+async def test_ndis_client_can_request_little_endian_first_and_events_in_the_current_frame() -> None:
     scene = CountingScene()
     async with Simulator(scene) as simulator, connected(simulator) as client:
         assert await client.ask("SetByteOrder LittleEndian") == (COMMAND, b"OK-SetByteOrder LittleEndian")
@@ -89,7 +89,7 @@ async def test_nothing_follows_bye() -> None:
 
 @pytest.mark.parametrize("ending", ["", "\0", "\n", "\r\n", " \n\0"])
 @pytest.mark.parametrize("words", ["streamframes allframes analog", "STREAMFRAMES ALLFRAMES ANALOG "])
-async def test_commands_end_in_anything_and_in_any_case(words: str, ending: str) -> None:
+async def test_commands_can_have_any_ending_and_any_case(words: str, ending: str) -> None:
     async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
         assert await client.ask(words + ending) == (COMMAND, f"OK-{words.strip()}".encode())
         frames = await client.frames(30)
@@ -97,7 +97,7 @@ async def test_commands_end_in_anything_and_in_any_case(words: str, ending: str)
         assert consecutive(frames)
 
 
-async def test_commands_come_in_pieces_and_in_bunches() -> None:
+async def test_commands_can_arrive_in_pieces_or_several_at_once() -> None:
     async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
         bunch = command("Version 1.0") + command("SetByteOrder LittleEndian") + command("Version 1.0")
         for byte in bunch:
@@ -125,7 +125,7 @@ async def test_commands_come_in_pieces_and_in_bunches() -> None:
         packet(77, b"?"),
     ],
 )
-async def test_what_is_refused_gets_an_error_packet_and_the_connection_lives_on(bad: bytes) -> None:
+async def test_invalid_packets_get_an_error_packet_and_the_connection_stays_open(bad: bytes) -> None:
     async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
         client.send(bad)
         packet_type, text = await client.read()
@@ -135,7 +135,7 @@ async def test_what_is_refused_gets_an_error_packet_and_the_connection_lives_on(
 
 
 @pytest.mark.parametrize("size", [0, 7, 64 * 1024 + 1, 0xFFFFFFFF])
-async def test_a_size_out_of_bounds_gets_an_error_packet_after_the_other_replies_and_the_end(
+async def test_a_size_out_of_bounds_gets_an_error_packet_and_ends_the_connection(
     size: int,
 ) -> None:
     async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
@@ -148,7 +148,7 @@ async def test_a_size_out_of_bounds_gets_an_error_packet_after_the_other_replies
         assert str(size).encode() in text
 
 
-async def test_a_recording_is_switched_on_without_a_reply() -> None:
+async def test_the_recording_packet_gets_no_reply() -> None:
     event = struct.pack(">IIIiqI", 1, 48, EVENT, -1, 0, 1) + struct.pack(">iqiii", 1, 0, -1, -1, -1)
     async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
         client.send(packet(DATA, event))
@@ -183,7 +183,7 @@ async def test_64_clients_get_every_frame() -> None:
     assert simulator.frames_sent >= 64 * 40
 
 
-async def test_a_client_that_does_not_read_delays_nobody_and_goes_on_when_it_reads(
+async def test_a_client_that_does_not_read_delays_no_other_and_continues_when_it_reads(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.WARNING)
@@ -214,7 +214,7 @@ async def test_a_client_that_does_not_read_delays_nobody_and_goes_on_when_it_rea
     assert caplog.text.count("does not read") == 1
 
 
-async def test_a_client_that_goes_away_in_mid_stream_is_forgotten() -> None:
+async def test_a_client_can_disconnect_while_it_streams() -> None:
     async with Simulator(CountingScene(FAST_HZ)) as simulator:
         async with connected(simulator) as client:
             await client.ask("StreamFrames")
@@ -229,7 +229,7 @@ async def test_a_client_that_goes_away_in_mid_stream_is_forgotten() -> None:
 # Statistics and life cycle ------------------------------------------------------------------
 
 
-async def test_what_was_sent_is_counted_for_each_client_and_in_all() -> None:
+async def test_sent_frames_are_counted_for_each_client_and_in_total() -> None:
     async with Simulator(CountingScene(FAST_HZ)) as simulator:
         received: Counter[str] = Counter()
         num_frames = 0
@@ -261,7 +261,7 @@ async def test_before_its_first_frame_a_clients_statistics_are_zero() -> None:
     assert (general.frames_sent, general.frames_per_s) == (0, 0.0)
 
 
-async def test_closing_takes_leave_of_the_clients_and_frees_the_port() -> None:
+async def test_closing_sends_no_data_and_frees_the_port() -> None:
     simulator = Simulator(CountingScene(FAST_HZ))
     await simulator.start()
     async with connected(simulator) as client:
@@ -286,7 +286,7 @@ async def test_closing_does_not_wait_for_a_client_that_does_not_read(
         await until(lambda: not simulator.connections)
 
 
-async def test_a_port_in_use_is_an_error_that_names_it() -> None:
+async def test_the_error_about_a_port_in_use_names_it() -> None:
     async with Simulator(CountingScene()) as simulator:
         with pytest.raises(GatewayError, match=f"127.0.0.1, port {simulator.port}: .*free"):
             await Simulator(CountingScene(), port=simulator.port).start()

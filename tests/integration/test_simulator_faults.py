@@ -1,4 +1,4 @@
-"""Faults of the server as a whole as a client sees them, and whom faults hit, when and how often."""
+"""Faults of the whole server from a client's side; which connections faults affect, when and how often."""
 
 import asyncio
 import contextlib
@@ -12,28 +12,15 @@ from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.simulator.faults.base import Fault
 from gateway.simulator.faults.kinds import KINDS
 from gateway.simulator.faults.momentary_faults import Garbage, Undersize
-from gateway.simulator.faults.reply_faults import (
-    MissingAcknowledgements,
-    ReplyText,
-)
+from gateway.simulator.faults.reply_faults import MissingAcknowledgements, ReplyText
 from gateway.simulator.faults.server_faults import ChangeScene, NoMeasurement, Restart
-from gateway.simulator.faults.stream_faults import (
-    Delay,
-    HalfOpen,
-)
+from gateway.simulator.faults.stream_faults import Delay, HalfOpen
 from gateway.simulator.scene_settings import SceneSettings
 from gateway.simulator.simulator import Simulator
 from tests.integration.faulty import FAST_HZ, NEVER_MS, VERSION, clear_and_check, only_connection, playing
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import (
-    COMMAND,
-    DATA,
-    MARKERS,
-    NO_DATA,
-    Part,
-    command,
-)
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, MARKERS, NO_DATA, Part, command
 
 # The server ---------------------------------------------------------------------------------
 
@@ -93,11 +80,11 @@ async def test_a_restarted_server_comes_back_by_itself_with_its_old_scene() -> N
 
 
 @pytest.mark.parametrize("rounds", range(6))
-async def test_a_connection_that_was_just_accepted_dies_with_the_server(rounds: int) -> None:
+async def test_a_connection_that_was_just_accepted_ends_when_the_server_crashes(rounds: int) -> None:
     async with Simulator(CountingScene()) as simulator:
         with socket.create_connection(("127.0.0.1", simulator.port)) as client:
             client.setblocking(False)
-            for _ in range(rounds):  # of the loop, between which the server accepts
+            for _ in range(rounds):  # turns of the loop, in one of which the server accepts
                 await asyncio.sleep(0)
             simulator.faults.begin(Restart(away_s=600))
             async with asyncio.timeout(TIMEOUT_S):
@@ -109,7 +96,7 @@ async def test_a_connection_that_was_just_accepted_dies_with_the_server(rounds: 
 async def test_a_server_that_is_about_to_come_back_can_be_restarted_again(rounds: int) -> None:
     async with playing() as (simulator, _):
         simulator.faults.end(simulator.faults.begin(Restart(away_s=600)))
-        for _ in range(rounds):  # of the loop, between which the server comes back
+        for _ in range(rounds):  # turns of the loop, in one of which the server comes back
             await asyncio.sleep(0)
         second = simulator.faults.begin(Restart(away_s=600))
         for _ in range(10):
@@ -119,7 +106,7 @@ async def test_a_server_that_is_about_to_come_back_can_be_restarted_again(rounds
         await until(lambda: simulator.is_listening)
 
 
-async def test_a_restarted_server_plays_its_recording_once_more() -> None:
+async def test_a_restarted_server_plays_its_recording_again() -> None:
     async with Simulator(CountingScene(FAST_HZ, num_frames=30), once=True) as simulator:
         for _ in range(2):
             async with connected(simulator) as client:
@@ -130,7 +117,7 @@ async def test_a_restarted_server_plays_its_recording_once_more() -> None:
             await until(lambda: simulator.is_listening)
 
 
-async def test_no_measurement_runs_after_a_restart_while_another_fault_says_so() -> None:
+async def test_no_measurement_runs_after_a_restart_while_another_fault_prevents_it() -> None:
     async with playing() as (simulator, _):
         no_measurement = simulator.faults.begin(NoMeasurement())
         restart = simulator.faults.begin(Restart(away_s=600))
@@ -176,7 +163,7 @@ async def frames_up_to(client: RawClient, num_markers: int) -> list[list[Part]]:
     return frames
 
 
-async def test_the_scene_changes_in_mid_stream_and_back() -> None:
+async def test_the_scene_changes_during_a_stream_and_back() -> None:
     async with playing() as (simulator, client):
         await client.ask("StreamFrames 3D")
         frames = await client.frames(5)
@@ -192,7 +179,7 @@ async def test_the_scene_changes_in_mid_stream_and_back() -> None:
         await clear_and_check(simulator, client)
 
 
-async def test_a_scene_keeps_what_does_not_change_of_the_scenarios() -> None:
+async def test_a_changed_scene_keeps_the_scenarios_other_settings() -> None:
     async with playing() as (simulator, _):
         simulator.faults.play([], scene=SceneSettings(markers=3, tools=1, rate_hz=50))
         simulator.faults.begin(ChangeScene(scene=SceneSettings(markers=7)))
@@ -201,10 +188,10 @@ async def test_a_scene_keeps_what_does_not_change_of_the_scenarios() -> None:
         assert len(simulator.scene.parameters.tools.tools) == 1
 
 
-# Whom, when and how often -------------------------------------------------------------------
+# Which connections, when and how often ------------------------------------------------------
 
 
-async def test_the_faults_that_are_on_stand_in_the_order_in_which_they_act() -> None:
+async def test_active_faults_are_listed_in_the_order_in_which_they_act() -> None:
     async with playing() as (simulator, _):
         delay = simulator.faults.begin(Delay())
         simulator.faults.begin(ReplyText())
@@ -217,7 +204,7 @@ async def test_the_faults_that_are_on_stand_in_the_order_in_which_they_act() -> 
         assert simulator.faults.active == []
 
 
-async def test_a_fault_can_be_one_connections_alone() -> None:
+async def test_a_fault_can_affect_one_connection_only() -> None:
     async with playing() as (simulator, first), connected(simulator) as second:
         await until(lambda: len(simulator.connections) == 2)
         simulator.faults.begin(ReplyText(form="echo", connection=2))
@@ -230,14 +217,14 @@ async def test_a_fault_can_be_one_connections_alone() -> None:
             assert await third.ask("Version 1.0") == VERSION
 
 
-async def test_a_connection_that_comes_later_has_the_fault_too() -> None:
+async def test_a_fault_affects_later_connections_too() -> None:
     async with playing() as (simulator, _):
         simulator.faults.begin(ReplyText(form="echo"))
         async with connected(simulator) as second:
             assert await second.ask("Version 1.0") == (COMMAND, b"Version 1.0")
 
 
-async def test_a_fault_ends_when_its_time_is_over(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_fault_ends_after_its_duration(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "gateway.simulator")
     async with playing() as (simulator, client):
         fault = simulator.faults.begin(MissingAcknowledgements(for_s=0.01))
@@ -250,7 +237,7 @@ async def test_a_fault_ends_when_its_time_is_over(caplog: pytest.LogCaptureFixtu
     ]
 
 
-async def test_planned_faults_come_as_often_as_they_may(caplog: pytest.LogCaptureFixture) -> None:
+async def test_planned_faults_happen_as_often_as_times_allows(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "gateway.simulator")
     async with playing() as (simulator, client):
         simulator.faults.play(
@@ -282,7 +269,7 @@ async def test_a_repeated_fault_begins_again_after_its_end(caplog: pytest.LogCap
 @pytest.mark.parametrize(
     "fault", [Restart(away_s=600), HalfOpen(), Delay(delay_ms=NEVER_MS), NoMeasurement()]
 )
-async def test_a_simulator_closes_whatever_is_wrong_with_it(fault: Fault) -> None:
+async def test_a_simulator_closes_during_any_fault(fault: Fault) -> None:
     async with playing() as (simulator, client):
         client.send(command("StreamFrames 3D"))
         await client.read()
@@ -296,7 +283,7 @@ async def test_a_simulator_closes_whatever_is_wrong_with_it(fault: Fault) -> Non
 
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS.keys())
-async def test_the_server_is_well_after_any_fault_and_all_of_them_before(kind: type[Fault]) -> None:
+async def test_the_server_recovers_from_any_fault_among_all_others(kind: type[Fault]) -> None:
     async with playing() as (simulator, client):
         await client.ask("StreamFrames")
         simulator.faults.begin(kind())

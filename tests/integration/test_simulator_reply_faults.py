@@ -1,4 +1,4 @@
-"""Faults of replies and data frames as a client sees them; then the server is well again."""
+"""Faults of replies and data frames from a client's side; afterwards the server works again."""
 
 import math
 import struct
@@ -58,7 +58,7 @@ async def test_a_refused_command_gets_an_error_packet_and_is_not_obeyed() -> Non
         await clear_and_check(simulator, client)
 
 
-async def test_a_minimal_server_streams_all_the_same() -> None:
+async def test_a_minimal_server_streams() -> None:
     async with playing() as (simulator, client):
         simulator.faults.begin(MinimalServer())
         for text in ("Version 1.0", "SendParameters", "StreamFrames AllFrames", "StreamFrames 3D"):
@@ -106,7 +106,7 @@ async def test_late_acknowledgements_are_overtaken_by_everything() -> None:
         await clear_and_check(simulator, client)
 
 
-async def test_late_acknowledgements_come_by_themselves() -> None:
+async def test_late_acknowledgements_are_sent_after_their_delay() -> None:
     async with playing() as (simulator, client):
         simulator.faults.begin(LateAcknowledgements(delay_ms=1))
         assert await client.ask("Version 1.0") == VERSION
@@ -139,7 +139,7 @@ async def test_without_frames_no_data_comes_before_the_acknowledgement() -> None
         (ReplyText(form="ok-verb"), b"ok-version"),
     ],
 )
-async def test_replies_can_be_worded_otherwise(fault: Fault, text: bytes) -> None:
+async def test_replies_can_have_another_text(fault: Fault, text: bytes) -> None:
     async with playing() as (simulator, client):
         simulator.faults.begin(fault)
         assert await client.ask("Version 1.0") == (COMMAND, text)
@@ -159,8 +159,8 @@ async def frames_with(simulator: Simulator, client: RawClient, fault: Fault, ask
     await client.ask(f"StreamFrames {asked}")
     await client.frames(5)
     simulator.faults.begin(fault)
-    only_before = simulator.frames_sent - 5
-    await client.frames(only_before)
+    num_before = simulator.frames_sent - 5
+    await client.frames(num_before)
     return await client.frames(20)
 
 
@@ -173,7 +173,7 @@ async def test_markers_and_tools_can_be_out_of_view() -> None:
         await clear_and_check(simulator, client)
 
 
-async def test_time_stamps_can_stand_still() -> None:
+async def test_time_stamps_can_freeze() -> None:
     async with playing() as (simulator, client):
         frames = await frames_with(simulator, client, FrozenTimestamps(), "3D")
         [(frozen, _)] = simulator.faults.active_on(only_connection(simulator).number)
@@ -190,7 +190,7 @@ async def test_time_stamps_can_jump() -> None:
         await clear_and_check(simulator, client)
 
 
-async def test_frame_numbers_can_stand_still() -> None:
+async def test_frame_numbers_can_be_constant() -> None:
     async with playing() as (simulator, client):
         frames = await frames_with(simulator, client, ConstantFrameNumbers(frame_number=5), "3D")
         assert {part.frame_number for [part] in frames} == {5}
@@ -223,7 +223,7 @@ async def test_a_byte_order_can_be_acknowledged_and_ignored() -> None:
         assert consecutive(await client.frames(10, "little"))
 
 
-async def test_a_component_of_unknown_type_comes_along() -> None:
+async def test_frames_can_have_a_component_of_unknown_type() -> None:
     async with playing() as (simulator, client):
         simulator.faults.begin(UnknownComponent(component_type=1234))
         await client.ask("StreamFrames 3D")
@@ -234,7 +234,7 @@ async def test_a_component_of_unknown_type_comes_along() -> None:
         await clear_and_check(simulator, client)
 
 
-async def test_as_many_frames_contradict_themselves_as_asked_for() -> None:
+async def test_wrong_counts_affect_as_many_frames_as_times_says() -> None:
     async with playing() as (simulator, client):
         simulator.faults.begin(WrongCounts(times=3))
         await client.ask("StreamFrames 3D")

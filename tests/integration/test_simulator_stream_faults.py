@@ -1,4 +1,4 @@
-"""Faults of the byte stream as a client sees them; then the server is well again."""
+"""Faults of the byte stream from a client's side; afterwards the server works again."""
 
 import struct
 
@@ -8,17 +8,8 @@ import pytest
 from gateway.rtc3d_server.client_connection import ClientConnection
 from gateway.simulator.faults.base import Fault
 from gateway.simulator.faults.momentary_faults import Cut, Garbage, Oversize, Undersize
-from gateway.simulator.faults.reply_faults import (
-    LateAcknowledgements,
-)
-from gateway.simulator.faults.stream_faults import (
-    Delay,
-    HalfOpen,
-    Jitter,
-    Merge,
-    SlowReader,
-    Split,
-)
+from gateway.simulator.faults.reply_faults import LateAcknowledgements
+from gateway.simulator.faults.stream_faults import Delay, HalfOpen, Jitter, Merge, SlowReader, Split
 from gateway.simulator.faults.write_queue import MAX_WAITING_BYTES
 from gateway.simulator.simulator import Simulator
 from tests.integration.faulty import (
@@ -32,18 +23,10 @@ from tests.integration.faulty import (
 )
 from tests.integration.raw_client import connected, consecutive, numbers, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import (
-    COMMAND,
-    DATA,
-    ERROR,
-    XML,
-    command,
-    cut,
-    frame_of,
-)
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, XML, command, cut, frame_of
 
 
-async def test_what_is_delayed_waits_and_keeps_its_order() -> None:
+async def test_delayed_packets_keep_their_order() -> None:
     async with playing() as (simulator, client):
         simulator.faults.begin(Delay(delay_ms=NEVER_MS))
         client.send(command("Version 1.0"), command("Fly"), command("StreamFrames 3D"))
@@ -70,7 +53,7 @@ async def test_a_short_delay_loses_nothing() -> None:
         await until(lambda: waiting_bytes(simulator) == 0)
 
 
-async def test_jitter_split_and_merge_together_lose_and_swap_nothing() -> None:
+async def test_jitter_split_and_merge_together_keep_all_packets_in_order() -> None:
     async with playing() as (simulator, client):
         faults = (Jitter(mean_ms=3), Split(pieces=5, pause_ms=0.1), Merge(window_ms=4), Delay(delay_ms=1))
         active_faults = [simulator.faults.begin(fault) for fault in faults]
@@ -101,7 +84,7 @@ async def test_merged_packets_come_in_one_segment() -> None:
         await clear_and_check(simulator, client)
 
 
-async def test_a_cut_comes_within_a_packet() -> None:
+async def test_a_cut_ends_a_connection_within_a_packet() -> None:
     async with playing() as (simulator, client):
         await client.ask("StreamFrames 3D")
         simulator.faults.begin(Cut())
@@ -120,7 +103,7 @@ async def test_a_cut_can_be_a_reset() -> None:
             await client.rest()
 
 
-async def test_a_half_open_server_says_and_hears_nothing_and_lets_clients_connect() -> None:
+async def test_a_half_open_server_accepts_clients_but_neither_reads_nor_writes() -> None:
     async with playing() as (simulator, client):
         await client.ask("StreamFrames 3D")
         frames = await client.frames(5)
@@ -151,7 +134,7 @@ def connection_with(simulator: Simulator, number: int) -> ClientConnection:
     return connection
 
 
-async def test_a_slow_reader_answers_late_and_streams_on() -> None:
+async def test_a_slow_reader_replies_late_and_continues_to_stream() -> None:
     async with playing() as (simulator, client):
         await client.ask("StreamFrames 3D")
         simulator.faults.begin(SlowReader(bytes_per_s=0.1))
@@ -165,14 +148,14 @@ async def test_a_slow_reader_answers_late_and_streams_on() -> None:
         await clear_and_check(simulator, client)
 
 
-async def test_a_slow_reader_reads_in_the_end() -> None:
+async def test_a_slow_reader_reads_all_commands() -> None:
     async with playing() as (simulator, client):
         simulator.faults.begin(SlowReader(bytes_per_s=2000))
         for _ in range(3):
             assert await client.ask("Version 1.0") == VERSION
 
 
-async def test_garbage_comes_between_two_packets_and_is_the_same_for_the_same_seed() -> None:
+async def test_garbage_is_sent_between_two_packets_and_is_the_same_for_the_same_seed() -> None:
     heard = []
     for seed in (1, 1, 2):
         async with playing() as (simulator, client):
@@ -194,14 +177,14 @@ async def test_garbage_comes_between_two_packets_and_is_the_same_for_the_same_se
         (Undersize(size_bytes=7), 7),
     ],
 )
-async def test_a_header_can_announce_a_size_that_is_wrong(fault: Fault, size: int) -> None:
+async def test_a_header_can_announce_a_wrong_size(fault: Fault, size: int) -> None:
     async with playing() as (simulator, client):
         simulator.faults.begin(fault)
         assert await client.exactly(8) == struct.pack(">II", size, DATA)
         await clear_and_check(simulator, client)
 
 
-async def test_what_is_injected_waits_behind_what_is_late() -> None:
+async def test_unexpected_bytes_are_sent_after_delayed_packets() -> None:
     async with playing() as (simulator, client):
         simulator.faults.begin(Delay(delay_ms=NEVER_MS))
         client.send(command("Version 1.0"))
@@ -212,7 +195,7 @@ async def test_what_is_injected_waits_behind_what_is_late() -> None:
         assert await client.exactly(8) == struct.pack(">II", 3, DATA)
 
 
-async def test_what_waits_has_a_limit(caplog: pytest.LogCaptureFixture) -> None:
+async def test_the_number_of_waiting_bytes_is_limited(caplog: pytest.LogCaptureFixture) -> None:
     scene = CountingScene(FAST_HZ, num_markers=5000)
     async with Simulator(scene) as simulator, connected(simulator) as client:
         simulator.faults.begin(Delay(delay_ms=NEVER_MS))
@@ -224,7 +207,7 @@ async def test_what_waits_has_a_limit(caplog: pytest.LogCaptureFixture) -> None:
         assert caplog.text.count("dropping packets") == 1
 
 
-async def test_a_goodbye_is_answered_before_the_connection_ends_however_late_all_is() -> None:
+async def test_bye_is_answered_before_the_connection_ends_despite_any_delay() -> None:
     async with playing() as (simulator, client):
         simulator.faults.begin(Delay(delay_ms=NEVER_MS))
         simulator.faults.begin(LateAcknowledgements(delay_ms=NEVER_MS))

@@ -1,4 +1,4 @@
-"""What the simulator streams, checked by frame numbers and values and never by the clock."""
+"""The simulator's streams, checked by frame numbers and values, never by the clock."""
 
 import asyncio
 import os
@@ -47,7 +47,7 @@ FAST_HZ = 1000.0
         ("StreamFrames Frequency:250 Analog", [40] * 59),
     ],
 )
-async def test_the_rate_asked_for_is_the_rate_sent(sent: str, gaps: list[int]) -> None:
+async def test_frames_are_sent_at_the_requested_rate(sent: str, gaps: list[int]) -> None:
     async with Simulator(CountingScene(FAST_HZ)) as simulator, connected(simulator) as client:
         await client.ask(sent)
         frames = await client.frames(60)
@@ -67,7 +67,7 @@ async def test_time_stamps_are_those_of_the_measurement_and_equal_within_a_frame
                 assert part.items[0][0] == part.frame_number - 1
 
 
-async def test_clients_have_rates_and_byte_orders_of_their_own() -> None:
+async def test_each_client_has_its_own_rate_and_byte_order() -> None:
     async with (
         Simulator(CountingScene(FAST_HZ)) as simulator,
         connected(simulator) as big,
@@ -121,7 +121,7 @@ async def test_the_end_and_the_start_of_a_measurement_reach_a_streaming_client()
         assert numbers(await client.frames(5)) == [1, 2, 3, 4, 5]
 
 
-async def test_without_a_measurement_there_is_no_data_and_everything_else_works() -> None:
+async def test_without_a_measurement_clients_get_no_data_and_everything_else_works() -> None:
     async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
         simulator.stop_measurement()
 
@@ -147,7 +147,7 @@ async def test_each_current_frame_is_newer_than_the_one_before() -> None:
     assert np.all(np.diff(numbers(frames)) >= 1)
 
 
-async def test_a_waiting_current_frame_ends_with_the_measurement() -> None:
+async def test_a_pending_request_for_the_current_frame_ends_with_the_measurement() -> None:
     async with Simulator(CountingScene(rate_hz=0.001)) as simulator, connected(simulator) as client:
         await client.ask("SendCurrentFrame 3D")
         assert numbers(await client.frames(1)) == [1]
@@ -172,7 +172,7 @@ async def test_once_plays_the_scene_from_the_first_request_to_its_end() -> None:
 
 
 async def played_once(scene: Scene, components: str) -> dict[int, list[Part]]:
-    """All that one pass of the scene sends, by component type."""
+    """Return all components that one pass of the scene sends, by component type."""
     parts: dict[int, list[Part]] = {}
     async with Simulator(scene, once=True) as simulator, connected(simulator) as client:
         await client.ask(f"StreamFrames {components}")

@@ -3,67 +3,17 @@
 # ruff: noqa: ARG002 - hooks: not every kind needs every argument
 
 import asyncio
-from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, Protocol, Self
+from collections.abc import Callable
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from pydantic import model_validator
 
 from gateway.config.section import Section, validation_error
 from gateway.rtc3d.packets import Packet
+from gateway.simulator.faults.faulty_server import FaultyConnection, FaultyServer
 from gateway.simulator.faults.outgoing import PendingWrite, Reply
 from gateway.simulator.faults.parameters import Count, Interval, Seconds, parameter_text
-from gateway.simulator.scene_settings import SceneSettings
-
-
-class FaultyConnection(Protocol):
-    """What a momentary fault may do to a connection."""
-
-    @property
-    def number(self) -> int:
-        """Counts the connections since the server's start, from 1."""
-        ...
-
-    def send_unchanged(self, data: bytes) -> None:
-        """Send bytes that no fault changes, after everything that waits."""
-        ...
-
-    def disconnect(self, last_data: bytes, *, reset: bool) -> None:
-        """Write ``last_data`` before everything that waits, and end the connection by FIN or by RST."""
-        ...
-
-
-class FaultyServer(Protocol):
-    """What a fault may do to the server."""
-
-    @property
-    def connections(self) -> Sequence[FaultyConnection]:
-        """The clients' connections."""
-        ...
-
-    def elapsed_us(self) -> int | None:
-        """Return the measurement's time in µs; None while no measurement runs."""
-        ...
-
-    def stop_measurement(self) -> None:
-        """Stop the measurement, if one runs."""
-        ...
-
-    def start_measurement(self) -> None:
-        """Start a measurement, unless another fault prevents it."""
-        ...
-
-    def change_scene(self, changes: SceneSettings) -> Callable[[], None]:
-        """Serve the scenario's scene with changes; return a function that restores the scene before."""
-        ...
-
-    def crash(self) -> None:
-        """End as if the process died."""
-        ...
-
-    def restart(self) -> None:
-        """Listen again after a crash, unless another fault prevents it."""
-        ...
 
 
 class ActiveFault:

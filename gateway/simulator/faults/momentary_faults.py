@@ -6,7 +6,8 @@ from pydantic import Field
 
 from gateway.config.section import expects
 from gateway.rtc3d.packets import HEADER, PacketType
-from gateway.simulator.faults.base import ActiveFault, FaultyConnection, MomentaryFault
+from gateway.simulator.faults.base import ActiveFault, MomentaryFault
+from gateway.simulator.faults.faulty_server import FaultyConnection
 
 NumBytes = Annotated[int, Field(strict=True, ge=1, le=1_000_000), expects("a whole number from 1 to 1000000")]
 TooLarge = Annotated[

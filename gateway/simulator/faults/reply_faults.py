@@ -57,7 +57,7 @@ class RefusedCommands(LastingConnectionFault):
 
 
 class MinimalServer(LastingConnectionFault):
-    """The server refuses all but StreamFrames [FrequencyDivisor:n or Stop] and SendCurrentFrame.
+    """The server accepts only SendCurrentFrame alone and StreamFrames alone, with Stop or FrequencyDivisor:n.
 
     Field note 2.
     """

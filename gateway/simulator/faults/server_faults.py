@@ -9,7 +9,7 @@ from gateway.simulator.scene_settings import SceneSettings
 
 
 class NoMeasurement(LastingFault):
-    """The measurement stops; when the fault ends, another one starts."""
+    """The measurement stops; when the fault ends, a new one starts."""
 
     kind: ClassVar[str] = "no_measurement"
 

@@ -1,4 +1,4 @@
-"""A scene whose values tell where they come from."""
+"""A scene whose values are the numbers of their samples."""
 
 import numpy as np
 

@@ -38,7 +38,7 @@ def test_a_command_is_acknowledged_as_it_was_sent(
 
 
 @pytest.mark.parametrize(
-    ("sent", "told"),
+    ("sent", "message"),
     [
         (b"Version 2.0", b"Version 2.0 is not supported; this server speaks version 1.0"),
         (b"Version", b"Version takes one parameter n.n, as in: Version 1.0"),
@@ -47,18 +47,20 @@ def test_a_command_is_acknowledged_as_it_was_sent(
         (b"Bye now", b"Bye takes no parameter"),
     ],
 )
-def test_a_bad_command_gets_an_error_that_says_why(client: ScriptedClient, sent: bytes, told: bytes) -> None:
+def test_a_bad_command_gets_an_error_that_says_why(
+    client: ScriptedClient, sent: bytes, message: bytes
+) -> None:
     [(packet_type, text)] = client.send(sent)
 
     assert packet_type == ERROR
-    assert text.startswith(b"Error-" + told)
+    assert text.startswith(b"Error-" + message)
 
 
 @pytest.mark.parametrize(
     "sent",
     [b"Play", b"StreamFrames Sometimes", b"StreamFrames Frequency:0", b"SendParameters 4D", b"\xff\xfe"],
 )
-def test_what_is_no_command_gets_an_error_in_ascii(client: ScriptedClient, sent: bytes) -> None:
+def test_unknown_commands_get_an_error_in_ascii(client: ScriptedClient, sent: bytes) -> None:
     [(packet_type, text)] = client.send(sent)
 
     assert packet_type == ERROR
@@ -83,7 +85,7 @@ def test_packets_that_only_servers_send_get_an_error(client: ScriptedClient, pac
     )
 
 
-def test_bye_is_answered_as_ndis_client_expects(client: ScriptedClient) -> None:
+def test_bye_gets_the_reply_that_ndis_client_expects(client: ScriptedClient) -> None:
     assert client.send("BYE\0") == [(COMMAND, b"bye")]
     assert client.session.said_bye
 
@@ -107,7 +109,7 @@ START_LITTLE = bytes.fromhex(
     ],
     ids=["big", "little"],
 )
-def test_wavefronts_recording_control_is_taken_without_a_reply(
+def test_wavefronts_recording_control_gets_no_reply(
     client: ScriptedClient, start: bytes, stop: bytes
 ) -> None:
     assert client.send(start, DATA) == []
@@ -136,7 +138,7 @@ def test_other_data_frames_from_a_client_get_an_error(client: ScriptedClient, bo
     assert not client.session.is_recording
 
 
-def test_parameters_come_as_xml_with_the_sections_asked_for(client: ScriptedClient) -> None:
+def test_the_reply_to_send_parameters_is_xml_with_the_requested_sections(client: ScriptedClient) -> None:
     [(packet_type, xml)] = client.send("SendParameters 3d General")
 
     parameters = parse_parameters(xml).parameters
@@ -148,7 +150,7 @@ def test_parameters_come_as_xml_with_the_sections_asked_for(client: ScriptedClie
 
 
 @pytest.mark.parametrize("sent", ["SendParameters", "SendParameters All\0"])
-def test_parameters_are_all_sent_by_default(client: ScriptedClient, sent: str) -> None:
+def test_all_sections_are_sent_by_default(client: ScriptedClient, sent: str) -> None:
     [(_, xml)] = client.send(sent)
 
     parameters = parse_parameters(xml).parameters

@@ -31,7 +31,7 @@ def test_a_stream_has_all_components_in_every_frame_by_default(client: ScriptedC
     assert [frame[2].timestamp_us for frame in frames] == list(range(0, 70_000, 10_000))
 
 
-def test_a_stream_of_a_fast_component_alone_has_its_rate(client: ScriptedClient) -> None:
+def test_a_stream_of_one_fast_component_has_its_rate(client: ScriptedClient) -> None:
     client.send("StreamFrames Analog")
 
     assert client.numbers_until(99_999) == list(range(1, 101))
@@ -43,7 +43,7 @@ def test_a_divisor_sends_every_nth_frame(client: ScriptedClient) -> None:
     assert client.numbers_until(200_000) == [1, 5, 9, 13, 17, 21]
 
 
-def test_60_of_100_hz_is_every_other_frame_and_now_and_then_two_in_a_row(client: ScriptedClient) -> None:
+def test_at_60_of_100_hz_mostly_every_other_frame_is_sent(client: ScriptedClient) -> None:
     client.send("StreamFrames Frequency:60 3D")
 
     numbers = client.numbers_until(SECOND_US - 1)
@@ -53,7 +53,9 @@ def test_60_of_100_hz_is_every_other_frame_and_now_and_then_two_in_a_row(client:
 
 
 @pytest.mark.parametrize("frequency", ["100", "100.5", "2000"])
-def test_no_frequency_is_above_that_of_the_slowest_component(client: ScriptedClient, frequency: str) -> None:
+def test_a_frequency_is_limited_to_the_rate_of_the_slowest_component(
+    client: ScriptedClient, frequency: str
+) -> None:
     client.send(f"StreamFrames Frequency:{frequency} 3D Analog")
 
     assert client.numbers_until(50_000) == [1, 2, 3, 4, 5, 6]
@@ -90,7 +92,7 @@ def test_a_new_stream_replaces_the_old_one(client: ScriptedClient) -> None:
     assert [(part.type, part.frame_number) for frame in frames for part in frame] == [(TOOLS, 4), (TOOLS, 6)]
 
 
-def test_stop_ends_the_stream_for_this_and_further_measurements(client: ScriptedClient) -> None:
+def test_stop_ends_the_stream_for_later_measurements_too(client: ScriptedClient) -> None:
     client.send("StreamFrames")
     client.send("StreamFrames Stop")
 
@@ -100,7 +102,7 @@ def test_stop_ends_the_stream_for_this_and_further_measurements(client: Scripted
     assert client.session.due_us is None
 
 
-def test_each_frame_has_the_byte_order_of_its_moment(client: ScriptedClient) -> None:
+def test_a_new_byte_order_applies_from_the_next_frame_on(client: ScriptedClient) -> None:
     client.send("StreamFrames 3D")
     big = client.frames_until(0)
     client.send("SetByteOrder LittleEndian")
@@ -109,13 +111,13 @@ def test_each_frame_has_the_byte_order_of_its_moment(client: ScriptedClient) -> 
     assert [frame[0].items[0][0] for frame in big + little] == [0, 1]
 
 
-def test_a_stream_of_what_the_scene_lacks_is_silent(client: ScriptedClient) -> None:
+def test_a_stream_of_components_that_the_scene_lacks_has_no_frames(client: ScriptedClient) -> None:
     client.send("StreamFrames Force")
 
     assert client.frames_until(50_000) == []
 
 
-def test_late_frames_are_caught_up_with_for_a_second_and_then_dropped(client: ScriptedClient) -> None:
+def test_frames_more_than_a_second_late_are_dropped(client: ScriptedClient) -> None:
     client.send("StreamFrames 3D Events")
 
     frames = client.frames_until(10 * SECOND_US)
@@ -156,7 +158,7 @@ def test_every_event_is_sent_once_with_the_next_frame(
     assert all(part.items for part in events)
 
 
-def test_events_before_the_stream_was_asked_for_are_not_sent(client: ScriptedClient) -> None:
+def test_events_before_the_request_are_not_sent(client: ScriptedClient) -> None:
     client.elapsed_us = 10 * SECOND_US
     client.send("StreamFrames Events")
 
@@ -204,7 +206,7 @@ def test_a_request_during_a_stream_is_answered_too(client: ScriptedClient) -> No
     assert client.numbers_until(10_000) == [2, 2]
 
 
-def test_the_current_frame_of_what_the_scene_lacks_is_empty(client: ScriptedClient) -> None:
+def test_the_current_frame_of_components_that_the_scene_lacks_is_empty(client: ScriptedClient) -> None:
     client.send("SendCurrentFrame Force")
 
     assert client.frames_until(0) == [[]]
@@ -231,7 +233,7 @@ def test_without_a_measurement_requests_get_no_data(client: ScriptedClient, sent
     assert client.send(sent) == [(COMMAND, f"OK-{sent}".encode()), (NO_DATA, b"")]
 
 
-def test_the_end_of_a_measurement_is_told_to_those_who_wait_for_frames(client: ScriptedClient) -> None:
+def test_clients_that_wait_for_frames_get_no_data_when_the_measurement_ends(client: ScriptedClient) -> None:
     assert client.session.measurement_stopped() == []
     client.send("StreamFrames")
     client.frames_until(0)
@@ -241,7 +243,7 @@ def test_the_end_of_a_measurement_is_told_to_those_who_wait_for_frames(client: S
     assert client.frames_until(50_000) == []
 
 
-def test_a_stream_goes_on_from_the_first_frame_of_the_next_measurement(client: ScriptedClient) -> None:
+def test_a_stream_continues_with_the_first_frame_of_the_next_measurement(client: ScriptedClient) -> None:
     client.elapsed_us = None
     client.send("StreamFrames 3D Events")
     client.session.measurement_started()
@@ -267,7 +269,7 @@ def test_the_events_of_frames_dropped_at_the_start_of_a_measurement_are_not_lost
     assert frames[0][1].items[0][:2] == (1, 70_000)
 
 
-def test_analog_frames_follow_their_own_numbers_after_a_restart(client: ScriptedClient) -> None:
+def test_analog_frame_numbers_start_again_with_each_measurement(client: ScriptedClient) -> None:
     client.send("StreamFrames Analog")
     client.frames_until(SECOND_US)
     client.session.measurement_stopped()

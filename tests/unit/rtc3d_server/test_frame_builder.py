@@ -7,16 +7,7 @@ from hypothesis import strategies as st
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d_server.frame_builder import FrameBuilder, exact_rate
 from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import (
-    ANALOG,
-    DATA,
-    EVENT,
-    MARKERS,
-    TOOLS,
-    Part,
-    cut,
-    frame_of,
-)
+from tests.unit.rtc3d_server.wire import ANALOG, DATA, EVENT, MARKERS, TOOLS, Part, cut, frame_of
 
 
 def parts_of(builder: FrameBuilder, tick: int, *, with_events: bool = False) -> list[Part]:
@@ -47,7 +38,7 @@ def test_a_frame_has_the_bytes_of_the_specification() -> None:
     )
 
 
-def test_asked_for_all_a_frame_has_what_the_scene_has_in_the_servers_order() -> None:
+def test_by_default_a_frame_has_all_components_of_the_scene_in_wire_order() -> None:
     builder = FrameBuilder(CountingScene(), ())
 
     assert [part.type for part in parts_of(builder, 7, with_events=True)] == [MARKERS, TOOLS, ANALOG, EVENT]
@@ -59,7 +50,7 @@ def test_components_the_scene_lacks_are_left_out() -> None:
     assert [part.type for part in parts_of(builder, 0)] == [ANALOG]
 
 
-def test_the_rate_is_that_of_the_slowest_component_and_each_sends_its_own_sample() -> None:
+def test_the_rate_is_that_of_the_slowest_component_and_each_has_its_own_sample() -> None:
     builder = FrameBuilder(CountingScene(rate_hz=200), (ComponentType.MARKERS, ComponentType.ANALOG))
 
     markers, analog = parts_of(builder, 20)
@@ -70,7 +61,7 @@ def test_the_rate_is_that_of_the_slowest_component_and_each_sends_its_own_sample
     assert (markers.items[0][0], analog.items[0][0]) == (20, 200)
 
 
-def test_samples_are_the_same_across_blocks_of_frames() -> None:
+def test_samples_are_consecutive_across_blocks_of_frames() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.ANALOG,))
 
     samples = [parts_of(builder, tick)[0].items[0][0] for tick in range(300)]
@@ -78,7 +69,7 @@ def test_samples_are_the_same_across_blocks_of_frames() -> None:
     assert samples == list(range(300))
 
 
-def test_an_event_alone_counts_frames_of_the_measurement_rate() -> None:
+def test_frames_of_events_alone_are_numbered_at_the_measurement_rate() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.EVENT,))
 
     assert parts_of(builder, 14, with_events=True) == [
@@ -94,7 +85,7 @@ def test_events_can_have_the_16_bytes_of_the_specification() -> None:
     assert frame_of(data.packet[8:], "little", event_bytes=16) == [Part(EVENT, 8, 70_000, [(1, -1, -1, -1)])]
 
 
-def test_events_not_asked_for_are_not_given() -> None:
+def test_events_that_were_not_requested_are_left_out() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.MARKERS,))
 
     assert len(builder.events(0, 1_000_000)) == 0
@@ -108,7 +99,7 @@ def test_frame_numbers_stay_within_a_signed_32_bit_field() -> None:
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "meant"),
+    ("rate_hz", "exact"),
     [
         (100.0, Fraction(100)),
         (59.94006, Fraction(60000, 1001)),
@@ -116,8 +107,8 @@ def test_frame_numbers_stay_within_a_signed_32_bit_field() -> None:
         (0.5, Fraction(1, 2)),
     ],
 )
-def test_rates_are_taken_as_meant(rate_hz: float, meant: Fraction) -> None:
-    assert exact_rate(rate_hz) == meant
+def test_a_rounded_rate_becomes_the_fraction_that_it_stands_for(rate_hz: float, exact: Fraction) -> None:
+    assert exact_rate(rate_hz) == exact
 
 
 @given(

@@ -1,4 +1,4 @@
-"""RTC3D as a client sees it, packed and read with struct from the specification's tables alone."""
+"""RTC3D packets and frames, packed and read with struct by the tables of the specification alone."""
 
 import struct
 from typing import Literal, NamedTuple
@@ -21,17 +21,17 @@ class Part(NamedTuple):
 
 
 def packet(packet_type: int, body: bytes = b"") -> bytes:
-    """§4.1: size of the whole packet, type, body."""
+    """Return a packet (§4.1): size of the whole packet, type, body."""
     return struct.pack(">II", 8 + len(body), packet_type) + body
 
 
 def command(text: str) -> bytes:
-    """§5.1: a command as a packet of type 1."""
+    """Return a command as a packet of type 1 (§5.1)."""
     return packet(COMMAND, text.encode("ascii"))
 
 
 def cut(stream: bytes) -> list[tuple[int, bytes]]:
-    """Return the packets (type, body) of a byte stream that must hold whole packets only."""
+    """Return the packets (type, body) in a byte stream; it must end with a whole packet."""
     packets = []
     while stream:
         size, packet_type = struct.unpack_from(">II", stream)
@@ -42,7 +42,7 @@ def cut(stream: bytes) -> list[tuple[int, bytes]]:
 
 
 def frame_of(body: bytes, byte_order: ByteOrder = "big", *, event_bytes: int = 24) -> list[Part]:
-    """§7.1: return the components of a data frame's body, all of whose sizes and counts must agree."""
+    """Return the components of a data frame's body (§7.1); all sizes and counts must agree."""
     sign = ">" if byte_order == "big" else "<"
     (component_count,) = struct.unpack_from(sign + "I", body)
     start, parts = 4, []

@@ -16,7 +16,7 @@ MISSING = b"\xff" * 12 + bytes.fromhex("4479C000")  # X, Y, Z all ones; 999.0
 
 
 def new_recording() -> Any:
-    """Five frames of two markers at 100 Hz, six channels of one plate and one more at 1000 Hz."""
+    """Return five frames of two markers at 100 Hz, and six channels of a plate and one more at 1000 Hz."""
     content = ezc3d.c3d()
     point, analog = content["parameters"]["POINT"], content["parameters"]["ANALOG"]
     point["RATE"]["value"], point["LABELS"]["value"], point["UNITS"]["value"] = [100], ["heel", "toe"], ["mm"]
@@ -103,7 +103,7 @@ def test_each_component_has_its_own_rate(path: Path) -> None:
     assert len(take.events(0, 10**9)) == 0
 
 
-def test_the_take_begins_again_after_its_last_sample(path: Path) -> None:
+def test_a_take_repeats_after_its_last_sample(path: Path) -> None:
     take = C3dScene(path)
 
     for component, length in (

@@ -25,13 +25,13 @@ def scene() -> SyntheticScene:
 
 
 def table(items: Items) -> Floats:
-    """The items' fields as a further axis, in the native byte order."""
+    """Return the items with their fields as one more axis, in the native byte order."""
     values: Floats = items.view(">f4").reshape(*items.shape, -1).astype(np.float64)
     return values
 
 
 def rotation(quaternion: Floats) -> Floats:
-    """Rotation matrices, shape (n, 3, 3), of quaternions (q0, qx, qy, qz), shape (n, 4)."""
+    """Return the rotation matrices, shape (n, 3, 3), of quaternions (q0, qx, qy, qz), shape (n, 4)."""
     w, x, y, z = quaternion.T
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -42,7 +42,7 @@ def rotation(quaternion: Floats) -> Floats:
 
 
 def fitted(local_mm: Floats, measured_mm: Floats) -> tuple[Floats, Floats]:
-    """Least-squares rotation and translation that bring local onto measured (Kabsch), shape (markers, 3)."""
+    """Return the least-squares rotation and translation from local to measured points (Kabsch)."""
     local_centre, centre = local_mm.mean(axis=0), measured_mm.mean(axis=0)
     u, _, vt = np.linalg.svd((measured_mm - centre).T @ (local_mm - local_centre))
     turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
@@ -50,7 +50,7 @@ def fitted(local_mm: Floats, measured_mm: Floats) -> tuple[Floats, Floats]:
 
 
 def tool_and_markers(scene: SyntheticScene, tool: int) -> tuple[Floats, Floats]:
-    """A minute of the tool's item, (frames, 8), and of its markers' items, (frames, markers, 4)."""
+    """Return a minute of the tool's item, (frames, 8), and of its markers' items, (frames, markers, 4)."""
     tools, markers = scene.parameters.tools, scene.parameters.markers
     assert tools is not None
     assert markers is not None
@@ -61,7 +61,7 @@ def tool_and_markers(scene: SyntheticScene, tool: int) -> tuple[Floats, Floats]:
 
 
 def local_mm_of(poses: Floats, markers: Floats) -> Floats:
-    """The markers in the tool's own coordinates, (frames, markers, 3)."""
+    """Return the markers in the tool's own coordinates, (frames, markers, 3)."""
     from_origin = markers[..., :3] - poses[:, None, 4:7]
     local_mm: Floats = np.einsum("tji,tmj->tmi", rotation(poses[:, :4]), from_origin)
     return local_mm
@@ -107,7 +107,7 @@ def test_a_tool_is_out_of_view_exactly_when_fewer_than_three_of_its_markers_are_
         assert np.array_equal(np.isnan(poses[:, 0]), num_visible < 3)
 
 
-def test_markers_are_out_of_view_now_and_then_and_tools_too(scene: SyntheticScene) -> None:
+def test_markers_and_tools_are_sometimes_out_of_view(scene: SyntheticScene) -> None:
     for component in (ComponentType.MARKERS, ComponentType.TOOLS):
         missing = np.isnan(table(scene.items(component, MINUTE))[..., 0])
         assert 0.005 < missing.mean() < 0.15
@@ -115,7 +115,7 @@ def test_markers_are_out_of_view_now_and_then_and_tools_too(scene: SyntheticScen
         assert not np.all(missing, axis=0).any()
 
 
-def test_what_is_missing_has_the_bytes_of_the_specification(scene: SyntheticScene) -> None:
+def test_missing_markers_and_tools_have_the_bytes_of_the_specification(scene: SyntheticScene) -> None:
     markers = scene.items(ComponentType.MARKERS, MINUTE)
     tools = scene.items(ComponentType.TOOLS, MINUTE)
 
@@ -134,7 +134,7 @@ def test_visible_markers_have_a_small_residual(scene: SyntheticScene) -> None:
 
 @settings(deadline=None)
 @given(first=st.integers(0, 10**9), cut=st.integers(0, 40))
-def test_a_sample_is_the_same_whatever_it_is_asked_for_with(first: int, cut: int) -> None:
+def test_a_sample_does_not_depend_on_the_others_in_one_call(first: int, cut: int) -> None:
     scene = SyntheticScene(markers=100, tools=10, analog=3, plates=2)
     samples = np.arange(first, first + 40)
     for component in scene.rates_hz:
@@ -152,14 +152,14 @@ def test_channels_are_sines_of_different_frequencies(scene: SyntheticScene) -> N
 
 
 def steps_on(scene: SyntheticScene, plate: int) -> list[Floats]:
-    """The force items, (samples, 6), of each whole step on the plate in 6 s."""
+    """Return the force items, (samples, 6), of each whole step on the plate in 6 s."""
     forces = table(scene.items(ComponentType.FORCE, np.arange(3000)))[:, plate]
     edges = np.flatnonzero(np.diff((forces[:, 2] > 30).astype(int)))
     return [forces[a + 1 : b] for a, b in pairwise(edges) if forces[a + 1, 2] > 30]
 
 
 @pytest.mark.parametrize("plate", [0, 1])
-def test_a_step_has_two_humps_of_about_the_bodys_weight(scene: SyntheticScene, plate: int) -> None:
+def test_a_step_has_two_peaks_of_about_the_weight_of_the_body(scene: SyntheticScene, plate: int) -> None:
     steps = steps_on(scene, plate)
 
     assert len(steps) >= 3
@@ -196,7 +196,7 @@ def test_moments_put_the_centre_of_pressure_on_the_plate_from_heel_to_toe(
         assert np.max(np.abs(free_moment_nm)) == pytest.approx(3.0, abs=0.05)
 
 
-def test_nobody_stands_on_a_plate_between_steps(scene: SyntheticScene) -> None:
+def test_a_plate_is_unloaded_between_steps(scene: SyntheticScene) -> None:
     fz = table(scene.items(ComponentType.FORCE, np.arange(3000)))[..., 2]
 
     assert np.mean(np.abs(fz) < 5) == pytest.approx(0.4, abs=0.05)
@@ -222,7 +222,7 @@ def test_a_button_is_pressed_and_released_every_second(scene: SyntheticScene) ->
         sorted
     )
 )
-def test_events_are_the_same_whatever_the_times_they_are_asked_between(times_us: list[int]) -> None:
+def test_events_do_not_depend_on_how_the_time_is_divided(times_us: list[int]) -> None:
     scene = SyntheticScene(markers=0, tools=0, analog=0, plates=0)
 
     parts = [scene.events(a, b).tolist() for a, b in pairwise(times_us)]
@@ -240,7 +240,7 @@ def test_events_are_the_same_whatever_the_times_they_are_asked_between(times_us:
     plates=st.integers(0, 3),
     seed=st.integers(0, 99),
 )
-def test_any_size_gives_what_its_parameters_describe(
+def test_the_parameters_describe_a_scene_of_any_size(
     markers: int, tools: int, analog: int, plates: int, seed: int
 ) -> None:
     scene = SyntheticScene(markers=markers, tools=tools, analog=analog, plates=plates, seed=seed)
@@ -266,7 +266,7 @@ def test_any_size_gives_what_its_parameters_describe(
     assert all(known.issuperset(tool.marker_ids) for tool in described.tools.tools)
 
 
-def test_labels_are_what_people_read() -> None:
+def test_labels_have_a_word_and_a_number() -> None:
     parameters = SyntheticScene(markers=2, tools=1, analog=1, plates=1).parameters
 
     assert parameters.markers is not None

@@ -1,0 +1,70 @@
+"""The RT server as a library: any scene, and a filter between its connections and their sockets."""
+
+from gateway.rtc3d.packets import Packet
+from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.rtc3d_server.client_session import error_packet
+from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
+from gateway.rtc3d_server.server import RtServer
+from tests.integration.raw_client import connected, consecutive, until
+from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, command
+
+
+class RefusingFilter(ConnectionFilter):
+    """Refuses SetByteOrder, drops every other data frame and writes a last text."""
+
+    def __init__(self, connection: FilteredConnection) -> None:
+        super().__init__(connection)
+        self.received = b""
+        self.num_frames = 0
+        self.is_lost = False
+
+    def send(self, packet: bytes) -> None:
+        is_frame = packet[7] == DATA
+        self.num_frames += is_frame
+        if not (is_frame and self.num_frames % 2):
+            super().send(packet)
+
+    def receive(self, data: bytes) -> None:
+        self.received += data
+        super().receive(data)
+
+    def answer(self, packet: Packet) -> list[bytes]:
+        if packet.body.startswith(b"SetByteOrder"):
+            return [error_packet("not here")]
+        return super().answer(packet)
+
+    def flush(self) -> None:
+        self.connection.write(b"the end")
+
+    def connection_lost(self) -> None:
+        self.is_lost = True
+
+
+async def test_a_server_without_a_filter_serves_a_scene_under_its_name() -> None:
+    async with RtServer(CountingScene(1000.0), name="Lab") as server, connected(server) as client:
+        general = parse_parameters((await client.ask("SendParameters General"))[1]).parameters.general
+        assert general is not None
+        assert general.name == "Lab"
+        await client.ask("StreamFrames 3D")
+        assert consecutive(await client.frames(20))
+
+
+async def test_a_filter_can_change_all_that_passes_through_a_connection() -> None:
+    filters: list[RefusingFilter] = []
+
+    def new_filter(connection: FilteredConnection) -> ConnectionFilter:
+        filters.append(RefusingFilter(connection))
+        return filters[-1]
+
+    async with RtServer(CountingScene(1000.0), new_filter=new_filter) as server, connected(server) as client:
+        assert await client.ask("SetByteOrder LittleEndian") == (ERROR, b"Error-not here")
+        assert await client.ask("StreamFrames 3D") == (COMMAND, b"OK-StreamFrames 3D")
+        numbers = [frame[0].frame_number for frame in await client.frames(10)]
+        assert numbers == list(range(numbers[0], numbers[0] + 20, 2))
+        client.send(command("Bye"))
+        assert (await client.rest()).endswith(b"bye" + b"the end")
+        [connection_filter] = filters
+        assert connection_filter.connection.number == 1
+        assert connection_filter.received.endswith(command("Bye"))
+        await until(lambda: connection_filter.is_lost)
