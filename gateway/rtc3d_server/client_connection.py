@@ -169,7 +169,7 @@ class ClientConnection(asyncio.Protocol):
             self._process_inbox()
 
     def answer(self, packet: Packet) -> list[bytes]:
-        """Obey a client's packet; return the replies, each one packet."""
+        """Execute a client's packet; return the replies, each one packet."""
         return self.session.answer(packet)
 
     def send_due_frames(self, elapsed_us: int) -> None:

@@ -145,7 +145,7 @@ class ClientSession:
             self._begin_stream(self._subscription, self._stream.due_us)
 
     def answer(self, packet: Packet) -> list[bytes]:
-        """Obey a client's packet; return the replies, each one packet."""
+        """Execute a client's packet; return the replies, each one packet."""
         match packet.type:
             case PacketType.COMMAND:
                 try:

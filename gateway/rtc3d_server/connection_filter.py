@@ -27,7 +27,7 @@ class FilteredConnection(Protocol):
         ...
 
     def answer(self, packet: Packet) -> list[bytes]:
-        """Obey a client's packet; return the replies, each one packet."""
+        """Execute a client's packet; return the replies, each one packet."""
         ...
 
     def resume_reading(self) -> None:

@@ -47,7 +47,7 @@ from tests.unit.rtc3d_server.wire import (
 # Replies ------------------------------------------------------------------------------------
 
 
-async def test_a_refused_command_gets_an_error_packet_and_is_not_obeyed() -> None:
+async def test_a_refused_command_gets_an_error_packet_and_is_not_executed() -> None:
     async with playing() as (simulator, client):
         simulator.faults.begin(RefusedCommands(commands=("setbyteorder",)))
         packet_type, text = await client.ask("SetByteOrder LittleEndian")

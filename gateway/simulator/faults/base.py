@@ -1,4 +1,4 @@
-"""What all kinds of faults have in common: when they happen, for how long, and what they may change."""
+"""The base classes of all faults: when they happen, for how long, and what they can change."""
 
 # ruff: noqa: ARG002 - hooks: not every kind needs every argument
 

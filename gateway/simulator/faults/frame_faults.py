@@ -26,7 +26,9 @@ from gateway.rtc3d.packets import HEADER, PacketType, encode_packet
 from gateway.simulator.faults.base import ActiveFault, LastingConnectionFault
 from gateway.simulator.faults.outgoing import PendingWrite, packet_type_of
 
-Share = Annotated[float, Field(strict=True, ge=0, le=1, allow_inf_nan=False), expects("a share from 0 to 1")]
+Fraction = Annotated[
+    float, Field(strict=True, ge=0, le=1, allow_inf_nan=False), expects("a number from 0 to 1")
+]
 Jump = Annotated[
     float,
     Field(strict=True, ge=-1e12, le=1e12, allow_inf_nan=False),
@@ -76,11 +78,11 @@ class Occlusion(FrameFault):
 
     kind: ClassVar[str] = "occlusion"
 
-    markers: Share = 1.0
-    """The share of the markers; other ones each time the fault begins."""
+    markers: Fraction = 1.0
+    """The fraction of the markers; different ones each time the fault begins."""
 
-    tools: Share = 1.0
-    """The share of the tools."""
+    tools: Fraction = 1.0
+    """The fraction of the tools."""
 
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
@@ -98,7 +100,7 @@ class Occlusion(FrameFault):
 
 
 class FrozenTimestamps(FrameFault):
-    """Time stamps stay at the time when the fault began."""
+    """Time stamps keep the value that they have when the fault begins."""
 
     kind: ClassVar[str] = "frozen_timestamps"
 
@@ -166,7 +168,7 @@ class ShortEvents(FrameFault):
 
 
 class WrongByteOrder(FrameFault):
-    """Frames have another byte order than the server acknowledged.
+    """Frames have a different byte order than the server acknowledged.
 
     Field note 4.
     """
@@ -174,7 +176,7 @@ class WrongByteOrder(FrameFault):
     kind: ClassVar[str] = "wrong_byte_order"
 
     byte_order: Annotated[Literal["big", "little", "other"], expects("big, little or other")] = "other"
-    """big or little, whatever the client requests; other: not the one that it requests."""
+    """big or little: always that one; other: not the one that the client requested."""
 
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
@@ -186,7 +188,7 @@ class WrongByteOrder(FrameFault):
 
 
 class UnknownComponent(FrameFault):
-    """Frames have one more component, of a type that is not in §7.2."""
+    """Frames have an additional component of a type that §7.2 does not define."""
 
     kind: ClassVar[str] = "unknown_component"
 
@@ -194,7 +196,7 @@ class UnknownComponent(FrameFault):
     """The type of the component."""
 
     data_bytes: DataBytes = 32
-    """The size of its data in bytes, which are all zero."""
+    """The size of its data in bytes, all zeros."""
 
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
@@ -261,7 +263,7 @@ def _rebuild(
     )
 
 
-def _choose(share: float, count: int, variant: int) -> Items:
-    """Return the indices of a share of ``count`` items, shape (⌈share · count⌉,); ``variant`` is the seed."""
+def _choose(fraction: float, count: int, variant: int) -> Items:
+    """Return the indices of a fraction of the items, shape (⌈fraction · count⌉,); ``variant`` is the seed."""
     order = np.random.default_rng(variant).permutation(count)
-    return order[: int(np.ceil(share * count))]
+    return order[: int(np.ceil(fraction * count))]

@@ -43,12 +43,12 @@ def _command_name(command: Packet) -> str:
 
 
 class RefusedCommands(LastingConnectionFault):
-    """The server refuses commands with an error packet and does not obey them."""
+    """The server answers commands with an error packet and does not execute them."""
 
     kind: ClassVar[str] = "refused_commands"
 
     commands: CommandNames = ("version",)
-    """The commands that it refuses."""
+    """The commands that the server refuses."""
 
     def refusal(self, command: Packet) -> str | None:
         """See LastingConnectionFault."""
@@ -93,7 +93,7 @@ class _AcknowledgementFault(LastingConnectionFault):
 
 
 class MissingAcknowledgements(_AcknowledgementFault):
-    """The server obeys commands and does not acknowledge them."""
+    """The server executes commands but does not acknowledge them."""
 
     kind: ClassVar[str] = "missing_acknowledgements"
 
@@ -140,7 +140,7 @@ class FramesFirst(LastingConnectionFault):
     kind: ClassVar[str] = "frames_first"
 
     frames: Count = 3
-    """The number of frames; after a No Data packet it acknowledges at once."""
+    """The number of frames; a No Data packet ends the wait."""
 
     def change_replies(self, command: Packet, replies: list[Reply]) -> list[Reply]:
         """See LastingConnectionFault."""
@@ -153,7 +153,7 @@ class FramesFirst(LastingConnectionFault):
 
 
 class ReplyText(LastingConnectionFault):
-    """Replies have the text of servers that are not NDI's; errors begin with err-.
+    """Replies are worded as by servers other than NDI's; errors begin with err-.
 
     Field note 1.
     """
@@ -161,7 +161,7 @@ class ReplyText(LastingConnectionFault):
     kind: ClassVar[str] = "reply_text"
 
     form: Annotated[Literal["echo", "ok-verb"], expects("echo or ok-verb")] = "ok-verb"
-    """echo repeats the command as it was sent; ok-verb is, for instance, ok-streamframes."""
+    """echo: the command as it was sent; ok-verb: a text such as ok-streamframes."""
 
     def change_replies(self, command: Packet, replies: list[Reply]) -> list[Reply]:
         """See LastingConnectionFault."""

@@ -25,9 +25,9 @@ from tests.unit.simulator.faults.faulty_packets import active, changed, frame, m
 MISSING = b"\xff" * 4
 
 
-@pytest.mark.parametrize(("share", "hidden"), [(0.0, 0), (0.01, 1), (0.5, 4), (0.51, 5), (1.0, 8)])
-def test_occlusion_hides_a_share_of_the_markers(share: float, hidden: int) -> None:
-    [part] = parts_of(changed(Occlusion(markers=share), frame(markers(count=8))))
+@pytest.mark.parametrize(("fraction", "hidden"), [(0.0, 0), (0.01, 1), (0.5, 4), (0.51, 5), (1.0, 8)])
+def test_occlusion_hides_a_fraction_of_the_markers(fraction: float, hidden: int) -> None:
+    [part] = parts_of(changed(Occlusion(markers=fraction), frame(markers(count=8))))
 
     seen = [item for item in part.items if not math.isnan(item[0])]
     assert len(seen) == 8 - hidden
