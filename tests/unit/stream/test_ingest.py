@@ -1,6 +1,4 @@
-"""Batches of frames with their times, against a clock that has learnt for three seconds."""
-
-from time import monotonic
+"""Batches of frames with their times, against a clock that has learned for three seconds."""
 
 import numpy as np
 import pytest
@@ -14,23 +12,36 @@ from gateway.stream.status import StreamStatus
 
 BOOT_UTIME = 1_700_000_000_000_000
 PERIOD_US = 5_000
+RATE_HZ = 200
+DTYPES = ITEM_DTYPES | {ComponentType.EVENT: LONG_EVENT}
+MARKERS, EVENT = ComponentType.MARKERS, ComponentType.EVENT
 
 
 def frame(number: int, *, event: bool = False) -> Frame:
-    markers = np.zeros(1, ITEM_DTYPES[ComponentType.MARKERS])
-    parts = [build_component(ComponentType.MARKERS, number, PERIOD_US * number, markers)]
-    if event:
-        events = np.zeros(1, LONG_EVENT)
-        parts.append(build_component(ComponentType.EVENT, number, PERIOD_US * number, events))
-    return split_frame(build_frame(parts), "big")
+    """Return a frame with one marker, and with an event if asked for, of number ``number``."""
+    return frame_of(number, *((MARKERS, number), (EVENT, number)) if event else ((MARKERS, number),))
+
+
+def frame_of(tick: int, *numbered: tuple[ComponentType, int]) -> Frame:
+    """Return the frame of period ``tick`` with these components, each with a frame number of its own."""
+    components = [
+        build_component(
+            component,
+            number,
+            PERIOD_US * tick,
+            np.zeros(1, LONG_EVENT if component is EVENT else ITEM_DTYPES[component]),
+        )
+        for component, number in numbered
+    ]
+    return split_frame(build_frame(components), "big")
 
 
 class Lab:
-    """An intake; ``published`` are the frame numbers and component keys that got through."""
+    """An ingest; ``published`` are the frame numbers and component keys that it passed on."""
 
     def __init__(self, backlog: str) -> None:
         self.backlog = backlog
-        self.status = StreamStatus("3d event")
+        self.status = StreamStatus("3d event", name="lab (3d event)")
         self.published: list[tuple[int, list[str]]] = []
         self.stamps: list[Stamp] = []
         self.halvings: list[int] = []
@@ -38,10 +49,10 @@ class Lab:
         stream = StreamSettings.model_validate({"components": ["all"], "backlog": backlog})
         source = SourceSettings(name="lab", host="127.0.0.1")
         self.ingest = Ingest(
-            source, stream, self.status, self._publish, self.halvings.append, self._restarted
+            source, stream, self.status, self._publish, self.halvings.append, self._on_restart
         )
 
-    def _restarted(self) -> None:
+    def _on_restart(self) -> None:
         self.restarts += 1
 
     def _publish(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
@@ -50,39 +61,42 @@ class Lab:
         if keys:
             self.published.append((frame.components[0].frame_number, keys))
 
-    def take(self, *frames: Frame, late_us: int = 0) -> None:
-        newest = frames[-1].components[0].timestamp_us
-        self.ingest.receive(list(frames), BOOT_UTIME + newest + late_us, monotonic())
+    def receive(self, *frames: Frame, late_us: int = 0) -> None:
+        """Receive the frames together, so long after the newest was captured."""
+        self.receive_at(BOOT_UTIME + frames[-1].components[0].timestamp_us + late_us, *frames)
+
+    def receive_at(self, utime: int, *frames: Frame) -> None:
+        self.ingest.receive(list(frames), utime, (utime - BOOT_UTIME) / 1e6)
 
 
 @pytest.fixture(params=["latest", "all"])
-async def lab(request: pytest.FixtureRequest) -> Lab:
+def lab(request: pytest.FixtureRequest) -> Lab:
     lab = Lab(request.param)
-    for number in range(600):
-        lab.take(frame(number))
+    for number in range(3 * RATE_HZ):
+        lab.receive(frame(number))
     assert [number for number, _ in lab.published] == list(range(600))
     lab.published.clear()
     lab.stamps.clear()
     return lab
 
 
-async def test_capture_time_is_the_servers_time_on_the_hosts_clock(lab: Lab) -> None:
-    lab.take(frame(600), late_us=20_000)
+def test_capture_time_is_the_servers_time_on_the_hosts_clock(lab: Lab) -> None:
+    lab.receive(frame(600), late_us=20_000)
     [stamp] = lab.stamps
-    assert stamp.utime == BOOT_UTIME + 600 * PERIOD_US + 20_000
+    assert stamp.utime == lab.status.last_frame_utime == BOOT_UTIME + 600 * PERIOD_US + 20_000
     assert stamp.capture_utime == pytest.approx(BOOT_UTIME + 600 * PERIOD_US, abs=500)
     assert lab.status.lag_s == pytest.approx(0.02, abs=0.001)
 
 
-async def test_frames_that_come_together_but_in_time_are_all_published(lab: Lab) -> None:
-    lab.take(*(frame(number) for number in range(600, 605)))
+def test_frames_that_arrive_together_but_in_time_are_all_published(lab: Lab) -> None:
+    lab.receive(*(frame(number) for number in range(600, 605)))
     assert [number for number, _ in lab.published] == list(range(600, 605))
     assert not lab.status.drops
 
 
-async def test_while_behind_the_newest_is_published_and_no_event_is_skipped(lab: Lab) -> None:
+def test_while_behind_the_newest_is_published_and_no_event_is_skipped(lab: Lab) -> None:
     late = [frame(number, event=number == 602) for number in range(600, 605)]
-    lab.take(*late, late_us=200_000)
+    lab.receive(*late, late_us=200_000)
     if lab.backlog == "latest":
         assert lab.published == [(602, ["event"]), (604, ["3d"])]
         assert lab.status.drops == {"skipped while behind": 4}
@@ -91,15 +105,69 @@ async def test_while_behind_the_newest_is_published_and_no_event_is_skipped(lab:
         assert not lab.status.drops
 
 
-async def test_a_restart_is_told_and_is_no_lateness(lab: Lab) -> None:
-    lab.ingest.receive([frame(3)], BOOT_UTIME + 600 * PERIOD_US, monotonic())
+def test_frames_that_stay_late_request_lower_rates(lab: Lab) -> None:
+    for number in range(600, 600 + 2 * RATE_HZ + RATE_HZ // 10):
+        lab.receive(frame(number), late_us=200_000 + 500 * (number - 600))
+    assert lab.halvings == [1, 2]
+
+
+def test_a_restart_of_the_server_is_reported_and_is_no_lateness(lab: Lab) -> None:
+    lab.receive_at(BOOT_UTIME + 600 * PERIOD_US, frame(3))
     assert (lab.restarts, lab.status.restarts) == (1, 1)
     assert [number for number, _ in lab.published] == [3]
     assert lab.halvings == []
 
 
-async def test_frames_without_components_are_counted_and_no_more(lab: Lab) -> None:
+def test_lateness_before_a_restart_does_not_count_after_it(lab: Lab) -> None:
+    for number in range(600, 600 + RATE_HZ * 9 // 10):  # 0.9 s late: 0.1 s more would halve the rate
+        lab.receive(frame(number), late_us=200_000)
+    assert lab.halvings == []
+    restart_utime = BOOT_UTIME + 780 * PERIOD_US + 200_000
+    lab.receive_at(restart_utime, frame(0), frame(1))
+    assert lab.restarts == 1
+    assert [number for number, _ in lab.published][-2:] == [0, 1]  # not behind: nothing is skipped
+    for number in range(2, 2 + RATE_HZ * 9 // 10):
+        lab.receive_at(restart_utime + number * PERIOD_US + 200_000, frame(number))
+    assert lab.halvings == []
+
+
+def test_frame_numbers_are_followed_for_one_component_type_only(lab: Lab) -> None:
+    for tick in range(600, 610):
+        lab.receive(frame_of(tick, (MARKERS, tick), (EVENT, 7)))
+        lab.receive(frame_of(tick, (EVENT, 3)))  # counted apart
+    assert lab.restarts == 0
+
+
+def test_frame_numbers_of_events_are_followed_until_another_type_arrives() -> None:
+    lab = Lab("all")
+    lab.receive(frame_of(0, (EVENT, 5000)))
+    for tick in range(1, 5):
+        lab.receive(frame(tick))
+    # The numbers of markers took over, below those of events: that is one restart, and no further one.
+    assert lab.restarts == 1
+    lab.receive(frame_of(5, (EVENT, 3)))
+    assert lab.restarts == 1
+    lab.receive_at(BOOT_UTIME + 10 * PERIOD_US, frame_of(6, (MARKERS, 1)))
+    assert lab.restarts == 2  # the markers' own numbers go back
+
+
+def test_frames_without_components_are_counted_and_not_published(lab: Lab) -> None:
     before = lab.status.frames_in
-    lab.ingest.receive([split_frame(build_frame([]), "big")], BOOT_UTIME, monotonic())
+    lab.receive_at(BOOT_UTIME, split_frame(build_frame([]), "big"))
     assert lab.status.frames_in == before + 1
     assert not lab.published
+
+
+def test_unknown_components_are_counted_and_the_others_published(
+    lab: Lab, caplog: pytest.LogCaptureFixture
+) -> None:
+    known = build_component(MARKERS, 600, 600 * PERIOD_US, np.zeros(1, ITEM_DTYPES[MARKERS]))
+    unknown = bytes.fromhex("0000000c 00000063 00000000")  # size, type 99, four bytes
+    body = build_frame([known])
+    count = (2).to_bytes(4, "big")
+    for _ in range(3):
+        lab.receive(split_frame(count + body[4:] + unknown, "big"))
+    assert len(lab.published) == 3
+    assert lab.status.drops == {"unknown component": 3}
+    assert lab.status.limitations == ["components of unknown type [99] are skipped"]
+    assert caplog.messages == ["lab (3d event): components of unknown type [99] are skipped"]

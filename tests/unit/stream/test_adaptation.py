@@ -1,0 +1,128 @@
+"""Streams that follow demand and lateness, with a scripted server."""
+
+import asyncio
+import logging
+from typing import Any
+
+import pytest
+
+from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.stream.adaptation import DEMAND_POLL_S, Adaptation
+from gateway.stream.session import Session
+from gateway.stream.status import StreamStatus
+from gateway.stream.stream_control import StreamControl
+from tests.unit.stream.scripted_server import ScriptedServer, silent_to
+from tests.unit.stream.virtual_time import settle
+
+START, STOP = "StreamFrames AllFrames", "StreamFrames Stop"
+HALF = "StreamFrames FrequencyDivisor:2"
+
+
+class Lab:
+    """The adaptation of one stream that has done its handshake."""
+
+    def __init__(self, **stream: Any) -> None:
+        self.server = ScriptedServer()
+        self.status = StreamStatus("3d", name="lab (3d)")
+        self.has_subscribers = True
+        source, settings = SourceSettings(name="lab", host="192.0.2.20"), StreamSettings(**stream)
+        self.session = Session(
+            source, settings, self.status, lambda *_: None, lambda _: None, self.server.connect
+        )
+        self._control = StreamControl(source, settings, self.status, self.session, lambda *_: None)
+        self.adaptation = Adaptation(
+            source, settings, self.status, self._control, lambda: self.has_subscribers
+        )
+
+    async def start(self) -> None:
+        await self.session.connect()
+        await self._control.start()
+        self.adaptation.start()
+
+    @property
+    def requests(self) -> list[str]:
+        """The commands since the handshake."""
+        return self.server.connection.commands[3:]
+
+
+async def test_an_on_demand_stream_stops_without_subscribers_and_resumes_with_them() -> None:
+    lab = Lab(on_demand=True, idle_after_s=5.0)
+    await lab.start()
+    await asyncio.sleep(60)
+    assert lab.requests == []
+    lab.has_subscribers = False
+    await asyncio.sleep(4.9)
+    assert lab.requests == []
+    await asyncio.sleep(0.1 + DEMAND_POLL_S)
+    await settle()
+    assert lab.requests == [STOP]
+    assert lab.status.rate == ""
+    await asyncio.sleep(60)
+    lab.has_subscribers = True
+    await asyncio.sleep(DEMAND_POLL_S)
+    await settle()
+    assert lab.requests == [STOP, START]
+    assert lab.status.rate == "AllFrames"
+    lab.adaptation.cancel()
+
+
+async def test_a_short_absence_of_subscribers_does_not_stop_an_on_demand_stream() -> None:
+    lab = Lab(on_demand=True, idle_after_s=5.0)
+    await lab.start()
+    for _ in range(5):
+        lab.has_subscribers = not lab.has_subscribers
+        await asyncio.sleep(4)
+    assert lab.requests == []
+    lab.adaptation.cancel()
+
+
+async def test_other_streams_run_without_subscribers() -> None:
+    lab = Lab(idle_after_s=5.0)
+    lab.has_subscribers = False
+    await lab.start()
+    await asyncio.sleep(60)
+    assert lab.requests == []
+
+
+async def test_lateness_is_a_warning_once_and_its_end_is_reported(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG, "gateway.stream.adaptation")
+    lab = Lab()
+    await lab.start()
+    for halvings, lag_s in ((1, 0.3), (2, 0.3), (1, 0.0), (0, 0.0)):
+        lab.status.lag_measured(lag_s)
+        lab.adaptation.request_rate(halvings)
+        await settle()
+    assert lab.requests == [HALF, "StreamFrames FrequencyDivisor:4", HALF, START]
+    assert lab.status.rate == "AllFrames"
+    assert [record.levelname for record in caplog.records] == ["WARNING", "DEBUG", "DEBUG", "INFO"]
+    first, second, third, last = caplog.messages
+    assert first == "lab (3d): frames arrive 300 ms late; asked the server for FrequencyDivisor:2"
+    assert second.endswith("asked the server for FrequencyDivisor:4 (failure 2 in a row)")
+    assert third == "lab (3d): frames arrive in time; asked the server for FrequencyDivisor:2"
+    assert last.startswith("lab (3d): frames arrive in time; asked the server for AllFrames, after ")
+
+
+async def test_the_end_of_the_connection_ends_a_change_quietly(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG, "gateway.stream.adaptation")
+    lab = Lab()
+    await lab.start()
+    lab.server.answer = silent_to("StreamFrames")
+    lab.adaptation.request_rate(1)
+    await settle()
+    lab.server.connection.end()
+    await settle()
+    assert [record.levelname for record in caplog.records] == ["DEBUG"]
+    assert lab.status.rate == "AllFrames"
+
+
+async def test_cancelling_ends_every_task() -> None:
+    tasks_before = asyncio.all_tasks()
+    lab = Lab(on_demand=True)
+    await lab.start()
+    lab.server.answer = silent_to("StreamFrames")
+    lab.adaptation.request_rate(1)
+    await settle()
+    assert len(asyncio.all_tasks() - tasks_before) == 2
+    lab.adaptation.cancel()
+    await settle()
+    assert asyncio.all_tasks() == tasks_before

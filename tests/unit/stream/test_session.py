@@ -1,0 +1,337 @@
+"""One session with a scripted server: replies, silence, errors and the end."""
+
+import asyncio
+from typing import Any
+
+import pytest
+
+from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.errors import ClosedError, LinkError, ReplyTimeoutError, ServerError, SilenceError
+from gateway.rtc3d.commands import SendParameters, StopStreaming, StreamFrames, Version
+from gateway.rtc3d.frames import Frame
+from gateway.stream.session import Session
+from gateway.stream.state import StreamState
+from gateway.stream.status import StreamStatus
+from tests.servers import markers_frame, packet
+from tests.unit.stream.scripted_server import Connection, ScriptedServer, obliging, refusing, silent_to
+from tests.unit.stream.virtual_time import settle
+
+NO_DATA = packet(4)
+
+
+class Lab:
+    """A session and its server; ``frames`` and ``files`` are what the session passed on."""
+
+    def __init__(self, components: tuple[str, ...] = ("3d",), **settings: Any) -> None:
+        self.server = ScriptedServer()
+        self.status = StreamStatus("3d", name="lab (3d)")
+        self.frames: list[tuple[int, float]] = []
+        self.files: list[bytes] = []
+        self.session = Session(
+            SourceSettings(name="lab", host="192.0.2.20", **settings),
+            StreamSettings.model_validate({"components": components}),
+            self.status,
+            self._on_frames,
+            self.files.append,
+            self.server.connect,
+            asyncio.get_running_loop().time,
+        )
+
+    def _on_frames(self, frames: list[Frame], utime: int, now_s: float) -> None:
+        assert utime > 0
+        self.frames += [(frame.components[0].frame_number, now_s) for frame in frames]
+
+    @property
+    def connection(self) -> Connection:
+        return self.server.connection
+
+    async def streaming(self) -> None:
+        """Connect and request frames."""
+        await self.session.connect()
+        await self.session.ask(StreamFrames())
+
+
+@pytest.fixture
+async def lab() -> Lab:
+    return Lab()
+
+
+def now_s() -> float:
+    return asyncio.get_running_loop().time()
+
+
+# --- questions
+
+
+async def test_an_answer_goes_to_the_command_that_asked(lab: Lab) -> None:
+    await lab.session.connect()
+    assert (await lab.session.ask(Version())).body == b"OK-Version 1.0"
+    assert (await lab.session.ask(SendParameters())).body.startswith(b"<RT_Parameters")
+
+
+async def test_a_refusal_raises_the_servers_text(lab: Lab) -> None:
+    lab.server.answer = refusing("Version")
+    await lab.session.connect()
+    with pytest.raises(ServerError, match=r"Error-Version 1\.0"):
+        await lab.session.ask(Version())
+    assert lab.session.is_open
+
+
+async def test_commands_are_sent_one_at_a_time(lab: Lab) -> None:
+    lab.server.answer = silent_to("")
+    await lab.session.connect()
+    first = asyncio.create_task(lab.session.ask(Version()))
+    second = asyncio.create_task(lab.session.ask(SendParameters()))
+    await settle()
+    assert lab.connection.commands == ["Version 1.0"]
+    lab.connection.send(obliging("Version 1.0"))
+    await first
+    await settle()
+    assert lab.connection.commands == ["Version 1.0", "SendParameters"]
+    lab.connection.send(obliging("SendParameters"))
+    await second
+
+
+async def test_an_unanswered_command_times_out_and_its_late_reply_answers_no_other(lab: Lab) -> None:
+    lab.server.answer = silent_to("Version")
+    await lab.session.connect()
+    asked_s = now_s()
+    with pytest.raises(ReplyTimeoutError, match=r"did not answer Version 1\.0 within 2 s"):
+        await lab.session.ask(Version())
+    assert now_s() - asked_s == pytest.approx(2)
+    assert lab.session.is_open
+    lab.server.answer = silent_to("")
+    second = asyncio.create_task(lab.session.ask(SendParameters()))
+    await settle()
+    lab.connection.send(obliging("Version 1.0"))
+    await settle()
+    assert not second.done()
+    lab.connection.send(obliging("SendParameters"))
+    assert (await second).body.startswith(b"<RT_Parameters")
+
+
+async def test_asking_before_connecting_raises(lab: Lab) -> None:
+    with pytest.raises(ClosedError, match="not connected"):
+        await lab.session.ask(Version())
+    with pytest.raises(ClosedError, match="not connected"):
+        lab.session.control_recording(start=True)
+
+
+# --- frames and states
+
+
+async def test_frames_of_one_read_are_passed_on_together_with_the_time(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send_frames(1, 2, 3)
+    assert lab.frames == [(1, now_s()), (2, now_s()), (3, now_s())]
+    assert lab.status.state is StreamState.STREAMING
+    assert lab.status.byte_order == "big"
+
+
+async def test_a_stopped_stream_is_idle_before_the_server_answers(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    lab.status.handshake_done(lab.session.protocol_state, lab.session.server)
+    lab.server.answer = silent_to("StreamFrames Stop")
+    stopping = asyncio.create_task(lab.session.ask(StopStreaming()))
+    await settle()
+    assert lab.status.state is StreamState.IDLE
+    lab.connection.send_frames(2)  # was under way
+    assert lab.status.state is StreamState.IDLE
+    stopping.cancel()
+
+
+async def test_a_rejected_frame_is_counted_and_the_next_is_taken(
+    lab: Lab, caplog: pytest.LogCaptureFixture
+) -> None:
+    await lab.streaming()
+    good = markers_frame(2, (0.0, 0.0, 0.0))
+    contradictory = bytearray(markers_frame(1, (0.0, 0.0, 0.0)))
+    contradictory[32:36] = (9).to_bytes(4, "big")  # announces 9 markers
+    lab.connection.send(bytes(contradictory) + good)
+    assert [number for number, _ in lab.frames] == [2]
+    assert lab.status.drops == {"frame rejected": 1}
+    assert lab.status.last_error.startswith("frame rejected: ")
+    assert any(record.levelname == "WARNING" for record in caplog.records)
+
+
+async def test_a_c3d_file_is_passed_on(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send(packet(5, b"content"))
+    assert lab.files == [b"content"]
+
+
+# --- silence
+
+
+async def test_silence_while_a_measurement_runs_ends_the_session(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    since_s = now_s()
+    with pytest.raises(SilenceError, match=r"no frame from 192\.0\.2\.20:3020 for 3 s although"):
+        await lab.session.monitor()
+    assert now_s() - since_s == pytest.approx(3)
+    assert lab.status.state is StreamState.STALLED
+
+
+async def test_each_frame_restarts_the_stall_timeout(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    monitoring = asyncio.create_task(lab.session.monitor())
+    for number in range(2, 8):
+        await asyncio.sleep(2.5)
+        lab.connection.send_frames(number)
+    since_s = now_s()
+    with pytest.raises(SilenceError):
+        await monitoring
+    assert now_s() - since_s == pytest.approx(3)
+
+
+async def test_silence_without_a_measurement_is_checked_by_a_command(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send(NO_DATA)
+    monitoring = asyncio.create_task(lab.session.monitor())
+    await asyncio.sleep(10)
+    assert lab.connection.commands[1:] == ["Version 1.0"] * 3
+    assert not monitoring.done()
+    lab.server.answer = silent_to("Version")
+    with pytest.raises(SilenceError, match=r"did not answer Version 1\.0 within 2 s, and sends no frames"):
+        await monitoring
+
+
+async def test_a_refusal_shows_that_the_server_is_alive(lab: Lab) -> None:
+    await lab.streaming()
+    lab.server.answer = refusing("Version")
+    lab.connection.send(NO_DATA)
+    monitoring = asyncio.create_task(lab.session.monitor())
+    await asyncio.sleep(10)
+    assert lab.connection.commands.count("Version 1.0") == 3
+    assert not monitoring.done()
+    monitoring.cancel()
+
+
+async def test_a_stream_of_events_alone_may_be_silent_during_a_measurement() -> None:
+    lab = Lab(components=("event",))
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    assert lab.status.state is StreamState.STREAMING
+    monitoring = asyncio.create_task(lab.session.monitor())
+    await asyncio.sleep(60)
+    assert not monitoring.done()
+    assert lab.connection.commands.count("Version 1.0") == 19
+    monitoring.cancel()
+
+
+# --- the end
+
+
+async def test_the_end_reaches_everybody_who_waits(lab: Lab) -> None:
+    lab.server.answer = silent_to("Version")
+    await lab.session.connect()
+    asking = asyncio.create_task(lab.session.ask(Version()))
+    monitoring = asyncio.create_task(lab.session.monitor())
+    await settle()
+    lab.connection.end()
+    errors = await asyncio.gather(asking, monitoring, return_exceptions=True)
+    assert [str(error) for error in errors] == [
+        "the connection to 192.0.2.20:3020 was closed by the server"
+    ] * 2
+    assert not lab.session.is_open
+
+
+async def test_the_first_error_wins(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send(b"HTTP/1.1 400 Bad Request\r\n\r\n")
+    await settle()  # the session has aborted the connection, which ended after that
+    lab.session.connection_lost(OSError("Connection reset by peer"))
+    for late_call in (lab.session.monitor(), lab.session.ask(Version())):
+        with pytest.raises(ClosedError, match="this is no RTC3D server"):
+            await late_call
+    with pytest.raises(ClosedError, match="this is no RTC3D server"):
+        lab.session.control_recording(start=True)
+    assert not lab.connection.is_open
+
+
+async def test_a_broken_connection_names_its_reason(lab: Lab) -> None:
+    await lab.session.connect()
+    lab.connection.end(OSError("Connection reset by peer"))
+    with pytest.raises(ClosedError, match=r"192\.0\.2\.20:3020 broke: Connection reset by peer"):
+        await lab.session.monitor()
+
+
+async def test_closing_says_bye_and_waits_for_the_server_to_close(lab: Lab) -> None:
+    await lab.streaming()
+    began_s = now_s()
+    await lab.session.close()
+    assert lab.connection.commands[-1] == "Bye"
+    assert lab.connection.got_eof
+    assert now_s() == began_s
+
+
+async def test_closing_waits_half_a_second_for_a_server_that_does_not_close(lab: Lab) -> None:
+    lab.server.closes_at_bye = False
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    began_s = now_s()
+    closing = asyncio.create_task(lab.session.close())
+    await settle()
+    lab.connection.send_frames(2)  # was under way
+    await closing
+    assert now_s() - began_s == pytest.approx(0.5)
+    assert not lab.connection.is_open
+    assert [number for number, _ in lab.frames] == [1, 2]
+    assert lab.status.state is StreamState.STREAMING  # only the supervisor reports the end
+
+
+async def test_closing_ends_everybody_who_waits_at_once(lab: Lab) -> None:
+    lab.server.closes_at_bye = False
+    lab.server.answer = silent_to("Version")
+    await lab.session.connect()
+    asking = asyncio.create_task(lab.session.ask(Version()))
+    monitoring = asyncio.create_task(lab.session.monitor())
+    await settle()
+    closing = asyncio.create_task(lab.session.close())
+    await settle()
+    for waiting in (asking, monitoring):
+        assert waiting.done()
+        assert "closed by the gateway" in str(waiting.exception())
+    await closing
+
+
+async def test_a_connection_that_is_lost_while_closing_does_not_change_the_reason(lab: Lab) -> None:
+    lab.server.closes_at_bye = False
+    await lab.streaming()
+    closing = asyncio.create_task(lab.session.close())
+    await settle()
+    began_s = now_s()
+    lab.connection.end(OSError("Connection reset by peer"))
+    await closing
+    assert now_s() == began_s  # it does not wait for the rest of the half second
+    with pytest.raises(ClosedError, match="closed by the gateway"):
+        await lab.session.ask(Version())
+
+
+async def test_closing_after_the_end_says_no_bye(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.end()
+    await settle()
+    await lab.session.close()
+    assert "Bye" not in lab.connection.commands
+
+
+async def test_closing_twice_and_before_connecting_does_nothing(lab: Lab) -> None:
+    await lab.session.close()
+    await lab.session.connect()
+    await lab.session.close()
+    await lab.session.close()
+    assert lab.connection.commands == ["Bye"]
+
+
+async def test_a_connection_lost_before_connect_returns_ends_the_session(lab: Lab) -> None:
+    connecting = asyncio.create_task(lab.session.connect())
+    await asyncio.sleep(0)
+    lab.connection.end()
+    await connecting
+    await settle()
+    with pytest.raises(LinkError, match="was closed by the server"):
+        await lab.session.ask(Version())

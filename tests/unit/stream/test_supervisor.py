@@ -1,0 +1,234 @@
+"""A whole stream with a scripted server: connecting again, and ending."""
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from itertools import pairwise
+from typing import Any
+
+import pytest
+
+from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
+from gateway.messages.stamp import Stamp
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import Frame
+from gateway.stream.state import StreamState
+from gateway.stream.status import StreamStatus
+from gateway.stream.supervisor import Callbacks, Supervisor, backoff_delays_s
+from tests.servers import packet
+from tests.unit.stream.scripted_server import ScriptedServer, refusing, silent_to
+from tests.unit.stream.virtual_time import settle, until
+
+FIRST_DELAY_S, MAX_DELAY_S = 0.2, 10.0
+
+
+class Lab:
+    """A supervisor of one stream, and its server."""
+
+    def __init__(self, **stream: Any) -> None:
+        self.server = ScriptedServer()
+        self.status = StreamStatus("3d", name="lab (3d)")
+        self.published: list[tuple[Frame, Stamp]] = []
+        self.has_subscribers = True
+        self.restarts = self.connected = 0
+        self.supervisor = Supervisor(
+            SourceSettings(name="lab", host="192.0.2.20"),
+            StreamSettings(**stream),
+            self.status,
+            Callbacks(
+                publish=self._publish,
+                on_parameters=lambda *_: None,
+                on_connected=self._on_connected,
+                on_restart=self._on_restart,
+                on_file=lambda _: None,
+                has_subscribers=lambda: self.has_subscribers,
+            ),
+            self.server.connect,
+            asyncio.get_running_loop().time,
+        )
+
+    def _publish(self, frame: Frame, stamp: Stamp, _wanted: frozenset[ComponentType]) -> None:
+        self.published.append((frame, stamp))
+
+    def _on_connected(self) -> None:
+        self.connected += 1
+        assert self.supervisor.session is not None  # questions can be asked
+
+    def _on_restart(self) -> None:
+        self.restarts += 1
+
+    @property
+    def delays_s(self) -> list[float]:
+        """The virtual time between each try to connect and the next."""
+        return [after - before for before, after in pairwise(self.server.tried_s)]
+
+    async def tried(self, times: int) -> None:
+        await until(lambda: len(self.server.tried_s) >= times)
+
+    async def ready(self, connections: int = 1) -> None:
+        await until(lambda: len(self.server.connections) == connections and self.supervisor.session)
+
+
+@asynccontextmanager
+async def running(lab: Lab) -> AsyncIterator[asyncio.Task[None]]:
+    task = asyncio.create_task(lab.supervisor.run())
+    try:
+        yield task
+    finally:
+        task.cancel()
+        await asyncio.gather(task, return_exceptions=True)
+
+
+def assert_delays(delays_s: list[float], nominal_s: list[float]) -> None:
+    """Each delay is shortened by at most half; ``until`` and timers add next to nothing."""
+    for delay_s, limit_s in zip(delays_s, nominal_s, strict=True):
+        assert limit_s / 2 <= delay_s + 1e-6
+        assert delay_s <= limit_s + 1e-6
+
+
+# --- connecting again
+
+
+def test_delays_double_up_to_the_maximum_and_are_shortened_at_random() -> None:
+    reconnect = ReconnectSettings(first_delay_s=FIRST_DELAY_S, max_delay_s=MAX_DELAY_S)
+    runs = [[next(delays) for _ in range(9)] for delays in (backoff_delays_s(reconnect) for _ in range(50))]
+    for delays_s in runs:
+        assert_delays(delays_s, [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10, 10, 10])
+    assert len({run[0] for run in runs}) > 1
+
+
+async def test_delays_grow_while_the_server_is_away(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG, "gateway.stream.supervisor")
+    lab = Lab()
+    lab.server.refuses = True
+    async with running(lab):
+        await lab.tried(9)
+    assert_delays(lab.delays_s[:8], [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10, 10])
+    assert lab.status.state is StreamState.WAITING
+    assert lab.status.last_error == "connection refused by the test"
+    assert lab.status.tries == 9
+    levels = [record.levelno for record in caplog.records]
+    assert levels == [logging.WARNING] + [logging.DEBUG] * (len(levels) - 1)
+
+
+async def test_delays_start_again_after_a_connection_that_brought_frames() -> None:
+    lab = Lab()
+    lab.server.refuses = True
+    async with running(lab):
+        await lab.tried(7)
+        lab.server.refuses = False
+        await lab.ready()
+        lab.server.connection.send_frames(1)
+        lab.server.refuses = True
+        tries = len(lab.server.tried_s)
+        ended_s = asyncio.get_running_loop().time()
+        lab.server.connection.end()
+        await lab.tried(tries + 2)
+    first_s, second_s = lab.server.tried_s[tries : tries + 2]
+    assert_delays([first_s - ended_s, second_s - first_s], [0.2, 0.4])
+
+
+async def test_delays_start_again_after_a_connection_without_a_measurement() -> None:
+    lab = Lab()
+    lab.server.refuses = True
+    async with running(lab):
+        await lab.tried(7)
+        lab.server.refuses = False
+        await lab.ready()
+        lab.server.connection.send(packet(4))
+        ended_s = asyncio.get_running_loop().time()
+        lab.server.connection.end()
+        await lab.ready(2)
+    assert_delays([lab.server.tried_s[-1] - ended_s], [0.2])
+
+
+async def test_delays_go_on_growing_if_connections_bring_nothing() -> None:
+    lab = Lab()
+    lab.server.answer = refusing("StreamFrames")
+    async with running(lab):
+        await lab.tried(8)
+    assert_delays(lab.delays_s[:7], [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10])
+    assert lab.status.reconnects >= 7
+
+
+async def test_recovery_is_logged_once_with_its_duration(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gateway.stream.supervisor")
+    lab = Lab()
+    lab.server.refuses = True
+    async with running(lab):
+        await lab.tried(3)
+        lab.server.refuses = False
+        await lab.ready()
+    assert caplog.messages[0] == "lab (3d): connection refused by the test"
+    assert caplog.messages[1].startswith("lab (3d): streaming from 192.0.2.20:3020, after ")
+    assert len(caplog.messages) == 2
+
+
+async def test_a_silent_measurement_is_connected_again() -> None:
+    lab = Lab()
+    async with running(lab):
+        await lab.ready()
+        lab.server.connection.send_frames(1)
+        await lab.ready(2)
+        lab.server.connection.send_frames(2)
+        assert lab.status.state is StreamState.STREAMING
+    assert (lab.connected, lab.status.session, lab.status.reconnects) == (2, 2, 1)
+    assert [stamp.session for _, stamp in lab.published] == [1, 2]
+    assert "although a measurement runs" in lab.status.last_error
+
+
+async def test_a_defect_is_raised_and_not_retried() -> None:
+    lab = Lab()
+    lab.server.answer = _raise_defect
+    async with running(lab) as task:
+        with pytest.raises(ZeroDivisionError):
+            await task
+    assert len(lab.server.tried_s) == 1
+
+
+def _raise_defect(_command: str) -> bytes:
+    raise ZeroDivisionError
+
+
+# --- the session that can be asked
+
+
+async def test_there_is_a_session_from_the_handshake_to_the_end() -> None:
+    lab = Lab()
+    lab.server.answer = silent_to("Version")
+    async with running(lab):
+        await until(lambda: lab.server.connections)
+        assert lab.supervisor.session is None  # still shaking hands
+        await lab.ready()
+        lab.server.refuses = True
+        lab.server.connection.end()
+        await settle()
+        assert lab.supervisor.session is None
+
+
+async def test_cancelling_says_bye() -> None:
+    lab = Lab()
+    async with running(lab):
+        await lab.ready()
+    assert lab.server.connection.commands[-1] == "Bye"
+    assert not lab.server.connection.is_open
+
+
+# --- the tasks of a session
+
+
+async def test_the_tasks_of_a_session_end_with_it() -> None:
+    """One task follows the demand of the first session, and another one that of the second."""
+    lab = Lab(on_demand=True)
+    tasks_before = len(asyncio.all_tasks())
+    async with running(lab):
+        await lab.ready()
+        await settle()
+        tasks_of_one = len(asyncio.all_tasks())
+        lab.server.connection.end()
+        await lab.ready(2)
+        await settle()
+        assert len(asyncio.all_tasks()) == tasks_of_one
+    await settle()
+    assert len(asyncio.all_tasks()) == tasks_before

@@ -1,0 +1,50 @@
+"""An event loop with virtual time: waiting takes no time, and the order of events is exact."""
+
+import asyncio
+import selectors
+from collections.abc import Callable
+from typing import Any
+
+_MAX_STEPS = 10_000
+
+
+class _JumpingSelector(selectors.DefaultSelector):
+    """Never waits: where the loop would, time jumps to the next timer."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.now_s = 1000.0
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        ready = super().select(0)
+        if not ready:
+            if timeout is None:
+                raise AssertionError("no task is ready and no timer is set: the test would wait for ever")
+            self.now_s += max(0.0, timeout)
+        return ready
+
+
+class VirtualTimeLoop(asyncio.SelectorEventLoop):
+    """An event loop for tests without sockets and threads."""
+
+    def __init__(self) -> None:
+        self._jumping = _JumpingSelector()
+        super().__init__(self._jumping)
+
+    def time(self) -> float:
+        return self._jumping.now_s
+
+
+async def settle() -> None:
+    """Let everything run that is ready now."""
+    for _ in range(20):
+        await asyncio.sleep(0)
+
+
+async def until(condition: Callable[[], Any]) -> None:
+    """Let virtual time pass, in steps of 10 ms, until ``condition`` holds."""
+    for _ in range(_MAX_STEPS):
+        if condition():
+            return
+        await asyncio.sleep(0.01)
+    raise AssertionError(f"still not true after {_MAX_STEPS / 100:g} s of virtual time")
