@@ -79,3 +79,12 @@ def test_a_frame_in_the_other_byte_order_is_refused() -> None:
 def test_a_frame_too_short_for_its_component_count_is_refused() -> None:
     with pytest.raises(FrameError, match="too short"):
         reader_after(EMPTY_FRAME["big"]).read(b"\0\0\0")
+
+
+def test_the_number_of_remembered_layouts_is_bounded() -> None:
+    """A server that varies its frames, by mistake or on purpose, must not fill the memory."""
+    reader = FrameReader("big")
+    for count in range(100):
+        markers = np.zeros(count, ITEM_DTYPES[ComponentType.MARKERS])
+        reader.read(frame("big", build_component(ComponentType.MARKERS, 1, 1, markers)))
+        assert len(reader._templates) <= 32
