@@ -71,7 +71,7 @@ class Supervisor:
         self._connect = connect
         self._monotonic = monotonic
         self._failures = FailureLog(logger, status.name)
-        self._ready_session: Session | None = None
+        self._ready_session: Session | None = None  # the newest whose handshake is done
 
     @property
     def session(self) -> Session | None:
@@ -138,6 +138,5 @@ class Supervisor:
             adaptation.start()
             await session.monitor()
         finally:
-            self._ready_session = None
             adaptation.cancel()
             await session.close()

@@ -199,6 +199,19 @@ async def test_silence_without_a_measurement_is_checked_by_a_command(lab: Lab) -
         await monitoring
 
 
+async def test_the_stall_timeout_begins_again_when_a_measurement_ends(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    monitoring = asyncio.create_task(lab.session.monitor())
+    await asyncio.sleep(2.9)
+    lab.connection.send(NO_DATA)
+    await asyncio.sleep(2.9)
+    assert "Version 1.0" not in lab.connection.commands
+    await asyncio.sleep(0.2)
+    assert lab.connection.commands[-1] == "Version 1.0"
+    monitoring.cancel()
+
+
 async def test_a_refusal_shows_that_the_server_is_alive(lab: Lab) -> None:
     await lab.streaming()
     lab.server.answer = refusing("Version")
