@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from typing import Final
 
 import rtc3d
 
@@ -10,6 +11,20 @@ from gateway.messages.host_time import now_utime
 from gateway.outputs.status import OutputHealth, OutputStatus
 from gateway.stream.clock import ServerClock
 from gateway.stream.status import StreamStatus
+
+_COPIED_FIELDS: Final = (
+    "components",
+    "byte_order",
+    "rate",
+    "session",
+    "frames_in",
+    "bytes_in",
+    "reconnects",
+    "restarts",
+    "last_error",
+    "last_error_utime",
+)
+"""Fields of ``stream_status_t`` with the same name and value in StreamStatus."""
 
 
 def status_message(
@@ -20,7 +35,10 @@ def status_message(
     streams: Sequence[tuple[StreamStatus, float]],
     outputs: Iterable[tuple[OutputStatus, OutputHealth]],
 ) -> rtc3d.status_t:
-    """Return the status of one source as its LCM message; ``streams`` come with their rates in Hz."""
+    """Return the status of one source.
+
+    ``server`` is HOST:PORT. Each stream comes with its frame rate in Hz, and each output with its health.
+    """
     message = rtc3d.status_t()
     message.utime = message.capture_utime = now_utime()
     message.sequence = sequence
@@ -35,19 +53,19 @@ def status_message(
     return message
 
 
-def clock_message(source_session: int, sequence: int, stream: StreamStatus) -> rtc3d.clock_t:
-    """Return the clock of one stream as its LCM message."""
+def clock_message(session: int, sequence: int, stream: StreamStatus) -> rtc3d.clock_t:
+    """Return the clock of one stream; ``session`` counts the connections of all streams."""
     message = rtc3d.clock_t()
     message.utime = message.capture_utime = now_utime()
     message.sequence = sequence
-    message.session = source_session
+    message.session = session
     message.components = stream.components
     message.clock = clock_model(stream.clock)
     return message
 
 
 def clock_model(clock: ServerClock) -> rtc3d.clock_model_t:
-    """Return what is known of a server's clock as its LCM type."""
+    """Return the model of a server's clock, empty if there is none."""
     model = rtc3d.clock_model_t()
     model.has_clock = clock.has_clock
     if clock.has_clock:
@@ -60,18 +78,7 @@ def clock_model(clock: ServerClock) -> rtc3d.clock_model_t:
 
 def _stream_message(stream: StreamStatus, rate_hz: float) -> rtc3d.stream_status_t:
     message = rtc3d.stream_status_t()
-    for name in (
-        "components",
-        "byte_order",
-        "rate",
-        "session",
-        "frames_in",
-        "bytes_in",
-        "reconnects",
-        "restarts",
-        "last_error",
-        "last_error_utime",
-    ):
+    for name in _COPIED_FIELDS:
         setattr(message, name, getattr(stream, name))
     message.state = stream.state.value
     message.frame_rate_hz = rate_hz

@@ -25,19 +25,19 @@ def test_counts_and_gaps_are_the_floor_or_the_ceiling(
     rate_hz: float, share: float, frames: int, start_us: int
 ) -> None:
     indices = picked(Pacer(rate_hz * share), stamps(rate_hz, frames, start_us))
-    nearly = 1e-9  # of a frame: the rates are not exact in binary
+    nearly = 1e-9  # in frames: the rates are not exact in binary
     assert math.floor(frames * share - nearly) <= len(indices) <= math.ceil(frames * share + nearly)
     shortest, longest = math.floor(1 / share + nearly), math.ceil(1 / share - nearly)
     assert all(shortest <= after - before <= longest for before, after in pairwise(indices))
 
 
 @given(server_rates_hz, st.floats(1, 1000), st.integers(1, 300))
-def test_rates_above_the_servers_let_all_frames_pass(rate_hz: float, factor: float, frames: int) -> None:
+def test_a_limit_above_the_rate_picks_all_frames(rate_hz: float, factor: float, frames: int) -> None:
     assert picked(Pacer(rate_hz * factor), stamps(rate_hz, frames, 0)) == list(range(frames))
 
 
 @given(st.integers(1, 20), st.integers(0, 2**20), st.data())
-def test_jitter_of_a_twentieth_of_a_frame_changes_nothing_in_even_gaps(
+def test_jitter_of_a_twentieth_of_a_frame_does_not_change_even_gaps(
     divisor: int, start_us: int, data: st.DataObject
 ) -> None:
     exact = stamps(200, 100, start_us)
@@ -50,13 +50,13 @@ nonsense = st.lists(st.tuples(st.none() | st.integers(-(2**63), 2**63 - 1), st.i
 
 
 @given(nonsense, server_rates_hz, shares, st.integers(0, 500))
-def test_after_any_nonsense_the_rate_is_right_at_once(
+def test_the_rate_is_right_at_once_after_any_nonsense(
     before: list[tuple[int | None, int]], rate_hz: float, share: float, frames: int
 ) -> None:
     pacer = Pacer(rate_hz * share)
     for timestamp_us, arrival_utime in before:
         pacer.due(timestamp_us, arrival_utime)
     indices = picked(pacer, stamps(rate_hz, frames, 2**63))
-    # It begins anew with the first, and the spacing is known with the third. Besides, a frame that is more
-    # than a quarter of the spacing ahead of its time may be left out: at the end three quarters are missing.
+    # The pacer restarts with the first frame and knows the spacing with the third. Besides, it may leave out
+    # a frame that is early by more than a quarter of the spacing: at the end three quarters are missing.
     assert frames * share - 2.75 <= len(indices) <= frames * share + 2

@@ -11,7 +11,7 @@ labels = st.text(max_size=80)
 
 
 @given(labels)
-def test_any_label_is_one_chunk_of_a_key_that_zenoh_takes(label: str) -> None:
+def test_any_label_becomes_one_chunk_of_a_valid_zenoh_key(label: str) -> None:
     key = zenoh.KeyExpr(zenoh_key("mocap", "lab", "6d", label))
     assert len(str(key).split("/")) == 4
     assert not key.includes("mocap/lab/6d/another")
@@ -29,14 +29,14 @@ def test_different_labels_have_different_keys(one: str, other: str) -> None:
 
 
 @given(st.from_regex(r"[A-Za-z0-9_]{1,16}", fullmatch=True), labels, labels)
-def test_any_label_gives_a_channel_that_lcm_takes(prefix: str, source: str, label: str) -> None:
+def test_any_label_gives_a_valid_lcm_channel(prefix: str, source: str, label: str) -> None:
     channel = lcm_channel(prefix, source, "6d", label)
     assert re.fullmatch(re.escape(prefix) + "_[A-Z0-9_]+", channel)
     assert len(channel) <= 63
 
 
 @given(st.lists(labels, max_size=30), st.integers(4, 63))
-def test_names_made_unique_are_different_and_not_too_long(wanted: list[str], max_length: int) -> None:
+def test_unique_names_differ_and_keep_to_the_length(wanted: list[str], max_length: int) -> None:
     taken: list[str] = []
     for name in wanted:
         taken.append(unique_name(name, taken, max_length))
@@ -45,5 +45,5 @@ def test_names_made_unique_are_different_and_not_too_long(wanted: list[str], max
 
 
 @given(labels, st.sets(labels))
-def test_a_free_name_stays_as_it_is(name: str, taken: set[str]) -> None:
+def test_a_free_name_is_not_changed(name: str, taken: set[str]) -> None:
     assert unique_name(name, taken - {name}, max_length=80) == name

@@ -4,7 +4,7 @@ from gateway.messages.topics import escape_key_chunk, lcm_channel, unique_name, 
 
 
 @pytest.mark.parametrize(
-    ("parts", "key", "channel"),
+    ("path", "key", "channel"),
     [
         (("3d",), "mocap/lab/3d", "MOCAP_LAB_3D"),
         (("6d",), "mocap/lab/6d", "MOCAP_LAB_6D"),
@@ -16,12 +16,12 @@ from gateway.messages.topics import escape_key_chunk, lcm_channel, unique_name, 
         (("6d", "tool 1"), "mocap/lab/6d/tool%201", "MOCAP_LAB_6D_TOOL_1"),
     ],
 )
-def test_keys_and_channels_are_named_as_documented(parts: tuple[str, ...], key: str, channel: str) -> None:
-    assert zenoh_key("mocap", "lab", *parts) == key
-    assert lcm_channel("MOCAP", "lab", *parts) == channel
+def test_keys_and_channels_are_as_documented(path: tuple[str, ...], key: str, channel: str) -> None:
+    assert zenoh_key("mocap", "lab", *path) == key
+    assert lcm_channel("MOCAP", "lab", *path) == channel
 
 
-def test_a_prefix_is_taken_as_it_is() -> None:
+def test_a_prefix_is_not_changed() -> None:
     assert zenoh_key("site/hall 2", "lab", "3d") == "site/hall 2/lab/3d"
     assert lcm_channel("Hall_2", "lab", "3d") == "Hall_2_LAB_3D"
 
@@ -41,7 +41,7 @@ def test_a_prefix_is_taken_as_it_is() -> None:
         ("", "%"),
     ],
 )
-def test_what_zenoh_refuses_in_a_label_is_percent_escaped(label: str, chunk: str) -> None:
+def test_characters_that_zenoh_refuses_in_a_label_are_percent_escaped(label: str, chunk: str) -> None:
     assert escape_key_chunk(label) == chunk
 
 
@@ -55,16 +55,16 @@ def test_what_zenoh_refuses_in_a_label_is_percent_escaped(label: str, chunk: str
         ("", "_"),
     ],
 )
-def test_what_is_not_ascii_letter_or_digit_is_one_underscore_in_a_channel(label: str, part: str) -> None:
+def test_characters_that_lcm_refuses_in_a_label_become_one_underscore(label: str, part: str) -> None:
     assert lcm_channel("MOCAP", "lab", "6d", label) == f"MOCAP_LAB_6D_{part}"
 
 
-def test_a_sources_dashes_are_underscores_in_channels_only() -> None:
+def test_dashes_of_a_source_become_underscores_only_in_channels() -> None:
     assert zenoh_key("mocap", "hall-2", "3d") == "mocap/hall-2/3d"
     assert lcm_channel("MOCAP", "hall-2", "3d") == "MOCAP_HALL_2_3D"
 
 
-def test_a_channel_is_cut_to_what_lcm_allows() -> None:
+def test_a_channel_is_cut_to_the_limit_of_lcm() -> None:
     assert lcm_channel("MOCAP", "lab", "6d", 100 * "a") == "MOCAP_LAB_6D_" + 50 * "A"
 
 

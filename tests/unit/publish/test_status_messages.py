@@ -16,7 +16,7 @@ NO_CLOCK = {"has_clock": False, "offset_us": 0, "drift_ppm": 0.0, "uncertainty_u
 
 
 def fields_of(value: Any) -> Any:
-    """Return an LCM object as a dictionary of all its fields, whatever they are."""
+    """Return an LCM object as a dictionary of all its fields."""
     if hasattr(value, "__slots__"):
         return {name: fields_of(getattr(value, name)) for name in value.__slots__}
     return [fields_of(item) for item in value] if isinstance(value, list) else value
@@ -150,9 +150,9 @@ def test_the_clock_message_has_every_field() -> None:
     }
 
 
-def test_a_clock_that_is_known_is_told() -> None:
+def test_the_clock_model_has_every_field_of_a_known_clock() -> None:
     clock = ServerClock()
-    for number in range(8_000):  # 20 s at 400 Hz, with a gateway's clock that is 50 ppm faster
+    for number in range(8_000):  # 20 s at 400 Hz, while the gateway's clock is 50 ppm faster
         timestamp_us = 2_500 * number
         clock.observe(timestamp_us, number, 1_700_000_000_000_000 + timestamp_us + timestamp_us // 20_000)
     assert clock.has_clock
@@ -167,7 +167,7 @@ def test_a_clock_that_is_known_is_told() -> None:
 
 
 @pytest.mark.parametrize("counter", ["messages", "drops"])
-def test_counts_stand_in_the_order_of_their_names(counter: str) -> None:
+def test_counts_are_sorted_by_name(counter: str) -> None:
     output = OutputStatus("zenoh", **{counter: Counter("cab")})
     outputs = [(output, OutputHealth(True))]
     message = encoded_and_decoded(
