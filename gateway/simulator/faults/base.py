@@ -19,7 +19,7 @@ from gateway.simulator.faults.parameters import Count, Interval, Seconds, parame
 class ActiveFault:
     """A fault on one server: when it begins and ends, how often, and its random numbers.
 
-    It begins once, or again and again if the fault has ``every_s``.
+    It begins once, or repeatedly if the fault has ``every_s``.
     """
 
     def __init__(self, fault: "Fault", server: FaultyServer, rng: np.random.Generator) -> None:
@@ -31,7 +31,7 @@ class ActiveFault:
         self.times = 0
         """How often it happened: packets, replies or reads that it changed; for other faults, beginnings."""
         self.variant = 0
-        """A random number that is another each time the fault begins."""
+        """A different random number each time the fault begins."""
         self.began_us = 0
         """The measurement's time when the fault last began."""
         self._undo: Callable[[], None] | None = None
