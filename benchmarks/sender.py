@@ -11,8 +11,8 @@ from collections.abc import Generator
 from typing import Final, NamedTuple
 
 from benchmarks.workloads import Frames, Workload
-from gateway.rtc3d.packets import HEADER, PacketType, encode_packet
-from gateway.rtc3d.parameters_xml import build_parameters
+from gateway.rtc3d.packets import PACKET_HEADER, PacketType, encode_packet
+from gateway.rtc3d.parameters_xml import encode_parameters
 
 _BLOCK_FRAMES: Final = 64
 _WAIT_S: Final = 30.0
@@ -46,7 +46,7 @@ def send(workload: Workload, clients: list[str]) -> Generator[dict[str, int] | S
 
     A client is sent its frames on one connection, which ends then; the next request waits for the next.
     """
-    doors = {name: _Door(build_parameters(workload.scene().parameters)) for name in clients}
+    doors = {name: _Door(encode_parameters(workload.scene().parameters)) for name in clients}
     one, block = Frames(workload.packet(), 1), Frames(workload.packet(), _BLOCK_FRAMES)
     numbers = dict.fromkeys(clients, 1)
     request = yield {name: door.port for name, door in doors.items()}
@@ -103,11 +103,11 @@ class _Door:
 
     def _shake_hands(self, connection: socket.socket) -> bool:
         while True:
-            header = connection.recv(HEADER.size, socket.MSG_WAITALL)
-            if len(header) < HEADER.size:
+            header = connection.recv(PACKET_HEADER.size, socket.MSG_WAITALL)
+            if len(header) < PACKET_HEADER.size:
                 return False
-            size, _ = HEADER.unpack(header)
-            text = connection.recv(size - HEADER.size, socket.MSG_WAITALL)
+            size, _ = PACKET_HEADER.unpack(header)
+            text = connection.recv(size - PACKET_HEADER.size, socket.MSG_WAITALL)
             if text.startswith(b"SendParameters"):
                 connection.sendall(self._xml)
             else:

@@ -16,7 +16,7 @@ import zenoh
 from gateway.messages.splice import CONTENT_OFFSET
 from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
-from gateway.rtc3d.packets import HEADER, PacketType, encode_packet
+from gateway.rtc3d.packets import PACKET_HEADER, PacketType, encode_packet
 
 LCM_BUFFER_BYTES: Final = 4_000_000
 """What subscribers that must lose nothing give as ``recv_buf_size``, as the documents tell."""
@@ -174,8 +174,8 @@ def subscribe_tcp(port: int, packet_bytes: int, offset: int) -> Iterator[Any]:
         command = encode_packet(PacketType.COMMAND, str(StreamFrames()).encode())
         with socket.create_connection(("127.0.0.1", port)) as connection:
             connection.sendall(command)
-            size, _ = HEADER.unpack(connection.recv(HEADER.size, socket.MSG_WAITALL))
-            connection.recv(size - HEADER.size, socket.MSG_WAITALL)
+            size, _ = PACKET_HEADER.unpack(connection.recv(PACKET_HEADER.size, socket.MSG_WAITALL))
+            connection.recv(size - PACKET_HEADER.size, socket.MSG_WAITALL)
             while len(packet := connection.recv(packet_bytes, socket.MSG_WAITALL)) == packet_bytes:
                 now_us = time.monotonic_ns() / 1000
                 ages_us.append(now_us - _CONTENT.unpack_from(packet, offset)[1])

@@ -8,7 +8,7 @@ import numpy as np
 
 from gateway.messages.splice import CONTENT_OFFSET
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.packets import HEADER
+from gateway.rtc3d.packets import PACKET_HEADER
 from gateway.rtc3d_server.frame_builder import FrameBuilder
 from gateway.simulator.synthetic import SyntheticScene
 
@@ -75,7 +75,7 @@ class Cut(NamedTuple):
 def cuts(packet: bytes) -> list[Cut]:
     """Return, for each component of a packet, as many bytes as its message has, its content at their end."""
     found = []
-    at = HEADER.size + 4  # behind the packet's header and the count of components
+    at = PACKET_HEADER.size + 4  # behind the packet's header and the count of components
     while at < len(packet):
         size, number = _COMPONENT.unpack_from(packet, at)
         first = at + _COMPONENT.size - CONTENT_OFFSET

@@ -12,7 +12,7 @@ from gateway.outputs.status import OutputStatus
 from gateway.publish.routes import ComponentRoute, OutputRoute
 from gateway.publish.tool_poses import ToolPoses
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame, Layout
+from gateway.rtc3d.frames import Frame, FrameLayout
 from gateway.rtc3d.parameters import Parameters
 
 _MAX_PLANS: Final = 256
@@ -56,7 +56,7 @@ class _Plan:
 
     def __init__(
         self,
-        layout: Layout,
+        layout: FrameLayout,
         wanted: frozenset[ComponentType],
         components: list[_ComponentPlan],
         tool_indices: list[int],
@@ -67,7 +67,7 @@ class _Plan:
         self.tool_indices = tool_indices
         self.num_items = {
             part.type: part.num_items
-            for part in layout.parts
+            for part in layout.components
             if part.type in wanted and part.type is not ComponentType.EVENT
         }
 
@@ -158,8 +158,8 @@ class FanOut:
         for index in plan.tool_indices:
             self._tool_poses.publish(frame, index, stamp)
 
-    def _new_plan(self, layout: Layout, wanted: frozenset[ComponentType]) -> _Plan:
-        parts = [(index, part) for index, part in enumerate(layout.parts) if part.type in wanted]
+    def _new_plan(self, layout: FrameLayout, wanted: frozenset[ComponentType]) -> _Plan:
+        parts = [(index, part) for index, part in enumerate(layout.components) if part.type in wanted]
         components = [
             _ComponentPlan(
                 self._components[part.type],

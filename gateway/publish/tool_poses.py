@@ -83,7 +83,7 @@ class ToolPoses:
         if self._metres is None:
             self._count_drop("unknown unit")
             return
-        num_tools = frame.layout.parts[index].num_items
+        num_tools = frame.layout.components[index].num_items
         if num_tools > _MAX_TOOLS:
             self._too_many.failed(
                 f"a frame of {num_tools} tools, more than {_MAX_TOOLS}: no tool poses are published"

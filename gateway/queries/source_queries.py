@@ -33,7 +33,7 @@ from gateway.queries.answers import (
 from gateway.queries.parameter_cache import Known, Sections, known_from
 from gateway.rtc3d.commands import Command, SendCurrentFrame, SendParameters
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, Component, ComponentType
-from gateway.rtc3d.frames import byte_order_of, split_frame
+from gateway.rtc3d.frames import detect_byte_order, split_frame
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters import SECTIONS
 from gateway.rtc3d.parameters_xml import ParsedParameters
@@ -259,7 +259,7 @@ class SourceQueries:
         if packet.type == PacketType.NO_DATA:
             raise QueryError(f"source {self.source.name!r}: no measurement runs", code="nothing-yet")
         try:
-            frame = split_frame(packet.body, byte_order_of(packet.body, self.source.byte_order))
+            frame = split_frame(packet.body, detect_byte_order(packet.body, self.source.byte_order))
         except FrameError as error:
             raise QueryError(f"the current frame cannot be read: {error}", code="unreadable") from error
         for component in frame.components:

@@ -7,7 +7,7 @@ from typing import Final, TypeVar
 
 from gateway.errors import CommandError
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
-from gateway.rtc3d.packets import text_of
+from gateway.rtc3d.packets import decode_text
 from gateway.rtc3d.parameters import SECTIONS
 
 # "Event" is an alias that some clients use.
@@ -142,7 +142,7 @@ def parse_command(body: bytes) -> Command:
     Case does not count; NUL, LF and white space at the end are dropped (§5.2, field note 13).
     Raises CommandError with a text for the client: what was wrong and what is accepted.
     """
-    words = text_of(body).split()
+    words = decode_text(body).split()
     if not words:
         raise CommandError(f"Empty command; {_KNOWN_COMMANDS}")
     verb, parameters = words[0].lower(), [word.lower() for word in words[1:]]

@@ -85,14 +85,14 @@ ITEM_DTYPES: Final[dict[ComponentType, np.dtype[Any]]] = {
 }
 """One item of each component in big-endian form (§7.3 to §7.7), 4-byte packing (§3.2)."""
 
-KNOWN_HEADER: Final = {"big": struct.Struct(">IIiqI"), "little": struct.Struct("<IIiqI")}
+COMPONENT_HEADER: Final = {"big": struct.Struct(">IIiqI"), "little": struct.Struct("<IIiqI")}
 """§7.1's header of a known component with the count that begins its data.
 
 That is size, type, frame number, time stamp in µs, count.
 """
-HEADER_BYTES: Final = 24
+COMPONENT_HEADER_BYTES: Final = 24
 
-NUMBER_AND_TIME: Final = {"big": struct.Struct(">iq"), "little": struct.Struct("<iq")}
+FRAME_NUMBER_AND_TIMESTAMP: Final = {"big": struct.Struct(">iq"), "little": struct.Struct("<iq")}
 """How Component.content begins: frame number, time stamp in µs."""
 _CONTENT_HEADER_BYTES: Final = 16  # with the count
 
@@ -138,7 +138,7 @@ def big_endian_content(component: Component) -> bytes:
     return header + items.astype(items.dtype.newbyteorder(">")).tobytes()
 
 
-def build_component(
+def encode_component(
     component: ComponentType,
     frame_number: int,
     timestamp_us: int,
@@ -151,5 +151,5 @@ def build_component(
     """
     wire = items.astype(items.dtype.newbyteorder(byte_order), copy=False)
     data = wire.tobytes()
-    size = HEADER_BYTES + len(data)
-    return KNOWN_HEADER[byte_order].pack(size, component, frame_number, timestamp_us, len(items)) + data
+    size = COMPONENT_HEADER_BYTES + len(data)
+    return COMPONENT_HEADER[byte_order].pack(size, component, frame_number, timestamp_us, len(items)) + data

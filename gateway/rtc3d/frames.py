@@ -1,4 +1,4 @@
-"""Data frames (§7.1): split into components, and built from them."""
+"""Data frames (§7.1): split into components, and encoded from them."""
 
 import struct
 from collections.abc import Iterable, Iterator
@@ -7,10 +7,10 @@ from typing import Final, NamedTuple
 
 from gateway.errors import FrameError
 from gateway.rtc3d.components import (
-    HEADER_BYTES,
+    COMPONENT_HEADER,
+    COMPONENT_HEADER_BYTES,
+    FRAME_NUMBER_AND_TIMESTAMP,
     ITEM_DTYPES,
-    KNOWN_HEADER,
-    NUMBER_AND_TIME,
     SHORT_EVENT,
     ByteOrder,
     Component,
@@ -18,102 +18,107 @@ from gateway.rtc3d.components import (
 )
 
 _SIZE_AND_TYPE: Final = {"big": struct.Struct(">II"), "little": struct.Struct("<II")}
+_SIZE_AND_TYPE_BYTES: Final = 8
 _COUNT: Final = {"big": struct.Struct(">I"), "little": struct.Struct("<I")}
+_COUNT_BYTES: Final = 4
 _ITEM_BYTES: Final = {int(component): (component, dtype.itemsize) for component, dtype in ITEM_DTYPES.items()}
+_MAX_CACHED_LAYOUTS: Final = 256
 
 
 class ComponentLayout(NamedTuple):
-    """What a layout says of a known component; ``item_bytes`` is 16 or 24 for events, else the item's own."""
+    """The layout of one known component; ``item_bytes`` is 16 or 24 for events, else the item's only size."""
 
     type: ComponentType
     num_items: int
     item_bytes: int
 
 
-class _Header(NamedTuple):
-    """What stays of a component's header; ``part`` is None where the type is unknown."""
+class LayoutField(NamedTuple):
+    """The size and type of one component, and its layout, which is None for an unknown type."""
 
     size: int
     type: int
-    part: ComponentLayout | None
+    component: ComponentLayout | None
 
 
-class Layout:
-    """All that frames laid out alike have in common; ``layout_of`` gives the same object for the same layout.
+class FrameLayout:
+    """What all frames with the same components and item counts have in common.
 
-    ``parts`` are the known components in their order, ``unknown_types`` the types of those skipped.
+    ``components`` are the known components in their order, ``unknown_types`` the types of the components
+    that are skipped. Equal layouts are one object, so that they can be compared with ``is``.
     """
 
-    def __init__(self, byte_order: ByteOrder, headers: tuple[_Header, ...]) -> None:
+    def __init__(self, byte_order: ByteOrder, fields: tuple[LayoutField, ...]) -> None:
         self.byte_order: ByteOrder = byte_order
-        self.parts = tuple(header.part for header in headers if header.part is not None)
-        self.first_type = self.parts[0].type if self.parts else None
-        """Of the first known component; None in a frame without any."""
-        self.unknown_types = tuple(header.type for header in headers if header.part is None)
-        self.number_and_time = NUMBER_AND_TIME[byte_order].unpack_from
-        """Called with a component's content: its frame number and time stamp in µs."""
-        self.headers = headers
-        """What stays of every component's header, those of unknown type included."""
-        self.spans = tuple(_spans(headers))
+        self.fields = fields
+        """All components, those of unknown type included."""
+        self.components = tuple(field.component for field in fields if field.component is not None)
+        self.first_component_type = self.components[0].type if self.components else None
+        """The type of the first known component; None in a frame without any."""
+        self.unknown_types = tuple(field.type for field in fields if field.component is None)
+        self.unpack_number_and_timestamp = FRAME_NUMBER_AND_TIMESTAMP[byte_order].unpack_from
+        """Returns the frame number and the time stamp in µs of a component's content."""
+        self.content_spans = tuple(_content_spans(fields))
         """Where in the body each known component's content begins and ends."""
 
 
-def _spans(headers: tuple[_Header, ...]) -> Iterator[tuple[int, int]]:
-    start = 4
-    for size, _, part in headers:
-        if part is not None:
-            yield start + 8, start + size
-        start += size
+def _content_spans(fields: tuple[LayoutField, ...]) -> Iterator[tuple[int, int]]:
+    start = _COUNT_BYTES
+    for field in fields:
+        end = start + field.size
+        if field.component is not None:
+            yield start + _SIZE_AND_TYPE_BYTES, end
+        start = end
 
 
-layout_of = lru_cache(256)(Layout)
+_layout = lru_cache(_MAX_CACHED_LAYOUTS)(FrameLayout)
 
 
 class Frame:
-    """A data frame: its layout, and the packet's ``body``, from which contents are cut when asked for.
+    """A data frame: its layout and its packet's ``body``, from which contents are cut on request.
 
     A component's content is what follows its size and type: frame number, time stamp, count and items,
-    in the layout's byte order.
+    in the layout's byte order. Indices count the known components.
     """
 
     __slots__ = ("body", "layout")
 
-    def __init__(self, layout: Layout, body: bytes) -> None:
+    def __init__(self, layout: FrameLayout, body: bytes) -> None:
         self.layout = layout
         self.body = body
 
     def content(self, index: int) -> bytes:
-        """Return the content of the known component at ``index``."""
-        start, end = self.layout.spans[index]
+        """Return the content of the component at ``index``."""
+        start, end = self.layout.content_spans[index]
         return self.body[start:end]
 
     @property
     def contents(self) -> tuple[bytes, ...]:
         """The contents of the known components."""
-        return tuple(self.content(index) for index in range(len(self.layout.parts)))
+        return tuple(self.content(index) for index in range(len(self.layout.components)))
 
     @property
-    def number_and_time(self) -> tuple[int, int]:
+    def number_and_timestamp(self) -> tuple[int, int]:
         """Frame number and time stamp in µs of the first known component; there must be one."""
         layout = self.layout
-        return layout.number_and_time(self.body, layout.spans[0][0])
+        return layout.unpack_number_and_timestamp(self.body, layout.content_spans[0][0])
 
     @property
     def components(self) -> tuple[Component, ...]:
-        """The known components, as they came."""
-        return tuple(self.component(index) for index in range(len(self.layout.parts)))
+        """The known components, in the order of the frame."""
+        return tuple(self.component(index) for index in range(len(self.layout.components)))
 
     def component(self, index: int) -> Component:
-        """Return the known component at ``index``."""
+        """Return the component at ``index``."""
         layout = self.layout
-        part, content = layout.parts[index], self.content(index)
-        frame_number, timestamp_us = layout.number_and_time(content, 0)
+        component, content = layout.components[index], self.content(index)
+        frame_number, timestamp_us = layout.unpack_number_and_timestamp(content, 0)
         return Component(
-            part.type,
+            component.type,
             frame_number,
             timestamp_us,
-            part.num_items,
-            part.item_bytes,
+            component.num_items,
+            component.item_bytes,
             layout.byte_order,
             content,
         )
@@ -127,19 +132,19 @@ class Frame:
 def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
     """Split a type-3 packet's body into components (§7.1).
 
-    Components of unknown type are skipped by their size. Raises FrameError where a size or count
-    contradicts another or the body's length; nothing of such a frame can be trusted.
+    Components of unknown type are skipped by their size. Raises FrameError if a size or count
+    contradicts another one or the body's length; then nothing in the frame can be trusted.
     """
     total = len(body)
-    if total < 4:
+    if total < _COUNT_BYTES:
         raise FrameError(f"data frame of {total} bytes: too short for its component count")
     (component_count,) = _COUNT[byte_order].unpack_from(body)
-    headers: list[_Header] = []
-    start = 4
+    fields: list[LayoutField] = []
+    start = _COUNT_BYTES
     for index in range(component_count):
-        if total - start >= HEADER_BYTES:
-            size, kind, _, _, count = KNOWN_HEADER[byte_order].unpack_from(body, start)
-        elif total - start >= 8:
+        if total - start >= COMPONENT_HEADER_BYTES:
+            size, kind, _, _, count = COMPONENT_HEADER[byte_order].unpack_from(body, start)
+        elif total - start >= _SIZE_AND_TYPE_BYTES:
             size, kind = _SIZE_AND_TYPE[byte_order].unpack_from(body, start)
             count = 0
         else:
@@ -147,37 +152,40 @@ def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
                 f"data frame announces {component_count} components; its {total} bytes end after {index}"
             )
         end = start + size
-        if size < 8 or end > total:
+        if size < _SIZE_AND_TYPE_BYTES or end > total:
             raise FrameError(
                 f"component {index + 1} of {component_count} (type {kind}) has size {size}; "
                 f"{total - start} bytes are left in the frame"
             )
-        headers.append(_Header(size, kind, _part(kind, size, count)))
+        fields.append(LayoutField(size, kind, _component_layout(kind, size, count)))
         start = end
     if start != total:
         raise FrameError(f"{total - start} bytes follow the last of the frame's {component_count} components")
-    return Frame(layout_of(byte_order, tuple(headers)), body)
+    return Frame(_layout(byte_order, tuple(fields)), body)
 
 
-def _part(kind: int, size: int, count: int) -> ComponentLayout | None:
-    """Return what the component is; None for an unknown type. Raises FrameError if size and count differ."""
+def _component_layout(kind: int, size: int, count: int) -> ComponentLayout | None:
+    """Return the layout of a component, None if its type is unknown.
+
+    Raises FrameError if the size does not fit the item count.
+    """
     known = _ITEM_BYTES.get(kind)
     if known is None:
         return None
     component, item_bytes = known
-    if size == HEADER_BYTES + count * item_bytes:
+    if size == COMPONENT_HEADER_BYTES + count * item_bytes:
         return ComponentLayout(component, count, item_bytes)
-    # Events in the specification's form (field note 6).
-    if component is ComponentType.EVENT and size == HEADER_BYTES + count * SHORT_EVENT.itemsize:
+    # Events may have the specification's size instead of the usual one (field note 6).
+    if component is ComponentType.EVENT and size == COMPONENT_HEADER_BYTES + count * SHORT_EVENT.itemsize:
         return ComponentLayout(component, count, SHORT_EVENT.itemsize)
     raise FrameError(f"{component.key} component of {size} bytes announces {count} items")
 
 
-def byte_order_of(body: bytes, expected: ByteOrder) -> ByteOrder:
+def detect_byte_order(body: bytes, expected: ByteOrder) -> ByteOrder:
     """Return the byte order in which the frame makes sense, ``expected`` if it does in both.
 
-    Some servers acknowledge a byte order and then ignore it (field note 4). Raises FrameError, the
-    one for ``expected``, if the frame makes sense in neither.
+    Some servers acknowledge a byte order and then ignore it (field note 4). Raises the FrameError of
+    ``expected`` if the frame makes sense in neither.
     """
     other: ByteOrder = "little" if expected == "big" else "big"
     try:
@@ -191,7 +199,7 @@ def byte_order_of(body: bytes, expected: ByteOrder) -> ByteOrder:
     return expected
 
 
-def build_frame(components: Iterable[bytes], byte_order: ByteOrder = "big") -> bytes:
-    """Return a type-3 packet's body from components that ``build_component`` made."""
-    parts = list(components)
-    return _COUNT[byte_order].pack(len(parts)) + b"".join(parts)
+def encode_frame(components: Iterable[bytes], byte_order: ByteOrder = "big") -> bytes:
+    """Return a type-3 packet's body from the components that ``encode_component`` returned."""
+    encoded = list(components)
+    return _COUNT[byte_order].pack(len(encoded)) + b"".join(encoded)

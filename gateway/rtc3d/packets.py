@@ -6,8 +6,8 @@ from typing import Final
 
 from gateway.errors import PacketError
 
-HEADER: Final = struct.Struct(">II")
-HEADER_BYTES: Final = 8
+PACKET_HEADER: Final = struct.Struct(">II")
+PACKET_HEADER_BYTES: Final = 8
 DEFAULT_MAX_PACKET_BYTES: Final = 16 * 1024 * 1024
 DEFAULT_MAX_C3D_BYTES: Final = 256 * 1024 * 1024
 _MAX_SIZE: Final = 0xFFFFFFFF
@@ -26,7 +26,7 @@ class PacketType(IntEnum):
 
 
 # Looking these up costs 0.1 µs each, and both are needed for every packet.
-_unpack_header: Final = HEADER.unpack_from
+_unpack_header: Final = PACKET_HEADER.unpack_from
 _C3D: Final = int(PacketType.C3D)
 
 
@@ -54,7 +54,7 @@ def encode_packet(packet_type: int, body: bytes = b"") -> bytes:
 
     Raises PacketError if the body does not fit the 32-bit size field.
     """
-    size = HEADER_BYTES + len(body)
+    size = PACKET_HEADER_BYTES + len(body)
     if size > _MAX_SIZE:
         raise PacketError(
             f"a packet of {size} bytes does not fit its 32-bit size field",
@@ -62,10 +62,10 @@ def encode_packet(packet_type: int, body: bytes = b"") -> bytes:
             packet_type=packet_type,
             offset=0,
         )
-    return HEADER.pack(size, packet_type) + body
+    return PACKET_HEADER.pack(size, packet_type) + body
 
 
-def text_of(body: bytes) -> str:
+def decode_text(body: bytes) -> str:
     """Return a type 0 or 1 body as text: NULs and white space around it are dropped (field notes 8, 13).
 
     Bytes that are not ASCII are kept as Latin-1, so that any body can be shown.
@@ -122,10 +122,10 @@ class PacketReader:
         packets: list[Packet] = []
         available = len(data)
         start = 0
-        while available - start >= HEADER_BYTES:
+        while available - start >= PACKET_HEADER_BYTES:
             size, packet_type = _unpack_header(data, start)
             limit = self._max_c3d_bytes if packet_type == _C3D else self._max_packet_bytes
-            if not HEADER_BYTES <= size <= limit:
+            if not PACKET_HEADER_BYTES <= size <= limit:
                 shown = data[start : start + _SHOWN_BYTES]
                 self.error = _size_error(size, packet_type, self._offset + start, limit, shown)
                 return packets, available
@@ -133,16 +133,18 @@ class PacketReader:
             if end > available:
                 self._partial_goal = size
                 break
-            packets.append(Packet(packet_type, data[start + HEADER_BYTES : end]))
+            packets.append(Packet(packet_type, data[start + PACKET_HEADER_BYTES : end]))
             start = end
         else:
-            self._partial_goal = HEADER_BYTES
+            self._partial_goal = PACKET_HEADER_BYTES
         self._offset += start
         return packets, start
 
 
 def _size_error(size: int, packet_type: int, offset: int, limit: int, begin: bytes) -> PacketError:
-    bound = f"less than the header's {HEADER_BYTES}" if size < HEADER_BYTES else f"limit {limit}"
+    bound = (
+        f"less than the header's {PACKET_HEADER_BYTES}" if size < PACKET_HEADER_BYTES else f"limit {limit}"
+    )
     return PacketError(
         f"packet size {size} ({bound}), type {packet_type}, at byte {offset} of the stream: "
         "this is no RTC3D server, or the connection is corrupt; check host and port",

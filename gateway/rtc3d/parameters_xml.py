@@ -315,7 +315,7 @@ def _number(element: etree._Element, text: str, kind: type, notes: list[str]) ->
     return None
 
 
-def build_parameters(parameters: Parameters) -> bytes:
+def encode_parameters(parameters: Parameters) -> bytes:
     """Return the XML of the sections that are not None, in §6's layout and in ASCII (§4.2).
 
     Characters that XML cannot hold are dropped, and numbers that are None are left out.

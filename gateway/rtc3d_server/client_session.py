@@ -23,10 +23,10 @@ from gateway.rtc3d.commands import (
     parse_command,
 )
 from gateway.rtc3d.components import ByteOrder, ComponentType
-from gateway.rtc3d.frames import byte_order_of, split_frame
-from gateway.rtc3d.packets import Packet, PacketType, encode_packet, text_of
+from gateway.rtc3d.frames import detect_byte_order, split_frame
+from gateway.rtc3d.packets import Packet, PacketType, decode_text, encode_packet
 from gateway.rtc3d.parameters import SECTIONS, Parameters
-from gateway.rtc3d.parameters_xml import build_parameters
+from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.rtc3d_server.frame_builder import DataPacket, FrameBuilder
 
 VERSION: Final = "1.0"
@@ -186,7 +186,7 @@ class ClientSession:
             self.frames_dropped += count
 
     def _execute(self, command: Command, body: bytes) -> list[bytes]:
-        acknowledgement = encode_packet(PacketType.COMMAND, f"OK-{text_of(body)}".encode("latin-1"))
+        acknowledgement = encode_packet(PacketType.COMMAND, f"OK-{decode_text(body)}".encode("latin-1"))
         match command:
             case Version(number) if number != VERSION:
                 return [
@@ -195,7 +195,7 @@ class ClientSession:
             case SetByteOrder(byte_order):
                 self.byte_order = byte_order
             case SendParameters(sections):
-                return [encode_packet(PacketType.XML, build_parameters(self._parameters(sections)))]
+                return [encode_packet(PacketType.XML, encode_parameters(self._parameters(sections)))]
             case SendCurrentFrame() | StreamFrames():
                 return [acknowledgement, *self._request_frames(command)]
             case StopStreaming():
@@ -249,7 +249,7 @@ class ClientSession:
 
     def _switch_recording(self, body: bytes) -> list[bytes]:
         try:
-            components = split_frame(body, byte_order_of(body, self.byte_order)).components
+            components = split_frame(body, detect_byte_order(body, self.byte_order)).components
         except FrameError as error:
             return [error_packet(f"Not a data frame: {error}")]
         if len(components) == 1 and components[0].type is ComponentType.EVENT:

@@ -7,8 +7,15 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from gateway.rtc3d.components import SHORT_EVENT, WIRE_ORDER, ByteOrder, ComponentType, Items, build_component
-from gateway.rtc3d.frames import build_frame
+from gateway.rtc3d.components import (
+    SHORT_EVENT,
+    WIRE_ORDER,
+    ByteOrder,
+    ComponentType,
+    Items,
+    encode_component,
+)
+from gateway.rtc3d.frames import encode_frame
 from gateway.rtc3d.packets import PacketType, encode_packet
 from gateway.rtc3d_server.scene import NO_EVENTS, Scene
 
@@ -86,16 +93,16 @@ class FrameBuilder:
         row = tick % _BLOCK_FRAMES
         components = self.measured
         parts = [
-            build_component(component, _frame_number(tick, per_tick), timestamp_us, items[row], byte_order)
+            encode_component(component, _frame_number(tick, per_tick), timestamp_us, items[row], byte_order)
             for component, per_tick, items in zip(components, self._samples_per_tick, block, strict=True)
         ]
         if len(events):
             components = (*components, ComponentType.EVENT)
             number = _frame_number(tick, self._events_per_tick)
             parts.append(
-                build_component(ComponentType.EVENT, number, timestamp_us, self._resized(events), byte_order)
+                encode_component(ComponentType.EVENT, number, timestamp_us, self._resized(events), byte_order)
             )
-        packet = encode_packet(PacketType.DATA, build_frame(parts, byte_order))
+        packet = encode_packet(PacketType.DATA, encode_frame(parts, byte_order))
         return DataPacket(packet, components)
 
     def _build_block(self, byte_order: ByteOrder, number: int) -> list[Items]:

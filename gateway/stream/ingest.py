@@ -57,7 +57,7 @@ class Ingest:
         for frame in frames:
             if frame.layout.unknown_types:
                 self._skip_unknown(frame.layout.unknown_types)
-            if not frame.layout.parts:
+            if not frame.layout.components:
                 continue
             stamp = self._stamp(frame, utime, now_s)
             if self._lag.behind and self._skips_when_behind and frame is not newest:
@@ -67,8 +67,8 @@ class Ingest:
                 self._publish(frame, stamp, self._wanted)
 
     def _stamp(self, frame: Frame, utime: int, now_s: float) -> Stamp:
-        frame_number, timestamp_us = frame.number_and_time
-        self._follow_number(frame.layout.first_type, frame_number)
+        frame_number, timestamp_us = frame.number_and_timestamp
+        self._follow_number(frame.layout.first_component_type, frame_number)
         clock = self._clock
         capture_utime, lag_s, restarted = clock.observe(timestamp_us, self._frame_number, utime)
         if restarted:
@@ -81,14 +81,14 @@ class Ingest:
                 self._request_rate(self._lag.halvings)
         return Stamp(utime, capture_utime, self._status.session, clock.has_clock)
 
-    def _follow_number(self, first_type: ComponentType | None, frame_number: int) -> None:
+    def _follow_number(self, first_component_type: ComponentType | None, frame_number: int) -> None:
         """Follow the frame numbers of one component type only, because servers may count types apart.
 
         That is the first type that arrives; events are followed only until another type arrives.
         """
         followed = self._numbered_type
-        if first_type is followed or followed is None or followed is ComponentType.EVENT:
-            self._numbered_type = first_type
+        if first_component_type is followed or followed is None or followed is ComponentType.EVENT:
+            self._numbered_type = first_component_type
             self._frame_number = frame_number
 
     def _skip_unknown(self, types: tuple[int, ...]) -> None:

@@ -14,20 +14,20 @@ from gateway.log import HOLD_S, FailureLog
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.client_protocol import (
     Answered,
-    Broken,
+    ByteOrderMismatch,
     ClientProtocol,
-    Event,
     FileReceived,
     FrameRejected,
-    OtherByteOrder,
+    ProtocolEvent,
     Refused,
-    State,
-    Stray,
+    StreamCorrupted,
+    UnexpectedPacket,
 )
 from gateway.rtc3d.commands import Bye, Command, Version
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
-from gateway.rtc3d.packets import Packet, text_of
+from gateway.rtc3d.packets import Packet, decode_text
+from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.stream.status import StreamStatus
 from gateway.stream.tcp import Connect, open_connection
 
@@ -88,7 +88,7 @@ class Session:
         return self._transport is not None and self._error is None
 
     @property
-    def protocol_state(self) -> State:
+    def protocol_state(self) -> ProtocolState:
         """What the server was asked for, and what it sends."""
         return self._protocol.state
 
@@ -149,7 +149,7 @@ class Session:
         While a measurement runs, it is a fault, unless only events were requested: those are rare.
         Otherwise a harmless command shows whether the server is alive: any reply does.
         """
-        if self._protocol.state is State.STREAMING and not self._only_events:
+        if self._protocol.state is ProtocolState.STREAMING and not self._only_events:
             text = f"no frame from {self.server} for {self._source.stall_timeout_s:g} s"
             self._status.silent(text)
             raise SilenceError(f"{text} although a measurement runs; connecting again")
@@ -213,7 +213,7 @@ class Session:
         self._fail(ClosedError(f"the connection to {self.server} {reason}"))
         self._lost.set()
 
-    def _on_event(self, event: Event) -> None:
+    def _on_event(self, event: ProtocolEvent) -> None:
         match event:
             case Answered(_, packet):
                 if self._reply is not None and not self._reply.done():
@@ -226,18 +226,18 @@ class Session:
                 self._rejected.failed(f"frame rejected: {frame_error}")
             case FileReceived(content):
                 self._on_file(content)
-            case OtherByteOrder(byte_order):
+            case ByteOrderMismatch(byte_order):
                 self._status.add_limitation(
                     f"the server sends {byte_order}-endian frames, not the byte order agreed"
                 )
-            case Broken(packet_error):
+            case StreamCorrupted(packet_error):
                 closed = ClosedError(f"{self.server}: {packet_error}")
                 closed.__cause__ = packet_error
                 self._fail(closed)
-            case Stray(packet):
+            case UnexpectedPacket(packet):
                 logger.debug(
                     "%s: unexpected packet of type %d: %.200s",
-                    self._source.name, packet.type, text_of(packet.body[:200]),
+                    self._source.name, packet.type, decode_text(packet.body[:200]),
                 )  # fmt: skip
 
     def _report_protocol(self) -> None:

@@ -3,7 +3,7 @@
 from enum import Enum
 from typing import Final
 
-from gateway.rtc3d.client_protocol import State
+from gateway.rtc3d.protocol_state import ProtocolState
 
 
 class Phase(Enum):
@@ -37,7 +37,7 @@ _BY_PHASE: Final = {
 }
 
 
-def stream_state(phase: Phase, protocol_state: State) -> StreamState:
+def stream_state(phase: Phase, protocol_state: ProtocolState) -> StreamState:
     """Return the state of a stream.
 
     Two facts decide it, and each has one owner. ``phase`` says how far the connection has come;
@@ -49,8 +49,8 @@ def stream_state(phase: Phase, protocol_state: State) -> StreamState:
     - In all other cases the phase decides. A connection that is ready and receives neither is idle.
     """
     if phase in {Phase.HANDSHAKING, Phase.READY}:
-        if protocol_state is State.STREAMING:
+        if protocol_state is ProtocolState.STREAMING:
             return StreamState.STREAMING
-        if protocol_state is State.NO_MEASUREMENT:
+        if protocol_state is ProtocolState.NO_MEASUREMENT:
             return StreamState.NO_MEASUREMENT
     return _BY_PHASE[phase]

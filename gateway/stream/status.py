@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.messages.host_time import now_utime
-from gateway.rtc3d.client_protocol import State
+from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.stream.clock import ServerClock
 from gateway.stream.state import Phase, StreamState, stream_state
 
@@ -21,9 +21,9 @@ MAX_LIMITATIONS: Final = 20
 _RECONNECTING: Final = (StreamState.CONNECTING, StreamState.HANDSHAKING, StreamState.WAITING)
 
 _PROTOCOL_EVENTS: Final = {
-    State.STREAMING: "a frame arrived",
-    State.NO_MEASUREMENT: "the server reports that no measurement runs",
-    State.IDLE: "the gateway stopped the frames",
+    ProtocolState.STREAMING: "a frame arrived",
+    ProtocolState.NO_MEASUREMENT: "the server reports that no measurement runs",
+    ProtocolState.IDLE: "the gateway stopped the frames",
 }
 """What brought the protocol into a state, for the log."""
 
@@ -81,13 +81,13 @@ class StreamStatus:
         self.byte_order = self.rate = ""
         self._enter(Phase.HANDSHAKING, "connected", server)
 
-    def handshake_done(self, protocol_state: State, server: str) -> None:
+    def handshake_done(self, protocol_state: ProtocolState, server: str) -> None:
         """Note that the server agreed to stream; frames may have arrived before."""
         self.tries = 0
         self._phase = Phase.READY
         self._update_state(protocol_state, "handshake done", server)
 
-    def protocol_changed(self, protocol_state: State, byte_order: str, server: str) -> None:
+    def protocol_changed(self, protocol_state: ProtocolState, byte_order: str, server: str) -> None:
         """Note what the server sends now; ``byte_order`` is empty while that is unknown."""
         self.byte_order = byte_order
         self._update_state(protocol_state, _PROTOCOL_EVENTS.get(protocol_state, "frames requested"), server)
@@ -165,9 +165,9 @@ class StreamStatus:
     def _enter(self, phase: Phase, event: str, cause: str) -> None:
         """Enter a phase in which nothing that the server sent before counts."""
         self._phase = phase
-        self._update_state(State.IDLE, event, cause)
+        self._update_state(ProtocolState.IDLE, event, cause)
 
-    def _update_state(self, protocol_state: State, event: str, cause: str) -> None:
+    def _update_state(self, protocol_state: ProtocolState, event: str, cause: str) -> None:
         """Derive the state; if it changed, log the change with its cause and call ``on_state``."""
         before, self.state = self.state, stream_state(self._phase, protocol_state)
         if self.state is before:

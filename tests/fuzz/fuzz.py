@@ -23,11 +23,12 @@ with atheris.instrument_imports(include=["gateway"]):
     from gateway.messages.splice import splice
     from gateway.messages.stamp import Stamp
     from gateway.messages.summary import summarise
-    from gateway.rtc3d.client_protocol import ClientProtocol, State
+    from gateway.rtc3d.client_protocol import ClientProtocol
     from gateway.rtc3d.commands import SendParameters, StreamFrames, Version, parse_command
-    from gateway.rtc3d.frames import byte_order_of, split_frame
+    from gateway.rtc3d.frames import detect_byte_order, split_frame
     from gateway.rtc3d.packets import PacketReader
-    from gateway.rtc3d.parameters_xml import build_parameters, parse_parameters
+    from gateway.rtc3d.parameters_xml import encode_parameters, parse_parameters
+    from gateway.rtc3d.protocol_state import ProtocolState
 
 from tests.vectors import COMPONENTS, FRAME_WITH_UNKNOWN, FULL_FRAME, PACKETS
 
@@ -50,7 +51,7 @@ def packets(data: bytes) -> None:
 def frames(data: bytes) -> None:
     """A data frame is split and its messages decode, or it is rejected."""
     try:
-        frame = split_frame(data, byte_order_of(data, "big"))
+        frame = split_frame(data, detect_byte_order(data, "big"))
     except FrameError:
         return
     for component in frame.components:
@@ -67,7 +68,7 @@ def connection(data: bytes) -> None:
     client = ClientProtocol(max_packet_bytes=4096)
     commands = (Version(), SendParameters(), StreamFrames())
     while provider.remaining_bytes():
-        if client.under_way is None and client.state is not State.CLOSED:
+        if client.pending_command is None and client.state is not ProtocolState.CLOSED:
             client.send(commands[provider.ConsumeIntInRange(0, 2)])
         elif provider.ConsumeBool():
             client.give_up()
@@ -90,7 +91,7 @@ def parameters(data: bytes) -> None:
         parsed = parse_parameters(data)
     except ParametersError:
         return
-    parse_parameters(build_parameters(parsed.parameters))
+    parse_parameters(encode_parameters(parsed.parameters))
 
 
 def configuration(data: bytes) -> None:

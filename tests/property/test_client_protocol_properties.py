@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.rtc3d.client_protocol import Answered, ClientProtocol, Event, FrameRejected, Refused, State
+from gateway.rtc3d.client_protocol import Answered, ClientProtocol, FrameRejected, ProtocolEvent, Refused
 from gateway.rtc3d.commands import (
     AllFrames,
     Command,
@@ -18,6 +18,7 @@ from gateway.rtc3d.commands import (
     Version,
 )
 from gateway.rtc3d.frames import Frame, split_frame
+from gateway.rtc3d.protocol_state import ProtocolState
 from tests.servers import ok, packet
 from tests.strategies import damaged, pieces_of
 from tests.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME
@@ -49,9 +50,9 @@ server_packets = st.lists(
 
 def received_in_pieces(
     connection: ClientProtocol, pieces: Iterable[bytes]
-) -> tuple[list[Frame], list[Event]]:
+) -> tuple[list[Frame], list[ProtocolEvent]]:
     frames: list[Frame] = []
-    events: list[Event] = []
+    events: list[ProtocolEvent] = []
     for piece in pieces:
         new_frames, new_events = connection.receive(piece)
         frames += new_frames
@@ -64,7 +65,7 @@ def test_no_bytes_make_it_raise(data: st.DataObject) -> None:
     stream = data.draw(st.one_of(server_packets, damaged(server_packets), st.binary(max_size=300)))
     connection = ClientProtocol(max_packet_bytes=4096)
     for piece in data.draw(pieces_of(stream)):
-        if connection.under_way is None and connection.state.value not in {"closed", "closing"}:
+        if connection.pending_command is None and connection.state.value not in {"closed", "closing"}:
             connection.send(data.draw(st.sampled_from(COMMANDS)))
         connection.receive(piece)
 
@@ -99,9 +100,13 @@ def test_frames_are_the_same_whether_recognised_by_their_layout_or_not(
     assert [frame.components for frame in frames] == [frame.components for frame in expected]
     rejected = [event for event in events if isinstance(event, FrameRejected)]
     assert len(rejected) == packets.count(CONTRADICTION)
-    states = {FRAME: State.STREAMING, OTHER_FRAME: State.STREAMING, packet(4): State.NO_MEASUREMENT}
+    states = {
+        FRAME: ProtocolState.STREAMING,
+        OTHER_FRAME: ProtocolState.STREAMING,
+        packet(4): ProtocolState.NO_MEASUREMENT,
+    }
     changes = [states[sent] for sent in packets if sent in states]
-    assert connection.state is (changes[-1] if changes else State.STREAMING)
+    assert connection.state is (changes[-1] if changes else ProtocolState.STREAMING)
 
 
 @given(st.data())

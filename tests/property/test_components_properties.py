@@ -14,10 +14,10 @@ from gateway.rtc3d.components import (
     Component,
     ComponentType,
     big_endian_content,
-    build_component,
+    encode_component,
 )
 from gateway.rtc3d.frame_reader import FrameReader
-from gateway.rtc3d.frames import Frame, build_frame, byte_order_of, split_frame
+from gateway.rtc3d.frames import Frame, detect_byte_order, encode_frame, split_frame
 from tests.strategies import damaged
 from tests.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME, ByteOrder
 
@@ -53,7 +53,7 @@ class Built(NamedTuple):
 
     def build(self, order: ByteOrder) -> bytes:
         kind = ComponentType(KINDS[self.kind][0])
-        return build_component(kind, self.frame_number, self.timestamp_us, self.items(), order)
+        return encode_component(kind, self.frame_number, self.timestamp_us, self.items(), order)
 
     def content(self, order: ByteOrder) -> bytes:
         """Return the component's bytes after size and type, without the codec under test."""
@@ -123,19 +123,19 @@ def test_any_items_are_built_bit_by_bit(built: Built, items_order: ByteOrder, or
     items = built.items()
     items = items.astype(items.dtype.newbyteorder(items_order))
     kind = ComponentType(KINDS[built.kind][0])
-    wire = build_component(kind, built.frame_number, built.timestamp_us, items, order)
+    wire = encode_component(kind, built.frame_number, built.timestamp_us, items, order)
     assert wire == built.wire(order)
 
 
 @given(frames_of_built, orders)
 def test_a_frame_is_its_count_and_its_components(parts: list[Built], order: ByteOrder) -> None:
     wires = [part.wire(order) for part in parts]
-    assert build_frame(wires, order) == frame(wires, order)
+    assert encode_frame(wires, order) == frame(wires, order)
 
 
 @given(frames_of_built, orders)
 def test_what_is_split_is_what_was_built(parts: list[Built], order: ByteOrder) -> None:
-    split = split_frame(build_frame([part.build(order) for part in parts], order), order)
+    split = split_frame(encode_frame([part.build(order) for part in parts], order), order)
     assert split.unknown_types == ()
     for part, component in zip(parts, split.components, strict=True):
         item_bytes = sum(FIELD_BYTES[part.kind])
@@ -187,7 +187,7 @@ def test_the_byte_order_of_a_frame_is_found(
     parts: list[Built], order: ByteOrder, expected: ByteOrder
 ) -> None:
     body = frame([part.wire(order) for part in parts], order)
-    assert byte_order_of(body, expected) == (order if parts else expected)
+    assert detect_byte_order(body, expected) == (order if parts else expected)
 
 
 # Bytes that nobody meant ---------------------------------------------------------------------
@@ -237,7 +237,7 @@ def test_any_bytes_have_a_byte_order_in_which_they_make_sense_or_give_a_frame_er
 ) -> None:
     makes_sense = {order: split_or_none(body, order) is not None for order in ("big", "little")}
     try:
-        found = byte_order_of(body, expected)
+        found = detect_byte_order(body, expected)
     except FrameError:
         assert not any(makes_sense.values())
     else:

@@ -3,7 +3,7 @@ from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 
 from gateway.errors import PacketError
-from gateway.rtc3d.packets import Packet, PacketReader, encode_packet, text_of
+from gateway.rtc3d.packets import Packet, PacketReader, decode_text, encode_packet
 from tests.strategies import damaged, pieces_of
 
 LIMIT = 64
@@ -135,6 +135,6 @@ def test_a_split_changes_neither_packets_nor_error(stream: list[bytes]) -> None:
 
 @given(st.binary())
 def test_any_body_has_a_text(body: bytes) -> None:
-    text = text_of(body)
+    text = decode_text(body)
     assert text.encode("latin-1") in body
     assert not text.endswith(("\0", " ", "\t", "\r", "\n"))

@@ -25,7 +25,7 @@ from gateway.rtc3d.parameters import (
     Point,
     Tool,
 )
-from gateway.rtc3d.parameters_xml import MAX_RECOVERED, build_parameters, parse_parameters
+from gateway.rtc3d.parameters_xml import MAX_RECOVERED, encode_parameters, parse_parameters
 
 _T = TypeVar("_T")
 
@@ -85,17 +85,17 @@ def read_or_refuse(xml: bytes) -> None:
     except ParametersError:
         return
     assert len(recovered) <= MAX_RECOVERED
-    build_parameters(found)
+    encode_parameters(found)
 
 
 @given(READABLE)
 def test_what_is_built_is_read_back_and_nothing_is_found_wrong(original: Parameters) -> None:
-    assert parse_parameters(build_parameters(original)) == (original, ())
+    assert parse_parameters(encode_parameters(original)) == (original, ())
 
 
 @given(ANY)
 def test_whatever_the_texts_hold_well_formed_xml_is_built(original: Parameters) -> None:
-    assert parse_parameters(build_parameters(original)).recovered == ()
+    assert parse_parameters(encode_parameters(original)).recovered == ()
 
 
 @given(st.binary())
@@ -106,7 +106,7 @@ def test_any_bytes_are_read_or_refused(xml: bytes) -> None:
 
 
 @given(
-    READABLE.map(build_parameters),
+    READABLE.map(encode_parameters),
     st.lists(
         st.tuples(
             st.floats(0, 1),
@@ -144,7 +144,7 @@ def test_garbled_xml_is_read_or_refused(xml: bytes, faults: list[tuple[float, in
 def test_an_end_tag_left_out_or_doubled_after_a_value_loses_nothing(
     original: Parameters, place: float, times: int
 ) -> None:
-    values = list(re.finditer(rb"<(\w+)[^>/]*>[^<]*(?P<end></\1>)", build_parameters(original)))
+    values = list(re.finditer(rb"<(\w+)[^>/]*>[^<]*(?P<end></\1>)", encode_parameters(original)))
     assume(values)
     value = values[round(place * (len(values) - 1))]
     xml = value.string[: value.start("end")] + value["end"] * times + value.string[value.end() :]

@@ -19,10 +19,10 @@ from gateway.rtc3d.components import (
     Component,
     ComponentType,
     Items,
-    build_component,
+    encode_component,
 )
-from gateway.rtc3d.frames import build_frame, byte_order_of, split_frame
-from gateway.rtc3d.packets import HEADER, PacketType, encode_packet
+from gateway.rtc3d.frames import detect_byte_order, encode_frame, split_frame
+from gateway.rtc3d.packets import PACKET_HEADER, PacketType, encode_packet
 from gateway.simulator.faults.base import ActiveFault, LastingConnectionFault
 from gateway.simulator.faults.outgoing import PendingWrite, packet_type_of
 
@@ -61,9 +61,9 @@ class FrameFault(LastingConnectionFault):
     def _change_packet(self, packet: bytes, active: ActiveFault) -> bytes:
         if packet_type_of(packet) != PacketType.DATA:
             return packet
-        body = packet[HEADER.size :]
+        body = packet[PACKET_HEADER.size :]
         try:
-            byte_order = byte_order_of(body, "big")
+            byte_order = detect_byte_order(body, "big")
         except FrameError:
             return packet
         return encode_packet(PacketType.DATA, self.change_frame(body, byte_order, active))
@@ -242,7 +242,7 @@ def _change_each(
 ) -> bytes:
     """Return a frame's body with every component changed."""
     components = split_frame(body, byte_order).components
-    return build_frame([change(component) for component in components], new_byte_order or byte_order)
+    return encode_frame([change(component) for component in components], new_byte_order or byte_order)
 
 
 def _rebuild(
@@ -254,7 +254,7 @@ def _rebuild(
     byte_order: ByteOrder | None = None,
 ) -> bytes:
     """Return a component's bytes with the values that are given instead of its own."""
-    return build_component(
+    return encode_component(
         component.type,
         component.frame_number if frame_number is None else frame_number,
         component.timestamp_us if timestamp_us is None else timestamp_us,

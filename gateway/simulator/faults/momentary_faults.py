@@ -5,7 +5,7 @@ from typing import Annotated, ClassVar, Final
 from pydantic import Field
 
 from gateway.config.section import expects
-from gateway.rtc3d.packets import HEADER, PacketType
+from gateway.rtc3d.packets import PACKET_HEADER, PacketType
 from gateway.simulator.faults.base import ActiveFault, MomentaryFault
 from gateway.simulator.faults.faulty_server import FaultyConnection
 
@@ -16,7 +16,7 @@ TooLarge = Annotated[
 TooSmall = Annotated[int, Field(strict=True, ge=0, le=7), expects("a whole number of bytes from 0 to 7")]
 Switch = Annotated[bool, Field(strict=True), expects("true or false")]
 
-_PART_OF_A_PACKET: Final = HEADER.pack(1000, PacketType.DATA) + bytes(100)
+_PART_OF_A_PACKET: Final = PACKET_HEADER.pack(1000, PacketType.DATA) + bytes(100)
 
 
 class Garbage(MomentaryFault):
@@ -42,7 +42,7 @@ class Oversize(MomentaryFault):
 
     def act_on(self, connection: FaultyConnection, active: ActiveFault) -> None:  # noqa: ARG002 - see MomentaryFault
         """See MomentaryFault."""
-        connection.send_unchanged(HEADER.pack(self.size_bytes, PacketType.DATA))
+        connection.send_unchanged(PACKET_HEADER.pack(self.size_bytes, PacketType.DATA))
 
 
 class Undersize(MomentaryFault):
@@ -55,7 +55,7 @@ class Undersize(MomentaryFault):
 
     def act_on(self, connection: FaultyConnection, active: ActiveFault) -> None:  # noqa: ARG002 - see MomentaryFault
         """See MomentaryFault."""
-        connection.send_unchanged(HEADER.pack(self.size_bytes, PacketType.DATA))
+        connection.send_unchanged(PACKET_HEADER.pack(self.size_bytes, PacketType.DATA))
 
 
 class Cut(MomentaryFault):

@@ -8,7 +8,7 @@ from typing import Annotated, ClassVar, Final, Literal, get_args
 from pydantic import AfterValidator, BeforeValidator, Field
 
 from gateway.config.section import expects, join_or
-from gateway.rtc3d.packets import HEADER, Packet, PacketType, encode_packet, text_of
+from gateway.rtc3d.packets import PACKET_HEADER, Packet, PacketType, decode_text, encode_packet
 from gateway.simulator.faults.base import LastingConnectionFault
 from gateway.simulator.faults.outgoing import Reply, is_acknowledgement, packet_type_of
 from gateway.simulator.faults.parameters import Count, Milliseconds
@@ -38,7 +38,7 @@ Copies = Annotated[int, Field(strict=True, ge=2, le=100), expects("a whole numbe
 
 def _command_name(command: Packet) -> str:
     """Return the first word of a command in lower case; "" for other packets."""
-    words = text_of(command.body).lower().split() if command.type == PacketType.COMMAND else []
+    words = decode_text(command.body).lower().split() if command.type == PacketType.COMMAND else []
     return words[0] if words else ""
 
 
@@ -66,7 +66,7 @@ class MinimalServer(LastingConnectionFault):
 
     def refusal(self, command: Packet) -> str | None:
         """See LastingConnectionFault."""
-        text = " ".join(text_of(command.body).lower().split())
+        text = " ".join(decode_text(command.body).lower().split())
         if command.type != PacketType.COMMAND or _MINIMAL.fullmatch(text):
             return None
         return f"{_command_name(command)} is not known in this form"
@@ -144,7 +144,7 @@ class FramesFirst(LastingConnectionFault):
 
     def change_replies(self, command: Packet, replies: list[Reply]) -> list[Reply]:
         """See LastingConnectionFault."""
-        if _command_name(command) != "streamframes" or text_of(command.body).lower().endswith("stop"):
+        if _command_name(command) != "streamframes" or decode_text(command.body).lower().endswith("stop"):
             return replies
         return [
             reply._replace(after_frames=self.frames) if is_acknowledgement(reply.packet) else reply
@@ -165,12 +165,12 @@ class ReplyText(LastingConnectionFault):
 
     def change_replies(self, command: Packet, replies: list[Reply]) -> list[Reply]:
         """See LastingConnectionFault."""
-        text = text_of(command.body) if self.form == "echo" else f"ok-{_command_name(command)}"
+        text = decode_text(command.body) if self.form == "echo" else f"ok-{_command_name(command)}"
         return [reply._replace(packet=self._reworded(reply.packet, text)) for reply in replies]
 
     @staticmethod
     def _reworded(packet: bytes, acknowledgement: str) -> bytes:
-        text = packet[HEADER.size :]
+        text = packet[PACKET_HEADER.size :]
         if is_acknowledgement(packet) and text.startswith(_OK):
             return encode_packet(PacketType.COMMAND, acknowledgement.encode("latin-1"))
         if packet_type_of(packet) == PacketType.ERROR:

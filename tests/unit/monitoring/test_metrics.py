@@ -14,9 +14,9 @@ from gateway.gateway import Gateway
 from gateway.messages.stamp import Stamp
 from gateway.monitoring.loop_delay import LoopDelay
 from gateway.monitoring.metrics import metrics_page, metrics_registry
-from gateway.rtc3d.client_protocol import State
-from gateway.rtc3d.components import ComponentType, build_component
-from gateway.rtc3d.frames import Frame, build_frame, split_frame
+from gateway.rtc3d.components import ComponentType, encode_component
+from gateway.rtc3d.frames import Frame, encode_frame, split_frame
+from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.stream.state import StreamState
 from tests.toy_output import ToyOutput
 
@@ -58,8 +58,8 @@ class Lab:
 
 def analog_frame() -> Frame:
     """Return a frame with one analog component of three channels."""
-    analog = build_component(ComponentType.ANALOG, 1, 1, np.zeros(3, ">f4"))
-    return split_frame(build_frame([analog]), "big")
+    analog = encode_component(ComponentType.ANALOG, 1, 1, np.zeros(3, ">f4"))
+    return split_frame(encode_frame([analog]), "big")
 
 
 @pytest.fixture
@@ -90,7 +90,7 @@ async def test_every_stream_has_its_counters(lab: Lab) -> None:
 async def test_exactly_one_state_of_a_stream_is_1(lab: Lab) -> None:
     lab.markers.connecting("server")
     lab.markers.connected("server")
-    lab.markers.protocol_changed(State.STREAMING, "big", "server")
+    lab.markers.protocol_changed(ProtocolState.STREAMING, "big", "server")
     states = {
         labels["state"]: value
         for labels, value in lab.samples("stream_state")

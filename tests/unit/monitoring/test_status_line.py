@@ -5,8 +5,8 @@ import pytest
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.monitoring.status_line import output_lines, source_line
 from gateway.outputs.status import OutputHealth
-from gateway.rtc3d.client_protocol import State
 from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 
@@ -64,5 +64,5 @@ def test_tries_are_counted_since_the_last_handshake() -> None:
     assert status.tries == 2
     status.connected("server")
     assert status.tries == 2
-    status.handshake_done(State.ASKED, "server")
+    status.handshake_done(ProtocolState.REQUESTED, "server")
     assert status.tries == 0

@@ -11,8 +11,8 @@ from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.memory import MemoryOutput
 from gateway.publish.fan_out import FanOut
-from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, ComponentType, build_component
-from gateway.rtc3d.frames import Frame, build_frame, split_frame
+from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, ComponentType, encode_component
+from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from tests.toy_output import ToyOutput
 from tests.vectors import EMPTY_FRAME, FULL_FRAME
 
@@ -253,10 +253,10 @@ def test_every_output_shows_whether_frames_flow() -> None:
 
 def markers_frame(number: int, *, timestamp_us: int, num_markers: int) -> Frame:
     items = np.zeros(num_markers, ITEM_DTYPES[ComponentType.MARKERS])
-    component = build_component(ComponentType.MARKERS, number, timestamp_us, items)
-    return split_frame(build_frame([component]), "big")
+    component = encode_component(ComponentType.MARKERS, number, timestamp_us, items)
+    return split_frame(encode_frame([component]), "big")
 
 
 def events_frame(num_events: int) -> Frame:
     items = np.zeros(num_events, ITEM_DTYPES[ComponentType.EVENT])
-    return split_frame(build_frame([build_component(ComponentType.EVENT, 1, 0, items)]), "big")
+    return split_frame(encode_frame([encode_component(ComponentType.EVENT, 1, 0, items)]), "big")

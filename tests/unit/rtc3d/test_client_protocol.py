@@ -7,15 +7,14 @@ import pytest
 from gateway.errors import ClosedError, LinkError
 from gateway.rtc3d.client_protocol import (
     Answered,
-    Broken,
+    ByteOrderMismatch,
     ClientProtocol,
-    Event,
     FileReceived,
     FrameRejected,
-    OtherByteOrder,
+    ProtocolEvent,
     Refused,
-    State,
-    Stray,
+    StreamCorrupted,
+    UnexpectedPacket,
 )
 from gateway.rtc3d.commands import (
     AllFrames,
@@ -30,6 +29,7 @@ from gateway.rtc3d.commands import (
 )
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, split_frame
+from gateway.rtc3d.protocol_state import ProtocolState
 from tests.servers import error, ok, packet
 from tests.vectors import EMPTY_FRAME, FULL_FRAME, START_RECORDING, STOP_RECORDING
 
@@ -56,7 +56,7 @@ def after(*commands: Command) -> ClientProtocol:
     return connection
 
 
-def answers(received: tuple[list[Frame], list[Event]]) -> list[Command]:
+def answers(received: tuple[list[Frame], list[ProtocolEvent]]) -> list[Command]:
     _, events = received
     return [event.command for event in events if isinstance(event, Answered)]
 
@@ -72,7 +72,7 @@ def test_a_command_goes_out_as_a_packet_of_type_1() -> None:
 def test_any_type_1_text_accepts(text: str) -> None:
     connection = after(Version())
     assert answers(connection.receive(ok(text))) == [Version()]
-    assert connection.under_way is None
+    assert connection.pending_command is None
 
 
 @pytest.mark.parametrize("text", ["Error-Wrong version", "err-unknown", "OK-Version 1.0", ""])
@@ -85,7 +85,7 @@ def test_any_type_0_text_refuses(text: str) -> None:
 
 def test_a_reply_that_nobody_waits_for_is_stray() -> None:
     _, [event] = ClientProtocol().receive(ok("hello"))
-    assert isinstance(event, Stray)
+    assert isinstance(event, UnexpectedPacket)
 
 
 @pytest.mark.parametrize("double", ["OK-Version 1.0", "version 1.0", "ok-version"])
@@ -103,7 +103,7 @@ def test_a_doubled_acknowledgement_without_a_name_in_one_segment_is_stray() -> N
     connection = after(Version())
     _, [first, second] = connection.receive(ok("OK") + ok("OK"))
     assert isinstance(first, Answered)
-    assert isinstance(second, Stray)
+    assert isinstance(second, UnexpectedPacket)
 
 
 def test_a_doubled_start_does_not_answer_stop() -> None:
@@ -135,7 +135,7 @@ def test_a_late_refusal_is_not_handed_to_the_next_command() -> None:
     connection.give_up()
     connection.send(SendParameters())
     _, [event] = connection.receive(error("err-unknown command"))
-    assert isinstance(event, Stray)
+    assert isinstance(event, UnexpectedPacket)
     assert answers(connection.receive(xml("The_3D"))) == [SendParameters()]
 
 
@@ -202,7 +202,7 @@ def test_xml_that_nobody_waits_for_settles_what_is_owed() -> None:
     connection = after(SendParameters(("3d",)))
     connection.give_up()
     _, [event] = connection.receive(xml("The_3D"))
-    assert isinstance(event, Stray)
+    assert isinstance(event, UnexpectedPacket)
     connection.send(SendParameters(("6d",)))
     assert answers(connection.receive(xml("The_3D"))) == [SendParameters(("6d",))]
 
@@ -218,7 +218,7 @@ def test_stream_frames_is_acknowledged_at_any_time(acknowledged: str) -> None:
     frames, events = connection.receive(parts[acknowledged])
     assert answers((frames, events)) == [STREAM]
     assert len(frames) == 2
-    assert connection.state is State.STREAMING
+    assert connection.state is ProtocolState.STREAMING
 
 
 def test_frames_in_flight_do_not_accept_a_change_of_rate() -> None:
@@ -229,7 +229,7 @@ def test_frames_in_flight_do_not_accept_a_change_of_rate() -> None:
     assert answers(connection.receive(FRAME)) == []
     _, [refused] = connection.receive(error("err-no"))
     assert isinstance(refused, Refused)
-    assert connection.state is State.STREAMING
+    assert connection.state is ProtocolState.STREAMING
 
 
 def test_the_current_frame_comes_after_an_acknowledgement() -> None:
@@ -262,7 +262,7 @@ def test_the_current_frame_is_no_part_of_a_stream_that_does_not_run() -> None:
     connection = after(SendCurrentFrame())
     frames, events = connection.receive(FRAME)
     assert (frames, [type(event) for event in events]) == ([], [Answered])
-    assert connection.state is State.IDLE
+    assert connection.state is ProtocolState.IDLE
 
 
 def test_states_of_a_measurement() -> None:
@@ -286,22 +286,22 @@ def test_states_of_a_measurement() -> None:
     connection.end()
     note()
     assert seen == [
-        State.IDLE,
-        State.ASKED,
-        State.ASKED,
-        State.NO_MEASUREMENT,
-        State.STREAMING,
-        State.NO_MEASUREMENT,
-        State.IDLE,
-        State.CLOSING,
-        State.CLOSED,
+        ProtocolState.IDLE,
+        ProtocolState.REQUESTED,
+        ProtocolState.REQUESTED,
+        ProtocolState.NO_MEASUREMENT,
+        ProtocolState.STREAMING,
+        ProtocolState.NO_MEASUREMENT,
+        ProtocolState.IDLE,
+        ProtocolState.CLOSING,
+        ProtocolState.CLOSED,
     ]
 
 
 def test_a_refused_stream_leaves_the_connection_idle() -> None:
     connection = after(STREAM)
     connection.receive(error("err-unknown parameter 3D"))
-    assert connection.state is State.IDLE
+    assert connection.state is ProtocolState.IDLE
 
 
 def test_recording_control_is_the_packet_of_field_note_16() -> None:
@@ -328,7 +328,7 @@ def test_nothing_is_sent_after_bye_or_the_end() -> None:
 
 def test_one_command_at_a_time() -> None:
     connection = after(Version())
-    with pytest.raises(LinkError, match=r"Version 1\.0 is still awaited"):
+    with pytest.raises(LinkError, match=r"Version 1\.0 has not been answered yet"):
         connection.send(SendParameters())
 
 
@@ -336,21 +336,21 @@ def test_one_command_at_a_time() -> None:
 def test_bye_may_be_answered_or_not(reply: bytes) -> None:
     connection = after(Bye())
     connection.receive(reply)
-    assert connection.state is State.CLOSING
+    assert connection.state is ProtocolState.CLOSING
 
 
 def test_the_first_frame_shows_the_byte_order_in_use() -> None:
     connection = after(SetByteOrder("little"), STREAM)
     frames, events = connection.receive(FRAME + FRAME)
     assert len(frames) == 2
-    assert {type(event) for event in events} == {Answered, OtherByteOrder}
+    assert {type(event) for event in events} == {Answered, ByteOrderMismatch}
     assert connection.byte_order == "big"
 
 
 def test_the_agreed_byte_order_is_used_without_a_warning() -> None:
     connection = after(SetByteOrder("little"), STREAM)
     _, events = connection.receive(packet(3, FULL_FRAME["little"]))
-    assert not any(isinstance(event, OtherByteOrder) for event in events)
+    assert not any(isinstance(event, ByteOrderMismatch) for event in events)
     assert connection.byte_order == "little"
 
 
@@ -359,7 +359,7 @@ def test_a_refused_byte_order_is_not_expected() -> None:
     connection.receive(error("err-no"))
     connection.send(STREAM)
     _, events = connection.receive(FRAME)
-    assert not any(isinstance(event, OtherByteOrder) for event in events)
+    assert not any(isinstance(event, ByteOrderMismatch) for event in events)
 
 
 def test_a_frame_without_components_does_not_settle_the_byte_order() -> None:
@@ -384,16 +384,16 @@ def test_a_c3d_file_is_handed_over_whole() -> None:
 
 def test_an_unknown_packet_type_is_stray() -> None:
     _, [event] = ClientProtocol().receive(packet(77, b"?"))
-    assert isinstance(event, Stray)
+    assert isinstance(event, UnexpectedPacket)
 
 
 def test_a_size_out_of_bounds_ends_the_connection_after_what_came_before() -> None:
     connection = after(STREAM)
     frames, events = connection.receive(FRAME + b"HTTP/1.1 400 Bad Request\r\n")
     assert len(frames) == 1
-    assert isinstance(events[-1], Broken)
+    assert isinstance(events[-1], StreamCorrupted)
     assert "1213486160" in str(events[-1].error)  # "HTTP"
-    assert connection.state is State.CLOSED
+    assert connection.state is ProtocolState.CLOSED
     assert connection.receive(FRAME) == ([], [])
 
 
@@ -405,7 +405,7 @@ def test_a_known_frame_after_no_data_is_streaming_again() -> None:
     connection.receive(FRAME + NO_DATA)
     states = [connection.state]
     [_], [] = connection.receive(FRAME)
-    assert [*states, connection.state] == [State.NO_MEASUREMENT, State.STREAMING]
+    assert [*states, connection.state] == [ProtocolState.NO_MEASUREMENT, ProtocolState.STREAMING]
 
 
 def test_the_error_of_a_broken_stream_has_its_offset_after_known_frames() -> None:
@@ -413,7 +413,7 @@ def test_the_error_of_a_broken_stream_has_its_offset_after_known_frames() -> Non
     connection.receive(FRAME)
     frames, [broken] = connection.receive(FRAME + FRAME + bytes(8))
     assert len(frames) == 2
-    assert isinstance(broken, Broken)
+    assert isinstance(broken, StreamCorrupted)
     assert broken.error.offset == 3 * len(FRAME)
 
 
@@ -425,7 +425,7 @@ def test_a_known_frame_in_pieces_is_the_same_frame_and_the_stream_goes_on_behind
     frames, [broken] = connection.receive(FRAME[first:] + FRAME + bytes(8))
     expected = split_frame(FULL_FRAME["big"], "big")
     assert [frame.components for frame in frames] == [expected.components] * 2
-    assert isinstance(broken, Broken)
+    assert isinstance(broken, StreamCorrupted)
     assert broken.error.offset == 3 * len(FRAME)
 
 
@@ -435,7 +435,7 @@ def test_a_packet_in_pieces_as_long_as_the_frame_before_is_read_for_what_it_is()
     text = packet(1, b"x" * (len(FRAME) - 8))
     assert connection.receive(text[:20]) == ([], [])
     [_], [event] = connection.receive(text[20:] + FRAME)
-    assert isinstance(event, Stray)
+    assert isinstance(event, UnexpectedPacket)
 
 
 def test_a_frame_in_pieces_that_is_asked_for_is_the_answer() -> None:

@@ -13,9 +13,9 @@ from gateway.rtc3d.components import (
     WIRE_ORDER,
     ComponentType,
     big_endian_content,
-    build_component,
+    encode_component,
 )
-from gateway.rtc3d.frames import build_frame, split_frame
+from gateway.rtc3d.frames import encode_frame, split_frame
 from tests.unit.rtc3d.wire import frame, only_component
 from tests.vectors import (
     ANALOG,
@@ -118,7 +118,7 @@ def test_reads_the_items_of_each_component_as_documented(vector: ComponentVector
 def test_builds_each_component_as_documented(vector: ComponentVector, order: ByteOrder) -> None:
     kind = ComponentType(vector.type)
     items = items_of(vector)
-    built = build_component(kind, vector.frame_number, vector.timestamp_us, items, order)
+    built = encode_component(kind, vector.frame_number, vector.timestamp_us, items, order)
     assert built == vector.wire[order]
 
 
@@ -130,7 +130,7 @@ def test_builds_from_items_in_any_byte_order(
 ) -> None:
     items = items_of(vector)
     items = items.astype(items.dtype.newbyteorder(items_order))
-    built = build_component(
+    built = encode_component(
         ComponentType(vector.type), vector.frame_number, vector.timestamp_us, items, order
     )
     assert built == vector.wire[order]
@@ -141,15 +141,15 @@ def test_builds_from_items_in_any_byte_order(
 def test_builds_from_items_that_are_not_contiguous(vector: ComponentVector, order: ByteOrder) -> None:
     items = np.repeat(items_of(vector), 2)[::2]
     kind = ComponentType(vector.type)
-    built = build_component(kind, vector.frame_number, vector.timestamp_us, items, order)
+    built = encode_component(kind, vector.frame_number, vector.timestamp_us, items, order)
     assert built == vector.wire[order]
 
 
 def test_builds_big_endian_unless_told_otherwise() -> None:
     kind = ComponentType(MARKERS.type)
-    built = build_component(kind, MARKERS.frame_number, MARKERS.timestamp_us, items_of(MARKERS))
+    built = encode_component(kind, MARKERS.frame_number, MARKERS.timestamp_us, items_of(MARKERS))
     assert built == MARKERS.wire["big"]
-    assert build_frame([built]) == frame("big", MARKERS.wire["big"])
+    assert encode_frame([built]) == frame("big", MARKERS.wire["big"])
 
 
 @both_orders
@@ -181,7 +181,7 @@ def test_a_tool_out_of_view_is_all_ones(order: ByteOrder) -> None:
 @both_orders
 @pytest.mark.parametrize("kind", ComponentType)
 def test_a_component_without_items_is_built_and_split(kind: ComponentType, order: ByteOrder) -> None:
-    wire = build_component(kind, -1, -1, np.empty(0, ITEM_DTYPES[kind]), order)
+    wire = encode_component(kind, -1, -1, np.empty(0, ITEM_DTYPES[kind]), order)
     size, number = (24).to_bytes(4, order), int(kind).to_bytes(4, order)
     assert wire == size + number + b"\xff" * 12 + b"\0\0\0\0"
     component = only_component(frame(order, wire), order)

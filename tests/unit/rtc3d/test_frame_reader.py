@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from gateway.errors import FrameError
-from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, build_component
+from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, encode_component
 from gateway.rtc3d.frame_reader import FrameReader
 from gateway.rtc3d.frames import split_frame
 from tests.unit.rtc3d.wire import bodies_of_both_orders, frame
@@ -39,7 +39,7 @@ def test_numbers_times_and_items_may_differ() -> None:
     wire[24:] = bytes(len(wire) - 24)
     read = reader_after(MARKERS_FRAME).read(frame("big", bytes(wire)))
     assert read.layout is split_frame(MARKERS_FRAME, "big").layout
-    assert read.number_and_time == (-7, 2**40)
+    assert read.number_and_timestamp == (-7, 2**40)
     assert read.contents == (bytes(wire[8:]),)
 
 
@@ -54,7 +54,7 @@ def test_a_frame_in_which_anything_else_differs_is_not_taken_for_the_same_layout
 
 def test_two_layouts_of_the_same_size_are_told_apart() -> None:
     bodies = [
-        frame("big", build_component(kind, 1, 1, np.zeros(count, ITEM_DTYPES[kind])))
+        frame("big", encode_component(kind, 1, 1, np.zeros(count, ITEM_DTYPES[kind])))
         for kind, count in ((ComponentType.MARKERS, 2), (ComponentType.TOOLS, 1))
     ]
     reader = FrameReader("big")
@@ -64,11 +64,11 @@ def test_two_layouts_of_the_same_size_are_told_apart() -> None:
 
 def test_any_number_of_layouts_may_follow_each_other() -> None:
     bodies = [
-        frame("big", build_component(ComponentType.ANALOG, 1, 1, np.zeros(count, ">f4")))
+        frame("big", encode_component(ComponentType.ANALOG, 1, 1, np.zeros(count, ">f4")))
         for count in range(100)
     ]
     reader = reader_after(*bodies)
-    assert [reader.read(body).layout.parts[0].num_items for body in bodies] == list(range(100))
+    assert [reader.read(body).layout.components[0].num_items for body in bodies] == list(range(100))
 
 
 def test_a_frame_in_the_other_byte_order_is_refused() -> None:
@@ -86,5 +86,5 @@ def test_the_number_of_remembered_layouts_is_bounded() -> None:
     reader = FrameReader("big")
     for count in range(100):
         markers = np.zeros(count, ITEM_DTYPES[ComponentType.MARKERS])
-        reader.read(frame("big", build_component(ComponentType.MARKERS, 1, 1, markers)))
+        reader.read(frame("big", encode_component(ComponentType.MARKERS, 1, 1, markers)))
         assert len(reader._templates) <= 32

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from gateway.rtc3d.components import LONG_EVENT, SHORT_EVENT, ComponentType, build_component
-from gateway.rtc3d.frames import build_frame, byte_order_of, split_frame
+from gateway.rtc3d.components import LONG_EVENT, SHORT_EVENT, ComponentType, encode_component
+from gateway.rtc3d.frames import detect_byte_order, encode_frame, split_frame
 from tests.unit.rtc3d.wire import bodies_of_both_orders, frame, only_component
 from tests.vectors import (
     ANALOG,
@@ -36,14 +36,14 @@ def test_splits_a_frame_of_all_five_components(order: ByteOrder) -> None:
 @both_orders
 def test_builds_a_frame_of_all_five_components(order: ByteOrder) -> None:
     parts = (vector.wire[order] for vector in FULL_FRAME_COMPONENTS)
-    assert build_frame(parts, order) == FULL_FRAME[order]
+    assert encode_frame(parts, order) == FULL_FRAME[order]
 
 
 @both_orders
 def test_an_empty_frame_has_no_components(order: ByteOrder) -> None:
     split = split_frame(EMPTY_FRAME[order], order)
     assert (split.components, split.unknown_types) == ((), ())
-    assert build_frame([], order) == EMPTY_FRAME[order]
+    assert encode_frame([], order) == EMPTY_FRAME[order]
 
 
 @both_orders
@@ -86,7 +86,7 @@ def test_reads_the_frame_that_controls_wavefronts_recording(
     packet: bytes, order: ByteOrder, event_id: int
 ) -> None:
     body = packet[8:]
-    assert byte_order_of(body, "big") == order
+    assert detect_byte_order(body, "big") == order
     component = only_component(body, order)
     assert component.type is ComponentType.EVENT
     assert component.frame_number == -1
@@ -94,7 +94,7 @@ def test_reads_the_frame_that_controls_wavefronts_recording(
     assert component.items().tolist() == [(event_id, 0, -1, -1, -1)]
 
     events = np.array([(event_id, 0, -1, -1, -1)], LONG_EVENT)
-    assert build_frame([build_component(ComponentType.EVENT, -1, 0, events, order)], order) == body
+    assert encode_frame([encode_component(ComponentType.EVENT, -1, 0, events, order)], order) == body
 
 
 @bodies_of_both_orders

@@ -6,7 +6,7 @@ import pytest
 
 from gateway.errors import FrameError
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import byte_order_of, split_frame
+from gateway.rtc3d.frames import detect_byte_order, split_frame
 from tests.unit.rtc3d.wire import frame
 from tests.vectors import (
     ANALOG,
@@ -157,7 +157,7 @@ def test_4_billion_announced_components_are_rejected_at_once(rest: bytes, order:
 def test_finds_the_byte_order_of_a_frame(
     vector: ComponentVector, expected: ByteOrder, order: ByteOrder
 ) -> None:
-    assert byte_order_of(frame(order, vector.wire[order]), expected) == order
+    assert detect_byte_order(frame(order, vector.wire[order]), expected) == order
 
 
 @both_orders
@@ -165,12 +165,12 @@ def test_finds_the_byte_order_of_a_frame(
 def test_finds_the_byte_order_of_a_frame_with_an_unknown_component(
     expected: ByteOrder, order: ByteOrder
 ) -> None:
-    assert byte_order_of(FRAME_WITH_UNKNOWN[order], expected) == order
+    assert detect_byte_order(FRAME_WITH_UNKNOWN[order], expected) == order
 
 
 @both_orders
 def test_a_frame_that_makes_sense_in_both_orders_is_in_the_expected_one(order: ByteOrder) -> None:
-    assert byte_order_of(EMPTY_FRAME["big"], order) == order
+    assert detect_byte_order(EMPTY_FRAME["big"], order) == order
 
 
 @both_orders
@@ -178,5 +178,5 @@ def test_a_frame_that_makes_sense_in_no_order_gets_the_expected_orders_error(ord
     with pytest.raises(FrameError) as of_split:
         split_frame(FULL_FRAME[order] + b"\0", order)
     with pytest.raises(FrameError) as of_search:
-        byte_order_of(FULL_FRAME[order] + b"\0", order)
+        detect_byte_order(FULL_FRAME[order] + b"\0", order)
     assert str(of_search.value) == str(of_split.value)

@@ -1,6 +1,6 @@
 """Late replies to a command that was repeated after its time-out, as the session repeats commands."""
 
-from gateway.rtc3d.client_protocol import Answered, ClientProtocol, Event, Stray
+from gateway.rtc3d.client_protocol import Answered, ClientProtocol, ProtocolEvent, UnexpectedPacket
 from gateway.rtc3d.commands import SendParameters
 from gateway.rtc3d.frames import Frame
 from tests.servers import packet
@@ -10,7 +10,7 @@ TOOLS_XML = packet(2, "<RT_Parameters Ver='1.00'><The_6D/></RT_Parameters>")
 MARKERS, TOOLS = SendParameters(("3d",)), SendParameters(("6d",))
 
 
-def only_event(received: tuple[list[Frame], list[Event]]) -> Event:
+def only_event(received: tuple[list[Frame], list[ProtocolEvent]]) -> ProtocolEvent:
     frames, [event] = received
     assert not frames
     return event
@@ -24,7 +24,7 @@ def test_the_second_reply_to_a_repeated_question_does_not_answer_the_next_questi
     event = only_event(protocol.receive(MARKERS_XML))  # the late reply, or the second one: nobody can know
     assert isinstance(event, Answered)
     protocol.send(TOOLS)
-    assert isinstance(only_event(protocol.receive(MARKERS_XML)), Stray)
+    assert isinstance(only_event(protocol.receive(MARKERS_XML)), UnexpectedPacket)
     event = only_event(protocol.receive(TOOLS_XML))
     assert isinstance(event, Answered)
     assert event.command == TOOLS

@@ -9,8 +9,8 @@ from gateway.rtc3d.packets import (
     Packet,
     PacketReader,
     PacketType,
+    decode_text,
     encode_packet,
-    text_of,
 )
 from tests.vectors import PACKETS, PacketVector
 
@@ -300,4 +300,4 @@ def test_the_memory_of_a_large_packet_is_given_back() -> None:
     ],
 )
 def test_text_ends_before_nul_and_white_space(body: bytes, text: str) -> None:
-    assert text_of(body) == text
+    assert decode_text(body) == text

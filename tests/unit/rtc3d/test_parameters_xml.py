@@ -25,7 +25,7 @@ from gateway.rtc3d.parameters import (
     Tool,
     sections_of,
 )
-from gateway.rtc3d.parameters_xml import MAX_RECOVERED, build_parameters, parse_parameters
+from gateway.rtc3d.parameters_xml import MAX_RECOVERED, encode_parameters, parse_parameters
 from tests.spec_parameters import (
     ALL,
     BY_SECTION,
@@ -144,7 +144,7 @@ class TestBrokenNesting:
         assert recovered
 
     def test_cut_anywhere_it_is_read_in_part_and_reported_or_refused(self) -> None:
-        xml = build_parameters(ALL).strip()
+        xml = encode_parameters(ALL).strip()
         complete = 0
         for end in range(len(xml)):
             try:
@@ -303,7 +303,7 @@ class TestEncodings:
 class TestBuilding:
     def test_it_writes_the_layout_of_the_specification(self) -> None:
         tools = Parameters6D(60.0, (Tool("1", "Hand", "", ("12", "14")),))
-        assert build_parameters(Parameters(tools=tools)) == (
+        assert encode_parameters(Parameters(tools=tools)) == (
             b'<RT_Parameters Ver="1.00">\n'
             b"  <The_6D>\n"
             b"    <Frequency>60.0</Frequency>\n"
@@ -323,7 +323,7 @@ class TestBuilding:
 
     def test_corners_rows_and_columns_are_numbered_from_one(self) -> None:
         plate = Plate("9", corners=(Point(1, 2, 3),) * 2, calibration_matrix=((1.0, 2.0), (3.0, 4.0)))
-        xml = build_parameters(Parameters(force=ParametersForce((plate,))))
+        xml = encode_parameters(Parameters(force=ParametersForce((plate,))))
         assert re.findall(rb"<(Plate|Corner|Row|Col) id=\"(\d+)\"", xml) == [
             (b"Plate", b"9"),
             (b"Corner", b"1"), (b"Corner", b"2"),
@@ -336,21 +336,21 @@ class TestBuilding:
         def tags(xml: bytes) -> set[bytes]:
             return set(re.findall(rb"<(\w+)", xml))
 
-        assert tags(build_parameters(BY_SECTION[section])) == tags(spec_xml(section))
+        assert tags(encode_parameters(BY_SECTION[section])) == tags(spec_xml(section))
 
     def test_sections_and_numbers_that_are_none_are_left_out(self) -> None:
-        xml = build_parameters(Parameters(general=General(), analog=ParametersAnalog()))
+        xml = encode_parameters(Parameters(general=General(), analog=ParametersAnalog()))
         assert set(re.findall(rb"<(\w+)", xml)) == {
             b"RT_Parameters", b"General", b"Server", b"Name", b"Ver", b"IPadd", b"Analog", b"Channels"
         }  # fmt: skip
 
     def test_it_is_ascii_whatever_the_labels_are(self) -> None:
         markers = Parameters3D(unit="µm", markers=(Marker("é", "a & b < c", "日本"),))
-        xml = build_parameters(Parameters(markers=markers))
+        xml = encode_parameters(Parameters(markers=markers))
         assert xml.isascii()
         assert markers_of(xml) == markers
 
     def test_characters_that_xml_cannot_hold_are_dropped(self) -> None:
         markers = Parameters3D(markers=(Marker("1\0", "a\x1bb\ud800", "c\uffff\nd"),))
-        xml = build_parameters(Parameters(markers=markers))
+        xml = encode_parameters(Parameters(markers=markers))
         assert markers_of(xml).markers == (Marker("1", "ab", "c\nd"),)

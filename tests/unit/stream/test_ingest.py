@@ -5,8 +5,8 @@ import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.messages.stamp import Stamp
-from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, build_component
-from gateway.rtc3d.frames import Frame, build_frame, split_frame
+from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, encode_component
+from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.stream.ingest import Ingest
 from gateway.stream.status import StreamStatus
 
@@ -25,7 +25,7 @@ def frame(number: int, *, event: bool = False) -> Frame:
 def frame_of(tick: int, *numbered: tuple[ComponentType, int]) -> Frame:
     """Return the frame of period ``tick`` with these components, each with a frame number of its own."""
     components = [
-        build_component(
+        encode_component(
             component,
             number,
             PERIOD_US * tick,
@@ -33,7 +33,7 @@ def frame_of(tick: int, *numbered: tuple[ComponentType, int]) -> Frame:
         )
         for component, number in numbered
     ]
-    return split_frame(build_frame(components), "big")
+    return split_frame(encode_frame(components), "big")
 
 
 class Lab:
@@ -153,7 +153,7 @@ def test_frame_numbers_of_events_are_followed_until_another_type_arrives() -> No
 
 def test_frames_without_components_are_counted_and_not_published(lab: Lab) -> None:
     before = lab.status.frames_in
-    lab.receive_at(BOOT_UTIME, split_frame(build_frame([]), "big"))
+    lab.receive_at(BOOT_UTIME, split_frame(encode_frame([]), "big"))
     assert lab.status.frames_in == before + 1
     assert not lab.published
 
@@ -161,9 +161,9 @@ def test_frames_without_components_are_counted_and_not_published(lab: Lab) -> No
 def test_unknown_components_are_counted_and_the_others_published(
     lab: Lab, caplog: pytest.LogCaptureFixture
 ) -> None:
-    known = build_component(MARKERS, 600, 600 * PERIOD_US, np.zeros(1, ITEM_DTYPES[MARKERS]))
+    known = encode_component(MARKERS, 600, 600 * PERIOD_US, np.zeros(1, ITEM_DTYPES[MARKERS]))
     unknown = bytes.fromhex("0000000c 00000063 00000000")  # size, type 99, four bytes
-    body = build_frame([known])
+    body = encode_frame([known])
     count = (2).to_bytes(4, "big")
     for _ in range(3):
         lab.receive(split_frame(count + body[4:] + unknown, "big"))

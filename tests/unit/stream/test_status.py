@@ -4,7 +4,7 @@ import time
 import pytest
 
 from gateway.messages.host_time import now_utime
-from gateway.rtc3d.client_protocol import State
+from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.stream.state import StreamState
 from gateway.stream.status import MAX_ERROR_LENGTH, MAX_LIMITATIONS, FrameRate, StreamStatus
 from tests.waiting import wait_until
@@ -42,11 +42,11 @@ def test_a_change_of_state_is_logged_with_source_states_and_cause(caplog: pytest
     status = StreamStatus("3d", name="lab (3d)", on_state=states.append)
     status.connecting(SERVER)
     status.connected(SERVER)
-    status.handshake_done(State.ASKED, SERVER)
-    status.protocol_changed(State.STREAMING, "big", SERVER)
-    status.protocol_changed(State.NO_MEASUREMENT, "big", SERVER)
-    status.protocol_changed(State.IDLE, "big", SERVER)
-    status.protocol_changed(State.ASKED, "big", SERVER)  # still idle: logged once
+    status.handshake_done(ProtocolState.REQUESTED, SERVER)
+    status.protocol_changed(ProtocolState.STREAMING, "big", SERVER)
+    status.protocol_changed(ProtocolState.NO_MEASUREMENT, "big", SERVER)
+    status.protocol_changed(ProtocolState.IDLE, "big", SERVER)
+    status.protocol_changed(ProtocolState.REQUESTED, "big", SERVER)  # still idle: logged once
     status.silent("no frame for 3 s")
     status.disconnected("closed by the server")
     assert caplog.messages == [
@@ -77,8 +77,8 @@ def test_a_frame_may_arrive_before_the_handshake_is_done() -> None:
     status = StreamStatus("3d")
     status.connecting(SERVER)
     status.connected(SERVER)
-    status.protocol_changed(State.STREAMING, "little", SERVER)
-    status.handshake_done(State.STREAMING, SERVER)
+    status.protocol_changed(ProtocolState.STREAMING, "little", SERVER)
+    status.handshake_done(ProtocolState.STREAMING, SERVER)
     assert status.state is StreamState.STREAMING
     assert status.byte_order == "little"
 

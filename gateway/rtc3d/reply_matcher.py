@@ -1,0 +1,154 @@
+"""Matching the server's replies to the client's commands.
+
+A reply carries no number that says which command it answers. The client therefore has at most one
+pending command, and the matcher remembers earlier commands whose replies may still arrive. The rules:
+
+- Only a packet of the right type answers a command: ``ANSWERING_TYPES``. An acknowledgement ahead of XML
+  or of a frame (field note 3) is skipped.
+- A text that names another command than the pending one is a duplicate or a late reply; it answers
+  nothing. A text that names no command goes to the oldest command whose reply is outstanding.
+- When the client gives up on a command, its reply stays outstanding until a later command has been
+  answered, because a server answers in order.
+"""
+
+import re
+from collections import deque
+from typing import Final
+
+from gateway.errors import ParametersError
+from gateway.rtc3d.commands import (
+    Bye,
+    Command,
+    SendCurrentFrame,
+    SendParameters,
+    SetByteOrder,
+    StopStreaming,
+    StreamFrames,
+    Version,
+)
+from gateway.rtc3d.packets import Packet, PacketType, decode_text
+from gateway.rtc3d.parameters import SECTIONS, sections_of
+from gateway.rtc3d.parameters_xml import parse_parameters
+
+ANSWERING_TYPES: Final[dict[type[Command], frozenset[PacketType]]] = {
+    Version: frozenset({PacketType.COMMAND}),
+    SetByteOrder: frozenset({PacketType.COMMAND}),
+    SendParameters: frozenset({PacketType.XML}),
+    SendCurrentFrame: frozenset({PacketType.DATA, PacketType.NO_DATA}),
+    # A frame shows that StreamFrames was accepted; its acknowledgement may follow (field note 3).
+    StreamFrames: frozenset({PacketType.COMMAND, PacketType.DATA, PacketType.NO_DATA}),
+    StopStreaming: frozenset({PacketType.COMMAND}),
+    Bye: frozenset({PacketType.COMMAND}),
+}
+"""The packet types that answer each command; an error packet answers any command."""
+
+_ACKNOWLEDGED: Final = re.compile(
+    r"(?:ok\W*)?(version|setbyteorder|sendparameters|sendcurrentframe|streamframes|bye)\b"
+)
+"""The command at the start of an acknowledgement's text, as all known servers write it (field note 1)."""
+
+_MAX_REMEMBERED: Final = 8
+"""How many outstanding and how many answered commands are remembered."""
+
+
+class ReplyMatcher:
+    """Finds the command that each reply on one connection answers."""
+
+    def __init__(self) -> None:
+        self.pending: Command | None = None
+        """The command whose answer the client is waiting for."""
+        self._outstanding: deque[Command] = deque(maxlen=_MAX_REMEMBERED)
+        """Earlier commands whose replies may still arrive, oldest first."""
+        self._answered: deque[Command] = deque(maxlen=_MAX_REMEMBERED)
+        """The last commands answered; another reply to one of them is a duplicate."""
+
+    def give_up(self) -> None:
+        """Stop waiting for the pending command; a late reply to it will answer nothing."""
+        if self.pending is not None:
+            self._outstanding.append(self.pending)
+            self.pending = None
+
+    def match_text(self, packet: Packet) -> Command | None:
+        """Return the pending command if a type 0 or 1 packet replies to it, otherwise None."""
+        return self._if_pending(self._command_of_text(packet))
+
+    def match_xml(self, packet: Packet) -> Command | None:
+        """Return the pending command if a type 2 packet answers it, otherwise None."""
+        return self._if_pending(self._command_of_xml(packet))
+
+    def finish_by_reply(self) -> None:
+        """End the pending command, which a text or XML has answered."""
+        # A server answers in order, so replies to earlier commands will not come. Exception: if an equal
+        # command is outstanding, this may be the reply to that one, and another may follow.
+        if self.pending not in self._outstanding:
+            self._outstanding.clear()
+        self._finish()
+
+    def finish_by_data(self) -> None:
+        """End the pending command, which a frame or No Data has answered."""
+        if isinstance(self.pending, StreamFrames):
+            self._outstanding.append(self.pending)  # its acknowledgement may follow
+        self._finish()
+
+    def _finish(self) -> None:
+        if self.pending is not None:
+            self._answered.append(self.pending)
+            self.pending = None
+
+    def _if_pending(self, command: Command | None) -> Command | None:
+        """Return ``command`` if it is the pending one; otherwise its late reply has now arrived."""
+        if command is None or command is self.pending:
+            return command
+        if command in self._outstanding:
+            self._outstanding.remove(command)
+        return None
+
+    def _command_of_text(self, packet: Packet) -> Command | None:
+        """Return the command to which a text replies: pending, outstanding or answered before."""
+        text = decode_text(packet.body).lower()
+        pending = [] if self.pending is None else [self.pending]
+        echoed = [
+            command
+            for command in (*pending, *self._outstanding, *self._answered)
+            if str(command).lower() in text
+        ]
+        if echoed:
+            # One command's text may be the beginning of another's, so the longest echo counts.
+            return max(echoed, key=lambda command: len(str(command)))
+        acknowledged = _ACKNOWLEDGED.match(text) if packet.type == PacketType.COMMAND else None
+        for command in (*self._outstanding, *pending):
+            if acknowledged and acknowledged[1] != str(command).split()[0].lower():
+                continue
+            if packet.type == PacketType.ERROR or packet.type in ANSWERING_TYPES[type(command)]:
+                return command
+        return None
+
+    def _command_of_xml(self, packet: Packet) -> Command | None:
+        """Return the SendParameters that the XML answers: pending or outstanding."""
+        pending = [self.pending] if isinstance(self.pending, SendParameters) else []
+        outstanding = [
+            command
+            for command in self._outstanding
+            if isinstance(command, SendParameters) and command not in pending
+        ]
+        if not outstanding:
+            # Accept any sections: a server may always send all of them, or leave some out.
+            return pending[0] if pending else None
+        sections = _sections_in(packet.body)
+        return max((*outstanding, *pending), key=lambda command: _similarity(sections, command))
+
+
+def _sections_in(xml: bytes) -> frozenset[str]:
+    try:
+        return sections_of(parse_parameters(xml).parameters)
+    except ParametersError:
+        return frozenset()
+
+
+def _similarity(received: frozenset[str], command: SendParameters) -> int:
+    """Return how well the received sections fit those requested: 2 exactly, 1 some are missing, 0 not.
+
+    Servers leave out sections that they do not have (field note 9).
+    """
+    requested = frozenset(command.sections or SECTIONS)
+    return 2 if received == requested else int(received < requested)
