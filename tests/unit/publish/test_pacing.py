@@ -127,3 +127,26 @@ def test_the_gaps_follow_a_change_of_the_rate() -> None:
     indices = picked(Pacer(50), frames)
     assert set(gaps(indices[:250])) == {2}
     assert set(gaps(indices[260:])) == {8}
+
+
+def test_one_frame_in_1000_seconds_goes_out_when_they_have_passed_to_the_millisecond() -> None:
+    timestamps_us = [0, 1_000, 2_000, 999_999_000, 1_000_000_000]
+    assert picked(Pacer(0.001), timestamps_us) == [0, 4]
+
+
+def test_a_frame_may_be_early_by_three_quarters_of_the_spacing() -> None:
+    # The period is 19 us; the frame at 12 us is 7 us early and the one at 16 us exactly 3 of 4 us.
+    assert picked(Pacer(1e6 / 19), [0, 4, 8, 12, 16]) == [0, 4]
+
+
+def test_a_frame_that_ends_a_pause_of_two_periods_starts_a_whole_period() -> None:
+    assert picked(Pacer(1000), [0, 2000, 2100, 2200]) == [0, 1]
+
+
+def test_a_frame_just_before_the_end_of_the_second_period_leaves_the_next_one_on_time() -> None:
+    assert picked(Pacer(1000), [0, 1999, 2099]) == [0, 1, 2]
+
+
+def test_no_time_passes_while_the_hosts_clock_stands_still_or_goes_back() -> None:
+    arrivals = [EPOCH_UTIME, EPOCH_UTIME, EPOCH_UTIME - 10, EPOCH_UTIME - 10]
+    assert picked(Pacer(1e6), [None] * 4, arrivals) == [0]

@@ -174,3 +174,37 @@ def test_halvings_are_bounded() -> None:
 def test_rates_halved_twice(rate: Rate | None, expected: Rate) -> None:
     assert halved(rate, 2) == expected
     assert halved(rate, 0) == rate
+
+
+@pytest.mark.parametrize(
+    ("rate", "expected"),
+    [
+        (AllFrames(), FrequencyDivisor(32)),
+        (FrequencyDivisor(3), FrequencyDivisor(96)),
+        (Frequency(64), Frequency(2)),
+    ],
+)
+def test_rates_halved_five_times(rate: Rate, expected: Rate) -> None:
+    assert halved(rate, 5) == expected
+
+
+def test_a_restart_forgets_that_frames_were_late() -> None:
+    control = LagControl(max_lag_s=0.05)
+    control.observe(0.0, 0.2)
+    control.restart()
+    assert control.behind is False
+    assert not control.observe(0.5, 0.2)
+    assert not control.observe(1.25, 0.2)
+    assert control.observe(1.5, 0.2)
+
+
+def test_after_a_restart_frames_must_be_in_time_for_the_whole_wait_again() -> None:
+    control = LagControl(max_lag_s=0.05)
+    control.observe(0.0, 0.2)
+    control.observe(1.0, 0.2)
+    control.observe(2.0, 0.0)
+    control.restart()
+    assert not control.observe(11.0, 0.0)
+    assert not control.observe(20.9, 0.0)
+    assert control.observe(21.0, 0.0)
+    assert control.halvings == 0

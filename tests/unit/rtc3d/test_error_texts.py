@@ -1,0 +1,41 @@
+"""The whole text of an error, as a person reads it in a log or a client's window."""
+
+import pytest
+
+from gateway.errors import CommandError
+from gateway.rtc3d.commands import parse_command
+from gateway.rtc3d.packets import PacketReader
+
+
+def size_error(header: bytes) -> str:
+    reader = PacketReader(max_packet_bytes=100)
+    reader.feed(header)
+    return str(reader.error)
+
+
+def test_a_packet_that_is_too_large() -> None:
+    assert size_error(b"\0\0\0\x65\0\0\0\x03") == (
+        "packet size 101 (limit 100), type 3, at byte 0 of the stream: "
+        "this is no RTC3D server, or the connection is corrupt; check host and port"
+    )
+
+
+def test_a_packet_that_is_shorter_than_its_header() -> None:
+    assert size_error(b"\0\0\0\x07\0\0\0\x01") == (
+        "packet size 7 (less than the header's 8), type 1, at byte 0 of the stream: "
+        "this is no RTC3D server, or the connection is corrupt; check host and port"
+    )
+
+
+@pytest.mark.parametrize(
+    ("word", "shown"),
+    [("x" * 39, "x" * 39), ("x" * 40, "x" * 40), ("x" * 41, "x" * 40 + "?"), ("é", "?"), ("\x01", r"\x01")],
+    ids=["39 characters", "40 characters", "41 characters", "beyond ASCII", "unprintable"],
+)
+def test_an_unknown_command_is_shown_in_40_printable_characters(word: str, shown: str) -> None:
+    with pytest.raises(CommandError) as caught:
+        parse_command(word.encode("latin-1"))
+    assert str(caught.value) == (
+        f"Unknown command '{shown}'; "
+        "known are Version, SetByteOrder, SendParameters, SendCurrentFrame, StreamFrames, Bye"
+    )
