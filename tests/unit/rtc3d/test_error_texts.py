@@ -28,6 +28,42 @@ def test_a_packet_that_is_shorter_than_its_header() -> None:
 
 
 @pytest.mark.parametrize(
+    ("command", "text"),
+    [
+        ("Version", "Version takes one parameter n.n, as in: Version 1.0"),
+        ("SetByteOrder", "SetByteOrder takes one parameter, BigEndian or LittleEndian"),
+        (
+            "SendParameters 7D",
+            "Unknown section '7d'; known are All, General, 3D, 6D, Analog, Force, Events, Event",
+        ),
+        (
+            "SendCurrentFrame 7D",
+            "Unknown component '7d'; known are All, 3D, 6D, Analog, Force, Events, Event",
+        ),
+        (
+            "StreamFrames 7D",
+            "Unknown parameter '7d'; known are All, 3D, 6D, Analog, Force, Events, Event, "
+            "FrequencyDivisor:n, Frequency:n, AllFrames, Stop (alone)",
+        ),
+        (
+            "StreamFrames AllFrames Frequency:60",
+            "StreamFrames takes one of FrequencyDivisor:n, Frequency:n, AllFrames",
+        ),
+        (
+            "StreamFrames Frequency:1:2",
+            "Unknown rate 'frequency:1:2'; known are FrequencyDivisor:n (n a whole number from 1), "
+            "Frequency:n (n Hz, above 0), AllFrames",
+        ),
+        ("Bye 3D", "Bye takes no parameter"),
+    ],
+)
+def test_a_command_that_cannot_be_read(command: str, text: str) -> None:
+    with pytest.raises(CommandError) as caught:
+        parse_command(command.encode("ascii"))
+    assert str(caught.value) == text
+
+
+@pytest.mark.parametrize(
     ("word", "shown"),
     [("x" * 39, "x" * 39), ("x" * 40, "x" * 40), ("x" * 41, "x" * 40 + "?"), ("é", "?"), ("\x01", r"\x01")],
     ids=["39 characters", "40 characters", "41 characters", "beyond ASCII", "unprintable"],

@@ -208,3 +208,12 @@ def test_after_a_restart_frames_must_be_in_time_for_the_whole_wait_again() -> No
     assert not control.observe(20.9, 0.0)
     assert control.observe(21.0, 0.0)
     assert control.halvings == 0
+
+
+def test_the_second_step_up_comes_exactly_one_wait_after_the_first() -> None:
+    control = LagControl(max_lag_s=0.05)
+    for now_s in (0.0, 1.0, 2.0):
+        control.observe(now_s, 0.2)
+    steps = [control.observe(3.0 + elapsed_s, 0.0) for elapsed_s in (0.0, 10.0, 20.0)]
+    assert steps == [False, True, True]
+    assert control.halvings == 0
