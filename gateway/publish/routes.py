@@ -1,4 +1,4 @@
-"""Routes from one source to one output: publishers, sequence numbers, counters and failures."""
+"""The route from one source to one output: publishers, sequence numbers, counters and failures."""
 
 import logging
 from collections import Counter
@@ -54,7 +54,7 @@ class OutputRoute:
 
     @property
     def status(self) -> OutputStatus:
-        """What was sent so far, and the drops: the counter itself, to which others may add."""
+        """The counters so far. ``drops`` is the live counter: dropped questions are added to it."""
         sent = {name: counter for name, counter in self.sent.items() if counter.messages}
         return OutputStatus(
             self.output.name,
@@ -69,10 +69,9 @@ class OutputRoute:
         self.drops[cause] += 1
         self._failures.failed(str(error) if isinstance(error, OutputError) else f"{cause}: {error}")
 
-    def count_success(self) -> None:
-        """End a failure that has been logged, if there is one."""
-        if self._failures.failing:
-            self._failures.recovered("sending again")
+    def note_success(self) -> None:
+        """Log that a failure is over, if one was logged."""
+        self._failures.recovered("sending again")
 
     def close(self) -> None:
         """Close the publishers and withdraw the source from the output."""
@@ -101,7 +100,7 @@ class TopicRoute:
         else:
             self._sent.messages += 1
             self._sent.bytes += len(message)
-            self._output_route.count_success()
+            self._output_route.note_success()
 
     def close(self) -> None:
         """Close the publisher."""

@@ -11,7 +11,7 @@ from gateway.messages.stamp import Stamp
 from gateway.messages.tool_pose import metres_per_unit, tool_poses
 from gateway.messages.topics import MAX_LABEL_LENGTH, unique_name
 from gateway.publish.routes import OutputRoute, TopicRoute
-from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import Parameters
 
@@ -75,7 +75,7 @@ class ToolPoses:
                 f"unit of length {unit[:40]!r} is unknown: no tool poses are published; "
                 "set it to mm or m in the server"
             )
-        elif self._unknown_unit.failing:
+        elif self._metres is not None:
             self._unknown_unit.recovered(f"unit of length is {unit!r}: tool poses are published")
 
     def publish(self, frame: Frame, index: int, stamp: Stamp) -> None:
@@ -90,16 +90,17 @@ class ToolPoses:
             )
             self._count_drop("too many tools")
             return
-        if self._too_many.failing:
-            self._too_many.recovered(f"frames of {num_tools} tools: tool poses are published")
+        self._too_many.recovered(f"frames of {num_tools} tools: tool poses are published")
         # Topics stay open when a frame has fewer tools: the number may go up and down.
         if num_tools > len(self._tools):
             self._open_topics(num_tools)
-        if not any(route.publisher.wanted for tool in self._tools for route in tool.routes.values()):
-            return
-        tools = self._tools[:num_tools]
+        if any(route.publisher.wanted for tool in self._tools for route in tool.routes.values()):
+            self._send(frame.component(index), stamp, self._metres)
+
+    def _send(self, component: Component, stamp: Stamp, metres: float) -> None:
+        tools = self._tools[: component.num_items]
         sequences = [self._sequences[tool.name] for tool in tools]
-        messages = tool_poses(frame.component(index), stamp, sequences, self._metres)
+        messages = tool_poses(component, stamp, sequences, metres)
         for tool, message in zip(tools, messages, strict=True):
             for route in tool.routes.values():
                 if route.publisher.wanted:

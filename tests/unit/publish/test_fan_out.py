@@ -66,7 +66,7 @@ def test_each_component_has_its_own_numbers_across_sessions(memory: MemoryOutput
     fan_out.publish(FULL, Stamp(STAMP.utime, STAMP.capture_utime, 2), ALL)
     messages = [(topic.path, decode(message)) for topic, message in memory.messages]
     counted = {
-        key: [(message.sequence, message.session) for parts, message in messages if parts == (key,)]
+        key: [(message.sequence, message.session) for path, message in messages if path == (key,)]
         for key in ("3d", "analog")
     }
     assert counted == {"3d": [(0, 1), (1, 1), (2, 2)], "analog": [(0, 1), (1, 2)]}
