@@ -29,7 +29,7 @@ COMPILED_TESTS := tests/packaging/test_compiled.py tests/contract tests/unit/rtc
     tests/integration/test_faults.py::test_several_faults_at_once \
     $(foreach name,clock components connection fanout gateway intake message pacing packets rate streams, \
         $(wildcard tests/*/test_$(name)*.py)) \
-    --deselect tests/integration/test_streams.py::test_late_frames_make_the_gateway_ask_for_less_until_they_are_in_time \
+    --deselect tests/integration/test_streams.py::test_late_frames_make_the_gateway_request_a_lower_rate_until_they_are_in_time \
     --deselect tests/unit/rtc3d/test_packets.py::test_a_packet_of_a_byte_less_can_be_encoded
 
 test-compiled: build/compiled/complete

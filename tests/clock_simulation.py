@@ -1,4 +1,4 @@
-"""Frames of a server whose clock is known exactly, as they come over a network. Nothing sleeps."""
+"""Simulated frames of a server whose clock is known exactly, as a network delivers them. Nothing sleeps."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -23,9 +23,9 @@ def whole_us(times_us: npt.NDArray[np.floating[Any]]) -> Times:
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames in the order in which they come; the arrays are of shape (frames,) and in µs.
+    """Frames in the order of arrival; the arrays are of shape (frames,) and in µs.
 
-    ``captured_utime`` has the network's least delay in it: who only receives cannot know better.
+    ``captured_utime`` includes the network's least delay, which a receiver cannot measure.
     """
 
     timestamps_us: Times
@@ -48,16 +48,16 @@ class Frames:
         return Frames(self.timestamps_us[part], self.arrivals_utime[part], self.captured_utime[part])
 
     def with_timestamps(self, timestamps_us: Times) -> "Frames":
-        """Return the same frames as another server would stamp them."""
+        """Return the same frames with other time stamps."""
         return replace(self, timestamps_us=timestamps_us)
 
     def with_delays(self, delays_us: npt.NDArray[np.floating[Any]]) -> "Frames":
-        """Return the same frames, each so much later on the network, and those behind not before it."""
+        """Return the same frames, each delayed by so much; later frames do not overtake it."""
         arrivals = self.arrivals_utime + whole_us(delays_us)
         return replace(self, arrivals_utime=np.maximum.accumulate(arrivals))
 
     def with_host_set(self, by_us: int) -> "Frames":
-        """Return the same frames as told by a host clock that was set forward by so much."""
+        """Return the same frames as seen by a host whose clock was set forward by so much."""
         return Frames(self.timestamps_us, self.arrivals_utime + by_us, self.captured_utime + by_us)
 
 
@@ -75,7 +75,7 @@ def simulate(
 
     The host's clock is faster than the server's by ``drift_ppm``, or by that as a function of the seconds.
     Delays are exponential with the mean ``jitter_us``; a share of ``outliers`` has 200 ms more. TCP keeps the
-    order: behind a late frame, all are late. The server's clock starts at ``start_us``.
+    order: frames that follow a late frame are late, too. The server's clock starts at ``start_us``.
     """
     random = np.random.default_rng(seed)
     host_s = np.arange(round(seconds * rate_hz)) / rate_hz
@@ -89,13 +89,13 @@ def simulate(
 
 
 def delayed(frames: Frames, rate_hz: float, seconds: Sequence[float], delays_s: Sequence[float]) -> Frames:
-    """Return the frames with the delays that a line through these points has at their time."""
+    """Return the frames with delays interpolated between these points."""
     return frames.with_delays(np.interp(np.arange(len(frames)) / rate_hz, seconds, delays_s) * 1e6)
 
 
 @dataclass(frozen=True)
 class Observed:
-    """What a clock said at each frame; arrays of shape (frames,)."""
+    """The readings of a clock at each frame; arrays of shape (frames,)."""
 
     captures_utime: Times
     lags_s: Numbers
@@ -107,13 +107,13 @@ class Observed:
 
 def observe(clock: ServerClock, frames: Frames, first_frame_number: int = 0) -> Observed:
     """Show the frames to ``clock``; their numbers count from ``first_frame_number``."""
-    said = []
+    readings = []
     pairs = zip(frames.timestamps_us.tolist(), frames.arrivals_utime.tolist(), strict=True)
     for number, (timestamp_us, arrival_utime) in enumerate(pairs, first_frame_number):
-        said.append(
+        readings.append(
             (*clock.observe(timestamp_us, number, arrival_utime), clock.has_clock, clock.uncertainty_us)
         )
-    captures, lags, restarted, has_clock, uncertainties = zip(*said, strict=True)
+    captures, lags, restarted, has_clock, uncertainties = zip(*readings, strict=True)
     captures_utime = np.array(captures, np.int64)
     return Observed(
         captures_utime,
@@ -133,5 +133,5 @@ def learned(frames: Frames) -> ServerClock:
 
 
 def percentile_95_us(errors_us: Times) -> float:
-    """Return what 95 of 100 errors are within, whatever their sign."""
+    """Return the 95th percentile of the errors' absolute values."""
     return float(np.percentile(np.abs(errors_us), 95))

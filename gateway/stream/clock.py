@@ -1,26 +1,28 @@
-"""Server time → host time, from nothing but the frames' time stamps and when they came.
+"""A model of the server's clock, learned only from the frames' time stamps and arrival times.
 
-A frame comes at ``offset + (1 + drift) * time stamp + delay``, and its delay is never below that of an idle
-network. So the frames that came soonest tell the clocks, and the others tell only that they were late:
+A frame arrives at ``offset + (1 + drift) * time stamp + delay``, and its delay is never less than that of
+an idle network. So only the frames with the least delay give information about the clocks; all others
+show only that they were late.
 
-1. Of every half second the frame with the least delay is kept, for 30 s. This is minimum filtering: a mean
-   would follow the jitter.
-2. The line below all kept frames with the least sum of distances to them is the clock: it is the most likely
-   one if delays are exponential. Its slope is that of the edge of their lower convex hull above their mean
+1. Minimum filtering: of every half second the frame with the least delay is kept, for 30 s. A mean would
+   follow the jitter.
+2. The clock is the line below all kept frames with the least sum of distances to them: the most likely one
+   if delays are exponential. Its slope is that of the edge of their lower convex hull above their mean
    time stamp (Zhang, Liu, Xia, "Clock synchronization algorithms for network measurements", INFOCOM 2002;
    before it the linear programme of Moon, Skelly, Towsley, INFOCOM 1999; for sensors Olson, "A passive
-   solution to the sensor synchronization problem", IROS 2010). In less than 5 s a drift cannot be told
-   from jitter; until then it stays as it was.
-3. A frame before the line proves it wrong: the line moves down to it at once. Far before means that a clock
-   was set: what was kept is void. The drift stays, because nobody sets a crystal's rate.
-4. A late frame proves nothing: a pause, a jam, or a clock that was set. Half seconds that are late
-   throughout are kept apart, and believed once they are equally late for two seconds, which a jam that
-   grows or clears is not, or late for 30 s.
-5. A time stamp or frame number that goes back is a new time base, with a new line through that frame at
-   once; a stamp that is just 2^32 µs short has wrapped around, and the line goes on (field note 11). Stamps
-   that stand still, or run at a rate that no crystal has, are no clock.
+   solution to the sensor synchronization problem", IROS 2010). Over less than 5 s, drift cannot be
+   distinguished from jitter; until then the drift keeps its last value.
+3. A frame that arrives before the line disproves the line, which moves down to that frame at once. A frame
+   far before it means that a clock was set: all kept frames become invalid. The drift stays, because
+   setting a clock does not change the rate of its crystal.
+4. A late frame proves nothing: the cause can be a pause, congestion, or a clock that was set. Half seconds
+   in which every frame is late are kept apart. They replace the others once they have been equally late for
+   two seconds, which rules out congestion that grows or clears, or once they have been late for 30 s.
+5. If a time stamp or frame number goes back, the server has a new time base: a new line starts at that
+   frame. A time stamp that is just 2^32 µs too small has wrapped around, and the line continues (field
+   note 11). Time stamps that do not change, or that run at a rate which no crystal has, are no clock.
 
-The least delay itself cannot be known from one side: it is in every time told here.
+The least delay itself cannot be measured from one side: every time computed here includes it.
 """
 
 import math
@@ -30,47 +32,47 @@ from itertools import islice, pairwise
 from typing import Final, NamedTuple
 
 MAX_DRIFT: Final = 500e-6
-"""Crystals are within 100e-6 of their rate. Beyond this, the stamps are not µs of a clock."""
+"""Crystals are within 100e-6 of their rate. With more drift, the time stamps are not µs of a clock."""
 
 _WINDOW_US: Final = 500_000
-"""Of each window the frame with the least delay is kept: 15 frames at 30 Hz are enough to choose from."""
+"""The frame with the least delay in each window is kept: 15 frames at 30 Hz are enough to choose from."""
 
 _KEPT_WINDOWS: Final = 60
-"""More would tell a constant drift better, and one that changes with the room's temperature worse."""
+"""More would be better for a constant drift, and worse for one that follows the room's temperature."""
 
-_LEAST_SAMPLES: Final = 3
-"""Through two frames there is always a line; the third tells whether it is one."""
+_MIN_SAMPLES: Final = 3
+"""There is always a line through two frames; only a third one can contradict it."""
 
 _DRIFT_SPAN_US: Final = 5_000_000
-"""A drift of 100 ppm is 0.5 ms by then, more than the least delays of half seconds differ."""
+"""In this time a drift of 100 ppm makes 0.5 ms: more than the least delays of half seconds differ."""
 
 _RATE_TOLERANCE_US: Final = 10_000
-"""By how much least delays may differ: what a slope may be beyond MAX_DRIFT, times its span."""
+"""How much least delays may differ: over a span, this allows the slope to exceed MAX_DRIFT."""
 
 _STEP_US: Final = 2_000
-"""The least that shows a clock that was set; what is less passes with the frames that are kept."""
+"""The smallest step that counts as a clock that was set; smaller ones disappear with the kept frames."""
 
 _STEP_WINDOWS: Final = 4
 _ROUNDING_US: Final = 2.0  # time stamps and arrivals are whole µs
 _FROZEN_US: Final = 500_000
 _WRAP_US: Final = 1 << 32
 _WRAP_TOLERANCE_US: Final = 1_000_000
-_NO_TIMESTAMP_US: Final = 1 << 63  # none is as great: they are signed and have 64 bits
+_NO_TIMESTAMP_US: Final = 1 << 63  # larger than any time stamp: those are signed 64-bit integers
 
 
 class Sample(NamedTuple):
-    """A frame with the least delay of its window: its time stamp, and by how much it came after that."""
+    """The frame with the least delay of its window: its time stamp, and its arrival minus that."""
 
     timestamp_us: int
     offset_us: int
 
 
 class ServerClock:
-    """The clock of one server, learned from its frames as the module tells.
+    """The clock of one server, learned from its frames as the module's text describes.
 
-    While ``has_clock`` is False (in the first 1.5 s, and whenever time stamps make no sense)
-    ``capture_utime`` is the arrival. It does not go back from frame to frame of a time base unless the
-    arrivals do; two frames may have the same.
+    While ``has_clock`` is False (in the first 1.5 s, and whenever time stamps are unusable),
+    ``capture_utime`` is the time of arrival. Within a time base, ``capture_utime`` never decreases from frame
+    to frame unless the arrival times do; two frames may have the same.
     """
 
     def __init__(self) -> None:
@@ -78,18 +80,18 @@ class ServerClock:
         self._samples: deque[Sample] = deque(maxlen=_KEPT_WINDOWS)
         self._late_samples: deque[Sample] = deque(maxlen=_KEPT_WINDOWS)
         self._scatter_us = math.inf
-        # The line: the host time of one time stamp, and by how much more than 1 it rises from there.
+        # The line: the host time of one time stamp, and the slope there minus 1.
         self._line_timestamp_us = self._line_utime = 0
         self._drift = 0.0
-        # The frame before.
+        # The previous frame.
         self._timestamp_us = _NO_TIMESTAMP_US
         self._frame_number = self._arrival_utime = self._capture_utime = 0
-        # What 32 bits have lost of the time stamps; the line and the samples are in whole ones.
+        # What 32-bit time stamps have lost by wrapping around; line and samples include it.
         self._wrapped_us = 0
-        # The time stamp that was last seen twice in a row, and when it came first.
+        # The time stamp that was last repeated, and when it first arrived.
         self._repeated_us = _NO_TIMESTAMP_US
         self._repeated_utime = 0
-        # The window under way, and the frame with the least delay in it.
+        # The current window, and the frame with the least delay in it.
         self._window_end_utime = 0
         self._least_lag_us: float = math.inf
         self._least_timestamp_us = self._least_offset_us = 0
@@ -105,37 +107,38 @@ class ServerClock:
 
     @property
     def drift_ppm(self) -> float:
-        """By how much the host's clock is faster than the server's; 0 without a clock."""
+        """How much faster the host's clock runs than the server's; 0 without a clock."""
         return self._drift * 1e6 if self.has_clock else 0.0
 
     @property
     def uncertainty_us(self) -> float:
-        """By how much the least delays of half seconds differ, which errors seldom exceed.
+        """How much the least delays of half seconds differ; errors rarely exceed it.
 
-        It is inf without a clock, and until three half seconds tell it. What all frames have in common, the
-        network's least delay, is not in it.
+        It is inf without a clock and during the first three half seconds. It does not include the network's
+        least delay, which all frames have in common.
         """
         return self._scatter_us if self.has_clock else math.inf
 
     @property
     def samples(self) -> int:
-        """On how many frames of least delay the line rests, at most 60."""
+        """The number of frames that determine the line, at most 60."""
         return len(self._samples)
 
     def observe(self, timestamp_us: int, frame_number: int, arrival_utime: int) -> tuple[int, float, bool]:
-        """Learn from the frame that came at ``arrival_utime``; return its (capture_utime, lag_s, restarted).
+        """Learn from one frame; return its (capture_utime, lag_s, restarted).
 
-        ``capture_utime`` is when it was captured, µs since the Unix epoch, never later than it came.
-        ``lag_s`` is by how much it came later than the soonest possible, at least 0, and 0 without a clock.
-        ``restarted`` tells that with this frame the server's time or frame numbers began anew.
+        Call it once per frame, in order of arrival. ``arrival_utime`` is µs since the Unix epoch.
+        ``timestamp_us`` and ``frame_number`` are those of one of its components (§7.1), preferably always of
+        the same type: servers may count types apart, and a number that goes back is a restart.
 
-        Called once per frame, in the order in which frames came. ``timestamp_us`` and ``frame_number`` are
-        those of one of its components (§7.1), at best always of the same type: servers may count types apart,
-        and a number that goes back is a restart. ``arrival_utime`` is µs since the Unix epoch.
+        ``capture_utime`` is when the frame was captured, µs since the Unix epoch, and never later than it
+        arrived. ``lag_s`` is how much later it arrived than a frame without delay would have, at least 0; it
+        is 0 without a clock. ``restarted`` is True if with this frame the server's time or frame numbers began
+        again.
         """
         restarted = False
         if timestamp_us <= self._timestamp_us or frame_number < self._frame_number:
-            restarted = self._take_irregular(timestamp_us, frame_number, arrival_utime)
+            restarted = self._handle_irregular(timestamp_us, frame_number, arrival_utime)
         elif arrival_utime >= self._window_end_utime:
             self._close_window(arrival_utime)
         self._timestamp_us = timestamp_us
@@ -149,7 +152,7 @@ class ServerClock:
         if lag_us < self._least_lag_us:
             if lag_us < 0:
                 if lag_us < -_STEP_US:
-                    self._forget_samples(arrival_utime)
+                    self._clear_samples(arrival_utime)
                 self._line_timestamp_us, self._line_utime = server_us, arrival_utime
                 capture_utime = arrival_utime
                 lag_us = 0
@@ -159,38 +162,38 @@ class ServerClock:
         if not self.has_clock:
             self._capture_utime = arrival_utime
             return arrival_utime, 0.0, restarted
-        # A new line may be below the one before; a subscriber's time is not to go back for that.
+        # A new line may be below the previous one; subscribers must not see time go back because of that.
         if capture_utime < self._capture_utime:
             capture_utime = min(self._capture_utime, arrival_utime)
         self._capture_utime = capture_utime
         return capture_utime, lag_us * 1e-6, restarted
 
-    def _take_irregular(self, timestamp_us: int, frame_number: int, arrival_utime: int) -> bool:
-        """Prepare for a frame that is the first or does not follow the last; return whether it restarts."""
+    def _handle_irregular(self, timestamp_us: int, frame_number: int, arrival_utime: int) -> bool:
+        """Handle a frame that is the first or does not follow the last; return whether it is a restart."""
         if self._timestamp_us == _NO_TIMESTAMP_US:
             self._start(timestamp_us, arrival_utime, has_clock=False)
             return False
         if frame_number >= self._frame_number:
             if timestamp_us == self._timestamp_us:
-                self._take_repeated(timestamp_us, arrival_utime)
+                self._handle_repeated(timestamp_us, arrival_utime)
                 return False
             advance_us = timestamp_us + _WRAP_US - self._timestamp_us
             elapsed_us = arrival_utime - self._arrival_utime
             if advance_us > 0 and abs(advance_us - elapsed_us) < _WRAP_TOLERANCE_US:
                 self._wrapped_us += _WRAP_US
                 return False
-        # A server that had a clock is trusted to have one again, unless it restarts all the time.
+        # Trust a server that had a clock to have one again, unless it restarts all the time.
         self._start(timestamp_us, arrival_utime, has_clock=self.has_clock and len(self._samples) > 0)
         return True
 
     def _start(self, timestamp_us: int, arrival_utime: int, *, has_clock: bool) -> None:
-        """Begin a line through this frame."""
+        """Start a new line through this frame."""
         self.has_clock = has_clock
         self._wrapped_us = 0
         self._line_timestamp_us, self._line_utime = timestamp_us, arrival_utime
-        self._forget_samples(arrival_utime)
+        self._clear_samples(arrival_utime)
 
-    def _forget_samples(self, arrival_utime: int) -> None:
+    def _clear_samples(self, arrival_utime: int) -> None:
         self._samples.clear()
         self._scatter_us = math.inf
         self._begin_window(arrival_utime)
@@ -199,15 +202,15 @@ class ServerClock:
         self._window_end_utime = arrival_utime + _WINDOW_US
         self._least_lag_us = math.inf
 
-    def _take_repeated(self, timestamp_us: int, arrival_utime: int) -> None:
-        # A doubled frame, or coarse stamps, go on being a clock; a stamp that stays does not.
+    def _handle_repeated(self, timestamp_us: int, arrival_utime: int) -> None:
+        # Doubled frames and coarse time stamps are still a clock; a frozen time stamp is none.
         if timestamp_us != self._repeated_us:
             self._repeated_us, self._repeated_utime = timestamp_us, self._arrival_utime
         if arrival_utime - self._repeated_utime > _FROZEN_US:
             self._start(timestamp_us, arrival_utime, has_clock=False)
 
     def _close_window(self, arrival_utime: int) -> None:
-        """Judge the least delay of the window before this frame, and draw the line anew."""
+        """Decide what to do with the sample of the window that ends, and fit the line again."""
         lag_us = self._least_lag_us
         least = Sample(self._least_timestamp_us, self._least_offset_us)
         self._begin_window(arrival_utime)
@@ -216,13 +219,13 @@ class ServerClock:
             self._samples.append(least)
         else:
             self._late_samples.append(least)
-            if not self._is_late_for_good(min(lag_us / 4, doubt_us)):
+            if not self._stays_late(min(lag_us / 4, doubt_us)):
                 return
             self._samples = self._late_samples.copy()
         self._late_samples.clear()
-        self._draw_line()
+        self._fit_line()
 
-    def _is_late_for_good(self, tolerance_us: float) -> bool:
+    def _stays_late(self, tolerance_us: float) -> bool:
         late = self._late_samples
         if len(late) < _STEP_WINDOWS:
             return False
@@ -230,13 +233,13 @@ class ServerClock:
         spread_us = max(sample.offset_us for sample in newest) - min(sample.offset_us for sample in late)
         return spread_us < tolerance_us or len(late) == _KEPT_WINDOWS
 
-    def _draw_line(self) -> None:
-        """Put the line below the samples, and tell whether it is that of a clock."""
+    def _fit_line(self) -> None:
+        """Fit the line to the samples, and decide whether its slope is that of a clock."""
         samples = self._samples
         last = samples[-1]
         span_us = last.timestamp_us - samples[0].timestamp_us
-        judged = len(samples) >= _LEAST_SAMPLES
-        if judged:
+        enough = len(samples) >= _MIN_SAMPLES
+        if enough:
             slope = envelope_slope(samples)
             self.has_clock = abs(slope) <= MAX_DRIFT + _RATE_TOLERANCE_US / span_us
             if span_us >= _DRIFT_SPAN_US:
@@ -248,8 +251,8 @@ class ServerClock:
         least_us = min(heights_us)
         self._line_timestamp_us = last.timestamp_us
         self._line_utime = last.timestamp_us + last.offset_us + math.floor(least_us)
-        if judged:
-            # The line was chosen so as to touch two of them: they tell nothing of the scatter.
+        if enough:
+            # The line touches two of the samples by construction: they do not count towards the scatter.
             scatter_us = sum(height_us - least_us for height_us in heights_us) / (len(samples) - 2)
             self._scatter_us = max(scatter_us, _ROUNDING_US)
 
@@ -257,8 +260,8 @@ class ServerClock:
 def envelope_slope(samples: Sequence[Sample]) -> float:
     """Return the slope of the line below all samples with the least sum of distances to them.
 
-    ``samples`` are at least two, their time stamps strictly increasing. Of the lines below them all, one
-    through an edge of the lower convex hull is nearest on the whole: that above the mean time stamp.
+    ``samples`` are at least two, with strictly increasing time stamps. The line through the edge of the
+    lower convex hull that spans the mean time stamp has the least sum.
     """
     hull: list[Sample] = []
     for sample in samples:
@@ -271,6 +274,6 @@ def envelope_slope(samples: Sequence[Sample]) -> float:
 
 
 def _turns_up(first: Sample, second: Sample, third: Sample) -> bool:
-    """Return whether the way from ``first`` over ``second`` to ``third`` bends upwards."""
+    """Return whether the path from ``first`` over ``second`` to ``third`` bends upwards."""
     run_us, run_on_us = second.timestamp_us - first.timestamp_us, third.timestamp_us - first.timestamp_us
     return (second.offset_us - first.offset_us) * run_on_us < (third.offset_us - first.offset_us) * run_us

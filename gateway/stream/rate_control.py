@@ -1,4 +1,4 @@
-"""Which rate is asked of a server: what is asked when it refuses, and less while frames come late."""
+"""The rate to request from a server: alternatives if it refuses, and lower rates while frames are late."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -7,23 +7,24 @@ from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate,
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 
 BEHIND_S: Final = 1.0
-"""How long frames must be late without a break before less is asked for."""
+"""How long frames must be late without interruption before a lower rate is requested."""
 
 FIRST_WAIT_S: Final = 10.0
 MAX_WAIT_S: Final = 300.0
-"""How long frames must be in time before more is asked for: at first, and at most."""
+"""How long frames must be in time before a higher rate is requested: at first, and at most."""
 
 MAX_HALVINGS: Final = 8
+"""The lowest rate is 1/256 of the configured one."""
 
 
 def stream_requests(
     rate: Rate, components: Sequence[ComponentType], server_rate_hz: float | None
 ) -> list[StreamFrames]:
-    """Return the StreamFrames commands to try, in order, the wanted one first.
+    """Return the StreamFrames commands to try, in order, beginning with the configured rate and components.
 
-    Some servers know neither ``Frequency:n`` nor ``AllFrames`` nor component names (field note 2): then
-    the same rate is asked for without names, a frequency as the nearest divisor of ``server_rate_hz``
-    (the rate that the parameters tell, if any), and at last whatever the server sends by default.
+    Some servers know neither ``Frequency:n`` nor ``AllFrames`` nor component names (field note 2). The
+    alternatives are: the same rate without names, a frequency as the nearest divisor of ``server_rate_hz``
+    (the rate in the parameters, if any), and finally the server's default.
     """
     names = () if set(components) == set(WIRE_ORDER) else tuple(components)
     rates: list[Rate] = [rate]
@@ -36,7 +37,7 @@ def stream_requests(
 
 
 def halved(rate: Rate | None, times: int) -> Rate | None:
-    """Return ``rate`` halved so many times; None, a server's default, counts as all frames."""
+    """Return ``rate`` halved ``times`` times; None, the server's default, counts as all frames."""
     if times == 0:
         return rate
     match rate:
@@ -51,10 +52,10 @@ def halved(rate: Rate | None, times: int) -> Rate | None:
 class LagControl:
     """Decides how often the configured rate is halved, from how late the frames are.
 
-    Late for BEHIND_S: halve once more. In time for ``wait_s``: one halving less, never above what was
-    configured. A step up that is taken back within its own wait has failed: the next wait is twice as
-    long, up to MAX_WAIT_S; one that holds makes it FIRST_WAIT_S again. So a link that carries half the
-    rate is not tried to death.
+    After BEHIND_S of late frames it halves the rate once more. After ``wait_s`` of frames in time it takes
+    one halving back, never above the configured rate. If a step up fails, that is, if it is taken back
+    within its own wait, the next wait doubles, up to MAX_WAIT_S; a step up that lasts resets the wait to
+    FIRST_WAIT_S. This avoids retrying the full rate again and again on a link that carries half of it.
     """
 
     def __init__(self, max_lag_s: float) -> None:
@@ -63,11 +64,11 @@ class LagControl:
         self.behind = False
         """Whether the newest frame was late."""
         self.wait_s = FIRST_WAIT_S
-        self._since_s: float | None = None  # of being behind, or in time, without a break
+        self._since_s: float | None = None  # since when frames are late, or in time, without interruption
         self._stepped_up_s: float | None = None
 
     def observe(self, now_s: float, lag_s: float) -> bool:
-        """Take one frame's lateness; return whether ``halvings`` changed."""
+        """Process the lag of one frame; return whether ``halvings`` changed."""
         behind = lag_s > self._max_lag_s
         if behind is not self.behind or self._since_s is None:
             self.behind = behind
@@ -79,7 +80,7 @@ class LagControl:
         return held_s >= self.wait_s and self.halvings > 0 and self._step_up(now_s)
 
     def restart(self) -> None:
-        """Forget how late frames were: what comes next is no continuation of what came before."""
+        """Forget how late frames were; the next frames do not continue the previous ones."""
         self.behind = False
         self._since_s = None
 

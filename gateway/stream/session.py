@@ -241,7 +241,7 @@ class Session:
                 )  # fmt: skip
 
     def _report_protocol(self) -> None:
-        """Report the protocol's state; what comes next has the whole stall time-out to arrive."""
+        """Report the protocol's new state, and start the stall time-out again."""
         self._quiet_since_s = self._monotonic()
         self._status.protocol_changed(self._protocol.state, self._protocol.byte_order or "", self.server)
 

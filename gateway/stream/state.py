@@ -7,13 +7,13 @@ from gateway.rtc3d.protocol_state import ProtocolState
 
 
 class Phase(Enum):
-    """How far the present connection of a stream has come."""
+    """The phases in the life of a connection."""
 
-    WAITING = "waiting"  # no connection; the next try comes after a delay
+    WAITING = "waiting"  # no connection; the next try follows after a delay
     CONNECTING = "connecting"
     HANDSHAKING = "handshaking"
     READY = "ready"
-    SILENT = "silent"  # a measurement runs and no frame comes: the connection is about to be closed
+    SILENT = "silent"  # a measurement runs and no frame arrives: the connection is about to be closed
 
 
 class StreamState(Enum):
@@ -24,7 +24,7 @@ class StreamState(Enum):
     IDLE = "idle"  # connected; frames are not requested, or neither a frame nor No Data has arrived yet
     NO_MEASUREMENT = "no measurement"
     STREAMING = "streaming"
-    STALLED = "stalled"  # a measurement runs and no frame comes
+    STALLED = "stalled"  # a measurement runs and no frame arrives
     WAITING = "waiting to reconnect"
 
 
@@ -40,13 +40,13 @@ _BY_PHASE: Final = {
 def stream_state(phase: Phase, protocol_state: ProtocolState) -> StreamState:
     """Return the state of a stream.
 
-    Two facts decide it, and each has one owner. ``phase`` says how far the connection has come;
-    session and supervisor know that. ``protocol_state`` says what the server sends; the ClientProtocol of
-    the connection knows that.
+    Two facts decide it, and each has one owner. ``phase`` is that of the connection; session and supervisor
+    report it. ``protocol_state`` is what was requested and what the server sends; the ClientProtocol of the
+    connection knows it.
 
-    - While the connection can be used, what the server sends decides: frames, or No Data. The handshake
-      need not be done, because a frame may arrive before StreamFrames is acknowledged (field note 3).
-    - In all other cases the phase decides. A connection that is ready and receives neither is idle.
+    - On a usable connection, what the server sends decides: frames or No Data. This holds during the
+      handshake, too, because a frame may arrive before StreamFrames is acknowledged (field note 3).
+    - Otherwise the phase decides. A connection that is ready and receives neither is idle.
     """
     if phase in {Phase.HANDSHAKING, Phase.READY}:
         if protocol_state is ProtocolState.STREAMING:

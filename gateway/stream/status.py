@@ -93,7 +93,7 @@ class StreamStatus:
         self._update_state(protocol_state, _PROTOCOL_EVENTS.get(protocol_state, "frames requested"), server)
 
     def silent(self, text: str) -> None:
-        """Note that no frames come although a measurement runs."""
+        """Note that no frames arrive although a measurement runs."""
         self._enter(Phase.SILENT, "silence", text)
 
     def disconnected(self, error: str) -> None:

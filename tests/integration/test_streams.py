@@ -1,8 +1,9 @@
-"""What happens to a stream while its connection stays: demand, layout, lateness, states."""
+"""Changes of a stream on one connection: demand, item counts, lateness, states."""
 
 import asyncio
 import math
 from functools import partial
+from typing import Any
 
 import pytest
 
@@ -17,7 +18,7 @@ XML = packet(2, "<RT_Parameters Ver='1.00'><The_3D/></RT_Parameters>")
 
 
 class Recorder:
-    """A server that streams a counted frame whenever it is told to, and remembers its commands."""
+    """A server that sends a numbered frame at each call of ``stream``, and records its commands."""
 
     def __init__(self) -> None:
         self.commands: list[str] = []
@@ -49,7 +50,7 @@ ORIGIN = (0.0, 0.0, 0.0)
 START, STOP = "StreamFrames AllFrames", "StreamFrames Stop"
 
 
-async def test_a_stream_on_demand_runs_while_somebody_listens() -> None:
+async def test_an_on_demand_stream_runs_while_it_has_subscribers() -> None:
     server = Recorder()
     stream = StreamSettings(on_demand=True, idle_after_s=0.1)
     async with (
@@ -67,7 +68,7 @@ async def test_a_stream_on_demand_runs_while_somebody_listens() -> None:
         assert lab.status.session == 1
 
 
-async def test_a_stream_that_is_always_on_runs_without_listeners() -> None:
+async def test_other_streams_run_without_subscribers() -> None:
     server = Recorder()
     async with ScriptedServer(server.script) as listening, gateway_to(listening.port) as lab:
         lab.output.listened = False
@@ -95,7 +96,23 @@ async def test_a_changed_number_of_markers_makes_the_gateway_ask_for_parameters(
         assert [message.num_markers for message in await lab.heard("3d", 3)] == [1, 1, 2]
 
 
-async def test_time_stamps_going_back_are_a_restart_and_no_reconnect() -> None:
+async def test_a_pending_question_for_parameters_ends_with_the_source() -> None:
+    def refreshing() -> list[asyncio.Task[Any]]:
+        names = {task: getattr(task.get_coro(), "__qualname__", "") for task in asyncio.all_tasks()}
+        return [task for task, name in names.items() if name == "Source._refresh"]
+
+    server = Recorder()
+    async with ScriptedServer(server.script) as listening:
+        async with gateway_to(listening.port, fresh_interval_s=1000) as lab:
+            await lab.until(lambda: server.count(START) == 1)
+            server.stream(ORIGIN)
+            server.stream(ORIGIN, ORIGIN)
+            await lab.until(refreshing)
+        await asyncio.sleep(0)  # lets the cancelled task run
+        assert not refreshing()
+
+
+async def test_time_stamps_that_go_back_are_a_restart_without_a_reconnect() -> None:
     server = Recorder()
     async with ScriptedServer(server.script) as listening, gateway_to(listening.port) as lab:
         await lab.until(lambda: server.count(START) == 1)
@@ -108,7 +125,7 @@ async def test_time_stamps_going_back_are_a_restart_and_no_reconnect() -> None:
         assert lab.status.session == 1
 
 
-async def test_states_follow_the_server_and_show_on_the_outputs(caplog: pytest.LogCaptureFixture) -> None:
+async def test_states_follow_the_server_and_the_outputs_show_them(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
     async with Simulator(SyntheticScene(rate_hz=200)) as simulator:
         simulator.stop_measurement()
@@ -126,10 +143,10 @@ async def test_states_follow_the_server_and_show_on_the_outputs(caplog: pytest.L
     assert sum("streaming → no measurement" in change for change in changes) == 1
 
 
-async def test_late_frames_make_the_gateway_ask_for_less_until_they_are_in_time(
+async def test_late_frames_make_the_gateway_request_a_lower_rate_until_they_are_in_time(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The server's frames come in time for 3 s, and then 0.3 s late: its time stamps stay behind."""
+    """For 3 s the frames arrive in time, and then 0.3 s late: the time stamps stay behind."""
     monkeypatch.setattr("gateway.stream.rate_control.FIRST_WAIT_S", 0.3)
     caplog.set_level("INFO", "gateway.stream")
     server = Recorder()
@@ -154,8 +171,8 @@ async def test_late_frames_make_the_gateway_ask_for_less_until_they_are_in_time(
         await lab.until(lambda: lab.status.rate == "FrequencyDivisor:2")
         await stream_until(START, late_after_s=math.inf)
         await lab.until(lambda: lab.status.rate == "AllFrames")
-        told = [(record.levelname, record.message) for record in caplog.records]
-    late, in_time = [(level, text) for level, text in told if "frames arrive" in text]
+        logged = [(record.levelname, record.message) for record in caplog.records]
+    late, in_time = [(level, text) for level, text in logged if "frames arrive" in text]
     assert late[0] == "WARNING"
     assert late[1].endswith(" ms late; asked the server for FrequencyDivisor:2")
     assert in_time[0] == "INFO"

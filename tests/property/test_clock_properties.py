@@ -10,10 +10,10 @@ timestamps_us = st.integers(-(2**63), 2**63 - 1)
 arrivals_utime = st.integers(EPOCH_UTIME, EPOCH_UTIME + 10**8)
 frame_numbers = st.integers(-(2**31), 2**31 - 1)
 
-anything = st.lists(st.tuples(timestamps_us | st.integers(0, 10**8), frame_numbers, arrivals_utime))
-"""Stamps of any size and of the size of real ones, in any order."""
+any_frames = st.lists(st.tuples(timestamps_us | st.integers(0, 10**8), frame_numbers, arrivals_utime))
+"""Time stamps of any size, real sizes included, in any order."""
 
-one_base = st.lists(st.tuples(st.integers(1, 10**6), st.integers(0, 10**6)), min_size=2).map(
+one_time_base = st.lists(st.tuples(st.integers(1, 10**6), st.integers(0, 10**6)), min_size=2).map(
     lambda steps: [
         (
             sum(step[0] for step in steps[: index + 1]),
@@ -22,11 +22,13 @@ one_base = st.lists(st.tuples(st.integers(1, 10**6), st.integers(0, 10**6)), min
         for index in range(len(steps))
     ]
 )
-"""Stamps that grow and arrivals that do not go back, at any rates."""
+"""Time stamps that grow and arrival times that do not decrease, at any rates."""
 
 
-@given(anything)
-def test_no_frame_is_captured_after_it_came_whatever_its_stamp(frames: list[tuple[int, int, int]]) -> None:
+@given(any_frames)
+def test_no_frame_is_captured_after_its_arrival_whatever_its_time_stamp(
+    frames: list[tuple[int, int, int]],
+) -> None:
     clock = ServerClock()
     for timestamp_us, frame_number, arrival_utime in frames:
         capture_utime, lag_s, _ = clock.observe(timestamp_us, frame_number, arrival_utime)
@@ -36,8 +38,10 @@ def test_no_frame_is_captured_after_it_came_whatever_its_stamp(frames: list[tupl
             assert (capture_utime, lag_s) == (arrival_utime, 0)
 
 
-@given(st.integers(0, 2**20), one_base)
-def test_capture_times_do_not_go_back_where_stamps_grow(seed: int, steps: list[tuple[int, int]]) -> None:
+@given(st.integers(0, 2**20), one_time_base)
+def test_capture_times_do_not_decrease_while_time_stamps_grow(
+    seed: int, steps: list[tuple[int, int]]
+) -> None:
     learned_from = simulate(seconds=4, rate_hz=30, seed=seed)
     clock = ServerClock()
     captures = list(observe(clock, learned_from).captures_utime)
@@ -57,7 +61,9 @@ def test_capture_times_do_not_go_back_where_stamps_grow(seed: int, steps: list[t
     rate_hz=st.floats(20, 400),
     start_us=st.integers(-(2**40), 2**40),
 )
-def test_any_crystals_drift_is_learned(seed: int, drift_ppm: float, rate_hz: float, start_us: int) -> None:
+def test_the_drift_of_any_crystal_is_learned(
+    seed: int, drift_ppm: float, rate_hz: float, start_us: int
+) -> None:
     frames = simulate(
         seconds=12, rate_hz=rate_hz, seed=seed, drift_ppm=drift_ppm, jitter_us=1_000, start_us=start_us
     )
@@ -67,11 +73,11 @@ def test_any_crystals_drift_is_learned(seed: int, drift_ppm: float, rate_hz: flo
 
 
 @given(st.integers(0, 2**20), st.integers(0, 2**60), st.integers(0, 10**15))
-def test_where_clocks_begin_makes_no_difference(seed: int, stamps_by_us: int, host_by_us: int) -> None:
+def test_the_epochs_of_the_clocks_make_no_difference(seed: int, stamps_by_us: int, host_by_us: int) -> None:
     frames = simulate(seconds=8, rate_hz=60, seed=seed, drift_ppm=100)
     moved = frames.with_timestamps(frames.timestamps_us + stamps_by_us).with_host_set(host_by_us)
-    told = observe(ServerClock(), frames).captures_utime
-    assert (observe(ServerClock(), moved).captures_utime == told + host_by_us).all()
+    captures = observe(ServerClock(), frames).captures_utime
+    assert (observe(ServerClock(), moved).captures_utime == captures + host_by_us).all()
 
 
 @given(
@@ -81,7 +87,7 @@ def test_where_clocks_begin_makes_no_difference(seed: int, stamps_by_us: int, ho
     away_us=st.integers(0, 10**7),
 )
 @example(seconds=1, back_us=2**32, frame_number=1000, away_us=0)
-def test_a_stamp_that_goes_back_is_a_restart(
+def test_a_time_stamp_that_goes_back_is_a_restart(
     seconds: float, back_us: int, frame_number: int, away_us: int
 ) -> None:
     frames = simulate(seconds=seconds, rate_hz=60)

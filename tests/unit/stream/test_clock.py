@@ -25,7 +25,7 @@ def samples(*points: tuple[int, int]) -> list[Sample]:
     return [Sample(*point) for point in points]
 
 
-# --- how exact
+# --- accuracy
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -34,7 +34,7 @@ def test_after_30_s_the_capture_time_is_within_half_a_millisecond(drift_ppm: flo
     frames = simulate(seconds=60, rate_hz=RATE_HZ, drift_ppm=drift_ppm, seed=seed)
     clock = ServerClock()
     observed = observe(clock, frames)
-    assert percentile_95_us(observed.errors_us[LEARNED:]) < 100  # five times better than asked for
+    assert percentile_95_us(observed.errors_us[LEARNED:]) < 100  # five times better than required
     assert clock.drift_ppm == pytest.approx(drift_ppm, abs=3)
     assert observed.has_clock[LEARNED:].all()
 
@@ -51,7 +51,7 @@ def test_after_30_s_the_capture_time_is_within_half_a_millisecond(drift_ppm: flo
         (1000, 5_000, 0.0, 1_000),
     ],
 )
-def test_it_is_as_exact_at_other_rates_and_on_worse_networks(
+def test_it_is_accurate_at_other_rates_and_on_worse_networks(
     rate_hz: float, jitter_us: float, outliers: float, within_us: float, seed: int
 ) -> None:
     frames = simulate(
@@ -61,7 +61,7 @@ def test_it_is_as_exact_at_other_rates_and_on_worse_networks(
     assert percentile_95_us(errors_us) < within_us
 
 
-def test_a_drift_that_changes_is_followed_for_ten_minutes() -> None:
+def test_a_changing_drift_is_followed_for_ten_minutes() -> None:
     def warming_up(host_s: Numbers) -> Numbers:
         return np.asarray(100 * np.sin(2 * np.pi * host_s / 600))
 
@@ -86,17 +86,17 @@ def test_the_uncertainty_is_the_scatter_of_the_samples_that_the_line_does_not_to
     assert (clock.samples, clock.uncertainty_us, clock.offset_us) == (3, 300, EPOCH_UTIME)
 
 
-def test_lag_is_how_much_later_than_the_soonest_a_frame_came() -> None:
+def test_lag_is_the_delay_beyond_the_least_delay() -> None:
     frames = simulate(seconds=40, rate_hz=RATE_HZ)
     lags_us = observe(ServerClock(), frames).lags_s[LEARNED:] * 1e6
     true_us = (frames.arrivals_utime - frames.captured_utime)[LEARNED:]
     assert np.abs(lags_us - true_us).max() < 100
 
 
-# --- the beginning
+# --- the first frames
 
 
-def test_at_the_first_frame_there_is_no_clock() -> None:
+def test_there_is_no_clock_at_the_first_frame() -> None:
     clock = ServerClock()
     reading = clock.observe(123, 7, EPOCH_UTIME)
     assert reading == (EPOCH_UTIME, 0.0, False)
@@ -107,24 +107,24 @@ def test_at_the_first_frame_there_is_no_clock() -> None:
 def test_there_is_a_clock_after_one_and_a_half_seconds() -> None:
     frames = simulate(seconds=2, rate_hz=RATE_HZ)
     observed = observe(ServerClock(), frames)
-    came_s = (frames.arrivals_utime - frames.arrivals_utime[0]) / 1e6
-    assert 1.5 <= came_s[observed.has_clock.argmax()] < 1.6
+    elapsed_s = (frames.arrivals_utime - frames.arrivals_utime[0]) / 1e6
+    assert 1.5 <= elapsed_s[observed.has_clock.argmax()] < 1.6
     assert observed.has_clock[-1]
 
 
-def test_the_offset_takes_a_time_stamp_to_the_hosts_time() -> None:
+def test_the_offset_converts_a_time_stamp_to_host_time() -> None:
     frames = simulate(seconds=40, rate_hz=RATE_HZ, drift_ppm=100)
     clock = learned(frames)
     captured_utime = int(frames.timestamps_us[-1]) + clock.offset_us
     assert captured_utime == pytest.approx(int(frames.captured_utime[-1]), abs=100)
 
 
-def test_samples_are_those_of_half_a_minute() -> None:
+def test_samples_are_kept_for_half_a_minute() -> None:
     assert learned(simulate(seconds=5.1, rate_hz=RATE_HZ)).samples == 10
     assert learned(simulate(seconds=60, rate_hz=RATE_HZ)).samples == 60
 
 
-def test_frames_more_seldom_than_the_windows_make_a_clock_too() -> None:
+def test_frames_rarer_than_the_windows_make_a_clock_too() -> None:
     frames = simulate(seconds=120, rate_hz=1, drift_ppm=50)
     observed = observe(ServerClock(), frames)
     assert observed.has_clock[-1]
@@ -140,14 +140,14 @@ def test_capture_times_do_not_go_back_when_a_better_line_is_lower(seed: int) -> 
 # --- late frames
 
 
-def test_one_late_frame_moves_nothing() -> None:
+def test_one_late_frame_does_not_move_the_clock() -> None:
     frames = delayed(simulate(seconds=40, rate_hz=RATE_HZ), RATE_HZ, [29.996, 30, 30.004], [0, 1, 0])
     observed = observe(ServerClock(), frames)
     assert observed.lags_s[LEARNED] == pytest.approx(1.0, abs=0.1)
     assert percentile_95_us(observed.errors_us[LEARNED:]) < 100
 
 
-def test_a_pause_of_the_gateway_moves_nothing() -> None:
+def test_a_pause_of_the_gateway_does_not_move_the_clock() -> None:
     frames = delayed(simulate(seconds=60, rate_hz=RATE_HZ), RATE_HZ, [29.999, 30, 35], [0, 5, 0])
     observed = observe(ServerClock(), frames)
     assert observed.lags_s[LEARNED] == pytest.approx(5.0, abs=0.1)
@@ -158,11 +158,13 @@ def test_a_pause_of_the_gateway_moves_nothing() -> None:
     ("seconds", "delays_s"),
     [
         pytest.param([30, 40, 45, 50], [0, 0.8, 0.8, 0], id="grows and clears"),
-        pytest.param([30, 30.2, 50], [0, 0.8, 0], id="begins at once and clears slowly"),
+        pytest.param([30, 30.2, 50], [0, 0.8, 0], id="begins suddenly and clears slowly"),
         pytest.param([30, 55], [0, 0.02], id="grows by 0.8 ms/s"),
     ],
 )
-def test_a_jam_moves_nothing_and_is_told_as_lag(seconds: Sequence[float], delays_s: Sequence[float]) -> None:
+def test_congestion_is_lag_and_does_not_move_the_clock(
+    seconds: Sequence[float], delays_s: Sequence[float]
+) -> None:
     frames = delayed(simulate(seconds=60, rate_hz=RATE_HZ), RATE_HZ, seconds, delays_s)
     observed = observe(ServerClock(), frames)
     assert percentile_95_us(observed.errors_us[LEARNED : 55 * SECOND]) < 500
@@ -170,7 +172,7 @@ def test_a_jam_moves_nothing_and_is_told_as_lag(seconds: Sequence[float], delays
     assert observed.lags_s[LEARNED : 55 * SECOND] == pytest.approx(true_s[LEARNED : 55 * SECOND], abs=0.001)
 
 
-def test_a_hiccup_every_three_seconds_moves_nothing() -> None:
+def test_a_hiccup_every_three_seconds_does_not_move_the_clock() -> None:
     frames = simulate(seconds=90, rate_hz=RATE_HZ)
     index = np.arange(len(frames))
     hiccups_us = 300_000.0 * ((index >= LEARNED) & (index % (3 * SECOND) < 1.2 * SECOND))
@@ -178,7 +180,7 @@ def test_a_hiccup_every_three_seconds_moves_nothing() -> None:
     assert np.abs(observed.errors_us[LEARNED:]).max() < 500
 
 
-def test_a_jam_without_end_is_the_networks_delay_after_half_a_minute() -> None:
+def test_endless_congestion_becomes_the_networks_delay_after_half_a_minute() -> None:
     frames = simulate(seconds=90, rate_hz=RATE_HZ)
     waves_s = 0.5 + 0.2 * np.sin(np.arange(len(frames)) / RATE_HZ * 2 * np.pi / 5)
     waves_s[:LEARNED] = 0
@@ -187,14 +189,14 @@ def test_a_jam_without_end_is_the_networks_delay_after_half_a_minute() -> None:
     assert observed.lags_s[65 * SECOND :].min() < 0.02
 
 
-def test_a_delay_that_stays_is_the_networks_after_half_a_minute() -> None:
+def test_a_lasting_delay_becomes_the_networks_delay_after_half_a_minute() -> None:
     frames = delayed(simulate(seconds=90, rate_hz=RATE_HZ), RATE_HZ, [30, 40], [0, 0.3])
     observed = observe(ServerClock(), frames)
     assert observed.lags_s[42 * SECOND : 58 * SECOND].min() > 0.29
     assert observed.lags_s[75 * SECOND :].max() < 0.1
 
 
-def test_doubled_frames_are_captured_at_the_same_time() -> None:
+def test_doubled_frames_have_the_same_capture_time() -> None:
     frames = simulate(seconds=40, rate_hz=RATE_HZ)
     doubled = Frames(
         np.repeat(frames.timestamps_us, 2),
@@ -225,11 +227,11 @@ def test_coarse_time_stamps_make_a_clock() -> None:
         (samples((0, 0), (10, 5)), 0.5),
         (samples((0, 5), (10, 0)), -0.5),
         (samples((0, 0), (5, 7), (10, 10)), 1.0),
-        # The mean, 5, is below the second edge of a hull of two.
+        # The hull has two edges, and the second one spans the mean time stamp, 5.
         (samples((0, 4), (4, 0), (5, 9), (6, 9), (10, 3)), 0.5),
-        # The mean, 3.8, is below the first.
+        # The first one spans the mean, 3.8.
         (samples((0, 6), (1, 9), (2, 9), (6, 0), (10, 4)), -1.0),
     ],
 )
-def test_the_line_is_below_all_and_nearest(points: Sequence[Sample], slope: float) -> None:
+def test_the_line_is_the_nearest_one_below_all_samples(points: Sequence[Sample], slope: float) -> None:
     assert envelope_slope(points) == slope

@@ -1,4 +1,4 @@
-"""What the clock makes of clocks that are set, of restarts and of nonsense."""
+"""Clocks that are set, restarts of the server, and time stamps that are no clock."""
 
 import math
 from collections.abc import Callable
@@ -39,7 +39,7 @@ def test_a_host_clock_that_is_set_is_learned_again_within_three_seconds(by_s: fl
     assert clock.drift_ppm == pytest.approx(100, abs=3)
 
 
-def test_a_hiccup_meanwhile_does_not_hinder_that() -> None:
+def test_a_hiccup_does_not_delay_learning_the_new_host_clock() -> None:
     frames = delayed(simulate(seconds=60, rate_hz=RATE_HZ), RATE_HZ, [31, 31.1, 31.9, 32], [0, 0.3, 0.3, 0])
     set_s = 30
     after = frames.part(set_s * SECOND).with_host_set(10_000_000)
@@ -61,7 +61,7 @@ def test_time_stamps_that_jump_forward_are_learned_again_at_once(by_us: int) -> 
 
 
 @pytest.mark.parametrize("start_us", [0, 5_000_000])
-def test_a_restarted_server_is_recognised_on_its_first_frame(start_us: int) -> None:
+def test_a_restarted_server_is_recognised_by_its_first_frame(start_us: int) -> None:
     before = simulate(seconds=40, rate_hz=RATE_HZ, drift_ppm=100)
     after = simulate(seconds=40, rate_hz=RATE_HZ, drift_ppm=100, seed=1, start_us=start_us)
     after = after.with_host_set(60_000_000)
@@ -73,7 +73,7 @@ def test_a_restarted_server_is_recognised_on_its_first_frame(start_us: int) -> N
     assert percentile_95_us(observed.errors_us[SECOND:]) < 100  # the drift was known
 
 
-def test_a_frame_number_that_goes_back_is_a_restart_though_time_stamps_go_on() -> None:
+def test_a_frame_number_that_goes_back_is_a_restart_even_if_time_stamps_continue() -> None:
     frames = simulate(seconds=40, rate_hz=RATE_HZ)
     clock = ServerClock()
     observe(clock, frames.part(0, LEARNED), first_frame_number=1000)
@@ -96,7 +96,7 @@ def test_frame_numbers_may_be_constant() -> None:
 
 @pytest.mark.parametrize("lowest", [0, -(2**31)], ids=["unsigned", "signed"])
 @pytest.mark.parametrize("seconds", [20.0, 20.1, 20.2, 20.3, 20.4])
-def test_time_stamps_of_32_bits_wrap_around_without_a_trace(seconds: float, lowest: int) -> None:
+def test_32_bit_time_stamps_that_wrap_around_do_not_disturb_the_clock(seconds: float, lowest: int) -> None:
     start_us = lowest + WRAP_US - round(seconds * 1e6)
     frames = simulate(seconds=40, rate_hz=RATE_HZ, drift_ppm=-100, start_us=start_us)
     wrapped = frames.with_timestamps((frames.timestamps_us - lowest) % WRAP_US + lowest)
@@ -108,7 +108,7 @@ def test_time_stamps_of_32_bits_wrap_around_without_a_trace(seconds: float, lowe
     assert clock.offset_us == same.offset_us + WRAP_US
 
 
-def test_a_restart_after_a_wrap_around_begins_with_whole_stamps() -> None:
+def test_a_restart_after_a_wrap_around_forgets_the_wrapped_time() -> None:
     frames = simulate(seconds=40, rate_hz=RATE_HZ, start_us=WRAP_US - 20_000_000)
     clock = learned(frames.with_timestamps(frames.timestamps_us % WRAP_US))
     clock.observe(0, 0, EPOCH_UTIME + 60_000_000)
@@ -148,7 +148,7 @@ def times(factor: float) -> Callable[[Times], Times]:
         *(pytest.param(times(factor), id=f"{factor} times as fast") for factor in (0.5, 0.9, 1.1, 2)),
     ],
 )
-def test_time_stamps_that_make_no_sense_are_no_clock(stamped: Callable[[Times], Times]) -> None:
+def test_unusable_time_stamps_are_no_clock(stamped: Callable[[Times], Times]) -> None:
     frames = simulate(seconds=60, rate_hz=RATE_HZ)
     clock = ServerClock()
     observed = observe(clock, frames.with_timestamps(stamped(frames.timestamps_us)))
@@ -159,16 +159,16 @@ def test_time_stamps_that_make_no_sense_are_no_clock(stamped: Callable[[Times], 
 
 
 @pytest.mark.parametrize("factor", [0.998, 1.002])
-def test_a_rate_that_no_crystal_has_is_found_within_ten_seconds(factor: float) -> None:
+def test_a_rate_that_no_crystal_has_is_detected_within_ten_seconds(factor: float) -> None:
     frames = simulate(seconds=60, rate_hz=RATE_HZ)
     observed = observe(ServerClock(), frames.with_timestamps(times(factor)(frames.timestamps_us)))
     assert not observed.has_clock[10 * SECOND :].any()
 
 
-def test_no_greater_drift_is_told_than_crystals_have() -> None:
+def test_the_drift_never_exceeds_that_of_crystals() -> None:
     frames = simulate(seconds=12, rate_hz=RATE_HZ)
     clock = ServerClock()
-    # Not enough to rule out the network.
+    # The drift is not large enough to rule out that the network is the cause.
     assert observe(clock, frames.with_timestamps(times(0.9991)(frames.timestamps_us))).has_clock[-1]
     assert clock.drift_ppm == 500
 
@@ -187,7 +187,7 @@ def test_a_time_stamp_that_freezes_ends_the_clock_until_it_moves_again() -> None
 
 
 @pytest.mark.parametrize("stamped", [random_stamps, times(0.9)], ids=["random", "0.9 times as fast"])
-def test_after_nonsense_there_is_a_clock_again(stamped: Callable[[Times], Times]) -> None:
+def test_there_is_a_clock_again_after_unusable_time_stamps(stamped: Callable[[Times], Times]) -> None:
     nonsense = simulate(seconds=40, rate_hz=RATE_HZ)
     clock = learned(nonsense.with_timestamps(stamped(nonsense.timestamps_us)))
     frames = simulate(seconds=40, rate_hz=RATE_HZ, start_us=0).with_host_set(40_000_000)
@@ -197,7 +197,7 @@ def test_after_nonsense_there_is_a_clock_again(stamped: Callable[[Times], Times]
     assert percentile_95_us(observed.errors_us[LEARNED:]) < 100
 
 
-def test_a_server_that_restarts_into_nonsense_has_no_clock_soon() -> None:
+def test_a_server_that_restarts_with_unusable_time_stamps_soon_has_no_clock() -> None:
     clock = learned(simulate(seconds=40, rate_hz=RATE_HZ))
     frames = simulate(seconds=20, rate_hz=RATE_HZ).with_host_set(60_000_000)
     milliseconds = frames.with_timestamps(np.arange(len(frames)) * 5)

@@ -21,16 +21,16 @@ def texts(rate: Rate, components: Sequence[ComponentType], server_rate_hz: float
     return [str(request) for request in stream_requests(rate, components, server_rate_hz)]
 
 
-def test_what_is_wanted_is_asked_first() -> None:
+def test_the_configured_rate_and_components_are_requested_first() -> None:
     assert texts(Frequency(60), TWO, 100)[0] == "StreamFrames Frequency:60 3D 6D"
 
 
-def test_all_components_are_asked_for_without_names() -> None:
+def test_all_components_are_requested_without_names() -> None:
     backwards = WIRE_ORDER[::-1]
     assert texts(AllFrames(), backwards, None)[0] == "StreamFrames AllFrames"
 
 
-def test_all_frames_fall_back_to_every_first_frame() -> None:
+def test_all_frames_fall_back_to_the_divisor_1() -> None:
     assert texts(AllFrames(), TWO, 100) == [
         "StreamFrames AllFrames 3D 6D",
         "StreamFrames AllFrames",
@@ -52,7 +52,7 @@ def test_a_frequency_falls_back_to_a_divisor_of_the_servers_rate() -> None:
     ("wanted_hz", "server_rate_hz", "divisor"),
     [(60, 100, 2), (70, 100, 1), (30, 100, 3), (0.5, 100, 200), (500, 100, 1)],
 )
-def test_the_divisor_is_the_nearest_and_at_least_one(
+def test_the_divisor_is_the_nearest_one_and_at_least_1(
     wanted_hz: float, server_rate_hz: float, divisor: int
 ) -> None:
     assert f"StreamFrames FrequencyDivisor:{divisor}" in texts(Frequency(wanted_hz), TWO, server_rate_hz)
@@ -76,7 +76,7 @@ def test_a_divisor_is_kept() -> None:
 
 
 @pytest.mark.parametrize("rate", [AllFrames(), Frequency(100), FrequencyDivisor(1)])
-def test_nothing_is_asked_twice(rate: Rate) -> None:
+def test_no_request_is_repeated(rate: Rate) -> None:
     requests = texts(rate, WIRE_ORDER, 100)
     assert len(set(requests)) == len(requests)
     assert requests[-1] == "StreamFrames"
@@ -86,7 +86,7 @@ FRAME_S = 0.005
 
 
 class Link:
-    """A link that carries a share of the frames: with more, they come late. Time is simulated."""
+    """A link that carries a share of the frames: if more are sent, they are late. Time is simulated."""
 
     def __init__(self, carries_halvings: int) -> None:
         self.control = LagControl(max_lag_s=0.05)
@@ -103,13 +103,13 @@ class Link:
                 self.changes.append((self.now_s, self.control.halvings))
 
 
-def test_frames_in_time_leave_the_rate_alone() -> None:
+def test_frames_in_time_do_not_change_the_rate() -> None:
     link = Link(carries_halvings=0)
     link.run(1000)
     assert link.changes == []
 
 
-def test_lateness_of_less_than_a_second_leaves_the_rate_alone() -> None:
+def test_lateness_of_less_than_a_second_does_not_change_the_rate() -> None:
     link = Link(carries_halvings=1)
     for _ in range(20):
         link.carries_halvings = 1
@@ -119,13 +119,13 @@ def test_lateness_of_less_than_a_second_leaves_the_rate_alone() -> None:
     assert link.changes == []
 
 
-def test_lateness_halves_until_frames_come_in_time() -> None:
+def test_the_rate_is_halved_until_frames_arrive_in_time() -> None:
     link = Link(carries_halvings=3)
     link.run(5)
     assert [halvings for _, halvings in link.changes] == [1, 2, 3]
 
 
-def test_ten_clean_seconds_bring_the_rate_back_up_to_what_was_configured_and_no_further() -> None:
+def test_the_rate_returns_to_the_configured_one_by_steps_of_ten_seconds() -> None:
     link = Link(carries_halvings=2)
     link.run(5)
     link.carries_halvings = 0
@@ -134,7 +134,7 @@ def test_ten_clean_seconds_bring_the_rate_back_up_to_what_was_configured_and_no_
     assert link.changes[2][0] - link.changes[1][0] == pytest.approx(FIRST_WAIT_S, abs=0.1)
 
 
-def test_steps_up_that_fail_become_rarer_up_to_five_minutes() -> None:
+def test_the_wait_after_failed_steps_up_doubles_to_five_minutes() -> None:
     link = Link(carries_halvings=1)
     link.run(4000)
     ups = [time_s for time_s, halvings in link.changes if halvings == 0]
@@ -145,7 +145,7 @@ def test_steps_up_that_fail_become_rarer_up_to_five_minutes() -> None:
     assert all(halvings <= 1 for _, halvings in link.changes)
 
 
-def test_a_step_up_that_holds_makes_the_next_wait_short_again() -> None:
+def test_a_step_up_that_lasts_resets_the_wait() -> None:
     link = Link(carries_halvings=1)
     link.run(200)
     assert link.control.wait_s > FIRST_WAIT_S
@@ -171,7 +171,7 @@ def test_halvings_are_bounded() -> None:
         (Frequency(60), Frequency(15)),
     ],
 )
-def test_rates_halved_twice(rate: Rate | None, expected: Rate) -> None:
+def test_a_rate_is_halved_twice(rate: Rate | None, expected: Rate) -> None:
     assert halved(rate, 2) == expected
     assert halved(rate, 0) == rate
 
