@@ -133,8 +133,8 @@ class ServerClock:
 
         ``capture_utime`` is when the frame was captured, µs since the Unix epoch, and never later than it
         arrived. ``lag_s`` is how much later it arrived than a frame without delay would have, at least 0; it
-        is 0 without a clock. ``restarted`` is True if with this frame the server's time or frame numbers began
-        again.
+        is 0 without a clock. ``restarted`` is True if the server's time or frame numbers began again
+        with this frame.
         """
         restarted = False
         if timestamp_us <= self._timestamp_us or frame_number < self._frame_number:
