@@ -57,7 +57,7 @@ def splice(component: Component, stamp: Stamp, sequence: int) -> bytes:
 
 def splice_content(component_type: ComponentType, content: bytes, stamp: Stamp, sequence: int) -> bytes:
     """Return the LCM message of a component whose content is in LCM form."""
-    return _FINGERPRINTS[component_type] + stamp.prefix(sequence) + content
+    return b"%b%b%b" % (_FINGERPRINTS[component_type], stamp.prefix(sequence), content)
 
 
 def has_lcm_form(layout: ComponentLayout, byte_order: ByteOrder) -> bool:
