@@ -27,7 +27,7 @@ test: .venv/installed
 # What rate.py waits cannot be shortened there, and takes 14 s; nor can bytes say another length than theirs.
 COMPILED_TESTS := tests/packaging/test_compiled.py tests/contract tests/unit/rtc3d tests/unit/outputs tests/unit/queries \
     tests/integration/test_faults.py::test_several_faults_at_once \
-    $(foreach name,clock components connection fanout gateway intake message pacing packets rate streams, \
+    $(foreach name,clock components client_protocol fanout gateway intake message pacing packets rate streams, \
         $(wildcard tests/*/test_$(name)*.py)) \
     --deselect tests/integration/test_streams.py::test_late_frames_make_the_gateway_request_a_lower_rate_until_they_are_in_time \
     --deselect tests/unit/rtc3d/test_packets.py::test_a_packet_of_a_byte_less_can_be_encoded

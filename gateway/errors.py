@@ -1,26 +1,26 @@
-"""Every error of the gateway, one tree.
+"""All errors of the gateway, in one tree.
 
 ::
 
-    GatewayError                  whatever this package raises on purpose
-    ├── ConfigError               a configuration cannot be used: every problem, with file and line
+    GatewayError                  base of all errors that this package raises on purpose
+    ├── ConfigError               a configuration is invalid: every problem, with file and line
     ├── TakeError                 a C3D file cannot be played
-    ├── ProtocolError             bytes that break RTC3D
-    │   ├── PacketError           §4: a size out of bounds; the connection cannot go on
+    ├── ProtocolError             bytes that violate RTC3D
+    │   ├── PacketError           §4: a size out of bounds; the connection must end
     │   ├── FrameError            §7: sizes and counts contradict each other; this frame is lost
-    │   ├── CommandError          §5: a text that is no command of the protocol
+    │   ├── CommandError          §5: a text that is not a command of the protocol
     │   └── ParametersError       §6: no parameters can be read from the XML
     ├── ServerError               the server answered with an error packet (type 0)
-    ├── LinkError                 a connection to a server is not, or no longer, to be used
-    │   ├── ConnectError          it could not be made
+    ├── LinkError                 a connection to a server is not usable
+    │   ├── ConnectError          it could not be opened
     │   ├── ReplyTimeoutError     a command was not answered in time
-    │   ├── SilenceError          nothing came although a measurement runs
-    │   └── ClosedError           it ended: by the server, by us, or by the network
-    ├── OutputError               a message could not be handed to Zenoh or LCM
-    ├── SpoolError                a C3D file from a server could not be kept
-    └── QueryError                a peer's question cannot be answered; the text goes to the peer
+    │   ├── SilenceError          nothing arrived although something should have
+    │   └── ClosedError           it was closed by the server, by the gateway, or by the network
+    ├── OutputError               Zenoh or LCM did not take a message
+    ├── SpoolError                a C3D file from a server could not be stored
+    └── QueryError                a peer's query cannot be answered; the text goes to the peer
 
-A message says what happened, to which server or file, and what to do about it.
+A message says what happened, to which server or file, and what to do.
 """
 
 
@@ -29,7 +29,7 @@ class GatewayError(Exception):
 
 
 class ConfigError(GatewayError):
-    """A configuration cannot be used. The text holds one line per problem: file, line, key, remedy."""
+    """A configuration is invalid. The text has one line per problem: file, line, key, remedy."""
 
 
 class TakeError(GatewayError):
@@ -37,13 +37,14 @@ class TakeError(GatewayError):
 
 
 class ProtocolError(GatewayError):
-    """Bytes that break RTC3D."""
+    """Bytes violate RTC3D."""
 
 
 class PacketError(ProtocolError):
-    """A packet's size is out of bounds (§4.1): the next packet's start is unknown, the connection ends.
+    """A packet's size is out of bounds (§4.1); the next packet cannot be found, so the connection ends.
 
-    ``begin`` is how the packet begins, up to 60 bytes of it: it may show what talks there instead.
+    ``size`` and ``packet_type`` are the header's fields, ``offset`` is the packet's position in the stream
+    in bytes. ``begin`` has up to the first 60 bytes; they may show which other protocol this is.
     """
 
     def __init__(self, message: str, *, size: int, packet_type: int, offset: int, begin: bytes = b"") -> None:
@@ -55,27 +56,27 @@ class PacketError(ProtocolError):
 
 
 class FrameError(ProtocolError):
-    """A data frame contradicts itself (§7): it is rejected whole, and the session goes on with the next."""
+    """A data frame contradicts itself (§7); it is rejected whole, and the session continues."""
 
 
 class CommandError(ProtocolError):
-    """A text is no command of the protocol (§5); the message is fit for the error packet's body."""
+    """A text is not a command of the protocol (§5); the message can be the body of an error packet."""
 
 
 class ParametersError(ProtocolError):
-    """No parameters can be read from what the server sent as XML (§6)."""
+    """No parameters can be read from the server's XML (§6)."""
 
 
 class ServerError(GatewayError):
-    """The server answered a command with an error packet (type 0); the message holds its text."""
+    """The server answered a command with an error packet (type 0); the message is its text."""
 
 
 class LinkError(GatewayError):
-    """A connection to a server is not, or no longer, to be used."""
+    """A connection to a server is not usable."""
 
 
 class ConnectError(LinkError):
-    """A connection could not be made."""
+    """A connection could not be opened."""
 
 
 class ReplyTimeoutError(LinkError):
@@ -83,15 +84,15 @@ class ReplyTimeoutError(LinkError):
 
 
 class SilenceError(LinkError):
-    """Nothing came from the server although something should have."""
+    """Nothing arrived from the server although something should have."""
 
 
 class ClosedError(LinkError):
-    """The connection ended."""
+    """The connection was closed."""
 
 
 class OutputError(GatewayError):
-    """A message could not be handed to Zenoh or LCM; ``cause`` is the short name it is counted under."""
+    """Zenoh or LCM did not take a message; the drop is counted under ``cause``, a short name."""
 
     def __init__(self, message: str, *, cause: str) -> None:
         super().__init__(message)
@@ -99,14 +100,16 @@ class OutputError(GatewayError):
 
 
 class SpoolError(GatewayError):
-    """A C3D file from a server could not be kept."""
+    """A C3D file from a server could not be stored."""
 
 
 class QueryError(GatewayError):
-    """A peer's question cannot be answered. The text goes to the peer, ``code`` to its program.
+    """A peer's query cannot be answered. The text is for the person who asked, ``code`` for the program.
 
-    ``code`` is bad-request (ask otherwise), no-connection (the server is away), refused (the server
-    said no), timeout (it said nothing) or nothing-yet (there is none so far).
+    The gateway's replies have these codes: bad-request (change the query), no-connection (the server is
+    not connected), refused (by the server), timeout (the server did not answer), unreadable (its answer
+    cannot be read), nothing-yet (no data so far), busy (too many queries) and defect (in the gateway).
+    The command ``params`` adds no-gateway and zenoh for problems of its own.
     """
 
     def __init__(self, message: str, *, code: str = "bad-request") -> None:

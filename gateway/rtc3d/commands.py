@@ -1,4 +1,4 @@
-"""Command texts (§5): typed commands, built and parsed; the texts of acknowledgements."""
+"""Commands (§5): typed, and encoded to and parsed from their texts."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -11,21 +11,23 @@ from gateway.rtc3d.packets import decode_text
 from gateway.rtc3d.parameters import SECTIONS
 
 # "Event" is an alias that some clients use.
-_COMPONENTS: Final = {component.command_word: component for component in WIRE_ORDER} | {
+_COMPONENT_BY_WORD: Final = {component.command_word: component for component in WIRE_ORDER} | {
     "Event": ComponentType.EVENT
 }
-_SECTIONS: Final = {section.command_word: key for key, section in SECTIONS.items()} | {"Event": "events"}
+_SECTION_BY_WORD: Final = {section.command_word: key for key, section in SECTIONS.items()} | {
+    "Event": "events"
+}
 _KNOWN_COMMANDS: Final = (
     "known are Version, SetByteOrder, SendParameters, SendCurrentFrame, StreamFrames, Bye"
 )
-_Name = TypeVar("_Name")
+_Named = TypeVar("_Named")
 _NUMBER: Final = re.compile(r"\d{1,9}(\.\d{1,20})?", re.ASCII)
-_MIN_HZ: Final = 1e-6  # the smallest that our own six decimals can write
+_MIN_HZ: Final = 1e-6  # the lowest frequency that Frequency can write, with its six decimals
 
 
 @dataclass(frozen=True, slots=True)
 class AllFrames:
-    """Every real-time frame that the server processes."""
+    """A rate: every real-time frame that the server processes."""
 
     def __str__(self) -> str:
         return "AllFrames"
@@ -33,7 +35,7 @@ class AllFrames:
 
 @dataclass(frozen=True, slots=True)
 class Frequency:
-    """About ``hz`` frames per second."""
+    """A rate: about ``hz`` frames per second."""
 
     hz: float
 
@@ -43,7 +45,7 @@ class Frequency:
 
 @dataclass(frozen=True, slots=True)
 class FrequencyDivisor:
-    """Every ``divisor``-th real-time frame."""
+    """A rate: every ``divisor``-th real-time frame."""
 
     divisor: int
 
@@ -56,7 +58,7 @@ Rate = AllFrames | Frequency | FrequencyDivisor
 
 @dataclass(frozen=True, slots=True)
 class Version:
-    """§5.3.1. ``number`` is n.n; this protocol is 1.0."""
+    """§5.3.1. ``number`` has the form n.n; the version of this protocol is 1.0."""
 
     number: str = "1.0"
 
@@ -76,7 +78,7 @@ class SetByteOrder:
 
 @dataclass(frozen=True, slots=True)
 class SendParameters:
-    """§5.3.3. ``sections`` are keys of SECTIONS; none means all."""
+    """§5.3.3. ``sections`` are keys of SECTIONS; () means all."""
 
     sections: tuple[str, ...] = ()
 
@@ -86,7 +88,7 @@ class SendParameters:
 
 @dataclass(frozen=True, slots=True)
 class SendCurrentFrame:
-    """§5.3.4. No components means all. NDI's client may name Events too (field note 14)."""
+    """§5.3.4. () as components means all. NDI's client may name Events too (field note 14)."""
 
     components: tuple[ComponentType, ...] = ()
 
@@ -96,7 +98,7 @@ class SendCurrentFrame:
 
 @dataclass(frozen=True, slots=True)
 class StreamFrames:
-    """§5.3.5. No rate leaves it to the server, which is all frames; no components means all."""
+    """§5.3.5. None as rate lets the server send every frame; () as components means all."""
 
     rate: Rate | None = None
     components: tuple[ComponentType, ...] = ()
@@ -126,8 +128,8 @@ Command = Version | SetByteOrder | SendParameters | SendCurrentFrame | StreamFra
 
 
 def _component_words(components: Iterable[ComponentType]) -> list[str]:
-    # No components means All by §5.3.4 and §5.3.5; servers that know no component names accept the
-    # bare command (field note 2), so it is left bare.
+    # No components means All (§5.3.4, §5.3.5). "All" itself is not sent, because servers that know no
+    # component names accept only the bare command (field note 2).
     return [component.command_word for component in components]
 
 
@@ -139,8 +141,8 @@ def encode_command(command: Command) -> bytes:
 def parse_command(body: bytes) -> Command:
     """Return the command in a type-1 packet's body.
 
-    Case does not count; NUL, LF and white space at the end are dropped (§5.2, field note 13).
-    Raises CommandError with a text for the client: what was wrong and what is accepted.
+    Case is ignored, as are NUL, LF and white space at the end (§5.2, field note 13). Raises
+    CommandError, whose text tells the client what is wrong and what is accepted.
     """
     words = decode_text(body).split()
     if not words:
@@ -152,9 +154,9 @@ def parse_command(body: bytes) -> Command:
         case "setbyteorder":
             return _parse_byte_order(parameters)
         case "sendparameters":
-            return SendParameters(_parse_names(parameters, _SECTIONS, "section"))
+            return SendParameters(_parse_names(parameters, _SECTION_BY_WORD, "section"))
         case "sendcurrentframe":
-            return SendCurrentFrame(_parse_names(parameters, _COMPONENTS, "component"))
+            return SendCurrentFrame(_parse_names(parameters, _COMPONENT_BY_WORD, "component"))
         case "streamframes":
             return _parse_stream_frames(parameters)
         case "bye" if not parameters:
@@ -162,7 +164,7 @@ def parse_command(body: bytes) -> Command:
         case "bye":
             raise CommandError("Bye takes no parameter")
         case _:
-            raise CommandError(f"Unknown command {_shown(words[0])}; {_KNOWN_COMMANDS}")
+            raise CommandError(f"Unknown command {_quote(words[0])}; {_KNOWN_COMMANDS}")
 
 
 def _parse_version(parameters: Sequence[str]) -> Version:
@@ -194,11 +196,11 @@ def _parse_stream_frames(parameters: Sequence[str]) -> StreamFrames | StopStream
         else:
             raise CommandError("StreamFrames takes one of FrequencyDivisor:n, Frequency:n, AllFrames")
     others = ("FrequencyDivisor:n", "Frequency:n", "AllFrames", "Stop (alone)")
-    return StreamFrames(rate, _parse_names(names, _COMPONENTS, "parameter", others))
+    return StreamFrames(rate, _parse_names(names, _COMPONENT_BY_WORD, "parameter", others))
 
 
 def _parse_rate(word: str) -> Rate | None:
-    """Return the rate in a lower-case parameter, None if it is no rate parameter at all."""
+    """Return the rate in a lower-case parameter, None if it is not a rate parameter."""
     if word == "allframes":
         return AllFrames()
     name, colon, value = word.partition(":")
@@ -210,29 +212,29 @@ def _parse_rate(word: str) -> Rate | None:
     if name == "frequencydivisor" and number >= 1 and number.is_integer():
         return FrequencyDivisor(int(number))
     raise CommandError(
-        f"Unknown rate {_shown(word)}; known are FrequencyDivisor:n (n a whole number from 1), "
+        f"Unknown rate {_quote(word)}; known are FrequencyDivisor:n (n a whole number from 1), "
         "Frequency:n (n Hz, above 0), AllFrames"
     )
 
 
 def _parse_names(
-    words: Sequence[str], known: dict[str, _Name], what: str, others: Sequence[str] = ()
-) -> tuple[_Name, ...]:
-    """Return the named things, each once, in the order given; empty for All or nothing.
+    words: Sequence[str], known: dict[str, _Named], noun: str, others: Sequence[str] = ()
+) -> tuple[_Named, ...]:
+    """Return what the words name in ``known``, each once, in the order given; () for All or no words.
 
-    ``others`` are what else the command takes, for the error's text.
+    ``others`` are the other parameters of the command, for the error's text.
     """
-    by_word = {word.lower(): name for word, name in known.items()}
-    names: dict[_Name, None] = {}
+    by_word = {word.lower(): named for word, named in known.items()}
+    named: dict[_Named, None] = {}
     for word in words:
         if word in by_word:
-            names[by_word[word]] = None
+            named[by_word[word]] = None
         elif word != "all":
             accepted = ", ".join(["All", *known, *others])
-            raise CommandError(f"Unknown {what} {_shown(word)}; known are {accepted}")
-    return () if "all" in words else tuple(names)
+            raise CommandError(f"Unknown {noun} {_quote(word)}; known are {accepted}")
+    return () if "all" in words else tuple(named)
 
 
-def _shown(word: str) -> str:
-    """Return a client's word fit for an error text: bounded, printable."""
+def _quote(word: str) -> str:
+    """Return a client's word for an error text: quoted, shortened and printable."""
     return repr(word if len(word) <= 40 else word[:40] + "…").encode("ascii", "replace").decode()

@@ -1,4 +1,4 @@
-"""The five components of data frames (§7.3 to §7.7): their items as numpy arrays, building them."""
+"""The five components of data frames (§7.3 to §7.7): their names, their items as numpy arrays, encoding."""
 
 import struct
 from enum import IntEnum
@@ -12,7 +12,7 @@ Items: TypeAlias = npt.NDArray[Any]
 
 
 class _Names(NamedTuple):
-    """What one component is called in different places."""
+    """The names of one component."""
 
     key: str
     command_word: str
@@ -69,12 +69,12 @@ def _floats(*names: str) -> np.dtype[Any]:
 
 
 SHORT_EVENT: Final = np.dtype([("id", ">i4"), ("param1", ">i4"), ("param2", ">i4"), ("param3", ">i4")])
-"""An event as §7.7 has it: 16 bytes."""
+"""An event as §7.7 specifies it: 16 bytes."""
 
 LONG_EVENT: Final = np.dtype(
     [("id", ">i4"), ("timestamp", ">i8"), ("param1", ">i4"), ("param2", ">i4"), ("param3", ">i4")]
 )
-"""An event as NDI's own code writes it: 24 bytes, with a time stamp in µs (field note 6)."""
+"""An event as NDI's own code writes it: 24 bytes, with its own time stamp in µs (field note 6)."""
 
 ITEM_DTYPES: Final[dict[ComponentType, np.dtype[Any]]] = {
     ComponentType.MARKERS: _floats("x", "y", "z", "reliability"),
@@ -83,26 +83,23 @@ ITEM_DTYPES: Final[dict[ComponentType, np.dtype[Any]]] = {
     ComponentType.TOOLS: _floats("q0", "qx", "qy", "qz", "x", "y", "z", "error"),
     ComponentType.EVENT: LONG_EVENT,
 }
-"""One item of each component in big-endian form (§7.3 to §7.7), 4-byte packing (§3.2)."""
+"""The dtype of one item of each component: big-endian (§7.3 to §7.7), 4-byte packing (§3.2)."""
 
 COMPONENT_HEADER: Final = {"big": struct.Struct(">IIiqI"), "little": struct.Struct("<IIiqI")}
-"""§7.1's header of a known component with the count that begins its data.
-
-That is size, type, frame number, time stamp in µs, count.
-"""
+"""The fields before a component's items: size, type, frame number, time stamp in µs (§7.1), item count."""
 COMPONENT_HEADER_BYTES: Final = 24
 
 FRAME_NUMBER_AND_TIMESTAMP: Final = {"big": struct.Struct(">iq"), "little": struct.Struct("<iq")}
-"""How Component.content begins: frame number, time stamp in µs."""
-_CONTENT_HEADER_BYTES: Final = 16  # with the count
+"""The first two fields of Component.content: frame number, time stamp in µs."""
+_ITEMS_OFFSET: Final = 16  # of the items in Component.content
 
 
 class Component(NamedTuple):
     """One component of a frame.
 
-    ``timestamp_us`` is µs from the server's start. ``content`` is the component after its size and
-    type fields (frame number, time stamp, count, items), in ``byte_order``.
-    ``item_bytes`` is 16 or 24 for events and the item's own size for the others.
+    ``timestamp_us`` is in µs since the server's start. ``content`` is what follows the size and type
+    fields (frame number, time stamp, count, items), in ``byte_order``. ``item_bytes`` is 16 or 24 for
+    events; every other component has items of one size.
     """
 
     type: ComponentType
@@ -118,19 +115,18 @@ class Component(NamedTuple):
 
         The dtype has the fields of ITEM_DTYPES (SHORT_EVENT for events of 16 bytes).
         """
-        dtype = SHORT_EVENT if self.item_bytes == 16 and self.type is ComponentType.EVENT else None
-        if dtype is None:
-            dtype = ITEM_DTYPES[self.type]
+        is_short_event = self.type is ComponentType.EVENT and self.item_bytes == SHORT_EVENT.itemsize
+        dtype = SHORT_EVENT if is_short_event else ITEM_DTYPES[self.type]
         return np.frombuffer(
             self.content,
             dtype.newbyteorder(self.byte_order),
             self.num_items,
-            _CONTENT_HEADER_BYTES,
+            _ITEMS_OFFSET,
         )
 
 
 def big_endian_content(component: Component) -> bytes:
-    """Return ``component.content`` in big-endian form, events in their own item size."""
+    """Return ``component.content`` in big-endian form; events keep their item size."""
     if component.byte_order == "big":
         return component.content
     header = struct.pack(">iqI", component.frame_number, component.timestamp_us, component.num_items)
@@ -145,11 +141,10 @@ def encode_component(
     items: Items,
     byte_order: ByteOrder = "big",
 ) -> bytes:
-    """Return one component's bytes (§7.1 to §7.7) from ``items``, shape (count,).
+    """Return the bytes of one component (§7.1 to §7.7) with ``items``, shape (num_items,).
 
     ``items`` has the dtype of ITEM_DTYPES in any byte order; events may be SHORT_EVENT instead.
     """
-    wire = items.astype(items.dtype.newbyteorder(byte_order), copy=False)
-    data = wire.tobytes()
+    data = items.astype(items.dtype.newbyteorder(byte_order), copy=False).tobytes()
     size = COMPONENT_HEADER_BYTES + len(data)
     return COMPONENT_HEADER[byte_order].pack(size, component, frame_number, timestamp_us, len(items)) + data

@@ -11,7 +11,7 @@ PACKET_HEADER_BYTES: Final = 8
 DEFAULT_MAX_PACKET_BYTES: Final = 16 * 1024 * 1024
 DEFAULT_MAX_C3D_BYTES: Final = 256 * 1024 * 1024
 _MAX_SIZE: Final = 0xFFFFFFFF
-_SHOWN_BYTES: Final = 60  # of what is not a packet
+_SHOWN_BYTES: Final = 60  # of data that is not a packet, kept for the error
 
 
 class PacketType(IntEnum):
@@ -66,9 +66,9 @@ def encode_packet(packet_type: int, body: bytes = b"") -> bytes:
 
 
 def decode_text(body: bytes) -> str:
-    """Return a type 0 or 1 body as text: NULs and white space around it are dropped (field notes 8, 13).
+    """Return a type 0 or 1 body as text, without NULs and white space around it (field notes 8, 13).
 
-    Bytes that are not ASCII are kept as Latin-1, so that any body can be shown.
+    Bytes that are not ASCII are read as Latin-1, so that any body can be shown.
     """
     return body.decode("latin-1").strip("\0 \t\r\n")
 
@@ -142,12 +142,11 @@ class PacketReader:
 
 
 def _size_error(size: int, packet_type: int, offset: int, limit: int, begin: bytes) -> PacketError:
-    bound = (
-        f"less than the header's {PACKET_HEADER_BYTES}" if size < PACKET_HEADER_BYTES else f"limit {limit}"
-    )
+    is_small = size < PACKET_HEADER_BYTES
+    bound = f"less than the header's {PACKET_HEADER_BYTES}" if is_small else f"limit {limit}"
     return PacketError(
         f"packet size {size} ({bound}), type {packet_type}, at byte {offset} of the stream: "
-        "this is no RTC3D server, or the connection is corrupt; check host and port",
+        "this is not an RTC3D server, or the connection is corrupt; check host and port",
         size=size,
         packet_type=packet_type,
         offset=offset,

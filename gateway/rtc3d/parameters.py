@@ -1,7 +1,7 @@
 """The parameters of §6 as typed, frozen objects; ``parameters_xml`` reads and writes them.
 
-Text is "" and numbers are None where the server did not send them. Ids are the server's own texts:
-numbering starts from anything (field note 9), and an event's id may be hexadecimal.
+A text that the server did not send is "", a number None. Ids are the server's own texts: they may be
+numbered from anything (field note 9), and an event's id may be hexadecimal.
 """
 
 from dataclasses import dataclass
@@ -32,7 +32,7 @@ class Marker:
 
 @dataclass(frozen=True, slots=True)
 class Parameters3D:
-    """§6.2: the markers in the order in which the 3D component has them."""
+    """§6.2: the markers, in the order of the 3D component."""
 
     frequency_hz: float | None = None
     unit: str = "mm"
@@ -41,7 +41,7 @@ class Parameters3D:
 
 @dataclass(frozen=True, slots=True)
 class Tool:
-    """One tool of §6.3; ``marker_ids`` refer to the 3D markers, in the order of the tool's definition."""
+    """One tool of §6.3; ``marker_ids`` are ids of 3D markers, in the order of the tool's definition."""
 
     id: str
     label: str = ""
@@ -51,7 +51,7 @@ class Tool:
 
 @dataclass(frozen=True, slots=True)
 class Parameters6D:
-    """§6.3: the tools in the order in which the 6D component has them."""
+    """§6.3: the tools, in the order of the 6D component."""
 
     frequency_hz: float | None = None
     tools: tuple[Tool, ...] = ()
@@ -70,14 +70,14 @@ class AnalogChannel:
 
 @dataclass(frozen=True, slots=True)
 class ParametersAnalog:
-    """§6.4: the channels in the order in which the Analog component has them."""
+    """§6.4: the channels, in the order of the Analog component."""
 
     channels: tuple[AnalogChannel, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A position in §6.5, in ``unit``; a coordinate that the server did not send is NaN."""
+    """A position of §6.5, in ``unit``; a coordinate that the server did not send is NaN."""
 
     x: float = nan
     y: float = nan
@@ -99,7 +99,7 @@ class Plate:
     """One force plate of §6.5.
 
     ``corners`` are the plate's four corners in the laboratory, ``origin`` the transducer's origin.
-    ``analog_channel_ids`` refer to the raw analog channels. ``calibration_matrix`` is a tuple of rows;
+    ``analog_channel_ids`` are ids of the raw analog channels. ``calibration_matrix`` is a tuple of rows;
     a cell that cannot be read is NaN.
     """
 
@@ -118,7 +118,7 @@ class Plate:
 
 @dataclass(frozen=True, slots=True)
 class ParametersForce:
-    """§6.5: the plates in the order in which the Force component has them."""
+    """§6.5: the plates, in the order of the Force component."""
 
     plates: tuple[Plate, ...] = ()
 
@@ -162,7 +162,7 @@ class ParametersEvents:
 
 @dataclass(frozen=True, slots=True)
 class Parameters:
-    """What one XML reply held; a section that it lacked is None. SECTIONS below lists the sections."""
+    """The content of one XML reply; a section that it lacks is None. SECTIONS below lists the sections."""
 
     general: General | None = None
     markers: Parameters3D | None = None

@@ -238,8 +238,8 @@ async def test_unknown_components_are_counted_and_told_once(caplog: pytest.LogCa
 @pytest.mark.parametrize(
     ("first_words", "reason"),
     [
-        (b"HTTP/1.1 400 Bad Request\r\n\r\n", "no RTC3D server"),
-        (b"SSH-2.0-OpenSSH_9.2\r\n", "no RTC3D server"),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n", "not an RTC3D server"),
+        (b"SSH-2.0-OpenSSH_9.2\r\n", "not an RTC3D server"),
         (b"\0\0\0\0\0\0\0\0", "less than the header"),
         (packet(3)[:4] + b"\0\0", "the connection to"),  # cut in the middle of a header
         (b"\0\xff\0\0\0\0\0\3" + b"x" * 50, "the connection to"),  # cut in the middle of a body

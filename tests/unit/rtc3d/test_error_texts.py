@@ -16,14 +16,14 @@ def size_error(header: bytes) -> str:
 def test_a_packet_that_is_too_large() -> None:
     assert size_error(b"\0\0\0\x65\0\0\0\x03") == (
         "packet size 101 (limit 100), type 3, at byte 0 of the stream: "
-        "this is no RTC3D server, or the connection is corrupt; check host and port"
+        "this is not an RTC3D server, or the connection is corrupt; check host and port"
     )
 
 
 def test_a_packet_that_is_shorter_than_its_header() -> None:
     assert size_error(b"\0\0\0\x07\0\0\0\x01") == (
         "packet size 7 (less than the header's 8), type 1, at byte 0 of the stream: "
-        "this is no RTC3D server, or the connection is corrupt; check host and port"
+        "this is not an RTC3D server, or the connection is corrupt; check host and port"
     )
 
 

@@ -258,9 +258,9 @@ async def test_the_first_error_wins(lab: Lab) -> None:
     await settle()  # the session has aborted the connection, which ended after that
     lab.session.connection_lost(OSError("Connection reset by peer"))
     for late_call in (lab.session.monitor(), lab.session.ask(Version())):
-        with pytest.raises(ClosedError, match="this is no RTC3D server"):
+        with pytest.raises(ClosedError, match="this is not an RTC3D server"):
             await late_call
-    with pytest.raises(ClosedError, match="this is no RTC3D server"):
+    with pytest.raises(ClosedError, match="this is not an RTC3D server"):
         lab.session.control_recording(start=True)
     assert not lab.connection.is_open
 
