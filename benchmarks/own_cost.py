@@ -20,7 +20,7 @@ from benchmarks.comparing import Pair, table_cell
 from benchmarks.processes import PLAIN_PYTHON, run_measured
 from benchmarks.report import Goal, Progress, Table
 from benchmarks.workloads import DENSE, Frames
-from gateway.config.settings import MetricsSettings, Settings, SourceSettings
+from gateway.config.settings import MetricsSettings, SourceSettings
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
@@ -28,6 +28,7 @@ from gateway.outputs.memory import MemoryOutput
 from gateway.simulator.simulator import Simulator
 from gateway.stream.session import Session
 from gateway.stream.state import StreamState
+from tests.configurations import make_settings
 from tests.waiting import wait_until_async
 
 TITLE: Final = "Own cost of one frame of five components, from TCP's bytes to messages"
@@ -99,7 +100,9 @@ class _Fed:
         self._server.stop_measurement()
         source = SourceSettings(name="lab", host="127.0.0.1", port=self._server.port, max_lag_ms=60_000.0)
         self._stop = asyncio.Event()
-        gateway = Gateway(Settings(sources=(source,), metrics=MetricsSettings(enabled=False)), [self._output])
+        gateway = Gateway(
+            make_settings(sources=(source,), metrics=MetricsSettings(enabled=False)), [self._output]
+        )
         self._running = self._loop.create_task(gateway.run(self._stop))
         [serving] = gateway.sources
         await wait_until_async(lambda: serving.statuses[0].state is StreamState.NO_MEASUREMENT)

@@ -11,7 +11,7 @@ from benchmarks.processes import Worker
 from benchmarks.report import Goal, Progress, Table
 from benchmarks.stage import GATEWAY
 from benchmarks.subscribers import Heard
-from gateway.cli.subscribers import open_zenoh
+from gateway.outputs.zenoh.subscriber import open_zenoh
 
 TITLE: Final = "Queries: parameters from the gateway's cache, while the lab workload streams"
 GOAL_MS: Final = 2.0

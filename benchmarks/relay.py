@@ -13,7 +13,8 @@ import lcm
 import uvloop
 import zenoh
 
-from gateway.outputs.zenoh.output import LCM_ENCODING, zenoh_config
+from gateway.outputs.encodings import LCM
+from gateway.outputs.zenoh.config import zenoh_config
 
 
 class Relay(asyncio.Protocol):
@@ -51,7 +52,7 @@ async def main(plan: dict[str, Any]) -> None:
         sends: list[Any] = []
         if session:
             key = f"mocap/{plan['name']}/{component}"
-            encoding, drop = zenoh.Encoding(LCM_ENCODING).with_schema(schema), zenoh.CongestionControl.DROP
+            encoding, drop = zenoh.Encoding(LCM).with_schema(schema), zenoh.CongestionControl.DROP
             sends.append(session.declare_publisher(key, encoding=encoding, congestion_control=drop).put)
         if channels:
             sends.append(partial(channels.publish, f"MOCAP_{plan['name']}_{component}".upper()))

@@ -1,13 +1,12 @@
-"""The demo: simulator, gateway, a Zenoh subscriber and an LCM subscriber in one process.
+"""The demo: simulator, gateway, and a subscriber of each output, in one process.
 
 Nothing leaves the machine: Zenoh uses loopback TCP without scouting, LCM stays in memory (or uses
-multicast with ``udpm``). The measurement starts after both subscribers receive the gateway's status and
+multicast with ``udpm``). The measurement starts after all subscribers receive the gateway's status and
 stops before they do, so every component that was sent must arrive.
 """
 
 import asyncio
 import contextlib
-import socket
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
@@ -18,27 +17,18 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from gateway.cli.subscribers import LcmListener, ZenohListener, channel_pattern, key_pattern, open_zenoh
-from gateway.config.settings import (
-    LcmSettings,
-    MetricsSettings,
-    Settings,
-    SourceSettings,
-    StreamSettings,
-    ZenohSettings,
-)
+from gateway.config.settings import MetricsSettings, Settings, SourceSettings, StreamSettings
 from gateway.errors import OutputError
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.messages.summary import summarise
-from gateway.outputs.lcm.output import LcmOutput, open_lcm
-from gateway.outputs.zenoh.output import ZenohOutput
+from gateway.outputs.kind import DemoSide
+from gateway.outputs.registry import OUTPUTS, settings_type
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d_server.scene import Scene
 from gateway.simulator.simulator import Simulator
 
 SOURCE: Final = "demo"
-_OUTPUTS: Final = ("zenoh", "lcm")
 _START_TIMEOUT_S: Final = 10.0
 _DRAIN_TIMEOUT_S: Final = 3.0
 _REFRESH_S: Final = 0.5
@@ -64,28 +54,22 @@ async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool
 
     Raises OutputError if Zenoh or LCM does not open on this machine.
     """
-    received = {output: _Received() for output in _OUTPUTS}
-    endpoint = f"tcp/127.0.0.1:{_free_port()}"
-    lcm_settings = LcmSettings(url=None if udpm else "memq://")
-    subscriber_lcm = open_lcm(lcm_settings.effective_url)
+    sides = {name: kind.demo(udpm) for name, kind in OUTPUTS.items() if kind.demo is not None}
+    received = {name: _Received() for name in sides}
     async with contextlib.AsyncExitStack() as stack:
         simulator = await stack.enter_async_context(Simulator(scene))
         simulator.stop_measurement()
-        settings = _settings(simulator.port, endpoint, lcm_settings)
-        zenoh_output = ZenohOutput(settings.zenoh)
-        # memq:// works only within one LCM object, so gateway and subscriber share it.
-        lcm_output = LcmOutput(lcm_settings, None if udpm else subscriber_lcm)
-        await stack.enter_async_context(_running(Gateway(settings, [zenoh_output, lcm_output])))
-        listener = LcmListener(subscriber_lcm, channel_pattern("MOCAP", SOURCE, None), received["lcm"].add)
-        stack.callback(listener.close)
-        await _until(lambda: zenoh_output.session is not None, _START_TIMEOUT_S, "Zenoh did not open")
-        session = open_zenoh(endpoint)
-        stack.callback(session.close)
-        ZenohListener(session, key_pattern("mocap", SOURCE, None), received["zenoh"].add)
+        settings = _settings(simulator.port, sides)
+        outputs = [side.output for side in sides.values()]
+        await stack.enter_async_context(_running(Gateway(settings, outputs)))
+        for name, side in sides.items():
+            health = side.output.health
+            await _until(lambda: health().connected, _START_TIMEOUT_S, f"{name} did not open")  # noqa: B023
+            stack.callback(side.subscribe(SOURCE, received[name].add).close)
         await _until(
             lambda: all(each.count["status"] for each in received.values()),
             _START_TIMEOUT_S,
-            "the gateway's status did not arrive on both Zenoh and LCM",
+            "the gateway's status did not arrive on every output",
         )
         simulator.start_measurement()
         await _show(received, seconds, console)
@@ -107,35 +91,17 @@ async def _running(gateway: Gateway) -> AsyncIterator[None]:
         await task
 
 
-def _settings(port: int, endpoint: str, lcm_settings: LcmSettings) -> Settings:
+def _settings(port: int, sides: dict[str, DemoSide]) -> Settings:
     # Analog has a higher rate than the other components, which needs a separate stream (§5.3.5).
     analog = StreamSettings(components=(ComponentType.ANALOG,))
     others = StreamSettings(
         components=tuple(component for component in WIRE_ORDER if component is not ComponentType.ANALOG)
     )
-    return Settings(
-        sources=(
-            SourceSettings(
-                name=SOURCE,
-                host="127.0.0.1",
-                port=port,
-                streams=(others, analog),
-            ),
-        ),
-        zenoh=ZenohSettings(
-            config={
-                "listen": {"endpoints": [endpoint]},
-                "scouting": {"multicast": {"enabled": False}},
-            }
-        ),
-        lcm=lcm_settings,
-        metrics=MetricsSettings(enabled=False),
+    sections = {name: side.settings for name, side in sides.items()}
+    source = SourceSettings(name=SOURCE, host="127.0.0.1", port=port, streams=(others, analog))
+    return settings_type().model_validate(
+        {"sources": (source,), "metrics": MetricsSettings(enabled=False), **sections}
     )
-
-
-def _free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
 
 
 async def _until(condition: Callable[[], bool], timeout_s: float, failure: str) -> None:
@@ -150,7 +116,7 @@ async def _until(condition: Callable[[], bool], timeout_s: float, failure: str) 
 async def _show(received: dict[str, _Received], seconds: float, console: Console) -> None:
     """Wait for ``seconds``, and show the live table if the output is a terminal."""
     start_s = time.monotonic()
-    previous: dict[str, Counter[str]] = {output: Counter() for output in _OUTPUTS}
+    previous: dict[str, Counter[str]] = {output: Counter() for output in received}
     with Live(console=console, auto_refresh=False, transient=True) as live:
         while (elapsed_s := time.monotonic() - start_s) < seconds:
             await asyncio.sleep(min(_REFRESH_S, seconds - elapsed_s))
@@ -187,15 +153,15 @@ def _table(
 ) -> Table:
     table = Table(title=f"RTC3D simulator → gateway → subscribers, {now_s:.0f} of {seconds:.0f} s")
     table.add_column("component")
-    for output in _OUTPUTS:
+    for output in received:
         table.add_column(f"{output} Hz", justify="right")
     table.add_column("newest message", width=_MESSAGE_WIDTH, no_wrap=True, overflow="ellipsis")
     for component in WIRE_ORDER:
-        newest = received["zenoh"].newest.get(component.key)
+        newest = next(iter(received.values())).newest.get(component.key)
         text = "" if newest is None else summarise(decode(newest))
         table.add_row(
             component.key,
-            *(f"{rates[output].get(component.key, 0.0):.1f}" for output in _OUTPUTS),
+            *(f"{rates[output].get(component.key, 0.0):.1f}" for output in received),
             text,
         )
     return table
@@ -206,12 +172,12 @@ def _report(sent: Counter[str], received: dict[str, _Received]) -> Table:
     for heading in (
         "component",
         "sent",
-        *(f"{output} {what}" for output in _OUTPUTS for what in ("received", "lost")),
+        *(f"{output} {what}" for output in received for what in ("received", "lost")),
     ):
         table.add_column(heading, justify="left" if heading == "component" else "right")
     for component in WIRE_ORDER:
         cells = []
-        for output in _OUTPUTS:
+        for output in received:
             count = received[output].count[component.key]
             cells += [str(count), str(sent[component.key] - count)]
         table.add_row(component.key, str(sent[component.key]), *cells)

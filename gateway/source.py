@@ -1,85 +1,95 @@
-"""One source: its streams' supervisors, the fan-out that they share, and the desk that answers for it."""
+"""One source: its streams' supervisors, the fan-out they share, and the queries about it."""
 
 import asyncio
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from typing import Any, Final
 
 from gateway.c3d_spool import Spool
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import LinkError, QueryError, SpoolError
 from gateway.log import log_fields
-from gateway.monitoring.status_line import source_line
+from gateway.outputs.contract import Answer, ServerParameters
+from gateway.outputs.encodings import C3D
 from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
-from gateway.queries.answers import C3D, Answer
-from gateway.queries.source_queries import Ask, SourceQueries, StreamAccess
+from gateway.queries.source_queries import SendCommand, SourceQueries, StreamAccess
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.stream.state import StreamState
 from gateway.stream.status import FrameRate, StreamStatus
 from gateway.stream.supervisor import Callbacks, Supervisor
 
 _MAX_WRITING: Final = 4
-"""How many C3D files may wait in memory for the disk; more are dropped and told."""
+"""How many C3D files may wait in memory for the disk; further ones are dropped and logged."""
 
 logger = logging.getLogger(__name__)
 
 
 class Source:
-    """Everything of one source, which publishes by ``fan_out``.
+    """Everything about one source, which publishes through ``fan_out``.
 
-    ``tell_parameters`` is called with the XML of every connection and whenever it changes, ``tell_file``
-    with the description of every C3D file that was kept. ``before`` is the one that this one takes over
-    from, fan-out and all, when the configuration has changed: the numbers go on.
+    ``publish_parameters`` is called with the parameters of every connection and whenever they change,
+    ``announce_file`` with the description of every C3D file that was kept. ``before`` is the source that this
+    one replaces after a change of the configuration: it passes on its fan-out, and the numbers continue.
     """
 
     def __init__(
         self,
-        source: SourceSettings,
+        settings: SourceSettings,
         fan_out: FanOut,
         spool: Spool,
-        tell_parameters: Callable[[str, bytes], None],
-        tell_file: Callable[[str, dict[str, Any]], None],
+        publish_parameters: Callable[[str, ServerParameters], None],
+        announce_file: Callable[[str, dict[str, Any]], None],
         before: "Source | None" = None,
     ) -> None:
-        self.source = source
+        self.settings = settings
         self.spool = spool
         self.fan_out = fan_out
-        self.fan_out.on_items_changed = self._ask_parameters_again
+        self.fan_out.on_items_changed = self._refresh_parameters_soon
         session = 0 if before is None else max(status.session for status in before.statuses)
-        self.statuses: list[StreamStatus] = [self._new_status(stream, session) for stream in source.streams]
+        self.statuses: list[StreamStatus] = [self._new_status(stream, session) for stream in settings.streams]
         self.supervisors = [
-            Supervisor(source, stream, status, self._callbacks(stream))
-            for stream, status in zip(source.streams, self.statuses, strict=True)
+            Supervisor(settings, stream, status, self._callbacks(stream))
+            for stream, status in zip(settings.streams, self.statuses, strict=True)
         ]
-        self.desk = SourceQueries(
-            source,
+        self.queries = SourceQueries(
+            settings,
             [
-                StreamAccess(stream.components, status, _asker(supervisor))
+                StreamAccess(stream.components, status, _sender(supervisor))
                 for stream, status, supervisor in zip(
-                    source.streams, self.statuses, self.supervisors, strict=True
+                    settings.streams, self.statuses, self.supervisors, strict=True
                 )
             ],
             lambda: self.fan_out.newest,
             lambda: self._newest_status,
             self._last_c3d,
             self._record,
-            self._on_change,
+            self._on_new_parameters,
         )
-        self._tell_parameters = tell_parameters
-        self._tell_file = tell_file
-        self._rates = [FrameRate() for _ in source.streams]
-        self._rates_hz = [0.0 for _ in source.streams]
+        self._publish_parameters = publish_parameters
+        self._announce_file = announce_file
+        self._rates = [FrameRate() for _ in settings.streams]
+        self._rates_hz = [0.0 for _ in settings.streams]
         self._tasks: set[asyncio.Task[None]] = set()
         self._num_writing = 0
-        self._asks_again = False
+        self._is_refresh_planned = False
         self.sequence: int = 0 if before is None else before.sequence
-        """Of the newest status and clock message."""
-        self._newest_status: bytes = self._status()
+        """The number of the newest status and clock message."""
+        self._newest_status: bytes = self._encoded_status()
+
+    @property
+    def name(self) -> str:
+        """The source's name."""
+        return self.settings.name
+
+    @property
+    def streams(self) -> list[tuple[StreamStatus, float]]:
+        """The status of each stream, with its frame rate in Hz at the last ``publish_status``."""
+        return list(zip(self.statuses, self._rates_hz, strict=True))
 
     async def run(self) -> None:
-        """Keep every stream going until cancelled; then say Bye to the server."""
+        """Run every stream until cancelled; then say Bye to the server."""
         try:
             async with asyncio.TaskGroup() as tasks:
                 for supervisor in self.supervisors:
@@ -88,31 +98,28 @@ class Source:
             for task in self._tasks:
                 task.cancel()
 
-    @property
-    def line(self) -> str:
-        """How the source is, in one line for people; rates are those of the last ``publish_status``."""
-        return source_line(self.source, list(zip(self.statuses, self._rates_hz, strict=True)))
+    # Status.
 
     def publish_status(self) -> None:
-        """Publish what ``status_t`` holds of this source; called once a second."""
+        """Publish the status and the clock of this source; called once a second."""
         self.sequence += 1
-        self._newest_status = self._status()
-        # One server has one clock: the stream that knows it best tells it.
-        best = min(self.statuses, key=_uncertainty_us)
-        clock = clock_message(self.desk.session, self.sequence, best)
-        with log_fields(source=self.source.name):
-            self.fan_out.publish_status(self._newest_status)
-            self.fan_out.publish_clock(clock.encode())
-
-    def _status(self) -> bytes:
         self._rates_hz = [
             rate.update(status.frames_in) for rate, status in zip(self._rates, self.statuses, strict=True)
         ]
+        self._newest_status = self._encoded_status()
+        # One server has one clock: publish the best estimate of all streams.
+        best = min(self.statuses, key=_uncertainty_us)
+        clock = clock_message(self.queries.session, self.sequence, best)
+        with log_fields(source=self.name):
+            self.fan_out.publish_status(self._newest_status)
+            self.fan_out.publish_clock(clock.encode())
+
+    def _encoded_status(self) -> bytes:
         message = status_message(
-            source=self.source.name,
-            server=f"{self.source.host}:{self.source.port}",
+            source=self.name,
+            server=f"{self.settings.host}:{self.settings.port}",
             sequence=self.sequence,
-            streams=list(zip(self.statuses, self._rates_hz, strict=True)),
+            streams=self.streams,
             outputs=[(status, output.health()) for output, status in self.fan_out.outputs],
         )
         encoded: bytes = message.encode()
@@ -120,62 +127,68 @@ class Source:
 
     def _new_status(self, stream: StreamSettings, session: int) -> StreamStatus:
         components = " ".join(component.key for component in stream.components)
-        name = f"{self.source.name} ({components})"
+        name = f"{self.name} ({components})"
         return StreamStatus(components, name=name, on_state=self._on_state, session=session)
 
     def _on_state(self, _state: StreamState) -> None:
-        flowing = any(status.state is StreamState.STREAMING for status in self.statuses)
-        self.fan_out.show_flowing(flowing)
+        is_streaming = any(status.state is StreamState.STREAMING for status in self.statuses)
+        self.fan_out.show_streaming(is_streaming)
+
+    # Parameters.
 
     def _callbacks(self, stream: StreamSettings) -> Callbacks:
-        wanted = frozenset(stream.components)
+        components = frozenset(stream.components)
 
         def on_parameters(xml: bytes, parsed: ParsedParameters) -> None:
-            self.fan_out.set_parameters(parsed.parameters)
-            self.desk.learn(xml, parsed)
-            self._tell_parameters(self.source.name, xml)
+            self.queries.cache_parameters(xml, parsed)
+            self._share_parameters(xml, parsed)
 
         return Callbacks(
             publish=self.fan_out.publish,
             on_parameters=on_parameters,
-            on_connected=lambda: self._start(self.desk.fill()),
-            on_restart=self._ask_parameters_again,
+            on_connected=lambda: self._start(self.queries.fill_cache()),
+            on_restart=self._refresh_parameters_soon,
             on_file=self._on_file,
-            has_subscribers=lambda: self.fan_out.listened(wanted),
+            has_subscribers=lambda: self.fan_out.has_subscribers(components),
         )
 
-    def _on_change(self, xml: bytes, parsed: ParsedParameters) -> None:
-        """The server says other parameters than it did: tell, and ask for each section anew."""
+    def _on_new_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
+        """Publish parameters that changed while connected, and refresh every section."""
+        self._share_parameters(xml, parsed)
+        self._start(self.queries.fill_cache())
+
+    def _share_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
         self.fan_out.set_parameters(parsed.parameters)
-        self._tell_parameters(self.source.name, xml)
-        self._start(self.desk.fill())
+        self._publish_parameters(self.name, ServerParameters(xml, self.queries.session))
 
-    def _ask_parameters_again(self) -> None:
-        """The scene may have changed: ask once the server may be asked again; who listens is told."""
-        if not self._asks_again:
-            self._asks_again = True
-            self._start(self._refresh())
+    def _refresh_parameters_soon(self) -> None:
+        """Ask for the parameters again, because the scene may have changed, once the server may be asked."""
+        if not self._is_refresh_planned:
+            self._is_refresh_planned = True
+            self._start(self._refresh_parameters())
 
-    async def _refresh(self) -> None:
+    async def _refresh_parameters(self) -> None:
         try:
-            await asyncio.sleep(self.source.fresh_interval_s)
-            await self.desk.parameters((), fresh=True, stale_ok=False)
+            await asyncio.sleep(self.settings.fresh_interval_s)
+            await self.queries.parameters((), fresh=True, stale_ok=False)
         except QueryError as error:
-            logger.debug("%s: parameters not asked again: %s", self.source.name, error)
+            logger.debug("%s: parameters not refreshed: %s", self.name, error)
         finally:
-            self._asks_again = False
+            self._is_refresh_planned = False
 
-    def _start(self, work: Any) -> None:
+    def _start(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
+    # C3D files and recording.
+
     def _on_file(self, content: bytes) -> None:
         if self._num_writing >= _MAX_WRITING:
             logger.error(
-                "%s: a C3D file of %d bytes is not kept: %d before it are still being written; "
+                "%s: a C3D file of %d bytes is dropped: %d earlier files are still being written; "
                 "is the disk slow, or the server faulty?",
-                *(self.source.name, len(content), self._num_writing),
+                *(self.name, len(content), self._num_writing),
             )
             return
         self._num_writing += 1
@@ -183,21 +196,19 @@ class Source:
 
     async def _keep(self, content: bytes) -> None:
         try:
-            path = await asyncio.to_thread(self.spool.store, self.source.name, content)
+            path = await asyncio.to_thread(self.spool.store, self.name, content)
         except SpoolError as error:
-            logger.error("%s: %s", self.source.name, error)  # noqa: TRY400 - the sentence says it all
+            logger.error("%s: %s", self.name, error)  # noqa: TRY400 - the sentence says everything
             return
         finally:
             self._num_writing -= 1
-        logger.info(
-            "%s: the server sent a C3D file of %d bytes, kept as %s", self.source.name, len(content), path
-        )
-        self._tell_file(self.source.name, {"name": path.name, "bytes": len(content)})
+        logger.info("%s: the server sent a C3D file of %d bytes, kept as %s", self.name, len(content), path)
+        self._announce_file(self.name, {"name": path.name, "bytes": len(content)})
 
     async def _last_c3d(self) -> Answer:
-        path = await asyncio.to_thread(self.spool.newest, self.source.name)
+        path = await asyncio.to_thread(self.spool.newest, self.name)
         if path is None:
-            raise QueryError(f"source {self.source.name!r} has sent no C3D file so far", code="nothing-yet")
+            raise QueryError(f"source {self.name!r} has sent no C3D file so far", code="nothing-yet")
         try:
             content = await asyncio.to_thread(path.read_bytes)
         except OSError as error:
@@ -215,11 +226,11 @@ class Source:
         return False
 
 
-def _asker(supervisor: Supervisor) -> Callable[[], Ask | None]:
-    def ask() -> Ask | None:
+def _sender(supervisor: Supervisor) -> Callable[[], SendCommand | None]:
+    def sender() -> SendCommand | None:
         return None if supervisor.session is None else supervisor.session.ask
 
-    return ask
+    return sender
 
 
 def _uncertainty_us(status: StreamStatus) -> float:

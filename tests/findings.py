@@ -2,9 +2,12 @@
 
 from typing import Any
 
-from gateway.config.settings import LcmSettings, Settings, SourceSettings, StreamSettings, ZenohSettings
+from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.doctor.all_checks import run_checks
 from gateway.findings import Finding, Result
+from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.zenoh.settings import ZenohSettings
+from tests.configurations import make_settings
 
 SECONDS = 0.3
 
@@ -35,7 +38,7 @@ async def run_doctor(
     lcm: LcmSettings | None = None,
     seconds: float = SECONDS,
 ) -> Findings:
-    settings = Settings(
+    settings = make_settings(
         sources=sources,
         zenoh=zenoh_settings or ZenohSettings(enabled=False),
         lcm=lcm or LcmSettings(url="memq://"),

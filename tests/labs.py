@@ -5,10 +5,11 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
 
-from gateway.config.settings import MetricsSettings, ReconnectSettings, Settings, SourceSettings
+from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.memory import MemoryOutput
+from tests.configurations import make_settings
 from tests.waiting import wait_until_async
 
 
@@ -48,7 +49,9 @@ async def gateway_to(port: int, **settings: Any) -> AsyncIterator[Running]:
     }
     output = MemoryOutput()
     unwatched = MetricsSettings(enabled=False)
-    gateway = Gateway(Settings(sources=(SourceSettings(**(source | settings)),), metrics=unwatched), [output])
+    gateway = Gateway(
+        make_settings(sources=(SourceSettings(**(source | settings)),), metrics=unwatched), [output]
+    )
     stop = asyncio.Event()
     task = asyncio.create_task(gateway.run(stop))
     try:

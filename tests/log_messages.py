@@ -2,7 +2,7 @@
 
 import ast
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Final
@@ -23,17 +23,24 @@ _LOGGED_CLASSES: Final = {
 _PRINTING_PACKAGES: Final = {"cli", "demo", "doctor"}
 """Commands that print their errors instead of logging them."""
 
+_PRINTING_MODULES: Final = {"checks.py", "subscriber.py"}
+"""The modules of outputs that only commands use."""
+
 
 def message_patterns(package: Path) -> dict[str, str]:
     """Return a regular expression for each message, with ``.+`` for its values, and where it is logged."""
     found: dict[str, str] = {}
-    for path in sorted(package.rglob("*.py")):
+    modules = {path: ast.parse(path.read_text()) for path in sorted(package.rglob("*.py"))}
+    for path, module in modules.items():
         if path.relative_to(package).parts[0].removesuffix(".py") in _PRINTING_PACKAGES:
             continue
-        module = ast.parse(path.read_text())
+        if path.name in _PRINTING_MODULES:
+            continue
         for scope in _scopes(module):
             for call in _logging_calls(scope):
-                texts = chain.from_iterable(_texts(node, scope, module) for node in call.args)
+                texts = chain.from_iterable(
+                    _texts(node, scope, module, list(modules.values())) for node in call.args
+                )
                 for text in filter(re.compile("[a-z]{3}").search, texts):
                     found.setdefault(text, f"{path.relative_to(package)}:{call.lineno}")
     return found
@@ -62,7 +69,9 @@ def _logging_calls(scope: ast.AST) -> Iterator[ast.Call]:
                 yield node
 
 
-def _texts(node: ast.expr, scope: ast.AST, module: ast.Module) -> Iterator[str]:
+def _texts(
+    node: ast.expr, scope: ast.AST, module: ast.Module, modules: Sequence[ast.Module]
+) -> Iterator[str]:
     """Yield a pattern for each text that ``node`` can be, following names and calls to their literals."""
     pending, seen = [(node, scope)], set()
     while pending:
@@ -81,10 +90,11 @@ def _texts(node: ast.expr, scope: ast.AST, module: ast.Module) -> Iterator[str]:
                 pending += [(choice, scope) for choice in choices]
             case ast.Name(name):
                 pending += [(value, scope) for value in _assigned(name, scope)]
+                pending += [(value, scope) for value in _constants(name, modules)]
             case ast.Attribute(attr=name):
                 pending += [(value, scope) for value in _assigned(name, module)]
             case ast.Call(func=ast.Name(name)):
-                pending += _returned(name, module)
+                pending += _returned(name, modules)
 
 
 def _assigned(name: str, scope: ast.AST) -> Iterator[ast.expr]:
@@ -96,9 +106,17 @@ def _assigned(name: str, scope: ast.AST) -> Iterator[ast.expr]:
                     yield value
 
 
-def _returned(name: str, module: ast.Module) -> Iterator[tuple[ast.expr, ast.AST]]:
-    """Yield the values that a function of the module returns."""
-    for function in module.body:
+def _constants(name: str, modules: Sequence[ast.Module]) -> Iterator[ast.expr]:
+    """Yield the value of a module's constant, such as ``CLOSED: Final = "…"``."""
+    for statement in chain.from_iterable(module.body for module in modules):
+        match statement:
+            case ast.AnnAssign(target=ast.Name(target), value=ast.expr() as value) if target == name:
+                yield value
+
+
+def _returned(name: str, modules: Sequence[ast.Module]) -> Iterator[tuple[ast.expr, ast.AST]]:
+    """Yield the values that a function returns, whatever module it is in."""
+    for function in chain.from_iterable(module.body for module in modules):
         if isinstance(function, ast.FunctionDef) and function.name == name:
             for node in ast.walk(function):
                 if isinstance(node, ast.Return) and node.value is not None:

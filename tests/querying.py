@@ -11,17 +11,17 @@ from typing import Any, NamedTuple
 import zenoh
 
 from gateway.config.settings import (
-    LcmSettings,
     MetricsSettings,
     ReconnectSettings,
-    Settings,
     SourceSettings,
     SpoolSettings,
-    ZenohSettings,
 )
 from gateway.gateway import Gateway
+from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import SendParameters, parse_command
 from gateway.rtc3d.parameters import SECTIONS
+from tests.configurations import make_settings
 from tests.networks import free_endpoint, free_port, open_zenoh, zenoh_keys
 from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
 from tests.spec_parameters import in_root, spec_xml
@@ -133,7 +133,7 @@ async def gateway_at(
         update={} if "fresh_interval_s" in source else {"fresh_interval_s": 0.0}
     )
     keys = zenoh_keys("client", connect=router) if router else zenoh_keys("peer", listen=listen)
-    settings = Settings(
+    settings = make_settings(
         sources=(lab,),
         zenoh=ZenohSettings(enabled=bool(listen or router), config=keys),
         lcm=LcmSettings(enabled=lcm_url is not None, url=lcm_url, queries_url=queries_url),
@@ -149,6 +149,13 @@ async def gateway_at(
         stop.set()
         async with asyncio.timeout(20):
             await task
+
+
+def queries_of(gateway: Gateway) -> Any:
+    """Return the object that answers queries on the gateway's only output."""
+    queries = [queries for output in gateway.outputs if (queries := getattr(output, "_queries", None))]
+    [only] = queries
+    return only
 
 
 async def is_filled(gateway: Gateway, server: LabServer) -> None:

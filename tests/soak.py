@@ -25,8 +25,8 @@ import uvloop
 from rich.console import Console
 
 from gateway import version_text
-from gateway.cli.subscribers import ZenohListener, key_pattern, open_zenoh
 from gateway.messages.decode import decode
+from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_pattern, open_zenoh
 from gateway.simulator.faults.control import Faults
 from gateway.simulator.faults.kinds import KINDS
 from gateway.simulator.simulator import Simulator
@@ -106,7 +106,7 @@ class Soak:
 
     async def _run(self, simulator: Simulator, pid: int, endpoint: str, console: Console) -> None:
         session = await _open(endpoint)
-        ZenohListener(session, key_pattern("mocap", "lab", None), self.messages.count)
+        ZenohSubscriber(session, key_pattern("mocap", "lab", None), self.messages.count)
         faults = simulator.faults
         end_s = time.monotonic() + 60 * self.minutes
         try:

@@ -18,12 +18,11 @@ import yaml
 import zenoh
 
 from gateway.cli.main import app
-from gateway.config import loading
-from gateway.config.settings import Settings
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME
 from gateway.messages.splice import ITEMS_OFFSET, MESSAGE_TYPES
 from gateway.rtc3d.components import ITEM_DTYPES
 from gateway.simulator.scenario import load_scenario
+from tests.configurations import MODEL, load
 from tests.documents import ROOT, Block, all_blocks, blocks, documents
 
 REFERENCE = (ROOT / "docs/reference/messages.md").read_text()
@@ -93,10 +92,10 @@ def test_yaml_is_what_a_program_takes(block: Block, tmp_path: Path, monkeypatch:
     file.write_text(block.text)
     if content.keys() & {"scene", "faults"}:
         assert load_scenario(file).faults
-    elif content.keys() <= Settings.model_fields.keys():
+    elif content.keys() <= MODEL.model_fields.keys():
         for other in ROOT.glob("config/*.json5"):
             shutil.copy(other, tmp_path)
-        assert loading.load(file).sources
+        assert load(file).sources
     else:
         assert content.keys() <= OTHERS
 

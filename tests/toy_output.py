@@ -1,24 +1,27 @@
-"""An output that tests steer: who listens, and what goes wrong."""
+"""An output that tests steer: who subscribes, and what goes wrong."""
 
 from typing import Any
 
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
+from gateway.outputs.contract import Output
 from gateway.outputs.status import OutputHealth
-from gateway.rtc3d.components import ComponentType
 
 
-class ToyOutput:
-    """Raises ``error`` while there is one; ``listened`` holds the last parts of topics somebody hears."""
+class ToyOutput(Output):
+    """Raises ``error`` while there is one; topics whose last name is in ``wanted`` have a subscriber."""
 
-    def __init__(self, name: str = "toy", *listened: str) -> None:
+    drop_causes = ("broken",)
+
+    def __init__(self, name: str = "toy", *wanted: str, has_tool_poses: bool = False) -> None:
         self.name = name
-        self.max_rate_hz: dict[ComponentType, float] = {}
-        self.flowing: list[bool] = []
-        self.listened = set(listened)
+        self.has_tool_poses = has_tool_poses
+        self.max_rate_hz = {}
+        self.streaming: list[bool] = []
+        self.wanted = set(wanted)
         self.error: Exception | None = None
         self.declared: list[Topic] = []
-        self.given_up: list[Topic] = []
+        self.closed_topics: list[Topic] = []
         self.messages: list[tuple[Topic, bytes]] = []
         self.announced: list[str] = []
 
@@ -34,10 +37,8 @@ class ToyOutput:
     def withdraw(self, source: str) -> None:
         self.announced.remove(source)
 
-    def show_flowing(self, _source: str, flowing: bool) -> None:
-        self.flowing.append(flowing)
-
-    def maintain(self) -> None: ...
+    def show_streaming(self, _source: str, is_streaming: bool) -> None:
+        self.streaming.append(is_streaming)
 
     def health(self) -> OutputHealth:
         return OutputHealth(True)
@@ -60,7 +61,7 @@ class ToyPublisher:
 
     @property
     def wanted(self) -> bool:
-        return self._topic.path[-1] in self._output.listened
+        return self._topic.path[-1] in self._output.wanted
 
     def publish(self, message: bytes) -> None:
         if self._output.error is not None:
@@ -69,4 +70,4 @@ class ToyPublisher:
 
     def close(self) -> None:
         self._output.declared.remove(self._topic)
-        self._output.given_up.append(self._topic)
+        self._output.closed_topics.append(self._topic)

@@ -9,12 +9,12 @@ from typing import Any
 import rtc3d
 
 from gateway.cli.asking import DISCOVERY_S, RETRY_S, ParametersReply, Replies, Sections, TimeLimits
-from gateway.cli.subscribers import LcmListener
-from gateway.config.settings import lcm_queries_url
 from gateway.errors import OutputError, ProtocolError, QueryError
 from gateway.messages.decode import decode
 from gateway.messages.topics import lcm_channel
-from gateway.outputs.lcm.output import open_lcm
+from gateway.outputs.lcm.connection import open_lcm
+from gateway.outputs.lcm.settings import lcm_queries_url
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 
 
 def ask_lcm(
@@ -78,8 +78,8 @@ class _LcmAsker:
         self._is_complete = threading.Event()
         channels = f"{re.escape(prefix)}_.+_"
         self._listeners = [
-            LcmListener(self._lcm, f"{channels}PARAMETERS_REPLY", self._receive),
-            LcmListener(open_lcm(url), f"{channels}STATUS", self._receive),
+            LcmSubscriber(self._lcm, f"{channels}PARAMETERS_REPLY", self._receive),
+            LcmSubscriber(open_lcm(url), f"{channels}STATUS", self._receive),
         ]
 
     def _receive(self, _channel: str, data: bytes) -> None:

@@ -7,10 +7,10 @@ import time
 import zenoh
 
 from gateway.cli.asking import RETRY_S, ParametersReply, Replies, Sections, TimeLimits
-from gateway.cli.subscribers import open_zenoh
 from gateway.errors import OutputError, QueryError
 from gateway.messages.topics import unique_name, zenoh_key
-from gateway.queries.answers import TEXT
+from gateway.outputs.encodings import TEXT
+from gateway.outputs.zenoh.subscriber import open_zenoh
 
 
 def ask_zenoh(

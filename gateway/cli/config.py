@@ -5,6 +5,7 @@ import typer
 from gateway.cli.options import ConfigOption, ServerOption, configuration_from_options
 from gateway.config.schema import schema_text
 from gateway.config.show import shown_configuration
+from gateway.outputs.registry import settings_type
 
 app = typer.Typer(no_args_is_help=True, help="Show the configuration in effect, or the JSON schema.")
 
@@ -18,4 +19,4 @@ def show(config: ConfigOption = None, server: ServerOption = None) -> None:
 @app.command()
 def schema() -> None:
     """Print the JSON schema of configuration files, for editors; same as config/gateway.schema.json."""
-    print(schema_text(), end="")
+    print(schema_text(settings_type()), end="")

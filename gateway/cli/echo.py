@@ -5,22 +5,17 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import Annotated, TextIO
+from typing import Annotated, Final, TextIO
 
 import typer
 
 from gateway.cli.message_lines import json_line, text_line
 from gateway.cli.options import ConnectOption, PrefixOption, SourceOption, UrlOption
-from gateway.cli.subscribers import (
-    QUEUE_MESSAGES,
-    LcmListener,
-    ZenohListener,
-    channel_pattern,
-    key_pattern,
-    open_zenoh,
-)
-from gateway.config.settings import effective_lcm_url
-from gateway.outputs.lcm.output import open_lcm
+from gateway.outputs.kind import SubscriptionRequest
+from gateway.outputs.registry import OUTPUTS
+
+QUEUE_MESSAGES: Final = 10_000
+"""How many messages may wait to be printed."""
 
 Messages = queue.Queue[tuple[str, bytes]]
 """Messages, each with its Zenoh key or LCM channel."""
@@ -29,6 +24,9 @@ Messages = queue.Queue[tuple[str, bytes]]
 def echo(
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Subscribe on Zenoh (the default).")] = False,
     lcm: Annotated[bool, typer.Option("--lcm", help="Subscribe on LCM.")] = False,
+    output: Annotated[
+        str | None, typer.Option(metavar="NAME", help="Subscribe to this output of the gateway.")
+    ] = None,
     source: SourceOption = None,
     component: Annotated[
         str | None,
@@ -42,13 +40,11 @@ def echo(
     prefix: PrefixOption = None,
 ) -> None:
     """Print what gateways publish. Exit status 1 if fewer than --count messages arrive in --seconds."""
-    if zenoh and lcm:
-        raise typer.BadParameter("give either --zenoh or --lcm")
-    if lcm:
-        subscription = subscribe_lcm(prefix or "MOCAP", source, component, effective_lcm_url(url))
-    else:
-        subscription = subscribe_zenoh(prefix or "mocap", source, component, connect)
-    with subscription as messages:
+    if sum((zenoh, lcm, output is not None)) > 1:
+        raise typer.BadParameter("give only one of --zenoh, --lcm and --output")
+    name = output or ("lcm" if lcm else "zenoh")
+    request = SubscriptionRequest(source, component, prefix, connect or url)
+    with subscribed(name, request) as messages:
         try:
             printed = print_messages(messages, sys.stdout, count=count, as_json=as_json, timeout_s=seconds)
         except KeyboardInterrupt:
@@ -59,31 +55,18 @@ def echo(
 
 
 @contextmanager
-def subscribe_zenoh(
-    prefix: str, source: str | None, component: str | None, connect: str | None
-) -> Iterator[Messages]:
-    """Provide a queue of messages from Zenoh; raises OutputError if no session opens."""
+def subscribed(output: str, request: SubscriptionRequest) -> Iterator[Messages]:
+    """Provide a queue of the messages of an output; raises OutputError if it does not open."""
+    subscribe = OUTPUTS[output].subscribe if output in OUTPUTS else None
+    if subscribe is None:
+        known = ", ".join(name for name, kind in OUTPUTS.items() if kind.subscribe is not None)
+        raise typer.BadParameter(f"no messages to print from output {output!r}; choose one of: {known}")
     messages: Messages = queue.Queue(QUEUE_MESSAGES)
-    session = open_zenoh(connect)
-    try:
-        ZenohListener(
-            session, key_pattern(prefix, source, component), lambda *sample: _put(messages, *sample)
-        )
-        yield messages
-    finally:
-        session.close()
-
-
-@contextmanager
-def subscribe_lcm(prefix: str, source: str | None, component: str | None, url: str) -> Iterator[Messages]:
-    """Provide a queue of messages from LCM; raises OutputError if LCM does not open."""
-    messages: Messages = queue.Queue(QUEUE_MESSAGES)
-    pattern = channel_pattern(prefix, source, component)
-    listener = LcmListener(open_lcm(url), pattern, lambda *event: _put(messages, *event))
+    subscription = subscribe(request, lambda *message: _put(messages, *message))
     try:
         yield messages
     finally:
-        listener.close()
+        subscription.close()
 
 
 def _put(messages: Messages, name: str, message: bytes) -> None:

@@ -8,6 +8,7 @@ import typer
 
 from gateway.config.environment import VARIABLE_PREFIX
 from gateway.config.loading import Configuration, read, read_server
+from gateway.outputs.registry import settings_type
 from gateway.rtc3d.ports import FIRST_PRINCIPLES_PORT
 from gateway.service.log_format import LogFormat, LogLevel
 
@@ -62,11 +63,11 @@ def configuration_from_options(config: Path | None, server: str | None) -> Confi
     Raises ConfigError if it is not valid, BadParameter if none or both of the options are given.
     """
     if server is not None and config is None:
-        return read_server(*_host_and_port(server))
+        return read_server(*_host_and_port(server), settings_type())
     if server is None and (
         config is not None or any(name.startswith(VARIABLE_PREFIX) for name in os.environ)
     ):
-        return read(config)
+        return read(config, settings_type())
     raise typer.BadParameter("give either --config FILE or --server HOST[:PORT]")
 
 

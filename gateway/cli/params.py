@@ -9,7 +9,7 @@ from gateway.cli.ask_lcm import ask_lcm
 from gateway.cli.ask_zenoh import ask_zenoh
 from gateway.cli.options import ConnectOption, PrefixOption, SourceOption, UrlOption
 from gateway.cli.params_tables import write_replies
-from gateway.config.settings import effective_lcm_url
+from gateway.outputs.lcm.settings import effective_lcm_url
 from gateway.rtc3d.parameters import SECTIONS
 
 EXIT_STATUSES: Final = {"no-gateway": 3, "no-connection": 4, "timeout": 5}

@@ -11,15 +11,13 @@ from pydantic import ValidationError
 from gateway.config.environment import VARIABLE_PREFIX, apply_overrides, variable_name
 from gateway.config.secrets import MASK, file_key_for, find_secrets, is_secret_key, mask_secrets_in_text
 from gateway.config.section import UNKNOWN_KEY, Section
-from gateway.config.settings import Settings
+from gateway.config.settings import OutputSettings, Settings
 from gateway.config.yaml_document import Document, Location, Position, line_and_column_after, read_yaml
 from gateway.errors import ConfigError
 
 MAX_FILE_BYTES: Final = 1024 * 1024
 
 AnySection = TypeVar("AnySection", bound=Section)
-
-_ZENOH_CONFIG: Final = ("zenoh", "config")
 
 
 class Configuration(NamedTuple):
@@ -29,32 +27,31 @@ class Configuration(NamedTuple):
     positions: Mapping[Location, Position]
 
 
-def load(path: Path | None, environ: Mapping[str, str] = os.environ) -> Settings:
-    """Return the gateway's settings; see ``read``."""
-    return read(path, environ).settings
+def read(path: Path | None, model: type[Settings], environ: Mapping[str, str] = os.environ) -> Configuration:
+    """Read the YAML file at ``path``, if any, and apply the overrides in ``environ`` (config/environment.py).
 
-
-def read(path: Path | None, environ: Mapping[str, str] = os.environ) -> Configuration:
-    """Return what ``environ`` says (``config_environment``), over the YAML file at ``path`` if there is one.
-
-    Relative paths count from the file's folder, else from the current one. Raises ConfigError with one
-    line per mistake, ``POSITION: KEY: what was found; what is accepted``; the position is FILE:LINE:COLUMN or
-    the variable. Of mistakes in the YAML itself only the first is told: the rest cannot be read.
+    ``model`` is the whole configuration with its outputs (``settings_model``). Relative paths count from the
+    file's folder, else from the current one. Raises ConfigError with one line per mistake, ``POSITION: KEY:
+    what was found; what was expected``; the position is FILE:LINE:COLUMN or the variable. Of mistakes in the
+    YAML itself only the first is reported, because the rest cannot be read.
     """
     if path is None:
         document = read_yaml("{}", "environment", has_lines=False)
-        return _configuration(document, Path.cwd(), environ)
-    document = _read_file(path, Settings, "config/gateway.yaml")
-    return _configuration(document, path.parent.absolute(), environ)
+        return _configuration(document, model, Path.cwd(), environ)
+    document = _read_file(path, model, "config/gateway.yaml")
+    return _configuration(document, model, path.parent.absolute(), environ)
 
 
-def read_server(host: str, port: int, environ: Mapping[str, str] = os.environ) -> Configuration:
+def read_server(
+    host: str, port: int, model: type[Settings], environ: Mapping[str, str] = os.environ
+) -> Configuration:
     """Return the configuration of one server as source "lab", all else as by default or in ``environ``.
 
     Raises ConfigError as ``read`` does, with the position ``--server``.
     """
     sources = json.dumps({"sources": [{"name": "lab", "host": host, "port": port}]})
-    return _configuration(read_yaml(sources, "--server", has_lines=False), Path.cwd(), environ)
+    document = read_yaml(sources, "--server", has_lines=False)
+    return _configuration(document, model, Path.cwd(), environ)
 
 
 def load_as(section: type[AnySection], path: Path, *, example: str) -> AnySection:
@@ -69,11 +66,19 @@ def load_as(section: type[AnySection], path: Path, *, example: str) -> AnySectio
         raise _in_order(_explained(document, error)) from None
 
 
-def _configuration(document: Document, folder: Path, environ: Mapping[str, str]) -> Configuration:
+def _configuration(
+    document: Document, model: type[Settings], folder: Path, environ: Mapping[str, str]
+) -> Configuration:
     apply_overrides(document, environ)
-    mistakes = _take_out_secrets(document)
+    mistakes = [
+        mistake
+        for name, field in model.model_fields.items()
+        if isinstance(field.annotation, type) and issubclass(field.annotation, OutputSettings)
+        for key, safe_place in field.annotation.foreign_keys.items()
+        for mistake in _mask_secrets(document, (name, key), safe_place)
+    ]
     try:
-        settings = Settings.model_validate(document.values, context={"folder": folder})
+        settings = model.model_validate(document.values, context={"folder": folder})
     except ValidationError as error:
         raise _in_order([*mistakes, *_explained(document, error)]) from None
     if mistakes:
@@ -139,17 +144,18 @@ def _variables_in(document: Document, location: Location) -> str:
     return f" (a part of it is from {', '.join(sorted(names))})" if names else ""
 
 
-def _take_out_secrets(document: Document) -> list[_Mistake]:
-    """Take secrets that stand in the file itself out of the values, and return a mistake for each.
+def _mask_secrets(document: Document, foreign: Location, safe_place: str) -> list[_Mistake]:
+    """Mask the secrets that stand in the file itself below ``foreign``, and return a mistake for each.
 
-    Files like this one are shown around and kept under version control. Taken out, no error quotes them.
+    People show such files around and keep them under version control. Masked, no error message quotes a
+    secret.
     """
     config = document.values
-    for key in _ZENOH_CONFIG:
+    for key in foreign:
         config = config.get(key) if isinstance(config, dict) else None
     mistakes = []
     for steps, secret in list(find_secrets(config)):
-        location = (*_ZENOH_CONFIG, *steps)
+        location = (*foreign, *steps)
         position = document.nearest_position(location)
         if not position.line:
             continue
@@ -158,8 +164,7 @@ def _take_out_secrets(document: Document) -> list[_Mistake]:
         others = f"{path_key} with the path of the key's file, " if path_key else ""
         text = (
             f"found a secret, which does not belong in this file; use {others}"
-            f"the environment variable {variable_name(location)}, or zenoh.config as the path "
-            "of a JSON5 file that only the gateway may read"
+            f"the environment variable {variable_name(location)}, or {safe_place}"
         )
         mistakes.append((position, position.error(location, text)))
     return mistakes

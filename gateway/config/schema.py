@@ -17,7 +17,7 @@ class _WithoutTitles(GenerateJsonSchema):
         return False
 
 
-def schema_text() -> str:
-    """Return the schema as JSON, the content of ``config/gateway.schema.json``."""
-    schema = Settings.model_json_schema(schema_generator=_WithoutTitles)
+def schema_text(model: type[Settings]) -> str:
+    """Return the schema of ``model`` as JSON, the content of ``config/gateway.schema.json``."""
+    schema = model.model_json_schema(schema_generator=_WithoutTitles)
     return json.dumps({"$schema": _DIALECT, **schema, "title": "RTC3D gateway"}, indent=2) + "\n"

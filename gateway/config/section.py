@@ -2,7 +2,7 @@
 
 import difflib
 from collections.abc import Iterable, Mapping
-from typing import Any, Final, Self
+from typing import Any, Final, NamedTuple, Self
 
 from pydantic import (
     BaseModel,
@@ -23,10 +23,22 @@ UNKNOWN_KEY: Final = "unknown_key"
 _MISTAKE: Final = "mistake"
 
 
+class Effective(NamedTuple):
+    """The value in effect for a key without one, and the environment variables that it may come from."""
+
+    value: Any
+    variables: tuple[str, ...] = ()
+
+
 class Section(BaseModel):
     """A mapping of the configuration: no other keys than its own, and nothing changes later."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
+
+    @property
+    def effective(self) -> dict[str, Effective]:
+        """What the program uses for keys without a value, by key; for showing the configuration."""
+        return {}
 
     @model_validator(mode="wrap")
     @classmethod

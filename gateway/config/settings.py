@@ -7,23 +7,19 @@ what is accepted. ``gateway.config.loading`` adds file, line and column.
 
 import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Final, Self
-from urllib.parse import urlsplit, urlunsplit
+from typing import Annotated, Any, ClassVar, Self
 
-from pydantic import AfterValidator, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, create_model, field_validator, model_validator
 
-from gateway.config.section import Section, expects, validation_error
+from gateway.config.section import Effective, Section, expects, join_or, validation_error
 from gateway.config.values import (
     Backlog,
     ByteLimit,
-    ChannelPrefix,
     Components,
     FileLimit,
     Host,
-    KeyPrefix,
-    LcmUrl,
-    MaxRates,
     Milliseconds,
     Port,
     Seconds,
@@ -32,16 +28,12 @@ from gateway.config.values import (
     SpoolDirectory,
     StreamRate,
     Switch,
-    ZenohConfig,
     not_empty,
 )
 from gateway.rtc3d.commands import AllFrames, Frequency
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.packets import DEFAULT_MAX_C3D_BYTES, DEFAULT_MAX_PACKET_BYTES
 from gateway.rtc3d.ports import FIRST_PRINCIPLES_PORT
-
-DEFAULT_LCM_URL: Final = "udpm://239.255.76.67:7667?ttl=0"
-"""LCM's own default, which stays on this host."""
 
 
 class StreamSettings(Section):
@@ -165,84 +157,14 @@ class SourceSettings(Section):
         return self
 
 
-class ZenohSettings(Section):
-    """How data and answers go to Zenoh."""
+class OutputSettings(Section):
+    """What the sections of all outputs have in common."""
 
-    enabled: Switch = True
-    """Whether anything is published, and answered, on Zenoh."""
+    foreign_keys: ClassVar[Mapping[str, str]] = {}
+    """The keys that hold another program's configuration, each with a place where its secrets may stay."""
 
-    prefix: KeyPrefix = "mocap"
-    """What all keys begin with."""
-
-    config: ZenohConfig = Field(default_factory=dict, repr=False)  # it may hold a password
-    """Zenoh's own configuration: the path of a JSON5 file, or its keys inline; without secrets."""
-
-    express: Switch = False
-    """Whether each message is sent at once instead of in batches."""
-
-    max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
-    """The highest rate of each component named; frames beyond it are left out, evenly."""
-
-    tool_poses: Switch = False
-    """Whether each tool's pose is published on a key of its own, while someone listens."""
-
-
-def effective_lcm_url(url: str | None) -> str:
-    """Return ``url``, else the environment's LCM_DEFAULT_URL, else DEFAULT_LCM_URL.
-
-    The environment's is not checked here: LCM itself says what it cannot use.
-    """
-    return url or os.environ.get("LCM_DEFAULT_URL") or DEFAULT_LCM_URL
-
-
-def lcm_queries_url(url: str) -> str:
-    """Return where requests go unless told otherwise: to the next port, where a URL is multicast's.
-
-    Whoever listens on a multicast URL is sent all that anybody sends there, the gateway its own messages
-    too: that would double what LCM costs it, and more. Others pass on only what is subscribed to.
-    """
-    parts = urlsplit(url)
-    try:
-        port = parts.port or 7667
-    except ValueError:  # LCM itself refuses it
-        return url
-    if parts.scheme != "udpm":
-        return url
-    host = parts.hostname or "239.255.76.67"
-    other = port + 1 if port < 65535 else port - 1
-    return urlunsplit(parts._replace(netloc=f"{host}:{other}"))
-
-
-class LcmSettings(Section):
-    """How data and answers go to LCM."""
-
-    enabled: Switch = True
-    """Whether anything is published, and answered, on LCM."""
-
-    prefix: ChannelPrefix = "MOCAP"
-    """What all channels begin with."""
-
-    url: LcmUrl | None = None
-    """Where to publish; null is the environment's LCM_DEFAULT_URL, else LCM's own, on this host only."""
-
-    queries_url: LcmUrl | None = None
-    """Where requests are awaited and answered; null is the port after that of url."""
-
-    max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
-    """The highest rate of each component named; frames beyond it are left out, evenly."""
-
-    tool_poses: Switch = False
-    """Whether each tool's pose is published on a channel of its own."""
-
-    @property
-    def effective_url(self) -> str:
-        """What ``effective_lcm_url`` makes of ``url``."""
-        return effective_lcm_url(self.url)
-
-    @property
-    def effective_queries_url(self) -> str:
-        """``queries_url``, else what belongs to ``effective_url``."""
-        return self.queries_url or lcm_queries_url(self.effective_url)
+    enabled: Switch = False
+    """Whether the output is used."""
 
 
 class SpoolSettings(Section):
@@ -256,6 +178,13 @@ class SpoolSettings(Section):
 
     max_bytes: ByteLimit = 1024 * 1024 * 1024
     """How many bytes they may take together; the oldest goes first."""
+
+    @property
+    def effective(self) -> dict[str, Effective]:
+        """See Section."""
+        if self.directory is not None:
+            return {}
+        return {"directory": Effective(str(self.effective_directory), ("STATE_DIRECTORY", "XDG_STATE_HOME"))}
 
     @property
     def effective_directory(self) -> Path:
@@ -283,7 +212,7 @@ class MetricsSettings(Section):
 
 
 class Settings(Section):
-    """The whole configuration."""
+    """The whole configuration, apart from the outputs: ``settings_model`` adds a section for each."""
 
     sources: Annotated[
         tuple[SourceSettings, ...],
@@ -296,14 +225,14 @@ class Settings(Section):
     spool: SpoolSettings = SpoolSettings()
     """Where the servers' C3D files are kept."""
 
-    zenoh: ZenohSettings = ZenohSettings()
-    """The Zenoh side."""
-
-    lcm: LcmSettings = LcmSettings()
-    """The LCM side."""
-
     metrics: MetricsSettings = MetricsSettings()
     """How the gateway is watched."""
+
+    @property
+    def outputs(self) -> dict[str, OutputSettings]:
+        """The sections of the outputs, by name."""
+        sections = {name: getattr(self, name) for name in type(self).model_fields}
+        return {name: section for name, section in sections.items() if isinstance(section, OutputSettings)}
 
     @field_validator("sources")
     @classmethod
@@ -326,10 +255,18 @@ class Settings(Section):
 
     @model_validator(mode="after")
     def _something_is_published(self) -> Self:
-        if not (self.zenoh.enabled or self.lcm.enabled):
-            raise validation_error(
-                "found false here and in zenoh.enabled; expected true in at least one of them",
-                "lcm",
-                "enabled",
-            )
+        outputs = self.outputs
+        if outputs and not any(section.enabled for section in outputs.values()):
+            *others, last = (f"{name}.enabled" for name in outputs)
+            found = f"found false here and in {join_or(others)}" if others else "found false"
+            raise validation_error(f"{found}; expected true in at least one of them", *last.split("."))
         return self
+
+
+def settings_model(outputs: Mapping[str, type[OutputSettings]]) -> type[Settings]:
+    """Return the model of whole configurations with these outputs, by the name of their section."""
+    sections: dict[str, Any] = {
+        name: (section, Field(default=section(), description=f"The output {name}."))
+        for name, section in outputs.items()
+    }
+    return create_model("Settings", __base__=Settings, __doc__="The whole configuration.", **sections)

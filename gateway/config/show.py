@@ -10,6 +10,7 @@ import yaml
 
 from gateway.config.loading import Configuration
 from gateway.config.secrets import mask_secrets
+from gateway.config.section import Section
 from gateway.config.settings import Settings
 from gateway.config.yaml_document import Location
 
@@ -46,14 +47,15 @@ class _Origins:
         self._resolved: dict[Location, str] = {}
 
     def resolve(self, settings: Settings, values: dict[str, Any]) -> None:
-        """Put in what the program takes where nothing is configured."""
-        if settings.lcm.url is None:
-            values["lcm"]["url"] = settings.lcm.effective_url
-            self._resolved["lcm", "url"] = _variable("LCM_DEFAULT_URL")
-        values["lcm"]["queries_url"] = settings.lcm.effective_queries_url
-        if settings.spool.directory is None:
-            values["spool"]["directory"] = str(settings.spool.effective_directory)
-            self._resolved["spool", "directory"] = _variable("STATE_DIRECTORY", "XDG_STATE_HOME")
+        """Set in ``values`` what the program uses where nothing is configured."""
+        for name in type(settings).model_fields:
+            section = getattr(settings, name)
+            if not isinstance(section, Section):
+                continue
+            for key, effective in section.effective.items():
+                values[name][key] = effective.value
+                if effective.variables:
+                    self._resolved[name, key] = _variable(*effective.variables)
 
     def of(self, location: Location) -> str:
         if location in self._resolved:

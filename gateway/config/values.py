@@ -1,27 +1,14 @@
 """The types of the configuration's single values: what is accepted, and how YAML writes it."""
 
 import ipaddress
-import json
 import re
-from collections.abc import Callable
-from pathlib import Path
-from typing import Annotated, Any, Final, Literal, TypeVar
+from typing import Annotated, Final, Literal, TypeVar
 
-import zenoh
-from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, TypeAdapter, ValidationInfo
+from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, TypeAdapter
 
-from gateway.config.secrets import mask_secrets_in_text
 from gateway.config.section import Section, describe, expects, join_or, spelling_hint, validation_error
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ByteOrder, ComponentType
-
-LCM_PROVIDERS: Final = ("udpm", "mpudpm", "memq", "tcpq", "file")
-"""The URL schemes that the lcm package knows."""
-
-_ZENOH_MESSAGE: Final = re.compile(
-    r'Message \{ msg: "((?:[^"\\]|\\.)*)", location: Some\(Location \{ line: (\d+), column: (\d+)'
-)
-"""How Zenoh tells of a value in a file that it cannot use: a Rust debug text."""
 
 _Item = TypeVar("_Item")
 _COMPONENT_KEYS: Final = [component.key for component in WIRE_ORDER]
@@ -40,21 +27,6 @@ def not_empty(values: tuple[_Item, ...]) -> tuple[_Item, ...]:
     if not values:
         raise ValueError
     return values
-
-
-def _key_prefix(text: str) -> str:
-    if len(text) > 128 or not all(text.split("/")) or not text.isprintable() or re.search(r"[\s*$#?]", text):
-        raise ValueError
-    return text
-
-
-def _lcm_url(text: str) -> str:
-    provider, separator, rest = text.partition("://")
-    if provider not in LCM_PROVIDERS or not separator or not text.isprintable() or " " in text:
-        raise ValueError
-    if "@" in rest.partition("/")[0]:  # LCM knows no password, and says the whole URL in the log
-        raise ValueError
-    return text
 
 
 def _absolute_path(text: str) -> str:
@@ -98,27 +70,6 @@ SourceName = Annotated[
     str,
     Field(pattern=r"^[A-Za-z0-9_-]{1,24}$"),
     expects("1 to 24 of the letters A to Z and a to z, digits, '_' and '-'"),
-]
-ChannelPrefix = Annotated[
-    str,
-    Field(pattern=r"^[A-Za-z0-9_]{1,16}$"),
-    expects("1 to 16 of the letters A to Z and a to z, digits and '_'"),
-]
-KeyPrefix = Annotated[
-    str,
-    AfterValidator(_key_prefix),
-    expects(
-        "a Zenoh key of at most 128 characters, such as mocap or site/mocap, "
-        "without spaces, * $ # ?, and without a leading, trailing or double /"
-    ),
-]
-LcmUrl = Annotated[
-    str,
-    AfterValidator(_lcm_url),
-    expects(
-        f"a URL that begins with {join_or(f'{provider}://' for provider in LCM_PROVIDERS)}, "
-        "without a user name"
-    ),
 ]
 
 
@@ -190,51 +141,6 @@ def _component_keys(components: tuple[ComponentType, ...]) -> list[str]:
     return [component.key for component in components]
 
 
-def _zenoh_config(value: object, info: ValidationInfo) -> Path | dict[str, Any]:
-    """Return the path of Zenoh's configuration, or its keys, once Zenoh itself has read them.
-
-    A relative path counts from ``folder`` in the validation's context; without one, no file is read.
-    """
-    match value:
-        case dict():
-            _ask_zenoh(lambda: zenoh.Config.from_json5(json.dumps(value, allow_nan=False)), "these keys")
-            return value
-        case Path():
-            return value
-        case str() if value and value.isprintable():
-            folder: Path | None = (info.context or {}).get("folder")
-            if folder is None:
-                return Path(value)
-            path = folder / value
-            _ask_zenoh(lambda: zenoh.Config.from_file(path), f"the file {path}")
-            return path
-    raise validation_error(
-        f"found {describe(value)}; expected a JSON5 file's path or a mapping with Zenoh's own keys"
-    )
-
-
-def _ask_zenoh(read: Callable[[], object], what: str) -> None:
-    try:
-        read()
-    except (zenoh.ZError, TypeError, ValueError) as error:
-        raise validation_error(f"Zenoh refuses {what}: {zenoh_reason(error)}") from None
-
-
-def zenoh_reason(error: Exception) -> str:
-    """Return the text of Zenoh's error on one line, without source locations and without secrets."""
-    text = str(error)
-    if message := _ZENOH_MESSAGE.search(text):
-        text = f"line {message[2]}, column {message[3]}: " + re.sub(r"\\(.)", r"\1", message[1])
-    text = re.sub(r"\s+at \S+\.rs:\d+\.?", "", text)
-    # A drawing shows the line of the file that cannot be read, which may hold a password: its place
-    # and what was expected remain. So does the type of a wrong value, without the value.
-    text = re.sub(r"^ *--> (\d+):(\d+)", r"line \1, column \2:", text)
-    text = re.sub(r"^ *(\d+ )?\|.*\n|^ *= ", "", text, flags=re.MULTILINE)
-    text = re.sub(r"(invalid (?:type|value): [a-z ]+) (?:`[^`]*`|\"(?:[^\"\\]|\\.)*\")", r"\1", text)
-    text = re.sub(r"\bSingle\(([^()]*)\)", r"\1", text)  # Rust's word for an endpoint without alternatives
-    return " ".join(mask_secrets_in_text(text).split())
-
-
 Components = Annotated[
     tuple[ComponentType, ...],
     PlainValidator(
@@ -254,11 +160,6 @@ StreamRate = Annotated[
 Backlog = Annotated[Literal["latest", "all"], expects("latest or all")]
 
 ServerByteOrder = Annotated[ByteOrder, expects("big or little")]
-
-ZenohConfig = Annotated[
-    Path | dict[str, Any], PlainValidator(_zenoh_config, json_schema_input_type=str | dict[str, Any])
-]
-"""YAML: a path, or a mapping."""
 
 _RATES: Final = TypeAdapter(dict[str, Hertz])
 

@@ -4,10 +4,12 @@ import asyncio
 from collections.abc import AsyncIterator, Iterator
 
 from gateway.config.settings import Settings
-from gateway.doctor import lcm_checks, source_checks, zenoh_checks
+from gateway.doctor import source_checks
 from gateway.doctor.clock_check import check_clock
+from gateway.doctor.output_checks import check_output
 from gateway.errors import ConfigError
 from gateway.findings import Finding, MessageLoad, Subject
+from gateway.outputs.registry import OUTPUTS
 
 _configuration = Subject("configuration")
 
@@ -17,19 +19,18 @@ async def run_checks(settings: Settings, origin: str, seconds: float) -> AsyncIt
 
     ``origin`` says where the settings come from, for example a file name.
     """
-    sides = [name for name, on in (("Zenoh", settings.zenoh.enabled), ("LCM", settings.lcm.enabled)) if on]
+    enabled = [name for name, section in settings.outputs.items() if section.enabled]
     names = [source.name for source in settings.sources]
-    yield _configuration.passing("file", f"{origin}: {', '.join(names)} to {' and '.join(sides)}")
+    yield _configuration.passing("file", f"{origin}: {', '.join(names)} to {' and '.join(enabled)}")
     loads: list[MessageLoad] = []
     for source in settings.sources:
         checks = source_checks.SourceChecks(source, seconds)
         async for finding in checks.run():
             yield finding
         loads += checks.message_loads
-    for finding in await asyncio.to_thread(zenoh_checks.check_zenoh, settings.zenoh, names, seconds):
-        yield finding
-    for finding in lcm_checks.check_lcm(settings.lcm, loads):
-        yield finding
+    for name, section in settings.outputs.items():
+        for finding in await asyncio.to_thread(check_output, OUTPUTS[name], section, names, loads, seconds):
+            yield finding
     yield check_clock()
 
 
@@ -38,11 +39,8 @@ def run_checks_without_settings(error: ConfigError) -> Iterator[Finding]:
     yield _configuration.failing(
         "file", str(error), "Correct these lines; config/gateway.yaml explains every key."
     )
-    for subject, checks in (
-        ("source", source_checks.CHECKS),
-        ("zenoh", zenoh_checks.CHECKS),
-        ("lcm", lcm_checks.CHECKS),
-    ):
+    subjects = {"source": source_checks.CHECKS, **{name: kind.checks for name, kind in OUTPUTS.items()}}
+    for subject, checks in subjects.items():
         for check in checks:
             yield Subject(subject).not_tested(check, "it needs the configuration, which failed")
     yield check_clock()

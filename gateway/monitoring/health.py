@@ -5,9 +5,9 @@ from http import HTTPStatus
 from typing import Any, Final
 
 from gateway.config.settings import StreamSettings
+from gateway.gateway import Gateway
 from gateway.messages.host_time import now_utime
 from gateway.monitoring.http_pages import Page
-from gateway.monitoring.monitored import Watched
 from gateway.outputs.contract import Output
 from gateway.rtc3d.components import ComponentType
 from gateway.source import Source
@@ -17,13 +17,13 @@ from gateway.stream.status import StreamStatus
 _ONLY_EVENTS: Final = {ComponentType.EVENT}
 
 
-def health_page(gateway: Watched) -> Page:
+def health_page(gateway: Gateway) -> Page:
     """Return the page /healthz: status 200, or 503 if something has a problem, and the details as JSON."""
     utime = now_utime()
     streams = [
         _stream_health(source, stream, status, utime)
         for source in gateway.sources
-        for stream, status in zip(source.source.streams, source.statuses, strict=True)
+        for stream, status in zip(source.settings.streams, source.statuses, strict=True)
     ]
     outputs = [_output_health(output) for output in gateway.outputs]
     healthy = not any(each["problem"] for each in (*streams, *outputs))
@@ -37,7 +37,7 @@ def _stream_health(
 ) -> dict[str, Any]:
     age_s = (utime - status.last_frame_utime) / 1e6 if status.last_frame_utime else None
     return {
-        "source": source.source.name,
+        "source": source.settings.name,
         "stream": status.components,
         "state": status.state.value,
         "last_frame_age_s": age_s,
@@ -52,7 +52,7 @@ def _output_health(output: Output) -> dict[str, str]:
 
 def _stream_problem(source: Source, stream: StreamSettings, status: StreamStatus, age_s: float | None) -> str:
     """Return what is wrong with a stream and what to check; "" if it has frames or needs none."""
-    host, max_age_s = source.source.host, source.source.stall_timeout_s
+    max_age_s = source.settings.stall_timeout_s
     if age_s is not None and age_s < max_age_s:
         return ""
     silence = "no frame so far" if age_s is None else f"no frame for {age_s:.1f} s (limit {max_age_s:g} s)"
@@ -61,9 +61,11 @@ def _stream_problem(source: Source, stream: StreamSettings, status: StreamStatus
             return ""
         case StreamState.IDLE | StreamState.STREAMING if set(stream.components) == _ONLY_EVENTS:
             return ""  # events are sporadic
-        case StreamState.IDLE if stream.on_demand and not source.fan_out.listened(stream.components):
+        case StreamState.IDLE if stream.on_demand and not source.fan_out.has_subscribers(stream.components):
             return ""
         case StreamState.IDLE:
-            return f"{silence}: {host} is connected but sends nothing; is a measurement running?"
-    reason = status.last_error or f"connecting to {host}:{source.source.port}"
+            return (
+                f"{silence}: {source.settings.host} is connected but sends nothing; is a measurement running?"
+            )
+    reason = status.last_error or f"connecting to {source.settings.host}:{source.settings.port}"
     return f"{silence}: {reason}"

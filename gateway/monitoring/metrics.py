@@ -20,9 +20,9 @@ from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 from prometheus_client.registry import Collector
 
 from gateway import __version__
+from gateway.gateway import Gateway
 from gateway.monitoring.http_pages import Page
 from gateway.monitoring.loop_delay import LoopDelay
-from gateway.monitoring.monitored import Watched
 from gateway.stream.clock import ServerClock
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
@@ -31,10 +31,6 @@ METRIC_PREFIX: Final = "rtc3d_gateway_"
 
 # These causes start at 0, so that queries see the first drop as an increase. Others appear when they occur.
 _STREAM_DROP_CAUSES: Final = ("frame rejected", "unknown component", "skipped while behind")
-_OUTPUT_DROP_CAUSES: Final[Mapping[str, tuple[str, ...]]] = {
-    "zenoh": ("not open", "no router", "put failed"),
-    "lcm": ("not open", "send failed"),
-}
 
 Labels = tuple[str, ...]
 Sample = tuple[Labels, float]
@@ -97,7 +93,7 @@ _STREAM_GAUGES: Final = (
 )
 
 
-def metrics_registry(gateway: Watched, loop_delay: LoopDelay) -> CollectorRegistry:
+def metrics_registry(gateway: Gateway, loop_delay: LoopDelay) -> CollectorRegistry:
     """Return the registry of all metrics of ``gateway``."""
     registry = CollectorRegistry()
     registry.register(GatewayCollector(gateway, loop_delay))
@@ -112,7 +108,7 @@ def metrics_page(registry: CollectorRegistry) -> Page:
 class GatewayCollector(Collector):
     """Reads a gateway's counters; ``collect`` runs in the thread of the event loop."""
 
-    def __init__(self, gateway: Watched, loop_delay: LoopDelay) -> None:
+    def __init__(self, gateway: Gateway, loop_delay: LoopDelay) -> None:
         self._gateway = gateway
         self._loop_delay = loop_delay
         self._build = {
@@ -132,7 +128,7 @@ class GatewayCollector(Collector):
 
     def _streams(self) -> Iterator[Metric]:
         streams = [
-            ((source.source.name, status.components), status)
+            ((source.settings.name, status.components), status)
             for source in self._gateway.sources
             for status in source.statuses
         ]
@@ -170,19 +166,19 @@ class GatewayCollector(Collector):
             "Frames with the component, including those that an output's max_rate_hz leaves out.",
             ("source", "component"),
             [
-                ((source.source.name, component.key), count)
+                ((source.settings.name, component.key), count)
                 for source in self._gateway.sources
                 for component, count in source.fan_out.frames.items()
-                if component in source.desk.components
+                if component in source.queries.components
             ],
         )
 
     def _routes(self) -> Iterator[Metric]:
         routes = [
             (
-                (source.source.name, output.name),
+                (source.settings.name, output.name),
                 status,
-                [component.key for component in source.desk.components],
+                [component.key for component in source.queries.components],
             )
             for source in self._gateway.sources
             for output, status in source.fan_out.outputs
@@ -214,8 +210,9 @@ class GatewayCollector(Collector):
             (*labels, "cause"),
             [
                 sample
-                for route, status, _ in routes
-                for sample in _samples(route, status.drops, _OUTPUT_DROP_CAUSES.get(route[-1], ()))
+                for source in self._gateway.sources
+                for output, status in source.fan_out.outputs
+                for sample in _samples((source.name, output.name), status.drops, output.drop_causes)
             ],
         )
 
@@ -232,8 +229,9 @@ class GatewayCollector(Collector):
             ("output", "result"),
             [
                 sample
-                for output, results in self._gateway.query_results.items()
-                for sample in _samples((output,), results, ("ok",))
+                for output in self._gateway.outputs
+                if (results := output.query_results) is not None
+                for sample in _samples((output.name,), results, ("ok",))
             ],
         )
 

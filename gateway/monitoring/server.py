@@ -3,11 +3,11 @@
 import logging
 
 from gateway.config.settings import MetricsSettings
+from gateway.gateway import Gateway
 from gateway.monitoring.health import health_page
 from gateway.monitoring.http_pages import HttpPages
 from gateway.monitoring.loop_delay import LoopDelay
 from gateway.monitoring.metrics import metrics_page, metrics_registry
-from gateway.monitoring.monitored import Watched
 
 logger = logging.getLogger(__name__)
 
@@ -15,7 +15,7 @@ logger = logging.getLogger(__name__)
 class MonitoringServer:
     """Serves the metrics and the health of one gateway over HTTP."""
 
-    def __init__(self, settings: MetricsSettings, gateway: Watched) -> None:
+    def __init__(self, settings: MetricsSettings, gateway: Gateway) -> None:
         self._settings = settings
         self._loop_delay = LoopDelay()
         registry = metrics_registry(gateway, self._loop_delay)

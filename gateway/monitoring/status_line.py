@@ -3,9 +3,19 @@
 from collections.abc import Iterable, Sequence
 
 from gateway.config.settings import SourceSettings
+from gateway.gateway import Gateway
 from gateway.outputs.status import OutputHealth
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
+
+
+def status_lines(gateway: Gateway) -> list[str]:
+    """Return a line per source, and one for each output that cannot send."""
+    outputs = ((output.name, output.health()) for output in gateway.outputs)
+    return [
+        *(source_line(source.settings, source.streams) for source in gateway.sources),
+        *output_lines(outputs),
+    ]
 
 
 def source_line(source: SourceSettings, streams: Sequence[tuple[StreamStatus, float]]) -> str:

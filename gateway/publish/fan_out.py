@@ -9,7 +9,7 @@ from gateway.messages.splice import MESSAGE_TYPES, has_lcm_form, lcm_content
 from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import Output
 from gateway.outputs.status import OutputStatus
-from gateway.publish.routes import ComponentRoute, OutputRoute
+from gateway.publish.routes import ComponentRoute, FrameRoute, OutputRoute
 from gateway.publish.tool_poses import ToolPoses
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
@@ -75,30 +75,30 @@ class _Plan:
 class FanOut:
     """Publishes the frames, status and clock of one source on every output.
 
-    ``tool_outputs`` are the names of the outputs that also get a message per tool. ``on_items_changed`` is
-    called when the number of markers, tools, channels or plates changes; it may be replaced.
+    ``on_items_changed`` is called when the number of markers, tools, channels or plates changes; it may be
+    replaced.
     """
 
     def __init__(
         self,
         source: str,
         outputs: Sequence[Output],
-        tool_outputs: Collection[str] = (),
         on_items_changed: Callable[[], None] = lambda: None,
     ) -> None:
         self.on_items_changed = on_items_changed
         self._source = source
         self._components = {component: _Component() for component in MESSAGE_TYPES}
         self._routes: list[OutputRoute] = []
+        self._frame_routes: list[FrameRoute] = []
         self._last_routes: dict[str, OutputRoute] = {}  # by the output's name; closed ones too
         self._tool_poses = ToolPoses(source)
         self._plan_for = lru_cache(_MAX_PLANS)(self._new_plan)
         self._plan: _Plan | None = None  # of the previous frame
         self._num_items: dict[ComponentType, int] = {}
-        self._flowing = False
-        self.use(outputs, tool_outputs)
+        self._is_streaming = False
+        self.use(outputs)
 
-    def use(self, outputs: Sequence[Output], tool_outputs: Collection[str] = ()) -> None:
+    def use(self, outputs: Sequence[Output]) -> None:
         """Publish on these outputs from now on; those already in use are not disturbed.
 
         An output that replaces another of the same name continues its sequence numbers and counters.
@@ -108,21 +108,22 @@ class FanOut:
             if output not in outputs:
                 route.close()
         self._routes = [open_routes.get(output) or self._open_route(output) for output in outputs]
-        self._tool_poses.use([route for route in self._routes if route.output.name in tool_outputs])
+        self._frame_routes = [route.frame_route for route in self._routes if route.frame_route is not None]
+        self._tool_poses.use([route for route in self._routes if route.output.has_tool_poses])
         self._plan_for.cache_clear()
         self._plan = None
 
     def _open_route(self, output: Output) -> OutputRoute:
         route = OutputRoute(self._source, output, self._last_routes.get(output.name))
         self._last_routes[output.name] = route
-        if self._flowing:
-            output.show_flowing(self._source, True)
+        if self._is_streaming:
+            output.show_streaming(self._source, True)
         return route
 
     def close(self) -> None:
         """Close every route; nothing of the source stays declared on an output."""
-        if self._flowing:
-            self.show_flowing(False)
+        if self._is_streaming:
+            self.show_streaming(False)
         self.use(())
 
     @property
@@ -148,6 +149,8 @@ class FanOut:
         if plan is None or plan.layout is not frame.layout or plan.wanted is not wanted:
             self._plan = plan = self._plan_for(frame.layout, wanted)
             self._check_item_counts(plan)
+        for frame_route in self._frame_routes:
+            frame_route.publish(frame, stamp, wanted)
         for planned in plan.components:
             content = planned.content(frame)
             planned.component.frames += 1
@@ -165,7 +168,7 @@ class FanOut:
                 self._components[part.type],
                 index,
                 has_lcm_form(part, layout.byte_order),
-                [route.components[part.type] for route in self._routes],
+                [route.components[part.type] for route in self._routes if route.frame_route is None],
             )
             for index, part in parts
         ]
@@ -184,17 +187,20 @@ class FanOut:
                 )
                 self.on_items_changed()
 
-    def listened(self, components: Collection[ComponentType]) -> bool:
+    def has_subscribers(self, components: Collection[ComponentType]) -> bool:
         """Return whether any output may have a subscriber to one of the components."""
-        return any(
-            route.components[component].publisher.wanted for route in self._routes for component in components
+        return any(route.publisher.wanted for route in self._frame_routes) or any(
+            route.components[component].publisher.wanted
+            for route in self._routes
+            if route.frame_route is None
+            for component in components
         )
 
-    def show_flowing(self, flowing: bool) -> None:
+    def show_streaming(self, is_streaming: bool) -> None:
         """Show on every output whether frames of the source flow."""
-        self._flowing = flowing
+        self._is_streaming = is_streaming
         for route in self._routes:
-            route.output.show_flowing(self._source, flowing)
+            route.output.show_streaming(self._source, is_streaming)
 
     def publish_status(self, message: bytes) -> None:
         """Publish an encoded ``status_t``."""

@@ -11,10 +11,11 @@ from gateway.log import HOLD_S, FailureLog
 from gateway.messages.splice import MESSAGE_TYPES, content_timestamp_us, lcm_type_name, splice_content
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import Output
+from gateway.outputs.contract import FramePublisher, Output
 from gateway.outputs.status import OutputStatus
 from gateway.publish.pacing import Pacer
 from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import Frame
 
 logger = logging.getLogger(__name__)
 
@@ -42,11 +43,18 @@ class OutputRoute:
         self.drops: Counter[str] = Counter() if predecessor is None else predecessor.drops
         """By cause."""
         self._failures = FailureLog(logger, f"{source} to {output.name}", HOLD_S)
+        frame_publisher = output.frame_publisher(source)
+        self.frame_route: FrameRoute | None = None
+        """The route of whole frames; an output that takes them gets no single components."""
+        if frame_publisher is not None:
+            self.frame_route = FrameRoute(
+                self, frame_publisher, None if predecessor is None else predecessor.frame_route
+            )
         self.components: dict[ComponentType, ComponentRoute] = {
             component: ComponentRoute(
-                self, component, None if predecessor is None else predecessor.components[component]
+                self, component, None if predecessor is None else predecessor.components.get(component)
             )
-            for component in MESSAGE_TYPES
+            for component in (MESSAGE_TYPES if frame_publisher is None else ())
         }
         self.status_route = TopicRoute(self, ("status",), rtc3d.status_t, "status")
         self.clock_route = TopicRoute(self, ("clock",), rtc3d.clock_t, "clock")
@@ -54,12 +62,12 @@ class OutputRoute:
 
     @property
     def status(self) -> OutputStatus:
-        """The counters so far. ``drops`` is the live counter: dropped questions are added to it."""
+        """What was sent so far, and the drops, with those that the output counted itself."""
         sent = {name: counter for name, counter in self.sent.items() if counter.messages}
         return OutputStatus(
             self.output.name,
             Counter({name: counter.messages for name, counter in sent.items()}),
-            self.drops,
+            self.drops + Counter(self.output.drops(self.source)),
             Counter({name: counter.bytes for name, counter in sent.items()}),
         )
 
@@ -77,6 +85,9 @@ class OutputRoute:
         """Close the publishers and withdraw the source from the output."""
         for route in (*self.components.values(), self.status_route, self.clock_route):
             route.close()
+        if self.frame_route is not None:
+            self.frame_route.close()
+        self.drops.update(self.output.drops(self.source))  # for the successor
         self.output.withdraw(self.source)
 
 
@@ -135,3 +146,33 @@ class ComponentRoute(TopicRoute):
         self.sequence += 1
         self.send(message)
         return message
+
+
+class FrameRoute:
+    """The whole frames of one source on one output that takes them, with their own sequence numbers."""
+
+    def __init__(
+        self, output_route: OutputRoute, publisher: FramePublisher, predecessor: "FrameRoute | None"
+    ) -> None:
+        self.publisher = publisher
+        self.sequence: int = 0 if predecessor is None else predecessor.sequence
+        """Of the next frame."""
+        self._output_route = output_route
+        self._sent = output_route.sent.setdefault("frame", SentCounter())
+
+    def publish(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
+        """Publish and count one frame; never raises, because outputs must not disturb each other."""
+        sequence = self.sequence
+        self.sequence += 1
+        try:
+            self.publisher.publish(frame, stamp, sequence, wanted)
+        except Exception as error:  # noqa: BLE001 - a defect in one output must not stop the others
+            self._output_route.count_failure(error)
+        else:
+            self._sent.messages += 1
+            self._sent.bytes += len(frame.body)
+            self._output_route.count_success()
+
+    def close(self) -> None:
+        """Close the publisher."""
+        self.publisher.close()

@@ -1,4 +1,4 @@
-"""What is known of a server's parameters: its XML as it came, and the forms made of it."""
+"""A server's parameters as cached: its XML as received, and the forms made of it."""
 
 import time
 from dataclasses import dataclass, field, replace
@@ -9,23 +9,23 @@ from gateway.queries.answers import parameters_json
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 
 Sections = tuple[str, ...]
-"""Parameter sections of a question, as in SECTIONS; () for all."""
+"""The parameter sections of a question, as in SECTIONS; () for all."""
 
 
 @dataclass(frozen=True)
-class Known:
-    """An answer of the server to SendParameters; ``parsed`` is None if nothing could be read from it."""
+class CachedParameters:
+    """A server's answer to SendParameters; ``parsed`` is None if nothing could be read from it."""
 
     sections: Sections
     xml: bytes
     parsed: ParsedParameters | None
     session: int
-    came_s: float = field(default_factory=time.monotonic)
+    received_s: float = field(default_factory=time.monotonic)
 
     @property
     def age_s(self) -> float:
-        """How long ago the server said it."""
-        return time.monotonic() - self.came_s
+        """How long ago the answer arrived."""
+        return time.monotonic() - self.received_s
 
     @cached_property
     def json(self) -> bytes | None:
@@ -35,8 +35,8 @@ class Known:
         return parameters_json(self.parsed.parameters, self.sections[0] if len(self.sections) == 1 else "")
 
     @cached_property
-    def content(self) -> object:
-        """What must be equal in two answers for them to say the same: not the statistics (§6.1)."""
+    def comparable(self) -> object:
+        """What two answers must have in common to say the same: everything but the statistics (§6.1)."""
         if self.parsed is None:
             return self.xml
         parameters = self.parsed.parameters
@@ -45,11 +45,11 @@ class Known:
         return replace(parameters, general=replace(parameters.general, frames_sent=None, frames_per_s=None))
 
 
-def known_from(sections: Sections, xml: bytes, session: int) -> Known:
-    """Return what the server said to a question about ``sections``, all forms of it made."""
+def parse_answer(sections: Sections, xml: bytes, session: int) -> CachedParameters:
+    """Return the server's answer to a question about ``sections``, with all its forms."""
     try:
-        known = Known(sections, xml, parse_parameters(xml), session)
+        cached = CachedParameters(sections, xml, parse_parameters(xml), session)
     except ParametersError:
-        return Known(sections, xml, None, session)
-    _ = known.json  # made here, where it may take long
-    return known
+        return CachedParameters(sections, xml, None, session)
+    _ = cached.json  # built here, where it may take long
+    return cached

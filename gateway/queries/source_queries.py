@@ -1,7 +1,7 @@
-"""Answers questions about one source, asking its server as little as can be.
+"""Answers to questions about one source, from caches where possible.
 
-One question to the server is under way at a time; peers that ask the same meanwhile share its answer,
-and for ``fresh_interval_s`` after it nobody's ``fresh`` reaches the server again.
+The server gets one question at a time. Peers that ask the same question meanwhile share its answer, and for
+``fresh_interval_s`` after it a ``fresh`` question does not reach the server again.
 """
 
 import asyncio
@@ -21,16 +21,11 @@ from gateway.errors import (
 from gateway.messages.host_time import now_utime
 from gateway.messages.splice import FINGERPRINT_BYTES, splice
 from gateway.messages.stamp import PREFIX, Stamp
-from gateway.queries.answers import (
-    JSON,
-    XML,
-    Answer,
-    Question,
-    json_bytes,
-    message_answer,
-    schema_answer,
-)
-from gateway.queries.parameter_cache import Known, Sections, known_from
+from gateway.outputs.contract import Answer
+from gateway.outputs.encodings import JSON, XML, json_bytes
+from gateway.queries.answers import message_answer, schema_answer
+from gateway.queries.parameter_cache import CachedParameters, Sections, parse_answer
+from gateway.queries.questions import Question
 from gateway.rtc3d.commands import Command, SendCurrentFrame, SendParameters
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, Component, ComponentType
 from gateway.rtc3d.frames import detect_byte_order, split_frame
@@ -41,13 +36,13 @@ from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 
 NOT_PUBLISHED: Final = -1
-"""The sequence number of a frame that was asked for and is no part of the stream."""
+"""The sequence number of a frame that a peer asked for and that is not part of the stream."""
 
 LONG_XML_BYTES: Final = 64 * 1024
-"""More than this is parsed in a thread: 1 MiB of it, made to be slow, takes 4 s."""
+"""Longer XML is parsed in a thread: 1 MiB of it, made to be slow, takes 4 s."""
 
-Ask = Callable[[Command], Awaitable[Packet]]
-"""Sends a command over a connection; raises ServerError, ReplyTimeoutError or LinkError."""
+SendCommand = Callable[[Command], Awaitable[Packet]]
+"""Sends a command to the server and returns its reply; raises ServerError, ReplyTimeoutError or LinkError."""
 
 _Result = TypeVar("_Result")
 
@@ -55,52 +50,52 @@ logger = logging.getLogger(__name__)
 
 
 class StreamAccess(NamedTuple):
-    """One stream as the desk sees it: ``ask`` gives None while there is no connection."""
+    """One stream, for questions: ``sender`` returns None while there is no connection."""
 
     components: Sequence[ComponentType]
     status: StreamStatus
-    ask: Callable[[], Ask | None]
+    sender: Callable[[], SendCommand | None]
 
 
 class _Refusal(NamedTuple):
-    """The server's no to a question about parameters."""
+    """The server's refusal of a question about parameters."""
 
     text: str
     session: int
-    came_s: float
+    received_s: float
 
 
 class SourceQueries:
     """Answers questions about one source.
 
-    ``newest`` returns the newest message of each component. ``last_c3d`` raises QueryError if there is
-    none. ``record`` starts (True) or stops a recording, and gives False if no connection is there to do
-    it. ``changed`` is called with all parameters when a server says something else than before.
+    ``newest_messages`` returns the newest message of each component. ``last_c3d`` raises QueryError if there
+    is none. ``record`` starts (True) or stops a recording, and returns False if there is no connection for
+    it. ``on_change`` is called with all parameters when the server's parameters differ from before.
     """
 
     def __init__(
         self,
         source: SourceSettings,
         streams: Sequence[StreamAccess],
-        newest: Callable[[], Mapping[ComponentType, bytes]],
+        newest_messages: Callable[[], Mapping[ComponentType, bytes]],
         status_message: Callable[[], bytes],
         last_c3d: Callable[[], Coroutine[Any, Any, Answer]],
         record: Callable[[bool], bool],
-        changed: Callable[[bytes, ParsedParameters], None],
+        on_change: Callable[[bytes, ParsedParameters], None],
     ) -> None:
         self.source = source
         self.components = frozenset(kind for stream in streams for kind in stream.components)
         self._streams = streams
-        self._newest = newest
+        self._newest_messages = newest_messages
         self._status_message = status_message
         self._last_c3d = last_c3d
         self._record = record
-        self._changed = changed
-        self._known: dict[Sections, Known] = {}
+        self._on_change = on_change
+        self._cached: dict[Sections, CachedParameters] = {}
         self._refusals: dict[Sections, _Refusal] = {}
-        self._whole_only: int | None = None  # the session whose server sends no single sections
-        self._under_way: dict[Hashable, asyncio.Task[Any]] = {}
-        self._server_is_asked = asyncio.Lock()
+        self._session_without_sections: int | None = None  # whose server does not send single sections
+        self._pending: dict[Hashable, asyncio.Task[Any]] = {}
+        self._server_lock = asyncio.Lock()
 
     async def answer(self, question: Question) -> Answer:
         """Return the answer; raises QueryError at the latest after query_timeout_s."""
@@ -118,47 +113,47 @@ class SourceQueries:
             case "recording":
                 return self._recording(question)
 
-    def learn(self, xml: bytes, parsed: ParsedParameters) -> None:
-        """Take the parameters that a connection began with."""
-        self._known[()] = Known((), xml, parsed, self.session)
+    def cache_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
+        """Cache all parameters, as the server sent them at the start of a connection."""
+        self._cached[()] = CachedParameters((), xml, parsed, self.session)
 
     @property
     def parameters_xml(self) -> bytes | None:
-        """All parameters as the server last sent them; None if it has not so far."""
-        known = self._known.get(())
-        return None if known is None else known.xml
+        """All parameters as the server last sent them; None before the first time."""
+        cached = self._cached.get(())
+        return None if cached is None else cached.xml
 
-    async def parameters(self, sections: Sections, *, fresh: bool, stale_ok: bool) -> Known:
-        """Return the server's answer for some sections, () for all: known already, or asked for now.
+    async def parameters(self, sections: Sections, *, fresh: bool, stale_ok: bool) -> CachedParameters:
+        """Return the server's answer for some sections, () for all: from the cache, or from the server.
 
-        What an earlier connection said is given only while there is none, and only if ``stale_ok``.
+        The answer of an earlier connection is returned only while there is none, and only if ``stale_ok``.
         Raises QueryError.
         """
-        known = self._known.get(sections)
-        if self._first_ask() is None:
-            if known is None or not stale_ok:
+        cached = self._cached.get(sections)
+        if self._first_sender() is None:
+            if cached is None or not stale_ok:
                 raise QueryError(self.connection_problem(), code="no-connection")
-            return known
-        if known is not None and self._still_counts(known, fresh=fresh):
-            return known
+            return cached
+        if cached is not None and self._is_valid(cached, fresh=fresh):
+            return cached
         refusal = self._refusals.get(sections)
-        if refusal is not None and self._still_counts(refusal, fresh=fresh):
+        if refusal is not None and self._is_valid(refusal, fresh=fresh):
             raise QueryError(refusal.text, code="refused")
         return await self._shared(("parameters", sections), lambda: self._ask_parameters(sections))
 
-    async def fill(self) -> None:
-        """Ask for each section, so that the cache has what the server says to each question.
+    async def fill_cache(self) -> None:
+        """Ask for each section, so that the cache has the server's answer to every question.
 
-        Not of a server that did not say its parameters at the start of the connection.
+        Do nothing if the server did not send its parameters at the start of the connection.
         """
-        everything = self._known.get(())
+        everything = self._cached.get(())
         if everything is None or everything.session != self.session:
             return
         for section in SECTIONS:
             try:
                 await self.parameters((section,), fresh=False, stale_ok=False)
             except QueryError as error:
-                logger.debug("%s: section %s not known: %s", self.source.name, section, error)
+                logger.debug("%s: section %s is not available: %s", self.source.name, section, error)
                 if error.code != "refused":
                     return
 
@@ -177,85 +172,86 @@ class SourceQueries:
         """A number that grows with every connection of any stream."""
         return sum(stream.status.session for stream in self._streams)
 
-    def _first_ask(self) -> Ask | None:
-        return next((ask for stream in self._streams if (ask := stream.ask()) is not None), None)
+    def _first_sender(self) -> SendCommand | None:
+        senders = (stream.sender() for stream in self._streams)
+        return next((sender for sender in senders if sender is not None), None)
 
-    def _still_counts(self, said: Known | _Refusal, *, fresh: bool) -> bool:
-        """Return whether this connection's server said it, and, for ``fresh``, just now."""
-        if said.session != self.session:
+    def _is_valid(self, answer: CachedParameters | _Refusal, *, fresh: bool) -> bool:
+        """Return whether the answer came in this connection, and, for ``fresh``, just now."""
+        if answer.session != self.session:
             return False
-        return not fresh or time.monotonic() - said.came_s < self.source.fresh_interval_s
+        return not fresh or time.monotonic() - answer.received_s < self.source.fresh_interval_s
 
-    async def _ask_parameters(self, sections: Sections) -> Known:
-        """Ask the server; where it knows no sections, or sends all whatever is asked, take all."""
+    async def _ask_parameters(self, sections: Sections) -> CachedParameters:
+        """Ask the server; ask for all parameters if it does not know sections."""
         session = self.session
-        takes_sections = bool(sections) and self._whole_only != session
+        takes_sections = bool(sections) and self._session_without_sections != session
         commands = [SendParameters(sections), SendParameters()] if takes_sections else [SendParameters()]
         try:
-            command, packet = await self._ask_server(self._first_ask, commands)
+            command, packet = await self._ask_server(self._first_sender, commands)
         except QueryError as error:
             if error.code == "refused":
                 self._refusals[sections] = _Refusal(str(error), session, time.monotonic())
             raise
         if takes_sections and command != commands[0]:
-            self._whole_only = session
+            self._session_without_sections = session
         if len(packet.body) > LONG_XML_BYTES:
-            known = await asyncio.to_thread(known_from, sections, packet.body, session)
+            answer = await asyncio.to_thread(parse_answer, sections, packet.body, session)
         else:
-            known = known_from(sections, packet.body, session)
-        before, self._known[sections] = self._known.get(sections), known
-        if before is None or before.session != session or known.content != before.content:
-            self._note_change(known, before)
-        return known
+            answer = parse_answer(sections, packet.body, session)
+        before, self._cached[sections] = self._cached.get(sections), answer
+        if before is None or before.session != session or answer.comparable != before.comparable:
+            self._parameters_changed(answer, before)
+        return answer
 
-    def _note_change(self, known: Known, before: Known | None) -> None:
-        """Tell of parameters that are new; where a section is, all are asked for first."""
-        if known.sections:
-            if before is not None and before.session == known.session:
+    def _parameters_changed(self, answer: CachedParameters, before: CachedParameters | None) -> None:
+        """Report changed parameters. If only a section was asked for, ask for all of them first."""
+        if answer.sections:
+            if before is not None and before.session == answer.session:
                 self._task(("parameters", ()), lambda: self._ask_parameters(()))
-        elif known.parsed is not None:
-            self._known = {(): known}  # the sections are to be asked for anew
-            self._changed(known.xml, known.parsed)
+        elif answer.parsed is not None:
+            self._cached = {(): answer}  # every section has to be asked for again
+            self._on_change(answer.xml, answer.parsed)
 
     async def _parameters(self, question: Question) -> Answer:
         sections = (question.name,) if question.name else ()
-        known = await self.parameters(sections, fresh=question.fresh, stale_ok=question.stale_ok)
-        attachment: dict[str, Any] = {"age_s": round(known.age_s, 3), "session": known.session}
-        if self._first_ask() is None:
+        cached = await self.parameters(sections, fresh=question.fresh, stale_ok=question.stale_ok)
+        attachment: dict[str, Any] = {"age_s": round(cached.age_s, 3), "session": cached.session}
+        if self._first_sender() is None:
             attachment["stale"] = True
         if not question.as_json:
-            return Answer(known.xml, XML, attachment)
-        if known.parsed is None:
+            return Answer(cached.xml, XML, attachment)
+        if cached.parsed is None:
             raise QueryError(
-                "the server's XML cannot be read; ask without format=json to see it as it came",
+                "the server's XML cannot be read; ask without format=json to see it as received",
                 code="unreadable",
             )
-        if known.json is None:
+        if cached.json is None:
             raise QueryError(f"the server's answer has no section {question.name}", code="nothing-yet")
-        return Answer(known.json, JSON, attachment | {"recovered": list(known.parsed.recovered)})
+        return Answer(cached.json, JSON, attachment | {"recovered": list(cached.parsed.recovered)})
 
     async def _component(self, question: Question) -> Answer:
         kind = COMPONENTS_BY_KEY[question.name]
         stream = next(stream for stream in self._streams if kind in stream.components)
         session = stream.status.session
-        if stream.ask() is None:
+        if stream.sender() is None:
             raise QueryError(self.connection_problem(), code="no-connection")
         if stream.status.state is StreamState.STREAMING:
-            message = self._newest().get(kind)
+            message = self._newest_messages().get(kind)
             if message is None or _session_of(message) != session:
                 raise QueryError(
-                    f"no {question.name} has come from source {self.source.name!r} in this session",
+                    f"no {question.name} has arrived from source {self.source.name!r} in this session",
                     code="nothing-yet",
                 )
         else:
-            component = await self._shared(("frame", kind), lambda: self._current(kind, stream))
+            component = await self._shared(("frame", kind), lambda: self._current_frame(kind, stream))
             utime = now_utime()
             message = splice(component, Stamp(utime, utime, session), NOT_PUBLISHED)
         return message_answer(message, question, {"session": session})
 
-    async def _current(self, kind: ComponentType, stream: StreamAccess) -> Component:
+    async def _current_frame(self, kind: ComponentType, stream: StreamAccess) -> Component:
         """Ask for the current frame (§5.3.4), without a name if the server knows none (field note 2)."""
-        _, packet = await self._ask_server(stream.ask, [SendCurrentFrame((kind,)), SendCurrentFrame()])
+        _, packet = await self._ask_server(stream.sender, [SendCurrentFrame((kind,)), SendCurrentFrame()])
         if packet.type == PacketType.NO_DATA:
             raise QueryError(f"source {self.source.name!r}: no measurement runs", code="nothing-yet")
         try:
@@ -281,22 +277,22 @@ class SourceQueries:
         return Answer(json_bytes({"source": self.source.name, "sent": question.set}), JSON)
 
     async def _ask_server(
-        self, find_ask: Callable[[], Ask | None], commands: Sequence[Command]
+        self, find_sender: Callable[[], SendCommand | None], commands: Sequence[Command]
     ) -> tuple[Command, Packet]:
         """Return the first of the commands that the server answers, and its answer.
 
-        Raises QueryError, at the latest after query_timeout_s, the wait for other questions included.
+        Raises QueryError, at the latest after query_timeout_s, including the wait for other questions.
         """
         name = f"source {self.source.name!r}"
         problem = QueryError(f"{name}: nothing to ask")
         try:
-            async with asyncio.timeout(self.source.query_timeout_s), self._server_is_asked:
+            async with asyncio.timeout(self.source.query_timeout_s), self._server_lock:
                 for command in commands:
-                    ask = find_ask()
-                    if ask is None:
+                    send = find_sender()
+                    if send is None:
                         raise QueryError(self.connection_problem(), code="no-connection")
                     try:
-                        return command, await ask(command)
+                        return command, await send(command)
                     except ServerError as error:
                         text = f"the server does not know {command}, or refuses it: {error}"
                         problem = QueryError(f"{name}: {text}", code="refused")
@@ -306,26 +302,26 @@ class SourceQueries:
             raise QueryError(f"{name} has just lost its connection: {error}", code="no-connection") from error
         except TimeoutError:
             waited = f"no answer within {self.source.query_timeout_s:g} s"
-            text = f"{name}: {waited}; questions that wait for the server: {len(self._under_way)}"
+            text = f"{name}: {waited}; questions waiting for the server: {len(self._pending)}"
             raise QueryError(text, code="timeout") from None
         raise problem
 
     async def _shared(self, key: Hashable, work: Callable[[], Coroutine[Any, Any, _Result]]) -> _Result:
-        """Return the result of ``work``, shared by all who want the same at the same time."""
+        """Return the result of ``work``, shared by everybody who asks for the same at the same time."""
         return await asyncio.shield(self._task(key, work))
 
     def _task(self, key: Hashable, work: Callable[[], Coroutine[Any, Any, _Result]]) -> asyncio.Task[_Result]:
-        task = self._under_way.get(key)
+        task = self._pending.get(key)
         if task is None:
             task = asyncio.create_task(work())
-            task.add_done_callback(lambda done: self._over(key, done))
-            self._under_way[key] = task
+            task.add_done_callback(lambda done: self._finished(key, done))
+            self._pending[key] = task
         return task
 
-    def _over(self, key: Hashable, task: asyncio.Task[Any]) -> None:
-        del self._under_way[key]
+    def _finished(self, key: Hashable, task: asyncio.Task[Any]) -> None:
+        del self._pending[key]
         if not task.cancelled():
-            task.exception()  # retrieved, also where every asker has gone
+            task.exception()  # retrieve it, even if every asker has gone
 
 
 def _session_of(message: bytes) -> int:

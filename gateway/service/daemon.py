@@ -9,6 +9,8 @@ from collections.abc import Callable
 from gateway.config.settings import Settings
 from gateway.errors import ConfigError
 from gateway.gateway import Gateway
+from gateway.monitoring.server import MonitoringServer
+from gateway.monitoring.status_line import status_lines
 from gateway.service.systemd import SystemdNotifier
 
 logger = logging.getLogger(__name__)
@@ -29,6 +31,7 @@ class Daemon:
     def __init__(self, load: Callable[[], Settings], gateway: Gateway) -> None:
         self._load = load
         self._gateway = gateway
+        self._monitoring = MonitoringServer(gateway.settings.metrics, gateway)
         self._systemd = SystemdNotifier()
         self._stop = asyncio.Event()
         self._reload_requested = asyncio.Event()
@@ -47,9 +50,13 @@ class Daemon:
                 tasks.create_task(self._notify_systemd()),
                 tasks.create_task(self._handle_reloads()),
             ]
-            await self._gateway.run(self._stop)
-            for task in background:
-                task.cancel()
+            await self._monitoring.start()
+            try:
+                await self._gateway.run(self._stop)
+            finally:
+                await self._monitoring.close()
+                for task in background:
+                    task.cancel()
 
     def _request_stop(self) -> None:
         self._systemd.notify_stopping()
@@ -75,7 +82,7 @@ class Daemon:
             self._systemd.notify_alive(self._status_line())
 
     def _status_line(self) -> str:
-        return "; ".join(filter(None, (self._reload_problem, *self._gateway.lines())))
+        return "; ".join(filter(None, (self._reload_problem, *status_lines(self._gateway))))
 
     async def _handle_reloads(self) -> None:
         await self._gateway.opened.wait()
@@ -87,11 +94,20 @@ class Daemon:
             self._systemd.notify_alive(self._status_line())
             self._systemd.notify_ready()
 
+    async def _replace_monitoring(self) -> None:
+        await self._monitoring.close()
+        self._monitoring = MonitoringServer(self._gateway.settings.metrics, self._gateway)
+        await self._monitoring.start()
+
     async def _reload(self) -> None:
         try:
             # In a thread, so that reading a large file does not delay frames.
             settings = await asyncio.to_thread(self._load)
+            metrics_before = self._gateway.settings.metrics
             changes = await self._gateway.reload(settings)
+            if settings.metrics != metrics_before:
+                await self._replace_monitoring()
+                changes.append("metrics changed")
         except ConfigError as error:
             problems = str(error).splitlines()
             for problem in problems:

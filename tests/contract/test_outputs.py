@@ -8,14 +8,16 @@ import lcm
 import pytest
 import zenoh
 
-from gateway.cli.subscribers import LcmListener, ZenohListener
-from gateway.config.settings import LcmSettings, ZenohSettings
 from gateway.errors import OutputError
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import Output, Publisher
 from gateway.outputs.lcm.output import LcmOutput
+from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.outputs.memory import MemoryOutput
 from gateway.outputs.zenoh.output import ZenohOutput
+from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.outputs.zenoh.subscriber import ZenohSubscriber
 from tests.networks import (
     add_multicast_route,
     free_endpoint,
@@ -103,7 +105,7 @@ class ZenohRig:
 
     def listen(self) -> None:
         self._session = open_zenoh("client", connect=self._endpoint)
-        self._listener = ZenohListener(self._session, "mocap/**", lambda *each: self.received.append(each))
+        self._listener = ZenohSubscriber(self._session, "mocap/**", lambda *each: self.received.append(each))
 
     def cut(self) -> None:
         self._router.close()
@@ -129,12 +131,12 @@ class LcmRig:
             PROBE: "MOCAP_HALL_2_6D_PROBE_1",
         }
         self._url = lcm_url()
-        self._listener: LcmListener | None = None
+        self._listener: LcmSubscriber | None = None
         self.received: list[tuple[str, bytes]] = []
         self.output = LcmOutput(LcmSettings(url=self._url))
 
     def listen(self) -> None:
-        self._listener = LcmListener(lcm.LCM(self._url), ".*", lambda *each: self.received.append(each))
+        self._listener = LcmSubscriber(lcm.LCM(self._url), ".*", lambda *each: self.received.append(each))
 
     def cut(self) -> None:
         remove_multicast_route()
@@ -331,7 +333,7 @@ def test_sources_can_be_shown_in_any_state(rig: Rig) -> None:
     def show() -> None:
         rig.output.announce("lab")
         for flowing in (True, True, False, False, True):
-            rig.output.show_flowing("lab", flowing)
+            rig.output.show_streaming("lab", flowing)
         rig.output.withdraw("lab")
 
     show()

@@ -17,7 +17,6 @@ from pathlib import Path
 import atheris
 
 with atheris.instrument_imports(include=["gateway"]):
-    from gateway.config.loading import load
     from gateway.errors import CommandError, ConfigError, FrameError, ParametersError, ProtocolError
     from gateway.messages.decode import decode, to_json
     from gateway.messages.splice import splice
@@ -29,6 +28,7 @@ with atheris.instrument_imports(include=["gateway"]):
     from gateway.rtc3d.packets import PacketReader
     from gateway.rtc3d.parameters_xml import encode_parameters, parse_parameters
     from gateway.rtc3d.protocol_state import ProtocolState
+    from tests.configurations import load
 
 from tests.vectors import COMPONENTS, FRAME_WITH_UNKNOWN, FULL_FRAME, PACKETS
 

@@ -101,7 +101,7 @@ async def test_a_healthy_server_passes_every_check() -> None:
         ("visibility", "in view: markers 100%, tools 100%"),
     ):
         assert text in texts
-    assert findings.of("file", "configuration").found == "lab.yaml: lab to LCM"
+    assert findings.of("file", "configuration").found == "lab.yaml: lab to lcm"
 
 
 async def test_a_host_name_is_resolved() -> None:

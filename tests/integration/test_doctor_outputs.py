@@ -11,9 +11,11 @@ from typing import Any
 
 import pytest
 
-from gateway.config.settings import LcmSettings, ZenohSettings
-from gateway.doctor import clock_check, lcm_checks
+from gateway.doctor import clock_check
 from gateway.findings import Finding, MessageLoad, Result
+from gateway.outputs.lcm import checks as lcm_checks
+from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests import networks
@@ -122,7 +124,7 @@ async def test_a_peer_that_can_listen_and_is_alone_passes() -> None:
 def check_lcm(url: str, *sizes: int, rate_hz: float = 200.0) -> Findings:
     """Return the findings for this LCM URL and messages of these sizes."""
     loads = [MessageLoad(rate_hz, size) for size in sizes]
-    return Findings(lcm_checks.check_lcm(LcmSettings(url=url), loads))
+    return Findings(lcm_checks.check_lcm(LcmSettings(url=url), (), loads, 0.0))
 
 
 async def test_disabled_lcm_is_not_tested() -> None:

@@ -9,15 +9,15 @@ from typing import Any, NamedTuple
 import pytest
 import rtc3d
 
-from gateway.cli.subscribers import LcmListener
-from gateway.config.settings import lcm_queries_url
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
-from gateway.outputs.lcm.output import open_lcm
+from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.queries import MAX_PENDING, MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES, LcmQueries
+from gateway.outputs.lcm.settings import lcm_queries_url
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.rtc3d.parameters import SECTIONS
 from tests.networks import free_port, lcm_url
-from tests.querying import LabServer, gateway_at, is_filled
+from tests.querying import LabServer, gateway_at, is_filled, queries_of
 from tests.servers import ScriptedServer
 from tests.spec_parameters import in_root, spec_xml
 from tests.waiting import wait_until_async
@@ -34,8 +34,8 @@ class Peer:
         self.replies: list[rtc3d.parameters_reply_t] = []
         self.statuses: list[rtc3d.status_t] = []
         self._listeners = [
-            LcmListener(self._lcm, REPLY, self._take),
-            LcmListener(open_lcm(url), "MOCAP_LAB_STATUS", self._take),
+            LcmSubscriber(self._lcm, REPLY, self._take),
+            LcmSubscriber(open_lcm(url), "MOCAP_LAB_STATUS", self._take),
         ]
 
     def _take(self, channel: str, data: bytes) -> None:
@@ -141,7 +141,7 @@ async def test_a_url_for_requests_that_does_not_open_stops_nothing_else(
             await wait_until_async(lambda: viewer.statuses)
         finally:
             viewer.close()
-    assert f"lcm: nobody can ask: LCM does not open {nobody}" in caplog.text
+    assert f"lcm: no requests can be received: LCM does not open {nobody}" in caplog.text
 
 
 @pytest.mark.parametrize("section", SECTIONS)
@@ -241,13 +241,13 @@ async def test_malformed_requests_are_counted_and_ignored() -> None:
         assert (await peer.ask(7)).error == ""
         await wait_until_async(lambda: peer.ignored("malformed request") == len(malformed))
         assert [reply.request_id for reply in peer.replies] == [7]
-        [queries] = gateway._queries.values()
+        queries = queries_of(gateway)
         assert queries.results == {"ok": 1}
 
 
 async def test_the_queue_is_bounded_and_what_is_beyond_it_is_counted() -> None:
     async with lab(reply_timeout_s=20.0, query_timeout_s=20.0) as (server, gateway, peer):
-        [queries] = gateway._queries.values()
+        queries = queries_of(gateway)
 
         def waiting(count: int) -> bool:
             return len(queries._tasks) == count
@@ -278,7 +278,7 @@ async def test_the_queue_is_bounded_and_what_is_beyond_it_is_counted() -> None:
 async def test_who_has_a_reply_may_ask_again_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("gateway.outputs.lcm.queries.MAX_PENDING", 1)
     async with lab() as (_, gateway, peer):
-        [queries] = gateway._queries.values()
+        queries = queries_of(gateway)
         assert isinstance(queries, LcmQueries)
         publish, free, could_ask = queries._publish, queries._free, []
 
@@ -313,7 +313,7 @@ async def test_requests_under_way_end_with_the_gateway() -> None:
     async with lab(reply_timeout_s=20.0, query_timeout_s=20.0) as (server, gateway, peer):
         server.silent = ("SendParameters",)
         peer.send(request(1, fresh=True))
-        [queries] = gateway._queries.values()
+        queries = queries_of(gateway)
         await wait_until_async(lambda: queries._tasks)
     assert queries._tasks == set()
     assert peer.replies == []

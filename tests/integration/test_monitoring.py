@@ -18,22 +18,23 @@ from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
 
 from gateway.config.settings import (
-    LcmSettings,
     MetricsSettings,
     ReconnectSettings,
-    Settings,
     SourceSettings,
     StreamSettings,
-    ZenohSettings,
 )
 from gateway.errors import OutputError
 from gateway.gateway import Gateway
 from gateway.log import FIELDS
+from gateway.monitoring.server import MonitoringServer
+from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.components import ComponentType
 from gateway.service.log_format import ContextFilter
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
+from tests.configurations import make_settings
 from tests.networks import free_port, zenoh_keys
 from tests.toy_output import ToyOutput
 from tests.waiting import wait_until_async
@@ -63,13 +64,14 @@ class Lab:
             reconnect=ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05),
             stall_timeout_s=1.0,
         )
-        settings = Settings(
+        settings = make_settings(
             sources=(source,),
             zenoh=ZenohSettings(config=zenoh_keys("peer")),
             lcm=LcmSettings(url="memq://"),
             metrics=MetricsSettings(port=metrics_port),
         )
         self.gateway = Gateway(settings)
+        self.monitoring = MonitoringServer(settings.metrics, self.gateway)
         self.source = self.gateway.sources[0]
 
     async def get(self, path: str) -> tuple[int, str]:
@@ -107,11 +109,13 @@ async def running_lab(port: int, metrics_port: int | None = None) -> AsyncIterat
     lab = Lab(port, metrics_port or free_port())
     stop = asyncio.Event()
     task = asyncio.create_task(lab.gateway.run(stop))
+    await lab.monitoring.start()
     try:
         async with asyncio.timeout(10):
             await lab.gateway.opened.wait()
         yield lab
     finally:
+        await lab.monitoring.close()
         stop.set()
         async with asyncio.timeout(10):
             await task
@@ -372,7 +376,7 @@ async def test_log_records_of_status_messages_have_the_source(
     output = ToyOutput()
     output.error = OutputError("no router", cause="no router")
     sources = tuple(SourceSettings(name=name, host="127.0.0.1") for name in ("hall", "lab"))
-    gateway = Gateway(Settings(sources=sources, metrics=MetricsSettings(enabled=False)), [output])
+    gateway = Gateway(make_settings(sources=sources, metrics=MetricsSettings(enabled=False)), [output])
     with caplog.filtering(ContextFilter()):
         for source in gateway.sources:
             source.publish_status()

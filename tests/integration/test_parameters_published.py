@@ -8,10 +8,10 @@ import rtc3d
 import zenoh
 import zenoh.ext
 
-from gateway.cli.subscribers import LcmListener
 from gateway.messages.decode import decode
 from gateway.outputs.lcm import queries as lcm_queries
-from gateway.outputs.lcm.output import open_lcm
+from gateway.outputs.lcm.connection import open_lcm
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
@@ -36,7 +36,7 @@ class Ears:
             session.declare_subscriber(KEY, lambda sample: self.plain.append(sample.payload.to_bytes()))
         ]
         self._advanced = listen_with_history(session, self.with_history)
-        self._listener = LcmListener(
+        self._listener = LcmSubscriber(
             open_lcm(url), "MOCAP_LAB_PARAMETERS", lambda _channel, data: self.lcm.append(decode(data))
         )
 
@@ -216,7 +216,7 @@ async def test_nothing_is_lost_while_two_hundred_questions_are_answered(router: 
                     "mocap/lab/3d",
                     lambda sample: sequences.append(decode(sample.payload.to_bytes()).sequence),
                 )
-                await wait_until_async(lambda: source.fan_out.listened(source.desk.components))
+                await wait_until_async(lambda: source.fan_out.has_subscribers(source.queries.components))
                 simulator.start_measurement()
                 keys = ("parameters?fresh=true", "parameters/3d", "6d", "*?format=json")
                 for start in range(0, 200, 20):

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import pytest
 import zenoh
 
+from gateway.outputs.encodings import json_bytes
 from gateway.outputs.lcm import queries as lcm_queries
-from gateway.queries.answers import json_bytes
 from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
 from tests.querying import LabServer, gateway_at, is_filled
 from tests.servers import ScriptedServer

@@ -3,20 +3,21 @@
 import asyncio
 import logging
 import threading
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 import zenoh
 
 from gateway.c3d_spool import Spool
-from gateway.config.settings import SourceSettings
 from gateway.errors import QueryError
+from gateway.outputs.contract import Answer, KeyPath
 from gateway.outputs.zenoh import queries as zenoh_queries
 from gateway.outputs.zenoh.queries import ZenohQueries
-from gateway.queries.answers import Answer
+from gateway.queries.service import SourceQueryService
 from gateway.queries.source_queries import SourceQueries
 from tests.networks import free_endpoint, open_zenoh
-from tests.querying import ask, asker_at, gateway_at, lab
+from tests.querying import ask, asker_at, gateway_at, lab, queries_of
 from tests.servers import packet
 from tests.waiting import wait_until_async
 
@@ -39,7 +40,7 @@ async def test_a_defect_is_told_to_the_asker_and_logged(
 async def test_questions_beyond_the_limit_are_told_to_come_again(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zenoh_queries, "MAX_PENDING", 2)
     async with lab() as (server, _, gateway, asker):
-        [queries] = gateway._queries.values()
+        queries = queries_of(gateway)
         server.open.clear()
         waiting = [asyncio.create_task(ask(asker, "mocap/lab/parameters?fresh=true")) for _ in range(2)]
         await wait_until_async(lambda: len(queries._tasks) == 2)
@@ -55,18 +56,18 @@ async def test_questions_beyond_the_limit_are_told_to_come_again(monkeypatch: py
 async def test_askers_see_at_once_that_the_gateway_ends() -> None:
     endpoint = free_endpoint()
     router = open_zenoh("router", listen=endpoint)
-    desk = SlowDesk()
-    queries = ZenohQueries("mocap", {"lab": desk})
+    service = SilentService()
+    queries = ZenohQueries("mocap", service, asyncio.get_running_loop())
     session = open_zenoh("client", connect=endpoint)
     try:
-        queries.declare(session)
+        queries.open(session, ["lab"])
         with asker_at(endpoint) as asker:
             ended = asyncio.Event()
             loop = asyncio.get_running_loop()
             replies: list[zenoh.Reply] = []
             end = zenoh.handlers.Callback(replies.append, drop=lambda: loop.call_soon_threadsafe(ended.set))
             asker.get("mocap/lab/status", end, timeout=60)
-            await desk.asked.wait()
+            await service.asked.wait()
             await queries.close()
             async with asyncio.timeout(10):
                 await ended.wait()
@@ -83,14 +84,14 @@ async def test_without_time_stamps_late_subscribers_must_ask_and_the_log_says_ho
     session = open_zenoh("peer", listen=endpoint)  # Zenoh's own default: no time stamps
     heard: list[bytes] = []
     try:
-        queries = ZenohQueries("mocap", {"lab": SlowDesk()})
-        queries.declare(session)
+        queries = ZenohQueries("mocap", SilentService(), asyncio.get_running_loop())
+        queries.open(session, ["lab"])
         assert "set timestamping: {enabled: true} in Zenoh's configuration file" in caplog.text
         with asker_at(endpoint) as asker:
             asker.declare_subscriber(
                 "mocap/lab/parameters", lambda sample: heard.append(sample.payload.to_bytes())
             )
-            queries.tell_parameters("lab", b"<RT_Parameters/>")
+            queries.publish_parameters("lab", b"<RT_Parameters/>")
             await wait_until_async(lambda: heard)
         await queries.close()
     finally:
@@ -98,30 +99,31 @@ async def test_without_time_stamps_late_subscribers_must_ask_and_the_log_says_ho
     assert set(heard) == {b"<RT_Parameters/>"}
 
 
-class SlowDesk(SourceQueries):
-    """Is asked, and never answers."""
+class SilentService(SourceQueryService):
+    """Has the source "lab", and never answers."""
 
     def __init__(self) -> None:
         self.asked = asyncio.Event()
-        self.components = frozenset()
-        self.source = SourceSettings(name="lab", host="192.0.2.1")
 
-    async def answer(self, _question: object) -> Answer:
+    def serves(self, source: str) -> bool:
+        return source == "lab"
+
+    async def answer(self, _source: str, _path: KeyPath, _options: Mapping[str, str]) -> Answer:
         self.asked.set()
         never: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
         return await never
 
 
-async def test_parameters_told_after_zenoh_has_closed_do_no_harm() -> None:
+async def test_parameters_published_after_zenoh_has_closed_do_no_harm() -> None:
     endpoint = free_endpoint()
     session = open_zenoh("peer", listen=endpoint)
-    queries = ZenohQueries("mocap", {"lab": SlowDesk()})
-    queries.declare(session)
+    queries = ZenohQueries("mocap", SilentService(), asyncio.get_running_loop())
+    queries.open(session, ["lab"])
     session.close()
-    queries.tell_parameters("lab", b"<RT_Parameters/>")
-    queries.tell_file("lab", {"name": "a.c3d"})
+    queries.publish_parameters("lab", b"<RT_Parameters/>")
+    queries.announce_file("lab", {"name": "a.c3d"})
     await queries.close()
-    queries.tell_parameters("lab", b"<RT_Parameters/>")
+    queries.publish_parameters("lab", b"<RT_Parameters/>")
 
 
 async def test_a_file_that_cannot_be_kept_is_logged_and_the_stream_goes_on(
@@ -150,7 +152,7 @@ async def test_files_that_come_faster_than_the_disk_takes_them_are_dropped_and_t
         async with lab(spool=tmp_path) as (server, _, _, _):
             for number in range(6):
                 server.send(packet(5, b"content %d" % number))
-            await wait_until_async(lambda: caplog.text.count("4 before it are still being written") == 2)
+            await wait_until_async(lambda: caplog.text.count("4 earlier files are still being written") == 2)
             disk.set()
             await wait_until_async(lambda: len(list(tmp_path.glob("*.c3d"))) == 4)
             server.send(packet(5, b"a later one"))
@@ -169,6 +171,6 @@ async def test_a_deleted_file_is_not_given(tmp_path: Path, monkeypatch: pytest.M
 
 async def test_a_gateway_whose_zenoh_is_not_open_yet_starts_and_ends() -> None:
     async with gateway_at(1, router=free_endpoint()) as gateway:
-        [queries] = gateway._queries.values()
-        queries.tell_parameters("lab", b"<RT_Parameters/>")
+        queries = queries_of(gateway)
+        queries.publish_parameters("lab", b"<RT_Parameters/>")
         assert gateway.sources

@@ -14,18 +14,22 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from gateway.cli.subscribers import LcmListener, ZenohListener, channel_pattern, key_pattern, open_zenoh
-from gateway.config.settings import LcmSettings, Settings, SourceSettings, StreamSettings, ZenohSettings
+from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.gateway import Gateway
 from gateway.messages.splice import ITEMS_OFFSET
 from gateway.outputs.contract import Output
 from gateway.outputs.lcm.output import LcmOutput
+from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lcm.subscriber import LcmSubscriber, channel_pattern
 from gateway.outputs.zenoh.output import ZenohOutput
+from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_pattern, open_zenoh
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.rtc3d_server.scene import Scene
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
+from tests.configurations import make_settings
 from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
@@ -59,7 +63,7 @@ async def lab(scene: Scene, *streams: StreamSettings) -> AsyncIterator[Lab]:
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     async with Simulator(scene) as simulator:
         simulator.stop_measurement()
-        settings = Settings(
+        settings = make_settings(
             sources=(SourceSettings(name="lab", host="127.0.0.1", port=simulator.port, streams=streams),),
             zenoh=ZenohSettings(
                 config={"listen": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
@@ -73,13 +77,13 @@ async def lab(scene: Scene, *streams: StreamSettings) -> AsyncIterator[Lab]:
         running = Lab(simulator)
         await running.until(lambda: zenoh_output.session is not None)
         session = open_zenoh(endpoint)
-        listener = LcmListener(
+        listener = LcmSubscriber(
             lcm.LCM(LCM_URL),
             channel_pattern("MOCAP", "lab", None),
             lambda channel, message: running.lcm[channel.rsplit("_", 1)[-1].lower()].append(message),
         )
         try:
-            ZenohListener(
+            ZenohSubscriber(
                 session,
                 key_pattern("mocap", "lab", None),
                 lambda key, message: running.zenoh[key.rsplit("/", 1)[-1]].append(message),

@@ -2,6 +2,9 @@
 
 import asyncio
 import json
+import logging
+import os
+import signal
 from collections import defaultdict
 from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager
@@ -10,22 +13,25 @@ from typing import Any
 
 import pytest
 
-from gateway.cli.subscribers import LcmListener, ZenohListener, open_zenoh
 from gateway.config.settings import (
-    LcmSettings,
     MetricsSettings,
     ReconnectSettings,
     Settings,
     SourceSettings,
     SpoolSettings,
-    ZenohSettings,
 )
 from gateway.errors import ConfigError
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
-from gateway.outputs.lcm.output import open_lcm
+from gateway.outputs.lcm.connection import open_lcm
+from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lcm.subscriber import LcmSubscriber
+from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.outputs.zenoh.subscriber import ZenohSubscriber, open_zenoh
+from gateway.service.daemon import Daemon
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
+from tests.configurations import make_settings
 from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
 from tests.querying import LabServer, ask, ask_all, asker_at
 from tests.servers import Client, ScriptedServer, ok, packet
@@ -45,10 +51,10 @@ class Site:
         self.endpoint = free_endpoint()
         self.url = lcm_url()
 
-    def settings(self, sources: Mapping[str, int], **sections: Any) -> Settings:
+    def settings(self, sources: Mapping[str, int], **sections: Any) -> Any:
         """Return settings with sources by name and port; other sections stand over those here."""
         reconnect = ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05)
-        return Settings(
+        return make_settings(
             sources=tuple(
                 SourceSettings(name=name, host="127.0.0.1", port=port, reconnect=reconnect)
                 for name, port in sources.items()
@@ -105,8 +111,8 @@ class Ears:
 def ears_at(site: Site) -> Iterator[Ears]:
     ears = Ears()
     session = open_zenoh(site.endpoint)
-    ZenohListener(session, "*/*/3d", ears.take)
-    listener = LcmListener(open_lcm(site.url), ".*_3D", ears.take)
+    ZenohSubscriber(session, "*/*/3d", ears.take)
+    listener = LcmSubscriber(open_lcm(site.url), ".*_3D", ears.take)
     try:
         yield ears
     finally:
@@ -160,7 +166,7 @@ async def test_sources_come_and_go_with_their_keys_channels_and_answers() -> Non
             await wait_until_async(lambda: server.count("SendParameters") >= 14)
             changes = await gateway.reload(site.settings({"new": new.port, "lab": lab.port}))
             assert changes == ["source gone removed", "source new added"]
-            assert [source.source.name for source in gateway.sources] == ["new", "lab"]
+            assert [source.name for source in gateway.sources] == ["new", "lab"]
             assert server.count("Bye") == 1
             await wait_until_async(lambda: other.count("SendParameters") >= 7)
             assert b"of new" in (await ask(asker, "mocap/new/parameters")).payload
@@ -248,7 +254,7 @@ async def test_what_zenoh_refuses_is_refused_whole(tmp_path: Path) -> None:
                 await gateway.reload(refused)
             await ears.more("mocap/lab/3d")
             ears.assert_whole("mocap/lab/3d")
-            assert [source.source.name for source in gateway.sources] == ["lab"]
+            assert [source.name for source in gateway.sources] == ["lab"]
 
 
 async def test_files_go_to_the_new_folder(tmp_path: Path) -> None:
@@ -271,15 +277,22 @@ async def test_files_go_to_the_new_folder(tmp_path: Path) -> None:
             assert len(clients) == 1
 
 
-async def test_metrics_move_to_another_port() -> None:
+async def test_metrics_move_to_another_port(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
     site, before, after = Site(), free_port(), free_port()
-    async with running(site.settings({"lab": free_port()}, metrics=MetricsSettings(port=before))) as gateway:
-        changed = gateway.settings.model_copy(update={"metrics": MetricsSettings(port=after)})
-        assert await gateway.reload(changed) == ["metrics changed"]
-        _, writer = await asyncio.open_connection("127.0.0.1", after)
-        writer.close()
-        with pytest.raises(ConnectionRefusedError):
-            await asyncio.open_connection("127.0.0.1", before)
+    first = site.settings({"lab": free_port()}, metrics=MetricsSettings(port=before))
+    settings = [first.model_copy(update={"metrics": MetricsSettings(port=after)})]
+    daemon = Daemon(settings.pop, Gateway(first))
+    task = asyncio.create_task(daemon.run())
+    await wait_until_async(daemon._gateway.opened.is_set)
+    os.kill(os.getpid(), signal.SIGHUP)
+    await wait_until_async(lambda: "configuration reloaded: metrics changed" in caplog.text)
+    _, writer = await asyncio.open_connection("127.0.0.1", after)
+    writer.close()
+    with pytest.raises(ConnectionRefusedError):
+        await asyncio.open_connection("127.0.0.1", before)
+    os.kill(os.getpid(), signal.SIGTERM)
+    await task
 
 
 async def test_a_stop_in_the_middle_of_a_reload_closes_everything() -> None:

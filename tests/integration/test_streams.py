@@ -61,17 +61,17 @@ async def test_an_on_demand_stream_runs_while_it_has_subscribers() -> None:
             await lab.until(partial(server.has, START, rounds))
             server.stream(ORIGIN)
             await lab.heard("3d", rounds)
-            lab.output.listened = False
+            lab.output.has_subscriber = False
             await lab.until(partial(server.has, STOP, rounds))
             await lab.until(lambda: lab.status.state is StreamState.IDLE)
-            lab.output.listened = True
+            lab.output.has_subscriber = True
         assert lab.status.session == 1
 
 
 async def test_other_streams_run_without_subscribers() -> None:
     server = Recorder()
     async with ScriptedServer(server.script) as listening, gateway_to(listening.port) as lab:
-        lab.output.listened = False
+        lab.output.has_subscriber = False
         await lab.until(lambda: server.count(START) == 1)
         for number in range(1, 20):
             server.stream(ORIGIN)
@@ -131,13 +131,13 @@ async def test_states_follow_the_server_and_the_outputs_show_them(caplog: pytest
         simulator.stop_measurement()
         async with gateway_to(simulator.port) as lab:
             await lab.until(lambda: lab.status.state is StreamState.NO_MEASUREMENT)
-            assert not lab.output.flowing
+            assert not lab.output.streaming
             simulator.start_measurement()
             await lab.until(lambda: lab.status.state is StreamState.STREAMING)
-            await lab.until(lambda: lab.output.flowing == {"lab"})
+            await lab.until(lambda: lab.output.streaming == {"lab"})
             simulator.stop_measurement()
             await lab.until(lambda: lab.status.state is StreamState.NO_MEASUREMENT)
-            await lab.until(lambda: not lab.output.flowing)
+            await lab.until(lambda: not lab.output.streaming)
     changes = [record.message for record in caplog.records if "→" in record.message]
     assert sum("no measurement → streaming" in change for change in changes) == 1
     assert sum("streaming → no measurement" in change for change in changes) == 1

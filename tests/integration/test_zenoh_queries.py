@@ -9,7 +9,16 @@ import zenoh
 from gateway.messages.decode import to_json
 from gateway.rtc3d.parameters import SECTIONS
 from tests.networks import free_endpoint
-from tests.querying import LabServer, ask, asker_at, gateway_at, is_filled, lab, lab_without_server
+from tests.querying import (
+    LabServer,
+    ask,
+    asker_at,
+    gateway_at,
+    is_filled,
+    lab,
+    lab_without_server,
+    queries_of,
+)
 from tests.servers import ScriptedServer
 from tests.spec_parameters import BY_SECTION, spec_xml
 from tests.waiting import wait_until_async
@@ -82,7 +91,7 @@ async def test_a_thousand_who_ask_at_once_cost_the_server_one_command() -> None:
         for number in range(1000):
             end = zenoh.handlers.Callback(take, drop=partial(ended.append, number))
             asker.get("mocap/lab/parameters?fresh=true", end, timeout=30)
-        [queries] = gateway._queries.values()
+        queries = queries_of(gateway)
         await wait_until_async(lambda: len(queries._tasks) == 1000)
         server.open.set()
         await wait_until_async(lambda: len(ended) == 1000, timeout_s=30)
@@ -199,7 +208,7 @@ async def test_questions_that_wait_too_long_for_others_are_told_so() -> None:
             *(ask(asker, f"mocap/lab/parameters/{section}?fresh=true") for section in SECTIONS)
         )
         assert {reply.code for reply in replies} == {"timeout"}
-        waited = "source 'lab': no answer within 0.3 s; questions that wait for the server: "
+        waited = "source 'lab': no answer within 0.3 s; questions waiting for the server: "
         assert all(reply.error.startswith(waited) for reply in replies)
 
 

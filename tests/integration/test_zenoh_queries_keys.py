@@ -10,7 +10,7 @@ import pytest
 import rtc3d
 import zenoh
 
-from gateway.queries.answers import SCHEMA_TYPES
+from gateway.queries.questions import SCHEMA_TYPES
 from gateway.rtc3d.components import ComponentType
 from tests.querying import LabServer, ask, ask_all, lab, lab_without_server
 from tests.servers import packet
@@ -62,7 +62,7 @@ async def test_a_component_that_has_not_come_is_said_not_to_have() -> None:
         await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
         reply = await ask(asker, "mocap/lab/event")
         assert reply.code == "nothing-yet"
-        assert reply.error == "no event has come from source 'lab' in this session"
+        assert reply.error == "no event has arrived from source 'lab' in this session"
 
 
 async def test_frames_of_an_earlier_connection_are_not_current() -> None:

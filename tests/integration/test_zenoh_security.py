@@ -14,7 +14,7 @@ import zenoh
 import zenoh.ext
 
 from gateway.config.environment import variable_name
-from gateway.config.loading import load
+from tests.configurations import load
 from tests.networks import free_port
 from tests.waiting import wait_until
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from gateway.config.settings import StreamSettings
-from gateway.queries.answers import SCHEMA_TYPES
+from gateway.queries.questions import SCHEMA_TYPES
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
 from tests.networks import free_endpoint, open_zenoh
@@ -18,9 +18,9 @@ from tests.waiting import wait_until_async
     ("selector", "accepted"),
     [
         ("parameters/4d", ["unknown section '4d'", *SECTIONS]),
-        ("parameters/3d/more", ["nothing is known of 'parameters/3d/more'", "parameters/3d", "status"]),
-        ("markers", ["nothing is known of 'markers'", "parameters", "3d", "recording", "schema/TYPE"]),
-        ("alive", ["nothing is known of 'alive'"]),
+        ("parameters/3d/more", ["unknown key 'parameters/3d/more'", "parameters/3d", "status"]),
+        ("markers", ["unknown key 'markers'", "parameters", "3d", "recording", "schema/TYPE"]),
+        ("alive", ["unknown key 'alive'"]),
         ("analog", ["component 'analog' is not configured for this source; accepted: 3d, event"]),
         ("schema/tools", ["unknown type", "tools_t", "parameters_reply_t"]),
         ("schema", ["unknown type", "markers_t"]),

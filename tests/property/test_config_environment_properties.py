@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.config.environment import VARIABLE_PREFIX, variable_name
-from gateway.config.loading import load
 from gateway.config.settings import Settings
 from gateway.config.yaml_document import Location
 from gateway.errors import ConfigError
+from tests.configurations import load
 from tests.property.test_config_properties import PIECES, SETTINGS
 
 

@@ -7,20 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from gateway.config.loading import load
-from gateway.config.settings import (
-    LcmSettings,
-    ReconnectSettings,
-    Settings,
-    SourceSettings,
-    StreamSettings,
-    ZenohSettings,
-)
-from gateway.config.values import LCM_PROVIDERS, KeyPrefix
+from gateway.config.settings import ReconnectSettings, Settings, SourceSettings, StreamSettings
 from gateway.errors import ConfigError
 from gateway.messages import topics
+from gateway.outputs.lcm.settings import LCM_PROVIDERS, LcmSettings
+from gateway.outputs.zenoh.settings import KeyPrefix, ZenohSettings
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from tests.configurations import load, make_settings
 from tests.strategies import damaged
 
 ROOT = Path(__file__).parents[2]
@@ -107,7 +101,7 @@ SOURCES = st.builds(
     max_c3d_bytes=st.integers(1024, 2**32 - 1),
 )
 SETTINGS = st.builds(
-    Settings,
+    make_settings,
     sources=st.lists(
         SOURCES, min_size=1, max_size=3, unique_by=lambda source: topics.lcm_channel("", source.name)
     ).map(tuple),
@@ -162,9 +156,9 @@ def test_names_are_refused_together_exactly_if_they_share_channels(first: str, s
     sources = tuple(SourceSettings(name=name, host="lab") for name in (first, second))
     if topics.lcm_channel("MOCAP", first) == topics.lcm_channel("MOCAP", second):
         with pytest.raises(ValidationError, match="has the same LCM channels"):
-            Settings(sources=sources)
+            make_settings(sources=sources)
     else:
-        assert Settings(sources=sources).sources == sources
+        assert make_settings(sources=sources).sources == sources
 
 
 @given(st.text(st.sampled_from("ab/*$#? @é\n\x07"), max_size=6) | st.text())

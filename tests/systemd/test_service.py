@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from gateway.cli.subscribers import ZenohListener, key_pattern, open_zenoh
 from gateway.messages.decode import decode
+from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_pattern, open_zenoh
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.clones import ROOT
@@ -146,7 +146,7 @@ def subscribed_to(endpoint: str) -> Iterator[Received]:
     received = Received()
     session = open_zenoh(endpoint)
     try:
-        ZenohListener(session, key_pattern("mocap", None, "3d"), received.add)
+        ZenohSubscriber(session, key_pattern("mocap", None, "3d"), received.add)
         yield received
     finally:
         session.close()

@@ -1,36 +1,26 @@
-"""Messages out on Zenoh: one publisher per key, a liveliness token per source.
+"""The Zenoh output: one session, its publishers, liveliness tokens and queryables.
 
-Opened in a thread of its own, because ``zenoh.open`` blocks; see docs/design.md for what was measured.
+The session opens in a thread of its own, because ``zenoh.open`` blocks; docs/design.md has the measurements.
 """
 
+import asyncio
 import json
 import logging
 import threading
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any, Final
 
 import zenoh
 
-from gateway.config.settings import ZenohSettings
-from gateway.config.values import zenoh_reason
-from gateway.errors import ConfigError, OutputError
+from gateway.errors import OutputError
 from gateway.log import FailureLog
 from gateway.messages.topics import Topic, zenoh_key
+from gateway.outputs.contract import Output, QueryService, ServerParameters
 from gateway.outputs.status import OutputHealth
-
-LCM_ENCODING: Final = "application/x-lcm"
-"""The Zenoh encoding of every message; its schema is the LCM type: ``application/x-lcm;rtc3d.markers_t``."""
-
-_DEFAULTS: Final = {
-    # 16 MB of /dev/shm, and files left behind after a kill, for messages of a few kB.
-    "transport": {"shared_memory": {"enabled": False}},
-    # Caches for late subscribers need samples with time stamps.
-    "timestamping": {"enabled": True},
-    # A lost router is found again within half a second instead of up to 4 s.
-    "connect": {"retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}},
-}
-"""What the gateway wants other than Zenoh's own defaults, where an inline configuration is silent."""
+from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason
+from gateway.outputs.zenoh.publisher import ZenohLink, ZenohPublisher
+from gateway.outputs.zenoh.queries import ZenohQueries
+from gateway.outputs.zenoh.settings import ZenohSettings
 
 _REMEDY: Final = "is the router running, are zenoh.config's endpoints right and free?"
 _NO_ROUTER: Final = OutputHealth(
@@ -40,131 +30,45 @@ _HEALTHY: Final = OutputHealth(True)
 _RETRY_S: Final = 1.0
 _JOIN_S: Final = 0.5
 _CLOSE_S: Final = 0.5
-"""How long closing may take. A peer that does not read holds it up for 10 s: that is left behind."""
+"""How long to wait for the session to close.
+
+A peer that does not read delays it by 10 s; then it goes on alone.
+"""
 
 logger = logging.getLogger(__name__)
 
 
-def zenoh_config(config: Path | Mapping[str, Any]) -> zenoh.Config:
-    """Return Zenoh's configuration from a JSON5 file, as it stands, or from keys given inline.
+class ZenohOutput(Output):
+    """One Zenoh session and everything declared on it.
 
-    Raises ConfigError with Zenoh's own reason.
+    Raises ConfigError if Zenoh refuses the configuration.
     """
-    try:
-        if isinstance(config, Path):
-            return zenoh.Config.from_file(str(config))
-        return zenoh.Config.from_json5(json.dumps(_merged(_DEFAULTS, config)))
-    except (zenoh.ZError, TypeError, ValueError) as error:
-        where = f"file {config}" if isinstance(config, Path) else "inline zenoh.config"
-        raise ConfigError(f"Zenoh does not accept the {where}: {zenoh_reason(error)}") from error
-
-
-def _merged(defaults: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    merged = dict(defaults)
-    for key, value in given.items():
-        default = merged.get(key)
-        if isinstance(default, Mapping) and isinstance(value, Mapping):
-            merged[key] = _merged(default, value)
-        else:
-            merged[key] = value
-    return merged
-
-
-class ZenohPublisher:
-    """Sends the messages of one topic, DROP on congestion: a stalled subscriber delays nobody."""
-
-    def __init__(self, output: "ZenohOutput", topic: Topic) -> None:
-        self._output = output
-        self._key = zenoh_key(output.settings.prefix, topic.source, *topic.path)
-        self._type_name = topic.type_name
-        self._publisher: zenoh.Publisher | None = None
-        self._closed = False
-        self.wanted = False
-        """Whether a subscriber matches the key now."""
-
-    def bind(self, session: zenoh.Session) -> None:
-        """Declare the publisher on an open session."""
-        publisher = session.declare_publisher(
-            self._key,
-            encoding=zenoh.Encoding(LCM_ENCODING).with_schema(self._type_name),
-            congestion_control=zenoh.CongestionControl.DROP,
-            express=self._output.settings.express,
-        )
-        publisher.declare_matching_listener(self._on_matching)  # tells of subscribers there already, too
-        self._publisher = publisher
-
-    def look(self) -> None:
-        """See again whether anybody listens: a notification may have been missed."""
-        # Zenoh's type stub says that matching_status is a bool; it is the MatchingStatus that listeners get.
-        publisher: Any = self._publisher
-        if publisher is not None:
-            self.wanted = publisher.matching_status.matching
-
-    def _on_matching(self, status: zenoh.MatchingStatus) -> None:
-        # From Zenoh's thread; setting a flag is all it does.
-        self.wanted = status.matching and not self._closed
-
-    def publish(self, message: bytes) -> None:
-        """Hand ``message`` to Zenoh; raises OutputError while not open, or a client without a router."""
-        if self._publisher is None or self._output.is_cut_off:
-            raise self._refusal()
-        try:
-            self._publisher.put(message)
-        except zenoh.ZError as error:
-            text = f"Zenoh did not take a message for {self._key}: {zenoh_reason(error)}"
-            raise OutputError(text, cause="put failed") from error
-
-    def _refusal(self) -> OutputError:
-        if self._closed:
-            return OutputError(f"Zenoh key {self._key} is closed; ask for a new publisher", cause="closed")
-        cause = "not open" if self._output.session is None else "no router"
-        return OutputError(self._output.health().problem, cause=cause)
-
-    def close(self) -> None:
-        """Undeclare the publisher."""
-        self._closed = True
-        self.wanted = False
-        self._output.forget(self)
-        publisher, self._publisher = self._publisher, None
-        if publisher is not None:
-            try:
-                publisher.undeclare()
-            except zenoh.ZError as error:
-                logger.debug("undeclaring %s: %s", self._key, error)
-
-
-def _close(session: zenoh.Session) -> None:
-    try:
-        session.close()
-    except zenoh.ZError as error:
-        logger.debug("zenoh: closing the session: %s", zenoh_reason(error))
-
-
-class ZenohOutput:
-    """One Zenoh session and its publishers. Raises ConfigError if Zenoh refuses the configuration."""
 
     name = "zenoh"
+    drop_causes = ("not open", "no router", "put failed")
 
     def __init__(self, settings: ZenohSettings) -> None:
         self.settings = settings
         self.max_rate_hz = settings.max_rate_hz
+        self.has_tool_poses = settings.tool_poses
         self.config = zenoh_config(settings.config)
         self._is_client = json.loads(self.config.get_json("mode") or "null") == "client"
-        self._lock = threading.Lock()  # of _session, _publishers and the tokens, shared with _opener
+        self._link = ZenohLink(self._refusal)
+        self._lock = (
+            threading.Lock()
+        )  # of everything that _opener shares: session, publishers, tokens, queries
         self._session: zenoh.Session | None = None
         self._publishers: list[ZenohPublisher] = []
-        self._declarations: list[Callable[[zenoh.Session], None]] = []
         # By the source's name; None while the session is not open.
         self._alive: dict[str, zenoh.LivelinessToken | None] = {}
-        self._flowing: dict[str, zenoh.LivelinessToken | None] = {}
-        self._transports = 0
-        self.is_cut_off = True
-        """Whether nothing can leave: not open, or without its router. Kept, because every message asks."""
+        self._streaming: dict[str, zenoh.LivelinessToken | None] = {}
+        self._queries: ZenohQueries | None = None
+        self._num_transports = 0
         self._problem = f"the Zenoh session is not open yet; {_REMEDY}"
         self._closing = threading.Event()
         self._opener = threading.Thread(target=self._open, name="zenoh-open", daemon=True)
         self._failures = FailureLog(logger, self.name)
-        self._links = FailureLog(logger, self.name)
+        self._router_failures = FailureLog(logger, self.name)
 
     @property
     def session(self) -> zenoh.Session | None:
@@ -173,11 +77,11 @@ class ZenohOutput:
 
     @property
     def lacks_router(self) -> bool:
-        """Whether this is a client (it reaches others through a router only) without its router."""
-        return self._is_client and self._transports == 0
+        """Whether this is a client, which reaches others through a router only, without its router."""
+        return self._is_client and self._num_transports == 0
 
     def start(self) -> None:
-        """Begin to open the session, again and again until it opens or ``close`` is called."""
+        """Start to open the session, again and again until it opens or ``close`` is called."""
         self._opener.start()
 
     def _open(self) -> None:
@@ -194,88 +98,52 @@ class ZenohOutput:
                 if self._closing.is_set():
                     session.close()
                     return
-                for publisher in self._publishers:
-                    publisher.bind(session)
-                for source in self._alive:
-                    self._alive[source] = self._token(session, source, "alive")
-                for source in self._flowing:
-                    self._flowing[source] = self._token(session, source, "server")
-                self._session = session
-                self._look()
-                for declare in self._declarations:
-                    declare(session)
+                self._declare_all(session)
             self._problem = ""
             self._failures.succeeded("the session is open")
             return
 
-    def _on_transport(self, event: zenoh.TransportEvent) -> None:
-        self._transports += 1 if event.kind == zenoh.SampleKind.PUT else -1
-        self._look()
+    def _declare_all(self, session: zenoh.Session) -> None:
+        """Declare on a new session everything that was asked for before it opened."""
+        for publisher in self._publishers:
+            publisher.declare(session)
+        for tokens, name in ((self._alive, "alive"), (self._streaming, "server")):
+            for source in tokens:
+                tokens[source] = self._token(session, source, name)
+        self._session = session
+        self._update_link()
+        if self._queries is not None:
+            self._queries.open(session, list(self._alive))
 
-    def _look(self) -> None:
-        """See whether anything can leave; ``maintain`` does so again, should two threads have crossed."""
-        self.is_cut_off = self._session is None or self.lacks_router
+    def _on_transport(self, event: zenoh.TransportEvent) -> None:
+        self._num_transports += 1 if event.kind == zenoh.SampleKind.PUT else -1
+        self._update_link()
+
+    def _update_link(self) -> None:
+        """Note whether messages can leave; ``maintain`` repeats it, in case two threads did it at once."""
+        self._link.is_cut_off = self._session is None or self.lacks_router
 
     def _token(self, session: zenoh.Session, source: str, name: str) -> zenoh.LivelinessToken:
         return session.liveliness().declare_token(zenoh_key(self.settings.prefix, source, name))
 
     def publisher(self, topic: Topic) -> ZenohPublisher:
         """Return a new publisher of ``topic``; it sends as soon as the session is open."""
-        publisher = ZenohPublisher(self, topic)
+        key = zenoh_key(self.settings.prefix, topic.source, *topic.path)
+        publisher = ZenohPublisher(self._link, key, topic.type_name, self.settings.express, self._forget)
         with self._lock:
             self._publishers.append(publisher)
             if self._session is not None:
-                publisher.bind(self._session)
+                publisher.declare(self._session)
         return publisher
 
-    def forget(self, publisher: ZenohPublisher) -> None:
-        """Drop a closed publisher."""
+    def _forget(self, publisher: ZenohPublisher) -> None:
         with self._lock:
             if publisher in self._publishers:
                 self._publishers.remove(publisher)
 
-    def announce(self, source: str) -> None:
-        """Hold the liveliness token PREFIX/SOURCE/alive."""
-        self._show(self._alive, source, "alive", True)
-
-    def withdraw(self, source: str) -> None:
-        """Let the liveliness token PREFIX/SOURCE/alive go."""
-        self._show(self._alive, source, "alive", False)
-
-    def show_flowing(self, source: str, flowing: bool) -> None:
-        """Hold the liveliness token PREFIX/SOURCE/server while frames flow, and only then."""
-        self._show(self._flowing, source, "server", flowing)
-
-    def _show(
-        self, tokens: dict[str, zenoh.LivelinessToken | None], source: str, name: str, shown: bool
-    ) -> None:
-        with self._lock:
-            if not shown:
-                token = tokens.pop(source, None)
-                if token is not None:
-                    token.undeclare()
-            elif source not in tokens:
-                tokens[source] = None if self._session is None else self._token(self._session, source, name)
-
-    def when_open(self, declare: Callable[[zenoh.Session], None]) -> None:
-        """Call ``declare`` with the session once it is open, in the thread that opens it."""
-        with self._lock:
-            self._declarations.append(declare)
-            if self._session is not None:
-                declare(self._session)
-
-    def maintain(self) -> None:
-        """Tell of a router lost or found; Zenoh itself reconnects."""
-        self._look()
-        if self._session is None:
-            return
-        with self._lock:
-            for publisher in self._publishers:
-                publisher.look()
-        if self.lacks_router:
-            self._links.failed(self.health().problem)
-        elif self._links.failing:
-            self._links.recovered("connected to the router")
+    def _refusal(self) -> OutputError:
+        cause = "not open" if self._session is None else "no router"
+        return OutputError(self.health().problem, cause=cause)
 
     def health(self) -> OutputHealth:
         """Return whether messages can leave."""
@@ -285,18 +153,104 @@ class ZenohOutput:
             return _NO_ROUTER
         return _HEALTHY
 
+    def maintain(self) -> None:
+        """Log a router lost or found, and check again who is subscribed; Zenoh itself reconnects."""
+        self._update_link()
+        if self._session is None:
+            return
+        with self._lock:
+            for publisher in self._publishers:
+                publisher.check_subscribers()
+        if self.lacks_router:
+            self._router_failures.failed(self.health().problem)
+        elif self._router_failures.failing:
+            self._router_failures.recovered("connected to the router")
+
+    def is_configured_like(self, other: Output) -> bool:
+        """Return whether the settings are the same, and the content of Zenoh's configuration file too."""
+        return (
+            isinstance(other, ZenohOutput)
+            and self.settings == other.settings
+            and str(self.config) == str(other.config)
+        )
+
+    # Sources: liveliness, queries, parameters.
+
+    def announce(self, source: str) -> None:
+        """Hold the liveliness token PREFIX/SOURCE/alive and answer queries about ``source``."""
+        self._show(self._alive, source, "alive", True)
+        self._serve_source(source)
+
+    def withdraw(self, source: str) -> None:
+        """Drop the liveliness token PREFIX/SOURCE/alive and answer no more queries about ``source``."""
+        self._show(self._alive, source, "alive", False)
+        with self._lock:
+            if self._queries is not None:
+                self._queries.remove(source)
+
+    def show_streaming(self, source: str, is_streaming: bool) -> None:
+        """Hold the liveliness token PREFIX/SOURCE/server while frames arrive, and only then."""
+        self._show(self._streaming, source, "server", is_streaming)
+
+    def _show(
+        self, tokens: dict[str, zenoh.LivelinessToken | None], source: str, name: str, is_shown: bool
+    ) -> None:
+        with self._lock:
+            if not is_shown:
+                token = tokens.pop(source, None)
+                if token is not None:
+                    token.undeclare()
+            elif source not in tokens:
+                tokens[source] = None if self._session is None else self._token(self._session, source, name)
+
+    def _serve_source(self, source: str) -> None:
+        with self._lock:
+            if self._queries is not None and self._session is not None:
+                self._queries.add(source)
+
+    def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
+        """Publish the XML on PREFIX/SOURCE/parameters, now and for everybody who subscribes later."""
+        if self._queries is not None:
+            self._queries.publish_parameters(source, parameters.xml)
+
+    def announce_file(self, source: str, description: Mapping[str, Any]) -> None:
+        """Publish the description of a C3D file on PREFIX/SOURCE/c3d, the key that returns it."""
+        if self._queries is not None:
+            self._queries.announce_file(source, description)
+
+    def serve_queries(self, service: QueryService) -> None:
+        """Answer queries below PREFIX/SOURCE/ for every announced source."""
+        self._queries = ZenohQueries(self.settings.prefix, service, asyncio.get_running_loop())
+
+    async def stop_queries(self) -> None:
+        """Drop the queries being answered; their askers see no reply at once."""
+        if self._queries is not None:
+            await self._queries.close()
+
+    @property
+    def query_results(self) -> Mapping[str, int] | None:
+        """See Output."""
+        return None if self._queries is None else self._queries.results
+
     def close(self) -> None:
-        """Close the session: without it a process with callbacks never ends."""
+        """Close the session: without this a process with Zenoh callbacks never ends."""
         self._closing.set()
         if self._opener.is_alive():
-            self._opener.join(_JOIN_S)  # an open() that blocks is left behind; it closes what it opens
+            self._opener.join(_JOIN_S)  # an open() that blocks is left alone; it closes what it opens
         with self._lock:
             session, self._session = self._session, None
-            self._look()
+            self._update_link()
             self._alive.clear()
-            self._flowing.clear()
+            self._streaming.clear()
             self._problem = "the Zenoh session is closed; start the gateway again"
         if session is not None:
             closer = threading.Thread(target=_close, args=(session,), name="zenoh-close", daemon=True)
             closer.start()
             closer.join(_CLOSE_S)
+
+
+def _close(session: zenoh.Session) -> None:
+    try:
+        session.close()
+    except zenoh.ZError as error:
+        logger.debug("zenoh: closing the session: %s", zenoh_reason(error))

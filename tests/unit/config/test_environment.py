@@ -4,11 +4,12 @@ from typing import Any
 import pytest
 
 from gateway.config.environment import variable_name
-from gateway.config.loading import load, read, read_server
-from gateway.config.settings import LcmSettings, Settings, SourceSettings, StreamSettings
+from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import ConfigError
+from gateway.outputs.lcm.settings import LcmSettings
 from gateway.rtc3d.commands import FrequencyDivisor
 from gateway.rtc3d.components import ComponentType
+from tests.configurations import load, make_settings, read, read_server
 
 FILE = """\
 sources:
@@ -100,7 +101,7 @@ def test_variables_alone_are_a_configuration() -> None:
         SourceSettings(name="a", host="lab-a"),
         SourceSettings(name="b", host="lab-b", streams=(stream,)),
     )
-    assert load(None, with_prefix(variables)) == Settings(sources=sources)
+    assert load(None, with_prefix(variables)) == make_settings(sources=sources)
 
 
 def test_more_than_ten_items_keep_their_order() -> None:
@@ -211,7 +212,7 @@ def test_no_sources_in_the_environment_are_told() -> None:
 
 def test_one_server_has_the_defaults() -> None:
     settings = read_server("::1", 3030, {}).settings
-    assert settings == Settings(sources=(SourceSettings(name="lab", host="::1", port=3030),))
+    assert settings == make_settings(sources=(SourceSettings(name="lab", host="::1", port=3030),))
 
 
 def test_one_servers_mistakes_are_told() -> None:

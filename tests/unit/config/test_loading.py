@@ -2,12 +2,15 @@ from pathlib import Path
 
 import pytest
 
-from gateway.config.loading import MAX_FILE_BYTES, load
+from gateway.config.loading import MAX_FILE_BYTES
 from gateway.config.section import Section
-from gateway.config.settings import LcmSettings, Settings, SourceSettings, StreamSettings, ZenohSettings
+from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import ConfigError
+from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import Frequency
 from gateway.rtc3d.components import ComponentType
+from tests.configurations import load, make_settings
 
 SHIPPED = Path(__file__).parents[3] / "config"
 
@@ -54,7 +57,7 @@ lcm: {enabled: true, prefix: MOCAP, url: "udpm://239.255.76.67:7667?ttl=0"}
         encoding="utf-8",
     )
     components = (ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.EVENT)
-    assert load(file) == Settings(
+    assert load(file) == make_settings(
         sources=(
             SourceSettings(
                 name="lab",
@@ -123,10 +126,10 @@ MISTAKES: list[tuple[str, str]] = [
     (
         "sorces: 1",
         "lab.yaml:4:1: sorces: unknown key (did you mean 'sources'?); "
-        "known keys: sources, spool, zenoh, lcm, metrics",
+        "known keys: sources, spool, metrics, zenoh, lcm",
     ),
-    ("on: 1", "lab.yaml:4:1: on: unknown key; known keys: sources, spool, zenoh, lcm, metrics"),
-    ("a b: 1", "lab.yaml:4:1: 'a b': unknown key; known keys: sources, spool, zenoh, lcm, metrics"),
+    ("on: 1", "lab.yaml:4:1: on: unknown key; known keys: sources, spool, metrics, zenoh, lcm"),
+    ("a b: 1", "lab.yaml:4:1: 'a b': unknown key; known keys: sources, spool, metrics, zenoh, lcm"),
     (
         "    byte_order: bigendian",
         "lab.yaml:4:17: sources[0].byte_order: found 'bigendian'; expected big or little",
@@ -279,7 +282,7 @@ def test_an_empty_file_is_refused(file: Path, content: str) -> None:
 def test_a_file_that_is_no_mapping_is_refused(file: Path, content: str, found: str) -> None:
     assert refused(file, content) == [
         f"lab.yaml:1:1: found {found}; expected a mapping with any of the keys "
-        "sources, spool, zenoh, lcm, metrics"
+        "sources, spool, metrics, zenoh, lcm"
     ]
 
 

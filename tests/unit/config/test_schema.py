@@ -8,19 +8,20 @@ from jsonschema import Draft202012Validator
 
 from gateway.config.schema import schema_text
 from gateway.config.settings import Settings
+from tests.configurations import MODEL
 from tests.property.test_config_properties import SETTINGS
 
 SHIPPED = Path(__file__).parents[3] / "config"
-VALIDATOR = Draft202012Validator(json.loads(schema_text()))
+VALIDATOR = Draft202012Validator(json.loads(schema_text(MODEL)))
 
 
 def test_the_shipped_schema_is_current() -> None:
     shipped = (SHIPPED / "gateway.schema.json").read_text(encoding="utf-8")
-    assert shipped == schema_text(), "rtc3d-gateway config schema > config/gateway.schema.json"
+    assert shipped == schema_text(MODEL), "rtc3d-gateway config schema > config/gateway.schema.json"
 
 
 def test_it_is_a_schema() -> None:
-    Draft202012Validator.check_schema(json.loads(schema_text()))
+    Draft202012Validator.check_schema(json.loads(schema_text(MODEL)))
 
 
 @pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.yaml")), ids=lambda path: path.name)

@@ -5,12 +5,12 @@ from typing import Any
 import pytest
 
 from gateway.config.environment import variable_name
-from gateway.config.loading import load, read
 from gateway.config.secrets import find_secrets, mask_secrets, mask_secrets_in_text
 from gateway.config.show import shown_configuration
-from gateway.config.values import zenoh_reason
 from gateway.errors import ConfigError
+from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.outputs.zenoh.output import ZenohOutput
+from tests.configurations import load, read
 from tests.networks import free_port
 from tests.waiting import wait_until
 

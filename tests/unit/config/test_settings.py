@@ -5,19 +5,14 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from gateway.config.section import describe
-from gateway.config.settings import (
-    LcmSettings,
-    ReconnectSettings,
-    Settings,
-    SourceSettings,
-    StreamSettings,
-    ZenohSettings,
-    lcm_queries_url,
-)
-from gateway.config.values import ChannelPrefix, SourceName
+from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
+from gateway.config.values import SourceName
 from gateway.messages import topics
+from gateway.outputs.lcm.settings import ChannelPrefix, LcmSettings, lcm_queries_url
+from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import AllFrames
 from gateway.rtc3d.components import ComponentType
+from tests.configurations import MODEL, make_settings
 from tests.settings import mistakes, source
 
 MARKERS, ANALOG, FORCE = ComponentType.MARKERS, ComponentType.ANALOG, ComponentType.FORCE
@@ -25,8 +20,8 @@ TOOLS, EVENT = ComponentType.TOOLS, ComponentType.EVENT
 
 
 def test_one_server_is_enough() -> None:
-    settings = Settings.model_validate({"sources": [source()]})
-    assert settings == Settings(sources=(SourceSettings(name="lab", host="192.0.2.20"),))
+    settings = MODEL.model_validate({"sources": [source()]})
+    assert settings == make_settings(sources=(SourceSettings(name="lab", host="192.0.2.20"),))
     assert settings.sources[0] == SourceSettings(
         name="lab",
         host="192.0.2.20",
@@ -47,7 +42,7 @@ def test_one_server_is_enough() -> None:
 
 
 def test_settings_do_not_change() -> None:
-    settings = Settings.model_validate({"sources": [source()]})
+    settings = MODEL.model_validate({"sources": [source()]})
     with pytest.raises(ValidationError):
         settings.sources[0].port = 1
 
@@ -62,7 +57,7 @@ def test_the_longest_name_and_prefix_fit_a_channel() -> None:
 
 def test_names_that_share_channels_are_both_named() -> None:
     value = {"sources": [source(name="hall"), source(name="lab-1"), source(name="LAB_1")]}
-    assert mistakes(Settings, value) == [
+    assert mistakes(MODEL, value) == [
         (
             "sources.2.name",
             "found 'LAB_1', which has the same LCM channels as 'lab-1' (sources[1]); "
@@ -98,7 +93,7 @@ def test_frames_of_a_slow_rate_are_no_stall() -> None:
     ("value", "found"), [([], "an empty list"), ({}, "an empty mapping"), ("x", "'x'"), (None, "nothing")]
 )
 def test_sources_and_streams_are_lists_of_at_least_one(value: object, found: str) -> None:
-    assert mistakes(Settings, {"sources": value}) == [
+    assert mistakes(MODEL, {"sources": value}) == [
         ("sources", f"found {found}; expected a list of sources, one or more, each with name and host")
     ]
     assert mistakes(SourceSettings, source(streams=value)) == [
@@ -138,16 +133,16 @@ def test_requests_go_to_the_next_port_where_whoever_listens_gets_all(url: str, q
 
 def test_one_side_must_be_on() -> None:
     off = {"enabled": False}
-    assert mistakes(Settings, {"sources": [source()], "zenoh": off, "lcm": off}) == [
+    assert mistakes(MODEL, {"sources": [source()], "zenoh": off, "lcm": off}) == [
         ("lcm.enabled", "found false here and in zenoh.enabled; expected true in at least one of them")
     ]
-    assert Settings.model_validate({"sources": [source()], "zenoh": off}).lcm.enabled
-    assert Settings.model_validate({"sources": [source()], "lcm": off}).zenoh.enabled
+    assert MODEL.model_validate({"sources": [source()], "zenoh": off}).lcm.enabled
+    assert MODEL.model_validate({"sources": [source()], "lcm": off}).zenoh.enabled
 
 
 def test_every_mistake_is_told_at_once() -> None:
     sources = [source(prt=1), {"name": "b"}]
-    assert dict(mistakes(Settings, {"sources": sources, "lcm": None, "zenho": {}})) == {
+    assert dict(mistakes(MODEL, {"sources": sources, "lcm": None, "zenho": {}})) == {
         "sources.0.prt": "unknown key (did you mean 'port'?); known keys: name, host, port, byte_order, "
         "streams, reconnect, connect_timeout_s, reply_timeout_s, stall_timeout_s, max_lag_ms, "
         "max_packet_bytes, max_c3d_bytes, "
@@ -155,7 +150,7 @@ def test_every_mistake_is_told_at_once() -> None:
         "sources.1.host": "missing; this key is required",
         "lcm": "found nothing; expected a mapping with any of the keys enabled, prefix, url, queries_url, "
         "max_rate_hz, tool_poses",
-        "zenho": "unknown key (did you mean 'zenoh'?); known keys: sources, spool, zenoh, lcm, metrics",
+        "zenho": "unknown key (did you mean 'zenoh'?); known keys: sources, spool, metrics, zenoh, lcm",
     }
 
 
@@ -171,7 +166,7 @@ def test_what_is_shown_has_no_password() -> None:
 def test_every_key_has_a_description_in_the_schema() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        schema: dict[str, Any] = Settings.model_json_schema()
+        schema: dict[str, Any] = MODEL.model_json_schema()
     sections = [schema, *schema["$defs"].values()]
     keys = [key for section in sections for key in section["properties"].values()]
     assert len(keys) > 20

@@ -4,8 +4,8 @@ from pathlib import Path
 import pytest
 import yaml
 
-from gateway.config.loading import load, read
 from gateway.config.show import shown_configuration
+from tests.configurations import load, read
 
 FILE = """\
 sources:

@@ -1,13 +1,9 @@
 import pytest
 
 from gateway.config.section import describe
-from gateway.config.settings import (
-    DEFAULT_LCM_URL,
-    LcmSettings,
-    SourceSettings,
-    StreamSettings,
-    ZenohSettings,
-)
+from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.outputs.lcm.settings import DEFAULT_LCM_URL, LcmSettings
+from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from tests.settings import mistakes, source

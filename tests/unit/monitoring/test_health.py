@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from gateway.config.settings import MetricsSettings, Settings, SourceSettings, StreamSettings
+from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
 from gateway.gateway import Gateway
 from gateway.messages.host_time import now_utime
 from gateway.monitoring.health import health_page
@@ -13,6 +13,7 @@ from gateway.outputs.memory import MemoryOutput
 from gateway.rtc3d.components import ComponentType
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
+from tests.configurations import make_settings
 
 MARKERS, ANALOG, EVENT = (
     (ComponentType.MARKERS,),
@@ -31,7 +32,7 @@ class Lab:
         source = SourceSettings(
             name="lab", host="192.0.2.20", streams=streams, stall_timeout_s=STALL_TIMEOUT_S
         )
-        settings = Settings(sources=(source,), metrics=MetricsSettings(enabled=False))
+        settings = make_settings(sources=(source,), metrics=MetricsSettings(enabled=False))
         self.gateway = Gateway(settings, [self.output])
         self.statuses = self.gateway.sources[0].statuses
 
@@ -95,7 +96,7 @@ async def test_an_on_demand_stream_without_subscribers_is_healthy() -> None:
     lab = Lab(StreamSettings(components=MARKERS, on_demand=True))
     set_state(lab.statuses[0], StreamState.IDLE, None)
     assert lab.problem() != ""
-    lab.output.listened = False
+    lab.output.has_subscriber = False
     assert lab.problem() == ""
     lab.statuses[0].state = StreamState.WAITING
     assert lab.problem() != ""
@@ -103,7 +104,7 @@ async def test_an_on_demand_stream_without_subscribers_is_healthy() -> None:
 
 async def test_other_streams_without_subscribers_still_need_frames() -> None:
     lab = Lab(StreamSettings(components=MARKERS))
-    lab.output.listened = False
+    lab.output.has_subscriber = False
     set_state(lab.statuses[0], StreamState.IDLE, None)
     assert lab.problem() != ""
 

@@ -9,7 +9,8 @@ from prometheus_client import Metric
 from prometheus_client.parser import text_string_to_metric_families
 
 from gateway import __version__
-from gateway.config.settings import MetricsSettings, Settings, SourceSettings, StreamSettings
+from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
+from gateway.errors import OutputError
 from gateway.gateway import Gateway
 from gateway.messages.stamp import Stamp
 from gateway.monitoring.loop_delay import LoopDelay
@@ -18,6 +19,7 @@ from gateway.rtc3d.components import ComponentType, encode_component
 from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.stream.state import StreamState
+from tests.configurations import make_settings
 from tests.toy_output import ToyOutput
 
 STREAMS = (
@@ -30,7 +32,7 @@ class Lab:
     """A gateway with two streams and two outputs that is not running."""
 
     def __init__(self) -> None:
-        settings = Settings(
+        settings = make_settings(
             sources=(SourceSettings(name="lab", host="192.0.2.20", streams=STREAMS),),
             metrics=MetricsSettings(enabled=False),
         )
@@ -102,9 +104,12 @@ async def test_exactly_one_state_of_a_stream_is_1(lab: Lab) -> None:
 async def test_drops_have_a_cause_and_common_causes_start_at_0(lab: Lab) -> None:
     lab.markers.drops["frame rejected"] = 2
     lab.markers.drops["quite unusual"] = 1
-    [(zenoh, zenoh_status), (toy, toy_status)] = lab.source.fan_out.outputs
-    zenoh_status.drops["no router"] = 9
-    toy_status.drops["ValueError"] = 1
+    stalled, broken = (output for output, _ in lab.source.fan_out.outputs)
+    errors = (OutputError("stalled", cause="queue full"), ValueError("oops"))
+    for output, error in zip((stalled, broken), errors, strict=True):
+        assert isinstance(output, ToyOutput)
+        output.error = error
+    lab.source.fan_out.publish_status(b"message")
     samples = {
         labels["cause"]: value
         for labels, value in lab.samples("stream_drops_total")
@@ -120,10 +125,10 @@ async def test_drops_have_a_cause_and_common_causes_start_at_0(lab: Lab) -> None
         (labels["output"], labels["cause"]): value for labels, value in lab.samples("output_drops_total")
     }
     assert drops == {
-        (zenoh.name, "not open"): 0,
-        (zenoh.name, "no router"): 9,
-        (zenoh.name, "put failed"): 0,
-        (toy.name, "ValueError"): 1,
+        (stalled.name, "broken"): 0,
+        (stalled.name, "queue full"): 1,
+        (broken.name, "broken"): 0,
+        (broken.name, "ValueError"): 1,
     }
 
 

@@ -238,17 +238,17 @@ def test_the_number_of_remembered_layouts_is_bounded(memory: MemoryOutput) -> No
 
 def test_a_component_is_listened_to_if_one_output_has_a_subscriber() -> None:
     without, with_tools = ToyOutput("without"), ToyOutput("with tools", "6d")
-    assert not FanOut("lab", [without]).listened(ALL)
-    assert FanOut("lab", [without, with_tools]).listened({ComponentType.MARKERS, ComponentType.TOOLS})
-    assert not FanOut("lab", [without, with_tools]).listened({ComponentType.MARKERS})
+    assert not FanOut("lab", [without]).has_subscribers(ALL)
+    assert FanOut("lab", [without, with_tools]).has_subscribers({ComponentType.MARKERS, ComponentType.TOOLS})
+    assert not FanOut("lab", [without, with_tools]).has_subscribers({ComponentType.MARKERS})
 
 
 def test_every_output_shows_whether_frames_flow() -> None:
     outputs = [ToyOutput("a"), ToyOutput("b")]
     fan_out = FanOut("lab", outputs)
-    fan_out.show_flowing(True)
-    fan_out.show_flowing(False)
-    assert [output.flowing for output in outputs] == [[True, False], [True, False]]
+    fan_out.show_streaming(True)
+    fan_out.show_streaming(False)
+    assert [output.streaming for output in outputs] == [[True, False], [True, False]]
 
 
 def markers_frame(number: int, *, timestamp_us: int, num_markers: int) -> Frame:

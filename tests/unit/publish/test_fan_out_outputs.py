@@ -28,7 +28,7 @@ def test_replacing_an_output_does_not_disturb_the_others() -> None:
     declared = list(stays.declared)
     fan_out.use([stays, after])
     publish(fan_out)
-    assert (stays.declared, stays.given_up) == (declared, [])
+    assert (stays.declared, stays.closed_topics) == (declared, [])
     assert sequences(stays, "3d") == [0]
 
 
@@ -54,7 +54,7 @@ def test_removing_an_output_closes_everything_declared_on_it() -> None:
     fan_out.use([])
     publish(fan_out)
     assert (output.declared, output.announced, output.messages) == ([], [], [])
-    assert sorted(output.given_up) == sorted(declared)
+    assert sorted(output.closed_topics) == sorted(declared)
 
 
 def test_an_output_that_comes_back_continues_its_numbers() -> None:
@@ -69,41 +69,44 @@ def test_an_output_that_comes_back_continues_its_numbers() -> None:
 
 def test_a_new_output_shows_that_frames_flow() -> None:
     fan_out = FanOut("lab", [ToyOutput("one")])
-    fan_out.show_flowing(True)
+    fan_out.show_streaming(True)
     new = ToyOutput("two")
     fan_out.use([new])
-    assert (new.announced, new.flowing) == (["lab"], [True])
+    assert (new.announced, new.streaming) == (["lab"], [True])
 
 
 def test_a_closed_fan_out_leaves_nothing_declared() -> None:
-    output = ToyOutput("toy", "Probe")
-    fan_out = FanOut("lab", [output], ["toy"])
+    output = ToyOutput("toy", "Probe", has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
     fan_out.set_parameters(PROBES)
-    fan_out.show_flowing(True)
+    fan_out.show_streaming(True)
     publish(fan_out)
     fan_out.close()
-    assert (output.declared, output.announced, output.flowing) == ([], [], [True, False])
+    assert (output.declared, output.announced, output.streaming) == ([], [], [True, False])
 
 
 def test_tool_topics_stay_open_on_an_output_that_stays() -> None:
-    stays, before, after = (ToyOutput(name, "Probe") for name in ("stays", "side", "side"))
-    fan_out = FanOut("lab", [stays, before], ["stays", "side"])
+    stays, before, after = (
+        ToyOutput(name, "Probe", has_tool_poses=True) for name in ("stays", "side", "side")
+    )
+    fan_out = FanOut("lab", [stays, before])
     fan_out.set_parameters(PROBES)
     publish(fan_out)
-    fan_out.use([stays, after], ["stays", "side"])
+    fan_out.use([stays, after])
     publish(fan_out)
-    assert stays.given_up == []
+    assert stays.closed_topics == []
     assert [len(output.poses("Probe")) for output in (stays, before, after)] == [2, 1, 1]
     assert [pose.sequence for pose in stays.poses("Probe")] == [0, 1]
     assert before.tool_names() == []
 
 
 def test_tool_topics_are_closed_where_they_are_switched_off() -> None:
-    output = ToyOutput("toy", "Probe")
-    fan_out = FanOut("lab", [output], ["toy"])
+    output = ToyOutput("toy", "Probe", has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
     fan_out.set_parameters(PROBES)
     publish(fan_out)
-    fan_out.use([output], [])
+    output.has_tool_poses = False
+    fan_out.use([output])
     publish(fan_out)
     assert output.tool_names() == []
     assert len(output.poses("Probe")) == 1

@@ -35,8 +35,8 @@ def publish_tools(fan_out: FanOut, count: int) -> None:
 
 
 def test_tools_have_topics_only_where_switched_on() -> None:
-    with_tools, without = ToyOutput("with", "Probe"), ToyOutput("without", "Probe")
-    fan_out = FanOut("lab", [with_tools, without], ["with"])
+    with_tools, without = ToyOutput("with", "Probe", has_tool_poses=True), ToyOutput("without", "Probe")
+    fan_out = FanOut("lab", [with_tools, without])
     fan_out.set_parameters(parameters("Probe"))
     publish_tools(fan_out, 1)
     [(topic, _)] = [each for each in with_tools.messages if len(each[0].path) == 2]
@@ -45,15 +45,15 @@ def test_tools_have_topics_only_where_switched_on() -> None:
 
 
 def test_a_pose_is_published_while_it_has_a_subscriber() -> None:
-    output = ToyOutput("toy", "Probe")
-    fan_out = FanOut("lab", [output], ["toy"])
+    output = ToyOutput("toy", "Probe", has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
     fan_out.set_parameters(parameters("Probe", "Head"))
     publish_tools(fan_out, 2)
     assert (len(output.poses("Probe")), len(output.poses("Head"))) == (1, 0)
-    output.listened = {"Head"}
+    output.wanted = {"Head"}
     publish_tools(fan_out, 2)
     assert (len(output.poses("Probe")), len(output.poses("Head"))) == (1, 1)
-    output.listened = set()
+    output.wanted = set()
     publish_tools(fan_out, 2)
     assert (len(output.poses("Probe")), len(output.poses("Head"))) == (1, 1)
     assert dict(fan_out.outputs[0][1].messages) == {"6d": 3, "6d/tool": 2}
@@ -71,24 +71,24 @@ def test_a_pose_is_published_while_it_has_a_subscriber() -> None:
     ],
 )
 def test_topics_are_named_after_the_labels(labels: list[str], names: list[str]) -> None:
-    output = ToyOutput()
-    fan_out = FanOut("lab", [output], ["toy"])
+    output = ToyOutput(has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
     fan_out.set_parameters(parameters(*labels))
     publish_tools(fan_out, len(names))
     assert output.tool_names() == names
 
 
 def test_tools_without_parameters_are_numbered() -> None:
-    output = ToyOutput()
-    fan_out = FanOut("lab", [output], ["toy"])
+    output = ToyOutput(has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
     fan_out.set_parameters(Parameters())
     publish_tools(fan_out, 2)
     assert output.tool_names() == ["tool 1", "tool 2"]
 
 
 def test_new_labels_replace_the_topics() -> None:
-    output = ToyOutput()
-    fan_out = FanOut("lab", [output], ["toy"])
+    output = ToyOutput(has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
     fan_out.set_parameters(parameters("Probe", "Head"))
     publish_tools(fan_out, 2)
     fan_out.set_parameters(parameters("Head", "Foot", "Hand"))
@@ -97,19 +97,19 @@ def test_new_labels_replace_the_topics() -> None:
 
 
 def test_topics_stay_open_while_the_labels_stay() -> None:
-    output = ToyOutput("toy", "Probe")
-    fan_out = FanOut("lab", [output], ["toy"])
+    output = ToyOutput("toy", "Probe", has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
     for session in (1, 2):
         fan_out.set_parameters(parameters("Probe"))
         fan_out.publish(tools_frame(IN_VIEW), Stamp(STAMP.utime, STAMP.capture_utime, session), ALL)
     counted = [(pose.sequence, pose.session) for pose in output.poses("Probe")]
     assert counted == [(0, 1), (1, 2)]
-    assert output.given_up == []
+    assert output.closed_topics == []
 
 
 def test_a_tool_that_keeps_its_label_continues_its_numbers() -> None:
-    output = ToyOutput("toy", "Probe", "Head")
-    fan_out = FanOut("lab", [output], ["toy"])
+    output = ToyOutput("toy", "Probe", "Head", has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
     for labels in (["Probe"], ["Head", "Probe"], ["Head", "Probe"]):
         fan_out.set_parameters(parameters(*labels))
         publish_tools(fan_out, len(labels))
@@ -118,20 +118,20 @@ def test_a_tool_that_keeps_its_label_continues_its_numbers() -> None:
 
 
 def test_a_number_of_tools_that_goes_up_and_down_reopens_no_topic() -> None:
-    output = ToyOutput("toy", "A", "B", "C")
-    fan_out = FanOut("lab", [output], ["toy"])
+    output = ToyOutput("toy", "A", "B", "C", has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
     fan_out.set_parameters(parameters("A", "B", "C"))
     publish_tools(fan_out, 3)
     for count in (1, 0, 3, 2):
         publish_tools(fan_out, count)
-    assert (output.tool_names(), output.given_up) == (["A", "B", "C"], [])
+    assert (output.tool_names(), output.closed_topics) == (["A", "B", "C"], [])
     counted = {name: [pose.sequence for pose in output.poses(name)] for name in "ABC"}
     assert counted == {"A": [0, 1, 2, 3], "B": [0, 1, 2], "C": [0, 1]}
 
 
 def test_too_many_tools_get_no_topics_and_are_counted(caplog: pytest.LogCaptureFixture) -> None:
-    output = ToyOutput("toy", "tool 1")
-    fan_out = FanOut("lab", [output], ["toy"])
+    output = ToyOutput("toy", "tool 1", has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
     for _ in range(2):
         publish_tools(fan_out, 257)
     assert output.tool_names() == []
@@ -148,16 +148,16 @@ def test_too_many_tools_get_no_topics_and_are_counted(caplog: pytest.LogCaptureF
 def test_poses_are_in_metres_whatever_the_unit_of_the_server(
     unit: str, position_m: tuple[float, ...]
 ) -> None:
-    output = ToyOutput("toy", "Probe")
-    fan_out = FanOut("lab", [output], ["toy"])
+    output = ToyOutput("toy", "Probe", has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
     fan_out.set_parameters(parameters("Probe", unit=unit))
     publish_tools(fan_out, 1)
     assert output.poses("Probe")[0].position_m == pytest.approx(position_m)
 
 
 def test_an_unknown_unit_is_logged_and_no_pose_is_published(caplog: pytest.LogCaptureFixture) -> None:
-    output = ToyOutput("toy", "Probe")
-    fan_out = FanOut("lab", [output], ["toy"])
+    output = ToyOutput("toy", "Probe", has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
     fan_out.set_parameters(parameters("Probe", unit="furlong"))
     publish_tools(fan_out, 1)
     assert output.poses("Probe") == []

@@ -1,4 +1,4 @@
-"""A desk before a server whose every answer the test decides."""
+"""A queries before a server whose every answer the test decides."""
 
 import asyncio
 from collections import deque
@@ -8,8 +8,9 @@ import pytest
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import QueryError
-from gateway.queries.answers import Answer, Question
-from gateway.queries.parameter_cache import Known
+from gateway.outputs.contract import Answer
+from gateway.queries.parameter_cache import CachedParameters
+from gateway.queries.questions import Question
 from gateway.queries.source_queries import SourceQueries, StreamAccess
 from gateway.rtc3d.commands import Command
 from gateway.rtc3d.components import ComponentType
@@ -55,7 +56,7 @@ class Server:
 
 
 class Rig:
-    """A desk with one stream."""
+    """A queries with one stream."""
 
     def __init__(self, **source: Any) -> None:
         self.server = Server()
@@ -68,7 +69,7 @@ class Rig:
         settings = SourceSettings(name="lab", host="192.0.2.1").model_copy(
             update={"fresh_interval_s": 0.0} | source
         )
-        self.desk = SourceQueries(
+        self.queries = SourceQueries(
             settings,
             [
                 StreamAccess(
@@ -94,13 +95,15 @@ class Rig:
         return self.server.connected
 
     def learn(self, xml: bytes) -> None:
-        self.desk.learn(xml, parse_parameters(xml))
+        self.queries.cache_parameters(xml, parse_parameters(xml))
 
-    async def parameters(self, *sections: str, fresh: bool = False, stale_ok: bool = False) -> Known:
-        return await self.desk.parameters(sections, fresh=fresh, stale_ok=stale_ok)
+    async def parameters(
+        self, *sections: str, fresh: bool = False, stale_ok: bool = False
+    ) -> CachedParameters:
+        return await self.queries.parameters(sections, fresh=fresh, stale_ok=stale_ok)
 
     async def ask(self, kind: Any, name: str = "", **question: Any) -> Answer:
-        return await self.desk.answer(Question(kind, name, **question))
+        return await self.queries.answer(Question(kind, name, **question))
 
     async def error(self, *sections: str, **options: bool) -> QueryError:
         with pytest.raises(QueryError) as caught:

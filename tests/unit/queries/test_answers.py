@@ -7,18 +7,15 @@ import rtc3d
 from gateway.errors import QueryError
 from gateway.messages.splice import splice
 from gateway.messages.stamp import Stamp
-from gateway.queries.answers import (
-    JSON,
+from gateway.outputs.encodings import JSON, TEXT
+from gateway.queries.answers import message_answer, parameters_json, schema_answer
+from gateway.queries.questions import (
     SCHEMA_TYPES,
-    TEXT,
     Question,
     accepted_keys,
     known_keys,
-    message_answer,
-    parameters_json,
     parse_question,
     parse_questions,
-    schema_answer,
 )
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import split_frame

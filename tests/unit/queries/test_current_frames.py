@@ -1,4 +1,4 @@
-"""Current frames, files and recording at the desk."""
+"""Current frames, files and recording at the queries."""
 
 import asyncio
 import json
@@ -51,7 +51,7 @@ async def test_the_newest_message_of_this_session_is_the_current_frame_while_str
     assert answer.payload == markers_message(session=1)
     assert answer.attachment == {"session": 1}
     rig.status.session = 2
-    with pytest.raises(QueryError, match="no 3d has come from source 'lab' in this session"):
+    with pytest.raises(QueryError, match="no 3d has arrived from source 'lab' in this session"):
         await rig.ask("component", "3d")
     assert rig.server.commands == []
 

@@ -1,4 +1,4 @@
-"""Parameters at the desk: what is known, asked for, remembered, told."""
+"""Parameters at the queries: what is known, asked for, remembered, told."""
 
 import asyncio
 import contextlib
@@ -22,7 +22,7 @@ async def test_what_is_known_is_given_without_asking() -> None:
     assert (known.xml, known.session) == (xml_of("mm"), 1)
     assert known.age_s >= 0
     assert rig.server.commands == []
-    assert rig.desk.parameters_xml == xml_of("mm")
+    assert rig.queries.parameters_xml == xml_of("mm")
 
 
 async def test_what_is_not_known_is_asked_for_and_then_known() -> None:
@@ -121,7 +121,7 @@ async def test_a_question_waits_no_longer_than_configured() -> None:
     rig = Rig(query_timeout_s=0.05)
     error = await rig.error()
     assert error.code == "timeout"
-    assert str(error) == "source 'lab': no answer within 0.05 s; questions that wait for the server: 1"
+    assert str(error) == "source 'lab': no answer within 0.05 s; questions waiting for the server: 1"
     rig.server.replies["SendParameters"] = xml_of("mm")
     assert (await rig.parameters()).xml == xml_of("mm")  # nobody is in its way
 
@@ -189,21 +189,21 @@ async def test_each_section_is_asked_for_once_to_fill_what_is_known() -> None:
     rig.learn(xml_of("mm"))
     words = ("General", "3D", "6D", "Analog", "Force", "Events")
     rig.server.replies = {f"SendParameters {word}": xml_of("mm") for word in words}
-    await rig.desk.fill()
+    await rig.queries.fill_cache()
     assert rig.server.commands == [f"SendParameters {word}" for word in words]
     for section in SECTIONS:
         await rig.parameters(section)
-    await rig.desk.fill()
+    await rig.queries.fill_cache()
     assert len(rig.server.commands) == 6
     assert rig.changes == []
 
 
 async def test_a_server_that_did_not_tell_its_parameters_is_not_asked_for_sections() -> None:
     rig = Rig()
-    await rig.desk.fill()
+    await rig.queries.fill_cache()
     rig.learn(xml_of("mm"))
     rig.status.session = 2
-    await rig.desk.fill()
+    await rig.queries.fill_cache()
     assert rig.server.commands == []
 
 
@@ -212,7 +212,7 @@ async def test_filling_ends_where_the_server_says_nothing() -> None:
     rig.learn(xml_of("mm"))
     silence = ReplyTimeoutError("did not answer")
     rig.server.replies = {"SendParameters General": silence, "SendParameters": silence}
-    await rig.desk.fill()
+    await rig.queries.fill_cache()
     assert rig.server.commands == ["SendParameters General", "SendParameters"]
 
 

@@ -5,10 +5,11 @@ from pathlib import Path
 import lcm
 import pytest
 
-from gateway.config.settings import LcmSettings
 from gateway.errors import OutputError
 from gateway.messages.topics import Topic
-from gateway.outputs.lcm.output import LcmOutput, multicast_problem, open_lcm
+from gateway.outputs.lcm.connection import multicast_problem, open_lcm
+from gateway.outputs.lcm.output import LcmOutput
+from gateway.outputs.lcm.settings import LcmSettings
 from tests.networks import add_multicast_route, lcm_url, remove_multicast_route
 from tests.waiting import wait_until
 
@@ -103,12 +104,14 @@ def test_a_channel_given_up_is_free_and_one_in_use_is_not(output: LcmOutput) -> 
 def test_a_url_that_lcm_refuses_is_told_with_the_url(url: str) -> None:
     output = LcmOutput(LcmSettings.model_construct(url=url))
     output.start()
+    wait_until(lambda: output.health().problem.startswith("LCM does not open"))
     problem = output.health().problem
     assert problem.startswith(f"LCM does not open {url}: ")
     assert problem.endswith("check lcm.url")
     with pytest.raises(OutputError, match=r"check lcm\.url$") as caught:
         output.publisher(topic("3d")).publish(b"message")
     assert caught.value.cause == "not open"
+    output.close()
 
 
 def test_it_is_opened_again_once_it_can_be(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

@@ -10,10 +10,11 @@ from typing import Any
 import pytest
 import zenoh
 
-from gateway.config.settings import ZenohSettings
 from gateway.errors import ConfigError
 from gateway.messages.topics import Topic
-from gateway.outputs.zenoh.output import ZenohOutput, zenoh_config
+from gateway.outputs.zenoh.config import zenoh_config
+from gateway.outputs.zenoh.output import ZenohOutput
+from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.networks import free_endpoint, open_zenoh, zenoh_keys
 from tests.waiting import wait_until
 
@@ -182,16 +183,16 @@ def test_a_server_is_shown_while_its_frames_flow(lab: Lab) -> None:
     def shown() -> list[str]:
         return lab.tokens("mocap/*/server")
 
-    lab.output.show_flowing("lab", True)
+    lab.output.show_streaming("lab", True)
     lab.open()
     wait_until(lambda: shown() == ["mocap/lab/server"])
-    lab.output.show_flowing("hall-2", True)
-    lab.output.show_flowing("hall-2", True)
+    lab.output.show_streaming("hall-2", True)
+    lab.output.show_streaming("hall-2", True)
     wait_until(lambda: shown() == ["mocap/hall-2/server", "mocap/lab/server"])
-    lab.output.show_flowing("lab", False)
-    lab.output.show_flowing("lab", False)
+    lab.output.show_streaming("lab", False)
+    lab.output.show_streaming("lab", False)
     wait_until(lambda: shown() == ["mocap/hall-2/server"])
-    lab.output.show_flowing("lab", True)
+    lab.output.show_streaming("lab", True)
     wait_until(lambda: shown() == ["mocap/hall-2/server", "mocap/lab/server"])
     lab.output.close()
     wait_until(lambda: shown() == [])
@@ -250,7 +251,7 @@ def test_a_process_ends_although_the_router_never_answers() -> None:
     keys = zenoh_keys("client", connect=free_endpoint())
     keys["connect"]["timeout_ms"] = -1
     program = f"""
-from gateway.config.settings import ZenohSettings
+from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.output import ZenohOutput
 output = ZenohOutput(ZenohSettings(config={keys!r}))
 output.start()

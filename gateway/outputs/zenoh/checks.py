@@ -13,12 +13,11 @@ from typing import Any, Final
 import zenoh
 
 from gateway.config.secrets import mask_secrets_in_text
-from gateway.config.settings import ZenohSettings
-from gateway.config.values import zenoh_reason
 from gateway.errors import ConfigError
-from gateway.findings import Finding, Subject
+from gateway.findings import Finding, MessageLoad, Subject
 from gateway.messages.topics import zenoh_key
-from gateway.outputs.zenoh.output import zenoh_config
+from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason
+from gateway.outputs.zenoh.settings import ZenohSettings
 
 CHECKS: Final = ("link", "gateway")
 
@@ -32,10 +31,10 @@ _POLL_S: Final = 0.05
 _zenoh: Final = Subject("zenoh")
 
 
-def check_zenoh(settings: ZenohSettings, sources: Sequence[str], seconds: float) -> list[Finding]:
+def check_zenoh(
+    settings: ZenohSettings, sources: Sequence[str], _loads: Sequence[MessageLoad], seconds: float
+) -> list[Finding]:
     """Check the session and find gateways that serve ``sources``. Blocks for ``seconds`` or a bit longer."""
-    if not settings.enabled:
-        return [_zenoh.not_tested(check, "zenoh.enabled is false") for check in CHECKS]
     try:
         config = zenoh_config(settings.config)
     except ConfigError as error:

@@ -5,30 +5,29 @@ from collections.abc import Sequence
 from typing import Final
 from urllib.parse import parse_qs, urlsplit
 
-from gateway.config.settings import LcmSettings
 from gateway.errors import OutputError
 from gateway.findings import Finding, MessageLoad, Subject
-from gateway.outputs.lcm.output import multicast_problem, open_lcm
+from gateway.outputs.lcm.connection import MULTICAST_SCHEMES, multicast_problem, open_lcm, scheme_of
+from gateway.outputs.lcm.settings import LcmSettings
 
 CHECKS: Final = ("route", "buffers")
 
 PAUSE_S: Final = 0.02
 """The longest time that a subscriber may pause without losing a message."""
 
-_MULTICAST_SCHEMES: Final = ("udpm", "mpudpm")
 _LARGEST_DATAGRAM: Final = 65_499
 """LCM splits larger messages into several datagrams."""
 
 _lcm: Final = Subject("lcm")
 
 
-def check_lcm(settings: LcmSettings, loads: Sequence[MessageLoad]) -> list[Finding]:
+def check_lcm(
+    settings: LcmSettings, _sources: Sequence[str], loads: Sequence[MessageLoad], _seconds: float
+) -> list[Finding]:
     """Check the route, and the default receive buffer of a subscriber to ``loads``."""
-    if not settings.enabled:
-        return [_lcm.not_tested(check, "lcm.enabled is false") for check in CHECKS]
     url = settings.effective_url
-    scheme = urlsplit(url).scheme
-    if scheme not in _MULTICAST_SCHEMES:
+    scheme = scheme_of(url)
+    if scheme not in MULTICAST_SCHEMES:
         return [
             _check_other_scheme(url, scheme),
             _lcm.not_tested("buffers", f"{scheme} does not need a receive buffer"),

@@ -1,0 +1,48 @@
+"""Checks of the outputs, as the registry lists them."""
+
+import time
+from collections.abc import Sequence
+from typing import Final
+
+from gateway.config.settings import OutputSettings
+from gateway.errors import ConfigError
+from gateway.findings import Finding, MessageLoad, Subject
+from gateway.outputs.kind import OPENS, OutputKind
+
+_POLL_S: Final = 0.05
+
+
+def check_output(
+    kind: OutputKind,
+    settings: OutputSettings,
+    sources: Sequence[str],
+    loads: Sequence[MessageLoad],
+    seconds: float,
+) -> list[Finding]:
+    """Run the checks of one output; blocks for ``seconds`` or a bit longer."""
+    if not settings.enabled:
+        subject = Subject(kind.name)
+        return [subject.not_tested(check, f"{kind.name}.enabled is false") for check in kind.checks]
+    if kind.run_checks is not None:
+        return kind.run_checks(settings, sources, loads, seconds)
+    return [_check_opens(kind, settings, seconds)]
+
+
+def _check_opens(kind: OutputKind, settings: OutputSettings, seconds: float) -> Finding:
+    """Open the output as the gateway does, and close it."""
+    subject = Subject(kind.name)
+    try:
+        output = kind.create(settings)
+    except ConfigError as error:
+        return subject.failing(OPENS, str(error), f"Correct {kind.name} in the configuration.")
+    output.start()
+    deadline_s = time.monotonic() + seconds
+    while not output.health().connected and time.monotonic() < deadline_s:
+        time.sleep(_POLL_S)
+        output.maintain()
+    health = output.health()
+    output.close()
+    if health.connected:
+        return subject.passing(OPENS, "the output opens")
+    found, _, remedy = health.problem.partition("; ")
+    return subject.failing(OPENS, found, f"{remedy[:1].upper()}{remedy[1:]}.")

@@ -1,0 +1,106 @@
+"""Sending on LCM from the event loop: what every message goes through."""
+
+import logging
+import time
+from collections.abc import Callable
+from typing import Any, Final
+
+import lcm
+
+from gateway.errors import OutputError
+from gateway.log import HOLD_S, FailureLog
+from gateway.outputs.lcm.connection import open_lcm, send_problem
+
+_NEVER: Final = float("inf")
+RETRY_S: Final = 1.0
+"""How long to wait between attempts to open LCM."""
+
+NOT_OPEN: Final = "LCM is not open; start the output first"
+CLOSED: Final = "LCM is closed; start the gateway again"
+
+logger = logging.getLogger(__name__)
+
+
+class LcmSender:
+    """One LCM object that publishes without blocking: multicast, or in memory.
+
+    ``shared`` is an LCM object that exists already, because memq:// reaches no other. ``on_open`` is called
+    once it is open.
+    """
+
+    def __init__(self, url: str, shared: lcm.LCM | None, on_open: Callable[[], None]) -> None:
+        self.problem = NOT_OPEN
+        """Why nothing can be sent now, and what to do; "" if it can."""
+        self._url = url
+        self._shared = shared
+        self._on_open = on_open
+        self._lcm: lcm.LCM | None = None
+        self._retry_at_s = _NEVER
+        self._opening = FailureLog(logger, "lcm")
+        self._sending = FailureLog(logger, "lcm", HOLD_S)
+
+    def open(self) -> None:
+        """Open LCM; ``maintain`` repeats what fails."""
+        try:
+            self._lcm = self._shared or open_lcm(self._url)
+        except OutputError as error:
+            self.problem = str(error)
+            self._opening.failed(self.problem)
+            self._retry_at_s = time.monotonic() + RETRY_S
+        else:
+            self.problem = ""
+            self._opening.succeeded(f"sending to {self._url}")
+            self._on_open()
+
+    def send(self, channel: str, message: bytes) -> None:
+        """Publish on ``channel``; raises OutputError if it failed. The next message is tried again."""
+        if self._lcm is None:
+            raise OutputError(self.problem, cause="not open")
+        try:
+            self._lcm.publish(channel, message)
+        except OSError as error:
+            self.problem = send_problem(self._url, error)
+            self._sending.failed(self.problem)
+            raise OutputError(self.problem, cause="send failed") from error
+        if self._sending.failing:
+            self.problem = ""
+            self._sending.recovered(f"sending to {self._url}")
+
+    def maintain(self) -> None:
+        """Open LCM again if it is not open and the last attempt was RETRY_S ago."""
+        if self._lcm is None and time.monotonic() >= self._retry_at_s:
+            self.open()
+
+    def close(self) -> None:
+        """Release LCM: it has no close, deleting the object frees its sockets and thread."""
+        self._lcm = None
+        self.problem = CLOSED
+        self._retry_at_s = _NEVER
+
+
+class LcmPublisher:
+    """Sends the messages of one topic on ``channel``."""
+
+    wanted = True  # LCM cannot know who is subscribed
+
+    def __init__(
+        self, channel: str, send: Callable[[str, bytes], None], forget: Callable[[Any], None]
+    ) -> None:
+        self.channel = channel
+        self._send = send
+        self._forget = forget
+        self._is_closed = False
+
+    def publish(self, message: bytes) -> None:
+        """Send one message; raises OutputError if LCM did not take it."""
+        if self._is_closed:
+            raise OutputError(
+                f"LCM channel {self.channel} is closed; ask for a new publisher", cause="closed"
+            )
+        self._send(self.channel, message)
+
+    def close(self) -> None:
+        """Free the channel's name."""
+        if not self._is_closed:
+            self._is_closed = True
+            self._forget(self)

@@ -1,0 +1,56 @@
+"""Subscribing on LCM to what a gateway publishes: for ``echo``, the demo and tests."""
+
+import re
+import threading
+from typing import Final
+
+import lcm
+
+from gateway.messages.topics import lcm_channel
+from gateway.outputs.kind import Receive, SubscriptionRequest
+from gateway.outputs.lcm.connection import open_lcm
+from gateway.outputs.lcm.settings import effective_lcm_url
+
+DEFAULT_PREFIX: Final = "MOCAP"
+
+QUEUE_MESSAGES: Final = 10_000
+"""LCM's own default of 30 messages loses some whenever this process pauses for a moment."""
+
+_POLL_MS: Final = 100
+
+
+def channel_pattern(prefix: str, source: str | None, component: str | None) -> str:
+    """Return the regular expression of the channels; None stands for all sources or components."""
+    if source is not None and component is not None:
+        return re.escape(lcm_channel(prefix, source, component))
+    if source is not None:
+        return re.escape(lcm_channel(prefix, source)) + "_.+"
+    return re.escape(prefix) + "_.+" + ("" if component is None else "_" + re.escape(component.upper()))
+
+
+class LcmSubscriber:
+    """Subscribes to ``channels``, a regular expression, and receives in a thread of its own."""
+
+    def __init__(self, connection: lcm.LCM, channels: str, receive: Receive) -> None:
+        self._lcm = connection
+        self._subscription = connection.subscribe(channels, receive)
+        self._subscription.set_queue_capacity(QUEUE_MESSAGES)
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._receive, name="lcm-subscriber", daemon=True)
+        self._thread.start()
+
+    def _receive(self) -> None:
+        while not self._stop.is_set():
+            self._lcm.handle_timeout(_POLL_MS)
+
+    def close(self) -> None:
+        """End the thread and unsubscribe."""
+        self._stop.set()
+        self._thread.join()
+        self._lcm.unsubscribe(self._subscription)
+
+
+def subscribe(request: SubscriptionRequest, receive: Receive) -> LcmSubscriber:
+    """Subscribe on a new LCM object; ``request.address`` is its URL. Raises OutputError."""
+    channels = channel_pattern(request.prefix or DEFAULT_PREFIX, request.source, request.component)
+    return LcmSubscriber(open_lcm(effective_lcm_url(request.address)), channels, receive)

@@ -1,0 +1,21 @@
+"""The registry of outputs: everything that lists outputs reads it. To add an output, add its line."""
+
+from typing import Final
+
+from gateway.config.settings import Settings, settings_model
+from gateway.outputs.contract import Output
+from gateway.outputs.kind import OutputKind
+from gateway.outputs.lcm.kind import LCM
+from gateway.outputs.zenoh.kind import ZENOH
+
+OUTPUTS: Final[dict[str, OutputKind]] = {kind.name: kind for kind in (ZENOH, LCM)}
+
+
+def settings_type() -> type[Settings]:
+    """Return the model of the whole configuration, with a section for every output."""
+    return settings_model({name: kind.settings for name, kind in OUTPUTS.items()})
+
+
+def build_outputs(settings: Settings) -> list[Output]:
+    """Return the outputs that are enabled; raises ConfigError if one refuses its configuration."""
+    return [OUTPUTS[name].create(section) for name, section in settings.outputs.items() if section.enabled]

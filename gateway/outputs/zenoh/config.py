@@ -1,0 +1,67 @@
+"""Zenoh's own configuration, and its error messages made readable."""
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final
+
+import zenoh
+
+from gateway.config.secrets import mask_secrets_in_text
+from gateway.errors import ConfigError
+
+_ZENOH_MESSAGE: Final = re.compile(
+    r'Message \{ msg: "((?:[^"\\]|\\.)*)", location: Some\(Location \{ line: (\d+), column: (\d+)'
+)
+"""How Zenoh reports a value in a file that it cannot use: a Rust debug text."""
+
+_DEFAULTS: Final = {
+    # 16 MB of /dev/shm, and files left behind after a kill, for messages of a few kB.
+    "transport": {"shared_memory": {"enabled": False}},
+    # Caches for late subscribers need samples with time stamps.
+    "timestamping": {"enabled": True},
+    # A lost router is found again within half a second instead of up to 4 s.
+    "connect": {"retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}},
+}
+"""The gateway's defaults where they differ from Zenoh's; an inline configuration overrides them."""
+
+
+def zenoh_config(config: Path | Mapping[str, Any]) -> zenoh.Config:
+    """Return Zenoh's configuration from a JSON5 file, as it stands, or from keys given inline.
+
+    Raises ConfigError with Zenoh's own reason.
+    """
+    try:
+        if isinstance(config, Path):
+            return zenoh.Config.from_file(str(config))
+        return zenoh.Config.from_json5(json.dumps(_merged(_DEFAULTS, config)))
+    except (zenoh.ZError, TypeError, ValueError) as error:
+        where = f"file {config}" if isinstance(config, Path) else "inline zenoh.config"
+        raise ConfigError(f"Zenoh does not accept the {where}: {zenoh_reason(error)}") from error
+
+
+def _merged(defaults: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    merged = dict(defaults)
+    for key, value in given.items():
+        default = merged.get(key)
+        if isinstance(default, Mapping) and isinstance(value, Mapping):
+            merged[key] = _merged(default, value)
+        else:
+            merged[key] = value
+    return merged
+
+
+def zenoh_reason(error: Exception) -> str:
+    """Return the text of Zenoh's error on one line, without source locations and without secrets."""
+    text = str(error)
+    if message := _ZENOH_MESSAGE.search(text):
+        text = f"line {message[2]}, column {message[3]}: " + re.sub(r"\\(.)", r"\1", message[1])
+    text = re.sub(r"\s+at \S+\.rs:\d+\.?", "", text)
+    # A drawing shows the line of the file that cannot be read, which may hold a password: its place
+    # and what was expected remain. So does the type of a wrong value, without the value.
+    text = re.sub(r"^ *--> (\d+):(\d+)", r"line \1, column \2:", text)
+    text = re.sub(r"^ *(\d+ )?\|.*\n|^ *= ", "", text, flags=re.MULTILINE)
+    text = re.sub(r"(invalid (?:type|value): [a-z ]+) (?:`[^`]*`|\"(?:[^\"\\]|\\.)*\")", r"\1", text)
+    text = re.sub(r"\bSingle\(([^()]*)\)", r"\1", text)  # Rust's word for an endpoint without alternatives
+    return " ".join(mask_secrets_in_text(text).split())

@@ -1,0 +1,36 @@
+"""The Zenoh output in the registry."""
+
+import socket
+from typing import Final
+
+from gateway.outputs.kind import DemoSide, OutputKind, Receive, Subscription
+from gateway.outputs.zenoh.checks import CHECKS, check_zenoh
+from gateway.outputs.zenoh.output import ZenohOutput
+from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_pattern, open_zenoh, subscribe
+
+
+def _demo(_use_network: bool) -> DemoSide:
+    """Return the Zenoh side of the demo: loopback TCP without scouting, so nothing leaves the machine."""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    settings = ZenohSettings(
+        config={"listen": {"endpoints": [endpoint]}, "scouting": {"multicast": {"enabled": False}}}
+    )
+
+    def subscribe_here(source: str, receive: Receive) -> Subscription:
+        keys = key_pattern(settings.prefix, source, None)
+        return ZenohSubscriber(open_zenoh(endpoint), keys, receive, owns_session=True)
+
+    return DemoSide(settings, ZenohOutput(settings), subscribe_here)
+
+
+ZENOH: Final = OutputKind(
+    name=ZenohOutput.name,
+    settings=ZenohSettings,
+    create=ZenohOutput,
+    subscribe=subscribe,
+    checks=CHECKS,
+    run_checks=check_zenoh,
+    demo=_demo,
+)

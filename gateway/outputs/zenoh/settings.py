@@ -1,0 +1,93 @@
+"""The section ``zenoh`` of the configuration."""
+
+import json
+import re
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Annotated, Any, ClassVar
+
+import zenoh
+from pydantic import AfterValidator, Field, PlainValidator, ValidationInfo
+
+from gateway.config.section import describe, expects, validation_error
+from gateway.config.settings import OutputSettings
+from gateway.config.values import MaxRates, Switch
+from gateway.outputs.zenoh.config import zenoh_reason
+
+
+def _key_prefix(text: str) -> str:
+    if len(text) > 128 or not all(text.split("/")) or not text.isprintable() or re.search(r"[\s*$#?]", text):
+        raise ValueError
+    return text
+
+
+KeyPrefix = Annotated[
+    str,
+    AfterValidator(_key_prefix),
+    expects(
+        "a Zenoh key of at most 128 characters, such as mocap or site/mocap, "
+        "without spaces, * $ # ?, and without a leading, trailing or double /"
+    ),
+]
+
+
+def _zenoh_config(value: object, info: ValidationInfo) -> Path | dict[str, Any]:
+    """Return the path of Zenoh's configuration, or its keys, once Zenoh itself has read them.
+
+    A relative path counts from ``folder`` in the validation's context; without one, no file is read.
+    """
+    match value:
+        case dict():
+            _ask_zenoh(lambda: zenoh.Config.from_json5(json.dumps(value, allow_nan=False)), "these keys")
+            return value
+        case Path():
+            return value
+        case str() if value and value.isprintable():
+            folder: Path | None = (info.context or {}).get("folder")
+            if folder is None:
+                return Path(value)
+            path = folder / value
+            _ask_zenoh(lambda: zenoh.Config.from_file(path), f"the file {path}")
+            return path
+    raise validation_error(
+        f"found {describe(value)}; expected a JSON5 file's path or a mapping with Zenoh's own keys"
+    )
+
+
+def _ask_zenoh(read: Callable[[], object], what: str) -> None:
+    try:
+        read()
+    except (zenoh.ZError, TypeError, ValueError) as error:
+        raise validation_error(f"Zenoh refuses {what}: {zenoh_reason(error)}") from None
+
+
+ZenohConfig = Annotated[
+    Path | dict[str, Any], PlainValidator(_zenoh_config, json_schema_input_type=str | dict[str, Any])
+]
+"""YAML: a path, or a mapping."""
+
+
+class ZenohSettings(OutputSettings):
+    """How data and answers go to Zenoh."""
+
+    foreign_keys: ClassVar[Mapping[str, str]] = {
+        "config": "zenoh.config as the path of a JSON5 file that only the gateway may read"
+    }
+
+    enabled: Switch = True
+    """Whether anything is published, and answered, on Zenoh."""
+
+    prefix: KeyPrefix = "mocap"
+    """What all keys begin with."""
+
+    config: ZenohConfig = Field(default_factory=dict, repr=False)  # it may hold a password
+    """Zenoh's own configuration: the path of a JSON5 file, or its keys inline; without secrets."""
+
+    express: Switch = False
+    """Whether each message is sent at once instead of in batches."""
+
+    max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
+    """The highest rate of each component named; frames beyond it are left out, evenly."""
+
+    tool_poses: Switch = False
+    """Whether each tool's pose is published on a key of its own, while someone listens."""

@@ -1,0 +1,66 @@
+"""Subscribing on Zenoh to what a gateway publishes: for ``echo``, the demo and tests."""
+
+from typing import Any
+
+import zenoh
+
+from gateway.errors import OutputError
+from gateway.messages.topics import zenoh_key
+from gateway.outputs.kind import Receive, SubscriptionRequest
+from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason
+
+DEFAULT_PREFIX = "mocap"
+
+
+def key_pattern(prefix: str, source: str | None, component: str | None) -> str:
+    """Return the key expression of one component, or of all (None), of one source or of all."""
+    return zenoh_key(prefix, source or "*") + "/" + (component or "**")
+
+
+def open_zenoh(connect: str | None) -> zenoh.Session:
+    """Return an open session; raises OutputError if it does not open.
+
+    With ``connect``, an endpoint such as tcp/127.0.0.1:7447, it is a client of that endpoint and looks for
+    nobody else. Without, it is a peer that finds others by multicast, as Zenoh does by default.
+    """
+    config: dict[str, Any] = {}
+    if connect is not None:
+        config = {
+            "mode": "client",
+            "connect": {"endpoints": [connect]},
+            "scouting": {"multicast": {"enabled": False}},
+        }
+    try:
+        return zenoh.open(zenoh_config(config))
+    except zenoh.ZError as error:
+        where = f" to {connect}" if connect else ""
+        raise OutputError(
+            f"no Zenoh session{where}: {zenoh_reason(error)}; is the gateway or the router running there?",
+            cause="not open",
+        ) from error
+
+
+class ZenohSubscriber:
+    """Subscribes to ``keys``, a key expression; closes the session too if it ``owns_session``."""
+
+    def __init__(
+        self, session: zenoh.Session, keys: str, receive: Receive, *, owns_session: bool = False
+    ) -> None:
+        def on_sample(sample: zenoh.Sample) -> None:
+            receive(str(sample.key_expr), sample.payload.to_bytes())
+
+        self._session = session
+        self._owns_session = owns_session
+        self._subscriber = session.declare_subscriber(keys, on_sample)
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        self._subscriber.undeclare()
+        if self._owns_session:
+            self._session.close()
+
+
+def subscribe(request: SubscriptionRequest, receive: Receive) -> ZenohSubscriber:
+    """Subscribe in a new session; ``request.address`` is the endpoint to connect to. Raises OutputError."""
+    keys = key_pattern(request.prefix or DEFAULT_PREFIX, request.source, request.component)
+    return ZenohSubscriber(open_zenoh(request.address), keys, receive, owns_session=True)

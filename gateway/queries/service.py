@@ -1,0 +1,77 @@
+"""The query service: which source, or which output's own command, answers a peer's query."""
+
+import asyncio
+from collections.abc import Callable, Mapping, Sequence
+
+from gateway.errors import QueryError
+from gateway.outputs.contract import Answer, Command, KeyPath, ServerParameters
+from gateway.queries.questions import (
+    RECORDING,
+    accepted_keys,
+    check_sections,
+    known_keys,
+    parse_question,
+    parse_questions,
+)
+from gateway.queries.source_queries import SourceQueries
+from gateway.rtc3d.parameters import SECTIONS
+
+
+class SourceQueryService:
+    """Implements QueryService (outputs/contract.py) for the sources of one gateway.
+
+    ``sources`` changes at a reload. ``commands`` returns the outputs' own commands, by name.
+    """
+
+    def __init__(
+        self, sources: Mapping[str, SourceQueries], commands: Callable[[], Mapping[str, Command]]
+    ) -> None:
+        self._sources = sources
+        self._commands = commands
+
+    def serves(self, source: str) -> bool:
+        """See QueryService."""
+        return source in self._sources
+
+    def keys(self, source: str) -> list[KeyPath]:
+        """See QueryService. Nobody starts a recording by a wildcard."""
+        return [path for path in known_keys(self._sources[source].components) if path != RECORDING]
+
+    def accepted_keys(self, source: str) -> str:
+        """See QueryService."""
+        return accepted_keys(self._sources[source].components, self._commands())
+
+    async def answer(self, source: str, path: KeyPath, options: Mapping[str, str]) -> Answer:
+        """See QueryService."""
+        command = self._commands().get("/".join(path))
+        if command is not None:
+            return await command(source, options)
+        queries = self._sources[source]
+        return await queries.answer(parse_question(path, options, queries.components))
+
+    async def answer_all(
+        self, source: str, paths: Sequence[KeyPath], options: Mapping[str, str]
+    ) -> dict[KeyPath, Answer]:
+        """See QueryService."""
+        queries = self._sources[source]
+        questions = parse_questions(paths, options, queries.components)
+        found = await asyncio.gather(*map(queries.answer, questions.values()), return_exceptions=True)
+        answers: dict[KeyPath, Answer] = {}
+        problem: BaseException | None = None
+        for path, each in zip(questions, found, strict=True):
+            if isinstance(each, Answer):
+                answers[path] = each
+            elif problem is None or not isinstance(each, QueryError):
+                problem = each
+        if problem is not None and (not answers or not isinstance(problem, QueryError)):
+            raise problem
+        return answers
+
+    async def parameters(self, source: str, sections: Sequence[str], *, fresh: bool) -> ServerParameters:
+        """See QueryService."""
+        check_sections(sections)
+        asked = tuple(section for section in SECTIONS if section in sections)
+        cached = await self._sources[source].parameters(
+            () if asked == tuple(SECTIONS) else asked, fresh=fresh, stale_ok=False
+        )
+        return ServerParameters(cached.xml, cached.session, cached.age_s)
