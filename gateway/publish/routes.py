@@ -171,7 +171,7 @@ class FrameRoute:
         else:
             self._sent.messages += 1
             self._sent.bytes += len(frame.body)
-            self._output_route.count_success()
+            self._output_route.note_success()
 
     def close(self) -> None:
         """Close the publisher."""
