@@ -1,4 +1,4 @@
-"""Puts the files of the repository that pages link to into the site, so that the links hold there as well."""
+"""A MkDocs hook that copies repository files into the site, so that links to them work there."""
 
 import posixpath
 import re
@@ -12,7 +12,7 @@ LINK = re.compile(r"\]\(([^)\s#]+)[^)\s]*\)")
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add each file above docs/ that a page links to, as text that a browser shows."""
+    """Add each file outside docs/ that a page links to, as a text file that a browser can display."""
     for page in files.documentation_pages():
         for link in LINK.findall(page.content_string):
             uri = posixpath.normpath(posixpath.join(posixpath.dirname(page.src_uri), link))
@@ -25,7 +25,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
                     dest_dir=config["site_dir"],
                     use_directory_urls=False,
                     dest_uri=f"files/{name}.txt",
-                    inclusion=InclusionLevel.INCLUDED,  # though it stands above docs/
+                    inclusion=InclusionLevel.INCLUDED,  # although it is outside docs/
                 )
                 file.content_bytes = path.read_bytes()
                 files.append(file)

@@ -1,9 +1,10 @@
-"""A ROS 2 node that publishes tools as PoseStamped and markers as PointCloud2, from a gateway's Zenoh keys.
+"""A ROS 2 node that publishes a gateway's tools as PoseStamped and its markers as PointCloud2.
 
     python examples/ros2_bridge.py tcp/192.0.2.5:7447 lab
 
-Needs rclpy (a sourced ROS 2), eclipse-zenoh and numpy, and ``zenoh: {tool_poses: true}`` in the gateway's
-configuration. Topics: /lab/markers, and a pose for each tool, as /lab/tool_Tool_1.
+It reads the gateway's Zenoh keys and publishes /lab/markers and one topic per tool, such as /lab/tool_Tool_1.
+It needs rclpy (from a sourced ROS 2 environment), eclipse-zenoh and numpy. The configuration of the gateway
+must contain ``zenoh: {tool_poses: true}``.
 """
 
 import re
@@ -28,7 +29,7 @@ FIELDS = [
 
 
 class Bridge(Node):
-    """Publishes what comes for one source; poses are in the frame that is called like it."""
+    """A node for the markers and tools of one source. The ROS frame has the name of the source."""
 
     def __init__(self, source: str) -> None:
         super().__init__("rtc3d_bridge")

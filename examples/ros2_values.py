@@ -1,6 +1,7 @@
-"""What ROS 2 messages hold, from the gateway's messages, without ROS. examples/ros2_bridge.py fills them in.
+"""Functions that convert the gateway's messages into values for ROS 2 messages. They do not need ROS.
 
-ROS counts in metres, with quaternions x, y, z, w and stamps in seconds and nanoseconds.
+examples/ros2_bridge.py uses them. ROS uses metres, quaternions in the order x, y, z, w, and stamps in
+seconds and nanoseconds.
 """
 
 import struct
@@ -9,26 +10,26 @@ from typing import Final, NamedTuple
 import numpy as np
 
 _POSE: Final = struct.Struct(">8sqqqiiq?3f4ff")  # tool_pose_t, 81 bytes
-_MARKERS: Final = struct.Struct(">8sqqqiiqi")  # markers_t, up to its items
-_MARKER: Final = np.dtype(">f4")
+_MARKERS: Final = struct.Struct(">8sqqqiiqi")  # markers_t without its items
+_FLOAT: Final = np.dtype(">f4")
 _MM_PER_M: Final = 1000
 
 
 class Stamp(NamedTuple):
-    """A time since the Unix epoch, as builtin_interfaces/Time has it."""
+    """A time since the Unix epoch, in the form of builtin_interfaces/Time."""
 
     sec: int
     nanosec: int
 
     @classmethod
     def of(cls, utime: int) -> "Stamp":
-        """Return the stamp of ``utime``, in µs."""
+        """Return the stamp for ``utime``, which is in µs."""
         seconds, microseconds = divmod(utime, 1_000_000)
         return cls(seconds, 1000 * microseconds)
 
 
 class Pose(NamedTuple):
-    """What geometry_msgs/PoseStamped holds, without its frame."""
+    """The values of a geometry_msgs/PoseStamped, without its frame."""
 
     stamp: Stamp
     position_m: tuple[float, float, float]
@@ -36,7 +37,7 @@ class Pose(NamedTuple):
 
 
 class Cloud(NamedTuple):
-    """What sensor_msgs/PointCloud2 holds: x, y, z of each point as float32, little-endian."""
+    """The values of a sensor_msgs/PointCloud2: x, y, z of each point as little-endian float32."""
 
     stamp: Stamp
     width: int
@@ -44,14 +45,14 @@ class Cloud(NamedTuple):
 
 
 def pose(message: bytes) -> Pose | None:
-    """Return the pose in a ``tool_pose_t``; None while the tool is out of view, for ROS has no NaN poses."""
+    """Return the pose in a ``tool_pose_t``, or None if the tool is out of view: ROS has no NaN poses."""
     _, _, capture_utime, _, _, _, _, visible, x, y, z, qx, qy, qz, qw, _ = _POSE.unpack(message)
     return Pose(Stamp.of(capture_utime), (x, y, z), (qx, qy, qz, qw)) if visible else None
 
 
 def cloud(message: bytes) -> Cloud:
-    """Return the markers of a ``markers_t`` in mm as points in m; a missing one stays, as NaN."""
+    """Return the markers of a ``markers_t`` in mm as points in m. A missing marker becomes a NaN point."""
     _, _, capture_utime, _, _, _, _, count = _MARKERS.unpack_from(message)
-    markers = np.frombuffer(message, _MARKER, 4 * count, _MARKERS.size).reshape(-1, 4)
+    markers = np.frombuffer(message, _FLOAT, 4 * count, _MARKERS.size).reshape(-1, 4)
     points_m = (markers[:, :3] / _MM_PER_M).astype("<f4")
     return Cloud(Stamp.of(capture_utime), count, points_m.tobytes())

@@ -1,8 +1,9 @@
-/* Prints the markers and events that a gateway publishes on LCM.
+/* Print the markers and events that a gateway publishes on LCM.
  *
- *   make -C examples && examples/build/subscriber [SOURCE [COUNT]]     e.g.  subscriber LAB 100
+ *   make -C examples && examples/build/subscriber [SOURCE [COUNT]]     for example: subscriber LAB 100
  *
- * The URL is that of $LCM_DEFAULT_URL, or LCM's own.
+ * SOURCE is the name of the source in upper case. The program stops after COUNT frames.
+ * The environment variable LCM_DEFAULT_URL sets the LCM URL. Without it, LCM uses its default.
  */
 #include <lcm/lcm.h>
 #include <math.h>
@@ -12,7 +13,7 @@
 #include "rtc3d_events_t.h"
 #include "rtc3d_markers_t.h"
 
-static long left;
+static long frames_left;
 
 static void on_markers(const lcm_recv_buf_t *buffer, const char *channel, const rtc3d_markers_t *message,
                        void *user)
@@ -28,7 +29,7 @@ static void on_markers(const lcm_recv_buf_t *buffer, const char *channel, const 
             printf(" %.3f,%.3f,%.3f", marker->x, marker->y, marker->z);
     }
     printf("\n");
-    left--;
+    frames_left--;
 }
 
 static void on_events(const lcm_recv_buf_t *buffer, const char *channel, const rtc3d_events_t *message,
@@ -47,12 +48,12 @@ int main(int argc, char **argv)
 {
     const char *source = argc > 1 ? argv[1] : "LAB";
     char channel[64];
-    left = argc > 2 ? atol(argv[2]) : 0;
-    const long endless = left == 0;
+    frames_left = argc > 2 ? atol(argv[2]) : 0;
+    const int run_forever = frames_left == 0;
 
     lcm_t *lcm = lcm_create(NULL);
     if (!lcm) {
-        fprintf(stderr, "LCM does not open; see $LCM_DEFAULT_URL and the multicast route\n");
+        fprintf(stderr, "Cannot open LCM; check $LCM_DEFAULT_URL and the multicast route\n");
         return 1;
     }
     snprintf(channel, sizeof channel, "MOCAP_%s_3D", source);
@@ -60,7 +61,7 @@ int main(int argc, char **argv)
     snprintf(channel, sizeof channel, "MOCAP_%s_EVENT", source);
     rtc3d_events_t_subscribe(lcm, channel, on_events, NULL);
     fprintf(stderr, "listening\n");
-    while ((endless || left > 0) && lcm_handle(lcm) == 0)
+    while ((run_forever || frames_left > 0) && lcm_handle(lcm) == 0)
         ;
     lcm_destroy(lcm);
     return 0;

@@ -1,6 +1,8 @@
-"""Prints the markers that a gateway publishes on LCM, with the types that come with the gateway.
+"""Print the markers that a gateway publishes on LCM, with the message types from the gateway's package.
 
-python examples/subscriber_lcm.py [SOURCE [COUNT]]        e.g.  subscriber_lcm.py LAB 100
+    python examples/subscriber_lcm.py [SOURCE [COUNT]]        for example: subscriber_lcm.py LAB 100
+
+SOURCE is the name of the source in upper case. The program stops after COUNT frames.
 """
 
 import math
@@ -12,24 +14,27 @@ from rtc3d import markers_t
 
 def main() -> None:
     source = sys.argv[1] if len(sys.argv) > 1 else "LAB"
-    left = int(sys.argv[2]) if len(sys.argv) > 2 else math.inf
+    frames_left = int(sys.argv[2]) if len(sys.argv) > 2 else math.inf
 
     def on_markers(_channel: str, data: bytes) -> None:
-        nonlocal left
+        nonlocal frames_left
         message = markers_t.decode(data)
-        seen = [marker for marker in message.markers if not math.isnan(marker.x)]
-        where = f", the first at {seen[0].x:.3f}, {seen[0].y:.3f}, {seen[0].z:.3f} mm" if seen else ""
+        visible = [marker for marker in message.markers if not math.isnan(marker.x)]
+        position = ""
+        if visible:
+            first = visible[0]
+            position = f", the first at {first.x:.3f}, {first.y:.3f}, {first.z:.3f} mm"
         print(
             f"#{message.sequence} frame {message.frame_number}: "
-            f"{len(seen)} of {message.num_markers} markers in view{where}"
+            f"{len(visible)} of {message.num_markers} markers in view{position}"
         )
-        left -= 1
+        frames_left -= 1
 
     connection = lcm.LCM()
     subscription = connection.subscribe(f"MOCAP_{source}_3D", on_markers)
-    subscription.set_queue_capacity(1000)  # LCM's own 30 lose frames whenever this program pauses
+    subscription.set_queue_capacity(1000)  # the default of 30 loses frames whenever this program pauses
     print("listening", flush=True)
-    while left > 0:
+    while frames_left > 0:
         connection.handle()
 
 

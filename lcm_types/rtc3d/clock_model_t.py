@@ -19,19 +19,19 @@ class clock_model_t(object):
     def __init__(self):
         self.has_clock = False
         """
-        False: the time stamps make no clock (constant, absurd); capture_utime is utime then.
+        False: the time stamps are not usable as a clock (constant or implausible). Then capture_utime equals utime.
         LCM Type: boolean
         """
 
         self.offset_us = 0
         """
-        µs since the Unix epoch at which the server's time stamp is 0, as seen now.
+        The current estimate of the time, in µs since the Unix epoch, at which the server's time stamp is 0.
         LCM Type: int64_t
         """
 
         self.drift_ppm = 0.0
         """
-        How much faster than the server's the gateway's clock runs, in parts per million.
+        How much faster the gateway's clock runs than the server's, in parts per million.
         LCM Type: double
         """
 
@@ -39,7 +39,7 @@ class clock_model_t(object):
         """ LCM Type: double """
         self.samples = 0
         """
-        Frames that the model was made from.
+        Number of frames that the model is based on.
         LCM Type: int64_t
         """
 

@@ -10,7 +10,7 @@ import struct
 import rtc3d
 
 class clock_t(object):
-    """ The clock of one source, once a second. """
+    """ The clock model of one source, published once per second. """
 
     __slots__ = ["utime", "capture_utime", "sequence", "session", "components", "clock"]
 
@@ -21,31 +21,31 @@ class clock_t(object):
     def __init__(self):
         self.utime = 0
         """
-        µs since the Unix epoch, the gateway's clock: when this message was sent.
+        When the gateway sent this message: µs since the Unix epoch, on the gateway's clock.
         LCM Type: int64_t
         """
 
         self.capture_utime = 0
         """
-        The same.
+        Equals utime.
         LCM Type: int64_t
         """
 
         self.sequence = 0
         """
-        Grows by one per message of this key and channel: a gap is loss.
+        Grows by one with each message of this key and channel. A gap means loss.
         LCM Type: int64_t
         """
 
         self.session = 0
         """
-        Grows by one at each connection to the server.
+        Grows by one with each connection to the server.
         LCM Type: int32_t
         """
 
         self.components = ""
         """
-        The components of the stream whose clock it is.
+        The components of the stream that the clock model belongs to.
         LCM Type: string
         """
 

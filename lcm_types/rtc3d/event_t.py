@@ -10,7 +10,7 @@ import struct
 class event_t(object):
     """
     One event (RTC3D §7.7), in the 24-byte form that NDI's own servers send.
-    The Events parameters say what id and parameters mean; an unused parameter is -1 (0xFFFFFFFF).
+    The Events parameters define the meaning of id and param1 to param3. An unused parameter is -1 (0xFFFFFFFF).
     """
 
     __slots__ = ["id", "timestamp", "param1", "param2", "param3"]
@@ -24,7 +24,7 @@ class event_t(object):
         """ LCM Type: int32_t """
         self.timestamp = 0
         """
-        µs since the server's start; the component's own where the server sent 16-byte events.
+        µs since the server's start. For 16-byte events, the gateway inserts the time stamp of the component.
         LCM Type: int64_t
         """
 

@@ -10,7 +10,7 @@ import struct
 class marker_t(object):
     """
     One 3D marker (RTC3D §7.3), in the unit of the 3D parameters (mm by default).
-    Missing: x, y and z have all 32 bits set (a NaN), reliability is often 999.0.
+    If the marker is missing, all 32 bits of x, y and z are set (a NaN), and reliability is often 999.0.
     """
 
     __slots__ = ["x", "y", "z", "reliability"]

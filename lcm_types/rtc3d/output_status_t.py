@@ -10,7 +10,7 @@ import struct
 import rtc3d
 
 class output_status_t(object):
-    """ One output (zenoh or lcm) as far as this source is concerned. """
+    """ The status of one output (zenoh or lcm) for this source. """
 
     __slots__ = ["name", "connected", "problem", "num_messages", "messages", "num_drops", "drops"]
 
@@ -25,13 +25,13 @@ class output_status_t(object):
         """ LCM Type: boolean """
         self.problem = ""
         """
-        What is wrong and what to do about it; "" if nothing is.
+        What is wrong and what to do about it; "" if there is no problem.
         LCM Type: string
         """
 
         self.num_messages = 0
         """
-        Messages sent, by component.
+        Number of messages sent, by component.
         LCM Type: int32_t
         """
 
@@ -39,7 +39,7 @@ class output_status_t(object):
         """ LCM Type: rtc3d.count_t[num_messages] """
         self.num_drops = 0
         """
-        Messages not sent, by cause.
+        Number of messages not sent, by cause.
         LCM Type: int32_t
         """
 

@@ -8,7 +8,7 @@ from io import BytesIO
 import struct
 
 class parameters_reply_t(object):
-    """ Answers a parameters_request_t. """
+    """ The reply to a parameters_request_t. """
 
     __slots__ = ["request_id", "requester", "xml", "age_s", "error", "error_code"]
 
@@ -23,25 +23,25 @@ class parameters_reply_t(object):
         """ LCM Type: string """
         self.xml = ""
         """
-        The server's XML as it came; "" if there is an error.
+        The server's XML, unchanged; "" if there is an error.
         LCM Type: string
         """
 
         self.age_s = 0.0
         """
-        Seconds since the server sent it.
+        Seconds since the server sent the XML.
         LCM Type: double
         """
 
         self.error = ""
         """
-        What is wrong; "" if nothing is.
+        What is wrong; "" if there is no error.
         LCM Type: string
         """
 
         self.error_code = ""
         """
-        For programs: "", bad-request, no-connection, refused, timeout or defect.
+        Error code for programs: "", bad-request, no-connection, refused, timeout or defect.
         LCM Type: string
         """
 

@@ -9,7 +9,7 @@ import struct
 
 class parameters_request_t(object):
     """
-    Asks for a source's parameters, on PREFIX_SOURCE_PARAMETERS_REQUEST.
+    Requests the parameters of a source, on PREFIX_SOURCE_PARAMETERS_REQUEST.
     The reply on PREFIX_SOURCE_PARAMETERS_REPLY has the same request_id and requester.
     """
 
@@ -22,19 +22,19 @@ class parameters_request_t(object):
     def __init__(self):
         self.request_id = 0
         """
-        Chosen by the requester, to know the reply by.
+        A number that the requester chooses. The reply contains the same number.
         LCM Type: int64_t
         """
 
         self.requester = ""
         """
-        Who asks, at most 128 bytes: a name that no other requester has.
+        The name of the requester, at most 128 bytes. No other requester may use it.
         LCM Type: string
         """
 
         self.num_sections = 0
         """
-        Of general, 3d, 6d, analog, force, events; none means all.
+        Any of general, 3d, 6d, analog, force, events; none means all.
         LCM Type: int32_t
         """
 
@@ -42,7 +42,7 @@ class parameters_request_t(object):
         """ LCM Type: string[num_sections] """
         self.fresh = False
         """
-        True: ask the server now; false: what is known will do.
+        True: query the server now; false: use the cache of the gateway.
         LCM Type: boolean
         """
 

@@ -8,7 +8,7 @@ from io import BytesIO
 import struct
 
 class parameters_t(object):
-    """ A source's parameters, unasked: at every connection, when they change, and every few seconds. """
+    """ The parameters of a source, published at every connection, when they change, and every few seconds. """
 
     __slots__ = ["utime", "capture_utime", "sequence", "session", "xml"]
 
@@ -19,31 +19,31 @@ class parameters_t(object):
     def __init__(self):
         self.utime = 0
         """
-        µs since the Unix epoch, the gateway's clock: when this message was sent.
+        When the gateway sent this message: µs since the Unix epoch, on the gateway's clock.
         LCM Type: int64_t
         """
 
         self.capture_utime = 0
         """
-        µs since the Unix epoch, the gateway's clock: when the server sent the parameters.
+        When the server sent the parameters: µs since the Unix epoch, on the gateway's clock.
         LCM Type: int64_t
         """
 
         self.sequence = 0
         """
-        Grows by one per message of this channel: a gap is loss.
+        Grows by one with each message of this channel. A gap means loss.
         LCM Type: int64_t
         """
 
         self.session = 0
         """
-        Grows by one at each connection to the server.
+        Grows by one with each connection to the server.
         LCM Type: int32_t
         """
 
         self.xml = ""
         """
-        The server's XML as it came.
+        The server's XML, unchanged.
         LCM Type: string
         """
 

@@ -10,7 +10,7 @@ import struct
 import rtc3d
 
 class status_t(object):
-    """ How the gateway and its connections to one source are, once a second. """
+    """ The status of the gateway and its connections to one source, published once per second. """
 
     __slots__ = ["utime", "capture_utime", "sequence", "session", "source", "server", "gateway_version", "num_streams", "streams", "num_outputs", "outputs"]
 
@@ -21,25 +21,25 @@ class status_t(object):
     def __init__(self):
         self.utime = 0
         """
-        µs since the Unix epoch, the gateway's clock: when the frame came.
+        When the gateway sent this message: µs since the Unix epoch, on the gateway's clock.
         LCM Type: int64_t
         """
 
         self.capture_utime = 0
         """
-        µs since the Unix epoch, the gateway's clock: when the frame was captured.
+        Equals utime.
         LCM Type: int64_t
         """
 
         self.sequence = 0
         """
-        Grows by one per message of this key and channel: a gap is loss.
+        Grows by one with each message of this key and channel. A gap means loss.
         LCM Type: int64_t
         """
 
         self.session = 0
         """
-        Grows by one at each connection to the server.
+        The sum of the session numbers of all streams.
         LCM Type: int32_t
         """
 

@@ -10,7 +10,7 @@ import struct
 import rtc3d
 
 class stream_status_t(object):
-    """ One stream of a source: a TCP session with the components and the rate asked for. """
+    """ The status of one stream of a source: a TCP session with the requested components and rate. """
 
     __slots__ = ["components", "state", "byte_order", "rate", "frame_rate_hz", "session", "frames_in", "bytes_in", "reconnects", "restarts", "lag_ms", "clock", "num_drops", "drops", "num_limitations", "limitations", "last_error", "last_error_utime"]
 
@@ -33,13 +33,13 @@ class stream_status_t(object):
 
         self.byte_order = ""
         """
-        The byte order of the data frames that come: "big", "little", or "" before the first frame.
+        The byte order of the received data frames: "big", "little", or "" before the first frame.
         LCM Type: string
         """
 
         self.rate = ""
         """
-        The rate request that the server accepted: "AllFrames", "Frequency:60", "" for none in force.
+        The rate request that the server accepted, for example "AllFrames" or "Frequency:60"; "" if there is none.
         LCM Type: string
         """
 
@@ -51,7 +51,7 @@ class stream_status_t(object):
 
         self.session = 0
         """
-        The connection's number.
+        The number of the connection.
         LCM Type: int32_t
         """
 
@@ -63,13 +63,13 @@ class stream_status_t(object):
         """ LCM Type: int64_t """
         self.restarts = 0
         """
-        How often frame numbers or time stamps began anew within a connection.
+        How often frame numbers or time stamps restarted within a connection.
         LCM Type: int64_t
         """
 
         self.lag_ms = 0.0
         """
-        How late the newest frame came, against the clock.
+        How late the newest frame was, compared with the clock model.
         LCM Type: float
         """
 
@@ -77,7 +77,7 @@ class stream_status_t(object):
         """ LCM Type: rtc3d.clock_model_t """
         self.num_drops = 0
         """
-        Frames and components that were not published, by cause.
+        Number of frames and components that were not published, by cause.
         LCM Type: int32_t
         """
 
@@ -93,7 +93,7 @@ class stream_status_t(object):
         """ LCM Type: string[num_limitations] """
         self.last_error = ""
         """
-        The last error in words; "" if there was none since the gateway's start.
+        The text of the last error; "" if there was none since the gateway's start.
         LCM Type: string
         """
 

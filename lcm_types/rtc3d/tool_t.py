@@ -9,8 +9,8 @@ import struct
 
 class tool_t(object):
     """
-    The pose of one 6D tool (RTC3D §7.6): a quaternion, scalar first, and a translation in mm.
-    Out of view: all 32 bytes are 0xFF, the error included (every field is a NaN).
+    The pose of one 6D tool (RTC3D §7.6): a quaternion with the scalar first, and a position in the server's unit
+    (mm by default). If the tool is out of view, all 32 bytes are 0xFF, so every field is a NaN.
     """
 
     __slots__ = ["q0", "qx", "qy", "qz", "x", "y", "z", "error"]

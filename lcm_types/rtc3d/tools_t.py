@@ -10,7 +10,7 @@ import struct
 import rtc3d
 
 class tools_t(object):
-    """ The 6D component of one frame (RTC3D §7.6). Tools stand in the order of the 6D parameters. """
+    """ The 6D component of one frame (RTC3D §7.6). Tools are in the order of the 6D parameters. """
 
     __slots__ = ["utime", "capture_utime", "sequence", "session", "frame_number", "timestamp", "num_tools", "tools"]
 
@@ -21,37 +21,37 @@ class tools_t(object):
     def __init__(self):
         self.utime = 0
         """
-        µs since the Unix epoch, the gateway's clock: when the frame came.
+        When the gateway received the frame: µs since the Unix epoch, on the gateway's clock.
         LCM Type: int64_t
         """
 
         self.capture_utime = 0
         """
-        µs since the Unix epoch, the gateway's clock: when the frame was captured.
+        When the frame was captured: µs since the Unix epoch, on the gateway's clock.
         LCM Type: int64_t
         """
 
         self.sequence = 0
         """
-        Grows by one per message of this key and channel: a gap is loss.
+        Grows by one with each message of this key and channel. A gap means loss.
         LCM Type: int64_t
         """
 
         self.session = 0
         """
-        Grows by one at each connection to the server.
+        Grows by one with each connection to the server.
         LCM Type: int32_t
         """
 
         self.frame_number = 0
         """
-        The frame's number, as the server sent it.
+        The server's frame number, unchanged.
         LCM Type: int32_t
         """
 
         self.timestamp = 0
         """
-        µs since the server's start, as the server sent it.
+        The server's time stamp in µs since its start, unchanged.
         LCM Type: int64_t
         """
 
