@@ -1,4 +1,4 @@
-"""The specification's examples of §6: as XML, word for word, and as what a human reads in them."""
+"""The specification's examples of §6: the XML, word for word, and the parameters that a human reads in it."""
 
 from pathlib import Path
 
@@ -91,22 +91,22 @@ BY_SECTION = {
 
 
 def spec_xml(section: str) -> bytes:
-    """Return the specification's example of the section, mistakes and all; only page breaks are left out."""
+    """Return the specification's example of the section with its mistakes, but without page breaks."""
     return (SPEC_XML / f"{section}.xml").read_bytes()
 
 
 def spec_body(section: str) -> bytes:
-    """Return the section's element in the specification's example, without the root around it."""
+    """Return the section's element in the specification's example, without the root element."""
     return spec_xml(section).partition(b"\n")[2].rpartition(b"</RT_Parameters")[0]
 
 
 def in_root(*sections: str) -> bytes:
-    """Return the lines of XML under a root RT_Parameters."""
+    """Return the lines of XML in a root element RT_Parameters."""
     return "\n".join(("<RT_Parameters Ver='1.00'>", *sections, "</RT_Parameters>")).encode()
 
 
 def markers_of(xml: bytes) -> Parameters3D:
-    """Return the 3D section of XML in which nothing is found wrong."""
+    """Return the 3D section of XML that must have no faults."""
     parameters, recovered = parse_parameters(xml)
     assert recovered == ()
     assert parameters.markers is not None

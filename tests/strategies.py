@@ -1,11 +1,11 @@
-"""Hypothesis strategies for byte streams: cut into pieces, and damaged."""
+"""Hypothesis strategies for byte streams that are split or damaged."""
 
 from itertools import pairwise
 
 from hypothesis import strategies as st
 from hypothesis.strategies import DrawFn, SearchStrategy
 
-# What a 32-bit field should not hold, in either byte order.
+# Unusual values of a 32-bit field, in both byte orders.
 _ODD_WORDS = [
     number.to_bytes(4, "big")[::step]
     for number in (0, 1, 7, 8, 9, 24, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF)
@@ -15,14 +15,14 @@ _ODD_WORDS = [
 
 @st.composite
 def pieces_of(draw: DrawFn, stream: bytes) -> list[bytes]:
-    """Return the stream cut anywhere; pieces may be empty."""
+    """Return the stream split anywhere; pieces may be empty."""
     cuts = draw(st.lists(st.integers(0, len(stream)), max_size=12))
     return [stream[start:end] for start, end in pairwise([0, *sorted(cuts), len(stream)])]
 
 
 @st.composite
 def damaged(draw: DrawFn, valid: SearchStrategy[bytes]) -> bytes:
-    """Return valid bytes with a few bits flipped, stretches cut out, bytes put in, or words replaced."""
+    """Return valid bytes with up to four faults: flipped bits, removed or inserted bytes, replaced words."""
     data = bytearray(draw(valid))
     for _ in range(draw(st.integers(1, 4))):
         at = draw(st.integers(0, len(data)))

@@ -1,4 +1,4 @@
-"""Bytes of RTC3D worked out by hand from the tables of the specification; no code of ours made them.
+"""Bytes of RTC3D, encoded by hand from the tables of the specification and not by the code under test.
 
 Floats are IEEE 754 single precision: sign, exponent + 127, 23 bits of fraction. So 1.0 is 3F800000,
 and 1000.25 = 1.11110100001b × 2^9 is 0 10001000 11110100001… = 447A1000.
@@ -13,12 +13,12 @@ ALL_ONES: Final = struct.unpack(">f", b"\xff\xff\xff\xff")[0]
 
 
 def _hex(rows: str) -> bytes:
-    """Return the bytes of rows that hold hex digits and what they are."""
+    """Return the bytes of rows; a row has hex digits and their meaning."""
     return b"".join(bytes.fromhex(row.split(maxsplit=1)[0]) for row in rows.strip().splitlines())
 
 
 def _both_orders(rows: str) -> dict[ByteOrder, bytes]:
-    """Return the bytes of rows that hold a field's big-endian hex, its little-endian hex, and what it is."""
+    """Return the bytes of rows; a row has a field's hex, big-endian and little-endian, and its meaning."""
     columns = [row.split(maxsplit=2) for row in rows.strip().splitlines()]
     return {
         "big": b"".join(bytes.fromhex(big) for big, _, _ in columns),
@@ -117,9 +117,9 @@ PACKETS: Final = (
 
 
 class ComponentVector(NamedTuple):
-    """One component's bytes, ``wire``, and what they mean.
+    """One component's bytes, ``wire``, and their meaning.
 
-    ``fields`` holds for each field of an item its values, one per item; Analog has "voltage" alone.
+    ``fields`` has the values of each field, one per item; Analog has only the field "voltage".
     """
 
     name: str
@@ -330,17 +330,17 @@ COMPONENTS: Final = (MARKERS, ANALOG, FORCE, TOOLS, SHORT_EVENTS, LONG_EVENTS)
 
 
 def _frame(count: dict[ByteOrder, bytes], *components: dict[ByteOrder, bytes]) -> dict[ByteOrder, bytes]:
-    parts = (count, *components)
+    fields = (count, *components)
     return {
-        "big": b"".join(part["big"] for part in parts),
-        "little": b"".join(part["little"] for part in parts),
+        "big": b"".join(field["big"] for field in fields),
+        "little": b"".join(field["little"] for field in fields),
     }
 
 
 EMPTY_FRAME: Final = _both_orders("00000000  00000000  ComponentCount 0")
 
 FULL_FRAME_COMPONENTS: Final = (MARKERS, TOOLS, ANALOG, FORCE, SHORT_EVENTS)
-"""In the order of field note 5."""
+"""The components of FULL_FRAME, in the order of field note 5."""
 
 FULL_FRAME: Final = _frame(
     _both_orders("00000005  05000000  ComponentCount 5"),
@@ -349,7 +349,7 @@ FULL_FRAME: Final = _frame(
 
 UNKNOWN_COMPONENT: Final = _both_orders("""
     0000001C          1C000000          ComponentSize 28 = 20 + 8
-    00000009          09000000          ComponentType 9, of no table
+    00000009          09000000          ComponentType 9, which is not in the specification
     00000007          07000000          FrameNumber
     0000000000003A98  983A000000000000  TimeStamp 15000 µs
     DEADBEEF          EFBEADDE          data of unknown meaning

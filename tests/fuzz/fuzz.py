@@ -1,10 +1,10 @@
-"""Coverage-guided fuzzing of everything that takes bytes from outside: only documented errors escape.
+"""Coverage-guided fuzzing of everything that takes bytes from outside: only documented errors may be raised.
 
-    make fuzz FUZZ_SECONDS=600                                          all targets, so long each
+    make fuzz FUZZ_SECONDS=600                                          all targets, this long each
     python tests/fuzz/fuzz.py TARGET CORPUS_FOLDER [libFuzzer options]  one of them
 
-The corpus begins with the tests' hand-written vectors. What is found is written as crash-… into the
-current folder; give that file in place of the folder to run it again.
+The initial corpus is the tests' hand-written vectors. An input that fails is written to the current
+folder as crash-…; pass that file instead of the corpus folder to run it again.
 """
 
 import contextlib
@@ -37,7 +37,7 @@ STAMP = Stamp(1, 2, 3)
 
 
 def packets(data: bytes) -> None:
-    """Any bytes in any split: packets or an error set, and no more held than was fed."""
+    """Any bytes in any split are packets or set an error; no more bytes are buffered than were fed."""
     provider = atheris.FuzzedDataProvider(data)
     reader = PacketReader(max_packet_bytes=4096, max_c3d_bytes=8192)
     fed = 0
@@ -49,7 +49,7 @@ def packets(data: bytes) -> None:
 
 
 def frames(data: bytes) -> None:
-    """A data frame is split and its messages decode, or it is rejected."""
+    """A data frame is split and its messages can be decoded, or it is rejected."""
     try:
         frame = split_frame(data, detect_byte_order(data, "big"))
     except FrameError:
@@ -63,7 +63,7 @@ def frames(data: bytes) -> None:
 
 
 def connection(data: bytes) -> None:
-    """A client survives whatever a server sends, between commands of its own."""
+    """The client's protocol does not raise for any bytes from a server between its own commands."""
     provider = atheris.FuzzedDataProvider(data)
     client = ClientProtocol(max_packet_bytes=4096)
     commands = (Version(), SendParameters(), StreamFrames())
@@ -76,7 +76,7 @@ def connection(data: bytes) -> None:
 
 
 def commands(data: bytes) -> None:
-    """A client's command is parsed, and says the same when written again, or is refused."""
+    """A client's command is parsed and can be encoded again, or is refused."""
     try:
         command = parse_command(data)
     except CommandError as error:
@@ -86,7 +86,7 @@ def commands(data: bytes) -> None:
 
 
 def parameters(data: bytes) -> None:
-    """XML is read, and what was read can be written and read again, or is refused."""
+    """XML is parsed, and the parameters can be encoded and parsed again, or it is refused."""
     try:
         parsed = parse_parameters(data)
     except ParametersError:
@@ -95,7 +95,7 @@ def parameters(data: bytes) -> None:
 
 
 def configuration(data: bytes) -> None:
-    """A file is a configuration, or every mistake in it has a line."""
+    """A file is a valid configuration, or each of its mistakes is reported with its line."""
     with tempfile.NamedTemporaryFile(suffix=".yaml") as file:
         file.write(data)
         file.flush()
@@ -109,7 +109,7 @@ def configuration(data: bytes) -> None:
 
 
 def messages(data: bytes) -> None:
-    """Bytes from LCM or Zenoh are one of our messages, or refused."""
+    """Bytes from LCM or Zenoh are one of the gateway's messages, or are refused."""
     with contextlib.suppress(ProtocolError):
         summarise(decode(data))
 
@@ -121,7 +121,7 @@ TARGETS: dict[str, Callable[[bytes], None]] = {
 
 
 def seeds() -> Iterator[bytes]:
-    """Give what a corpus begins with: the same for all targets, libFuzzer keeps what is of use."""
+    """Yield the initial corpus, the same for all targets; libFuzzer keeps the useful inputs."""
     for vector in PACKETS:
         yield vector.packet
     for component in COMPONENTS:

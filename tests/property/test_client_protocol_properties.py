@@ -1,4 +1,4 @@
-"""Whatever a server sends, the connection gives events, and the replies stay with their commands."""
+"""ClientProtocol with generated input: it never raises, and replies answer their own commands."""
 
 from collections.abc import Iterable
 
@@ -49,25 +49,25 @@ server_packets = st.lists(
 
 
 def received_in_pieces(
-    connection: ClientProtocol, pieces: Iterable[bytes]
+    protocol: ClientProtocol, pieces: Iterable[bytes]
 ) -> tuple[list[Frame], list[ProtocolEvent]]:
     frames: list[Frame] = []
     events: list[ProtocolEvent] = []
     for piece in pieces:
-        new_frames, new_events = connection.receive(piece)
+        new_frames, new_events = protocol.receive(piece)
         frames += new_frames
         events += new_events
     return frames, events
 
 
 @given(st.data())
-def test_no_bytes_make_it_raise(data: st.DataObject) -> None:
+def test_receive_never_raises(data: st.DataObject) -> None:
     stream = data.draw(st.one_of(server_packets, damaged(server_packets), st.binary(max_size=300)))
-    connection = ClientProtocol(max_packet_bytes=4096)
+    protocol = ClientProtocol(max_packet_bytes=4096)
     for piece in data.draw(pieces_of(stream)):
-        if connection.pending_command is None and connection.state.value not in {"closed", "closing"}:
-            connection.send(data.draw(st.sampled_from(COMMANDS)))
-        connection.receive(piece)
+        if protocol.pending_command is None and protocol.state.value not in {"closed", "closing"}:
+            protocol.send(data.draw(st.sampled_from(COMMANDS)))
+        protocol.receive(piece)
 
 
 @given(st.data())
@@ -89,13 +89,13 @@ streamed_packets = st.lists(
 
 
 @given(streamed_packets, st.data())
-def test_frames_are_the_same_whether_recognised_by_their_layout_or_not(
+def test_frames_are_the_same_whatever_frames_were_received_before(
     packets: list[bytes], data: st.DataObject
 ) -> None:
-    connection = ClientProtocol()
-    connection.send(StreamFrames())
-    connection.receive(FRAME + OTHER_FRAME)
-    frames, events = received_in_pieces(connection, data.draw(pieces_of(b"".join(packets))))
+    protocol = ClientProtocol()
+    protocol.send(StreamFrames())
+    protocol.receive(FRAME + OTHER_FRAME)
+    frames, events = received_in_pieces(protocol, data.draw(pieces_of(b"".join(packets))))
     expected = [split_frame(sent[8:], "big") for sent in packets if sent in (FRAME, OTHER_FRAME)]
     assert [frame.components for frame in frames] == [frame.components for frame in expected]
     rejected = [event for event in events if isinstance(event, FrameRejected)]
@@ -106,20 +106,20 @@ def test_frames_are_the_same_whether_recognised_by_their_layout_or_not(
         packet(4): ProtocolState.NO_MEASUREMENT,
     }
     changes = [states[sent] for sent in packets if sent in states]
-    assert connection.state is (changes[-1] if changes else ProtocolState.STREAMING)
+    assert protocol.state is (changes[-1] if changes else ProtocolState.STREAMING)
 
 
 @given(st.data())
-def test_each_command_gets_its_own_reply_from_a_server_that_names_commands(data: st.DataObject) -> None:
-    """Acknowledgements may be doubled, late (after give_up) or missing; frames come in between."""
-    connection = ClientProtocol()
+def test_each_command_is_answered_by_its_own_reply_if_replies_name_commands(data: st.DataObject) -> None:
+    """Replies may be duplicate, late (after give_up) or missing; frames arrive in between."""
+    protocol = ClientProtocol()
     late: list[bytes] = []
     for _ in range(data.draw(st.integers(1, 8))):
         command = data.draw(st.sampled_from(COMMANDS))
         refused = data.draw(st.booleans())
         behaviour = data.draw(st.sampled_from(["once", "twice", "late", "missing"]))
         reply = _reply(command, refused=refused)
-        connection.send(command)
+        protocol.send(command)
         arrived = b"".join(late) + data.draw(st.sampled_from([b"", FRAME]))
         late = []
         if behaviour in {"once", "twice"}:
@@ -129,16 +129,16 @@ def test_each_command_gets_its_own_reply_from_a_server_that_names_commands(data:
             late.append(reply)
         if behaviour == "late":
             late.append(reply)
-        _, events = connection.receive(arrived)
+        _, events = protocol.receive(arrived)
         for event in events:
             if isinstance(event, Answered | Refused):
-                # A reply to an equal question is as good; one to another question never is.
+                # The reply to an equal earlier command is as good; that to another command is not.
                 assert event.command == command
                 if isinstance(event, Refused):
                     assert str(event.error) == f"Error-{command}"
                 elif event.packet.type != 3:
                     assert event.packet.body == _reply(command, refused=False)[8:]
-        connection.give_up()
+        protocol.give_up()
 
 
 def _reply(command: Command, *, refused: bool) -> bytes:

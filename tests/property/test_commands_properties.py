@@ -26,7 +26,7 @@ from tests.strategies import damaged
 digits = st.text(string.digits, min_size=1, max_size=4)
 component_lists = st.lists(st.sampled_from(ComponentType), unique=True).map(tuple)
 section_lists = st.lists(st.sampled_from(list(SECTIONS)), unique=True).map(tuple)
-# A frequency's text has at most nine digits before the point and six after it.
+# A frequency has at most nine digits before the point and six after it.
 frequencies = st.integers(1, 10**15 - 1).map(lambda millionths: Frequency(millionths / 1e6))
 divisors = st.integers(1, 10**9 - 1).map(FrequencyDivisor)
 rates = st.none() | st.just(AllFrames()) | frequencies | divisors
@@ -40,7 +40,7 @@ commands: st.SearchStrategy[Command] = st.one_of(
 )
 bodies = commands.map(encode_command)
 
-# Lists of words of the protocol, in no sensible order, go deeper into the parser than bytes at random.
+# Random lists of the protocol's words reach more of the parser than random bytes.
 WORDS = [
     *["Version", "SetByteOrder", "SendParameters", "SendCurrentFrame", "StreamFrames", "Bye"],
     *["1.0", "BigEndian", "LittleEndian", "Stop", "\xe9"],
@@ -52,13 +52,13 @@ word_lists = st.lists(st.sampled_from(WORDS), max_size=6).map(lambda words: " ".
 
 
 @given(commands)
-def test_a_command_is_read_from_its_text(command: Command) -> None:
+def test_a_command_is_parsed_from_its_text(command: Command) -> None:
     assert parse_command(str(command).encode("ascii")) == command
     assert encode_command(command) == str(command).encode("ascii")
 
 
 @given(bodies, st.data(), st.text(" \0\t\r\n", max_size=6))
-def test_case_and_what_ends_it_do_not_change_a_command(body: bytes, data: st.DataObject, end: str) -> None:
+def test_case_and_ending_do_not_change_a_command(body: bytes, data: st.DataObject, end: str) -> None:
     text = body.decode("ascii")
     upper = data.draw(st.lists(st.booleans(), min_size=len(text), max_size=len(text)))
     mixed = "".join(letter.upper() if up else letter.lower() for letter, up in zip(text, upper, strict=True))
@@ -67,7 +67,7 @@ def test_case_and_what_ends_it_do_not_change_a_command(body: bytes, data: st.Dat
 
 @settings(max_examples=300)
 @given(st.binary(max_size=200) | damaged(bodies) | word_lists | damaged(word_lists))
-def test_any_bytes_are_a_command_or_a_command_error_fit_for_an_error_packet(body: bytes) -> None:
+def test_any_bytes_are_a_command_or_raise_an_error_with_a_short_ascii_text(body: bytes) -> None:
     try:
         command = parse_command(body)
     except CommandError as error:

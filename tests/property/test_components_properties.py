@@ -21,7 +21,7 @@ from gateway.rtc3d.frames import Frame, detect_byte_order, encode_frame, split_f
 from tests.strategies import damaged
 from tests.vectors import FRAME_WITH_UNKNOWN, FULL_FRAME, ByteOrder
 
-# The bytes of each field of one item, by §7.3 to §7.7 and field note 6.
+# The bytes of each field of one item (§7.3 to §7.7, field note 6).
 FIELD_BYTES = {
     "3d": (4, 4, 4, 4),
     "analog": (4,),
@@ -40,8 +40,8 @@ KINDS = {
 }
 
 
-class Built(NamedTuple):
-    """What a component is built from; ``data`` is its items in big-endian form, any bits at all."""
+class RawComponent(NamedTuple):
+    """The values of one component; ``data`` is its items in big-endian form, with any bits."""
 
     kind: str
     frame_number: int
@@ -51,12 +51,12 @@ class Built(NamedTuple):
     def items(self) -> npt.NDArray[Any]:
         return np.frombuffer(self.data, KINDS[self.kind][1])
 
-    def build(self, order: ByteOrder) -> bytes:
+    def encode(self, order: ByteOrder) -> bytes:
         kind = ComponentType(KINDS[self.kind][0])
         return encode_component(kind, self.frame_number, self.timestamp_us, self.items(), order)
 
     def content(self, order: ByteOrder) -> bytes:
-        """Return the component's bytes after size and type, without the codec under test."""
+        """Return the component's bytes after size and type, made without the encoder under test."""
         fields = FIELD_BYTES[self.kind]
         count = len(self.data) // sum(fields)
         parts = [
@@ -92,11 +92,11 @@ ODD_FLOATS = [
 
 
 @st.composite
-def built_components(draw: st.DrawFn) -> Built:
+def raw_components(draw: st.DrawFn) -> RawComponent:
     kind = draw(st.sampled_from(sorted(KINDS)))
     words = sum(FIELD_BYTES[kind]) // 4 * draw(st.integers(0, 4))
     word = st.binary(min_size=4, max_size=4) | st.sampled_from(ODD_FLOATS)
-    return Built(
+    return RawComponent(
         kind,
         draw(st.integers(-(2**31), 2**31 - 1)),
         draw(st.integers(-(2**63), 2**63 - 1)),
@@ -105,7 +105,7 @@ def built_components(draw: st.DrawFn) -> Built:
 
 
 orders: SearchStrategy[ByteOrder] = st.sampled_from(["big", "little"])
-frames_of_built = st.lists(built_components(), max_size=5)
+raw_component_lists = st.lists(raw_components(), max_size=5)
 
 
 def frame(components: list[bytes], order: ByteOrder) -> bytes:
@@ -113,68 +113,76 @@ def frame(components: list[bytes], order: ByteOrder) -> bytes:
 
 
 valid_bodies = (st.sampled_from([*FULL_FRAME.values(), *FRAME_WITH_UNKNOWN.values()])) | st.builds(
-    lambda parts, order: frame([part.wire(order) for part in parts], order), frames_of_built, orders
+    lambda components, order: frame([raw.wire(order) for raw in components], order),
+    raw_component_lists,
+    orders,
 )
 any_bodies = damaged(valid_bodies) | valid_bodies | st.binary(max_size=300)
 
 
-@given(built_components(), orders, orders)
-def test_any_items_are_built_bit_by_bit(built: Built, items_order: ByteOrder, order: ByteOrder) -> None:
-    items = built.items()
+@given(raw_components(), orders, orders)
+def test_any_items_are_encoded_bit_by_bit(
+    raw: RawComponent, items_order: ByteOrder, order: ByteOrder
+) -> None:
+    items = raw.items()
     items = items.astype(items.dtype.newbyteorder(items_order))
-    kind = ComponentType(KINDS[built.kind][0])
-    wire = encode_component(kind, built.frame_number, built.timestamp_us, items, order)
-    assert wire == built.wire(order)
+    kind = ComponentType(KINDS[raw.kind][0])
+    wire = encode_component(kind, raw.frame_number, raw.timestamp_us, items, order)
+    assert wire == raw.wire(order)
 
 
-@given(frames_of_built, orders)
-def test_a_frame_is_its_count_and_its_components(parts: list[Built], order: ByteOrder) -> None:
-    wires = [part.wire(order) for part in parts]
+@given(raw_component_lists, orders)
+def test_a_frame_is_encoded_as_its_count_and_its_components(
+    components: list[RawComponent], order: ByteOrder
+) -> None:
+    wires = [raw.wire(order) for raw in components]
     assert encode_frame(wires, order) == frame(wires, order)
 
 
-@given(frames_of_built, orders)
-def test_what_is_split_is_what_was_built(parts: list[Built], order: ByteOrder) -> None:
-    split = split_frame(encode_frame([part.build(order) for part in parts], order), order)
+@given(raw_component_lists, orders)
+def test_splitting_an_encoded_frame_returns_its_components(
+    components: list[RawComponent], order: ByteOrder
+) -> None:
+    split = split_frame(encode_frame([raw.encode(order) for raw in components], order), order)
     assert split.unknown_types == ()
-    for part, component in zip(parts, split.components, strict=True):
-        item_bytes = sum(FIELD_BYTES[part.kind])
-        assert component.type == KINDS[part.kind][0]
-        assert component.frame_number == part.frame_number
-        assert component.timestamp_us == part.timestamp_us
-        assert component.num_items == len(part.data) // item_bytes
+    for raw, component in zip(components, split.components, strict=True):
+        item_bytes = sum(FIELD_BYTES[raw.kind])
+        assert component.type == KINDS[raw.kind][0]
+        assert component.frame_number == raw.frame_number
+        assert component.timestamp_us == raw.timestamp_us
+        assert component.num_items == len(raw.data) // item_bytes
         assert component.byte_order == order
-        assert bytes(component.content) == part.content(order)
-        assert component.items().tobytes() == part.content(order)[16:]
+        assert bytes(component.content) == raw.content(order)
+        assert component.items().tobytes() == raw.content(order)[16:]
         if component.num_items:
             assert component.item_bytes == item_bytes
-            assert component.items().dtype.names == KINDS[part.kind][1].names
+            assert component.items().dtype.names == KINDS[raw.kind][1].names
 
 
-@given(frames_of_built, orders)
+@given(raw_component_lists, orders)
 def test_big_endian_content_does_not_depend_on_the_order_received(
-    parts: list[Built], order: ByteOrder
+    components: list[RawComponent], order: ByteOrder
 ) -> None:
-    split = split_frame(frame([part.wire(order) for part in parts], order), order)
-    for part, component in zip(parts, split.components, strict=True):
-        assert bytes(big_endian_content(component)) == part.content("big")
+    split = split_frame(frame([raw.wire(order) for raw in components], order), order)
+    for raw, component in zip(components, split.components, strict=True):
+        assert bytes(big_endian_content(component)) == raw.content("big")
 
 
 unknown_types = st.integers(0, 0xFFFFFFFF).filter(lambda kind: not 1 <= kind <= 5)
 unknown_components = st.tuples(unknown_types, st.binary(max_size=40))
 
 
-@given(st.lists(built_components() | unknown_components, max_size=6), orders)
-def test_unknown_components_are_skipped_wherever_they_stand(
-    parts: list[Built | tuple[int, bytes]], order: ByteOrder
+@given(st.lists(raw_components() | unknown_components, max_size=6), orders)
+def test_unknown_components_are_skipped_at_any_position(
+    components: list[RawComponent | tuple[int, bytes]], order: ByteOrder
 ) -> None:
     wires, known, unknown = [], [], []
-    for part in parts:
-        if isinstance(part, Built):
-            known.append(part.content(order))
-            wires.append(part.wire(order))
+    for raw in components:
+        if isinstance(raw, RawComponent):
+            known.append(raw.content(order))
+            wires.append(raw.wire(order))
         else:
-            kind, data = part
+            kind, data = raw
             unknown.append(kind)
             wires.append((8 + len(data)).to_bytes(4, order) + kind.to_bytes(4, order) + data)
     split = split_frame(frame(wires, order), order)
@@ -182,15 +190,15 @@ def test_unknown_components_are_skipped_wherever_they_stand(
     assert list(split.unknown_types) == unknown
 
 
-@given(frames_of_built, orders, orders)
-def test_the_byte_order_of_a_frame_is_found(
-    parts: list[Built], order: ByteOrder, expected: ByteOrder
+@given(raw_component_lists, orders, orders)
+def test_the_byte_order_of_a_frame_is_detected(
+    components: list[RawComponent], order: ByteOrder, expected: ByteOrder
 ) -> None:
-    body = frame([part.wire(order) for part in parts], order)
-    assert detect_byte_order(body, expected) == (order if parts else expected)
+    body = frame([raw.wire(order) for raw in components], order)
+    assert detect_byte_order(body, expected) == (order if components else expected)
 
 
-# Bytes that nobody meant ---------------------------------------------------------------------
+# Arbitrary bytes ------------------------------------------------------------------------------
 
 
 def split_or_none(body: bytes, order: ByteOrder) -> Frame | None:
@@ -200,8 +208,8 @@ def split_or_none(body: bytes, order: ByteOrder) -> Frame | None:
         return None
 
 
-def assert_sound(component: Component, order: ByteOrder) -> None:
-    """Assert that the component's sizes and counts agree, so that what uses it cannot fail."""
+def assert_consistent(component: Component, order: ByteOrder) -> None:
+    """Assert that the component's sizes, counts and items agree with its content."""
     assert component.byte_order == order
     assert len(component.content) == 16 + component.num_items * component.item_bytes
     items = component.items()
@@ -216,13 +224,13 @@ def assert_sound(component: Component, order: ByteOrder) -> None:
 
 @settings(max_examples=300)
 @given(any_bodies, orders)
-def test_any_bytes_give_a_sound_frame_or_a_frame_error(body: bytes, order: ByteOrder) -> None:
+def test_any_bytes_are_a_consistent_frame_or_raise_frame_error(body: bytes, order: ByteOrder) -> None:
     split = split_or_none(body, order)
     if split is None:
         return
     assert len(split.components) + len(split.unknown_types) == int.from_bytes(body[:4], order)
     for component in split.components:
-        assert_sound(component, order)
+        assert_consistent(component, order)
     known_bytes = 4 + sum(8 + len(component.content) for component in split.components)
     if split.unknown_types:
         assert known_bytes + 8 * len(split.unknown_types) <= len(body)
@@ -232,7 +240,7 @@ def test_any_bytes_give_a_sound_frame_or_a_frame_error(body: bytes, order: ByteO
 
 @settings(max_examples=300)
 @given(any_bodies, orders)
-def test_any_bytes_have_a_byte_order_in_which_they_make_sense_or_give_a_frame_error(
+def test_any_bytes_make_sense_in_the_detected_byte_order_or_raise_frame_error(
     body: bytes, expected: ByteOrder
 ) -> None:
     makes_sense = {order: split_or_none(body, order) is not None for order in ("big", "little")}
@@ -247,11 +255,11 @@ def test_any_bytes_have_a_byte_order_in_which_they_make_sense_or_give_a_frame_er
 
 @settings(max_examples=300)
 @given(any_bodies, st.data(), orders)
-def test_a_frame_is_read_alike_whatever_frames_came_before_it(
+def test_a_frame_is_read_alike_whatever_frames_were_read_before(
     body: bytes, data: st.DataObject, order: ByteOrder
 ) -> None:
     reader = FrameReader(order)
-    # Mostly a changed byte or two: in what may differ between frames of a layout, or in what may not.
+    # The second body mostly differs in up to two bytes, which may or may not be raw of the layout.
     other = bytearray(body)
     for _ in range(data.draw(st.integers(0, 2)) if other else 0):
         other[data.draw(st.integers(0, len(other) - 1))] = data.draw(st.integers(0, 255))

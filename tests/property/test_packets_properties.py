@@ -15,7 +15,7 @@ packet_lists = st.lists(packets, max_size=8)
 
 
 def wire(packet: Packet) -> bytes:
-    """Return the packet's bytes by §4.1, without the encoder under test."""
+    """Return the packet's bytes (§4.1), made without the encoder under test."""
     return (8 + len(packet.body)).to_bytes(4, "big") + packet.type.to_bytes(4, "big") + packet.body
 
 
@@ -31,7 +31,7 @@ def new_reader() -> PacketReader:
     return PacketReader(max_packet_bytes=LIMIT, max_c3d_bytes=C3D_LIMIT)
 
 
-def facts_of(error: PacketError | None) -> tuple[str, int, int, int] | None:
+def attributes_of(error: PacketError | None) -> tuple[str, int, int, int] | None:
     if error is None:
         return None
     return str(error), error.size, error.packet_type, error.offset
@@ -42,7 +42,7 @@ def pieces(streams: SearchStrategy[bytes]) -> SearchStrategy[list[bytes]]:
 
 
 valid_streams = packet_lists.map(stream_of)
-# Headers of any size and type make the bounds likely to be met, which bytes at random seldom do.
+# Random bytes seldom have a size near the limits; these headers often do.
 headers = st.builds(
     lambda size, packet_type: size.to_bytes(4, "big") + packet_type.to_bytes(4, "big"),
     st.sampled_from([7, 8, LIMIT, LIMIT + 1, C3D_LIMIT, C3D_LIMIT + 1]) | st.integers(0, 0xFFFFFFFF),
@@ -84,7 +84,7 @@ def test_a_stream_fed_byte_by_byte_gives_the_same_packets(packet_list: list[Pack
 
 @settings(max_examples=300)
 @given(pieces(any_streams))
-def test_every_byte_is_returned_or_held_until_an_error(stream: list[bytes]) -> None:
+def test_every_byte_is_returned_or_buffered_until_an_error(stream: list[bytes]) -> None:
     reader = new_reader()
     fed = returned = 0
     for piece in stream:
@@ -102,7 +102,7 @@ def test_every_byte_is_returned_or_held_until_an_error(stream: list[bytes]) -> N
 
 @settings(max_examples=300)
 @given(pieces(any_streams))
-def test_what_is_read_from_any_bytes_is_what_they_hold(stream: list[bytes]) -> None:
+def test_the_packets_read_from_any_bytes_are_those_in_the_bytes(stream: list[bytes]) -> None:
     reader = new_reader()
     read = []
     for piece in stream:
@@ -123,13 +123,13 @@ def test_what_is_read_from_any_bytes_is_what_they_hold(stream: list[bytes]) -> N
 
 @settings(max_examples=300)
 @given(pieces(any_streams))
-def test_a_split_changes_neither_packets_nor_error(stream: list[bytes]) -> None:
+def test_a_split_of_the_stream_changes_neither_packets_nor_error(stream: list[bytes]) -> None:
     whole, split = new_reader(), new_reader()
     read = []
     for piece in stream:
         read += split.feed(piece)
     assert read == whole.feed(b"".join(stream))
-    assert facts_of(split.error) == facts_of(whole.error)
+    assert attributes_of(split.error) == attributes_of(whole.error)
     assert split.buffered_bytes == whole.buffered_bytes
 
 

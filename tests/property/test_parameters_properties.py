@@ -1,4 +1,4 @@
-"""Parameters (§6) over generated input: what is built is read back, and no bytes bring the reader down."""
+"""Parameters (§6) with generated input: encoding and parsing are inverse, and no bytes crash the parser."""
 
 import re
 from typing import TypeVar
@@ -35,7 +35,7 @@ def some(items: st.SearchStrategy[_T]) -> st.SearchStrategy[tuple[_T, ...]]:
 
 
 def parameters(texts: st.SearchStrategy[str], words: st.SearchStrategy[str]) -> st.SearchStrategy[Parameters]:
-    """Parameters with ``texts``, and ``words`` where a text that is empty reads as its default."""
+    """Return parameters with ``texts``, and with ``words`` where an empty text would be read as a default."""
     reals = st.floats(allow_nan=False, allow_infinity=False)
     numbers = st.none() | reals
     counts = st.none() | st.integers(0, 2**63)
@@ -69,7 +69,7 @@ def parameters(texts: st.SearchStrategy[str], words: st.SearchStrategy[str]) -> 
     )
 
 
-# What XML can hold, without the white space around it that the reader drops.
+# Characters that XML can represent; the parser drops white space around texts.
 _CHARACTERS = st.characters(
     exclude_categories=("Cc", "Cs"), include_characters="\t\n\r", exclude_characters="\ufffe\uffff"
 )
@@ -78,8 +78,8 @@ READABLE = parameters(TEXTS, TEXTS.filter(bool))
 ANY = parameters(st.text(max_size=8), st.text(max_size=8))
 
 
-def read_or_refuse(xml: bytes) -> None:
-    """Read ``xml``: any exception but ParametersError fails the test."""
+def parse_or_refuse(xml: bytes) -> None:
+    """Parse ``xml``; any exception except ParametersError fails the test."""
     try:
         found, recovered = parse_parameters(xml)
     except ParametersError:
@@ -89,20 +89,20 @@ def read_or_refuse(xml: bytes) -> None:
 
 
 @given(READABLE)
-def test_what_is_built_is_read_back_and_nothing_is_found_wrong(original: Parameters) -> None:
+def test_parsing_encoded_parameters_returns_them_without_faults(original: Parameters) -> None:
     assert parse_parameters(encode_parameters(original)) == (original, ())
 
 
 @given(ANY)
-def test_whatever_the_texts_hold_well_formed_xml_is_built(original: Parameters) -> None:
+def test_any_texts_are_encoded_as_well_formed_xml(original: Parameters) -> None:
     assert parse_parameters(encode_parameters(original)).recovered == ()
 
 
 @given(st.binary())
 @example(b"<")
 @example(b"\xff\xfe<\0")
-def test_any_bytes_are_read_or_refused(xml: bytes) -> None:
-    read_or_refuse(xml)
+def test_any_bytes_are_parsed_or_raise_an_error(xml: bytes) -> None:
+    parse_or_refuse(xml)
 
 
 @given(
@@ -133,15 +133,15 @@ def test_any_bytes_are_read_or_refused(xml: bytes) -> None:
         max_size=5,
     ),
 )
-def test_garbled_xml_is_read_or_refused(xml: bytes, faults: list[tuple[float, int, bytes]]) -> None:
+def test_damaged_xml_is_parsed_or_raises_an_error(xml: bytes, faults: list[tuple[float, int, bytes]]) -> None:
     for place, removed, inserted in faults:
         start = int(place * len(xml))
         xml = xml[:start] + inserted + xml[start + removed :]
-    read_or_refuse(xml)
+    parse_or_refuse(xml)
 
 
 @given(READABLE, st.floats(0, 1), st.sampled_from([0, 2]))
-def test_an_end_tag_left_out_or_doubled_after_a_value_loses_nothing(
+def test_a_missing_or_doubled_end_tag_after_a_value_loses_nothing(
     original: Parameters, place: float, times: int
 ) -> None:
     values = list(re.finditer(rb"<(\w+)[^>/]*>[^<]*(?P<end></\1>)", encode_parameters(original)))

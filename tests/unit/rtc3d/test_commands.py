@@ -21,7 +21,7 @@ from gateway.rtc3d.components import ComponentType
 MARKERS, ANALOG, FORCE = ComponentType.MARKERS, ComponentType.ANALOG, ComponentType.FORCE
 TOOLS, EVENT = ComponentType.TOOLS, ComponentType.EVENT
 
-# Each command with its one text: built so, and read so. "§" marks the specification's own examples.
+# Each command with its canonical text. "§" marks examples of the specification.
 TEXTS: list[tuple[Command, str]] = [
     (Version(), "Version 1.0"),  # § 5.3.1
     (Version("2.13"), "Version 2.13"),
@@ -67,7 +67,7 @@ each_text = pytest.mark.parametrize(("command", "text"), TEXTS, ids=[text for _,
 
 
 def error_text(body: bytes) -> str:
-    """Return the text of the error that the body is answered with, fit for an error packet."""
+    """Return the text of the error that the body raises, which must fit into an error packet."""
     with pytest.raises(CommandError) as caught:
         parse_command(body)
     text = str(caught.value)
@@ -78,31 +78,31 @@ def error_text(body: bytes) -> str:
 
 
 @each_text
-def test_builds_the_text_of_each_command(command: Command, text: str) -> None:
+def test_each_command_is_encoded_as_its_text(command: Command, text: str) -> None:
     assert str(command) == text
     assert encode_command(command) == text.encode("ascii")
 
 
 @each_text
-def test_reads_each_command(command: Command, text: str) -> None:
+def test_each_command_is_parsed_from_its_text(command: Command, text: str) -> None:
     assert parse_command(text.encode("ascii")) == command
 
 
 @pytest.mark.parametrize("end", [b"\0", b"\n", b"\r\n", b" ", b"   ", b" \0", b"\n\0", b"\0\n", b" \r\n\0\0"])
 @each_text
-def test_reads_each_command_whatever_ends_it(command: Command, text: str, end: bytes) -> None:
+def test_each_command_is_parsed_with_any_ending(command: Command, text: str, end: bytes) -> None:
     assert parse_command(text.encode("ascii") + end) == command
 
 
 @each_text
-def test_reads_each_command_in_any_case(command: Command, text: str) -> None:
+def test_each_command_is_parsed_in_any_case(command: Command, text: str) -> None:
     body = text.encode("ascii")
     for variant in (body.lower(), body.upper(), body.swapcase()):
         assert parse_command(variant) == command
 
 
 @each_text
-def test_reads_each_command_with_more_than_one_space(command: Command, text: str) -> None:
+def test_each_command_is_parsed_with_several_spaces(command: Command, text: str) -> None:
     assert parse_command(text.replace(" ", "   ").encode("ascii")) == command
 
 
@@ -126,11 +126,11 @@ def test_reads_each_command_with_more_than_one_space(command: Command, text: str
         ("Version 01.00", Version("01.00")),
     ],
 )
-def test_reads_other_spellings(text: str, command: Command) -> None:
+def test_other_spellings_are_parsed(text: str, command: Command) -> None:
     assert parse_command(text.encode("ascii")) == command
 
 
-# Errors --------------------------------------------------------------------------------------
+# Errors ---------------------------------------------------------------------------------------
 
 ALL_COMMANDS = ("Version", "SetByteOrder", "SendParameters", "SendCurrentFrame", "StreamFrames", "Bye")
 ALL_COMPONENTS = ("All", "3D", "6D", "Analog", "Force", "Events")
@@ -139,7 +139,7 @@ ALL_RATES = ("FrequencyDivisor:n", "Frequency:n", "AllFrames")
 
 
 @pytest.mark.parametrize("body", [b"Hello", b"Hello 3D", b"StreamFrames3D", b"GetState", b"3D", b"Stop"])
-def test_an_unknown_command_is_told_the_known_ones(body: bytes) -> None:
+def test_the_error_of_an_unknown_command_lists_the_known_ones(body: bytes) -> None:
     text = error_text(body)
     assert body.split()[0].decode() in text
     for word in ALL_COMMANDS:
@@ -147,7 +147,7 @@ def test_an_unknown_command_is_told_the_known_ones(body: bytes) -> None:
 
 
 @pytest.mark.parametrize("body", [b"", b"\0", b"\n", b"   ", b" \r\n\0\0"])
-def test_an_empty_command_is_told_the_known_ones(body: bytes) -> None:
+def test_the_error_of_an_empty_command_lists_the_known_ones(body: bytes) -> None:
     text = error_text(body)
     assert "empty" in text.lower()
     for word in ALL_COMMANDS:
@@ -158,21 +158,21 @@ def test_an_empty_command_is_told_the_known_ones(body: bytes) -> None:
     "parameters",
     ["", "1", "1.", ".0", "1.0.0", "1,0", "one", "1.0 1.0", "-1.0", "+1.0", "1.0e0", "12345.0", "1.12345"],
 )
-def test_a_version_that_is_not_n_n_is_told_the_form(parameters: str) -> None:
+def test_the_error_of_a_version_that_is_not_n_n_shows_the_form(parameters: str) -> None:
     text = error_text(f"Version {parameters}".encode())
     assert "n.n" in text
     assert "Version 1.0" in text
 
 
 @pytest.mark.parametrize("parameters", ["", "Big", "Little", "MiddleEndian", "BigEndian LittleEndian", "1"])
-def test_an_unknown_byte_order_is_told_the_known_ones(parameters: str) -> None:
+def test_the_error_of_an_unknown_byte_order_lists_the_known_ones(parameters: str) -> None:
     text = error_text(f"SetByteOrder {parameters}".encode())
     assert "BigEndian" in text
     assert "LittleEndian" in text
 
 
 @pytest.mark.parametrize("parameters", ["5D", "3D 5D", "All 5D", "5D All", "3D,5D"])
-def test_an_unknown_section_is_named_and_told_the_known_ones(parameters: str) -> None:
+def test_the_error_of_an_unknown_section_names_it_and_lists_the_known_ones(parameters: str) -> None:
     text = error_text(f"SendParameters {parameters}".encode())
     assert "5d" in text.lower()
     for word in ALL_SECTIONS:
@@ -180,14 +180,14 @@ def test_an_unknown_section_is_named_and_told_the_known_ones(parameters: str) ->
 
 
 @pytest.mark.parametrize("parameters", ["5D", "3D 5D", "All 5D", "3D,5D", "General 5D", "Frequency:60 5D"])
-def test_an_unknown_component_of_the_current_frame_is_told_the_known_ones(parameters: str) -> None:
+def test_the_error_of_an_unknown_component_lists_the_known_ones(parameters: str) -> None:
     text = error_text(f"SendCurrentFrame {parameters}".encode())
     for word in ALL_COMPONENTS:
         assert word in text
 
 
 @pytest.mark.parametrize("parameters", ["5D", "Frequency:60 5D", "All 5D", "3D General", "60", "Frequency"])
-def test_an_unknown_parameter_of_stream_frames_is_told_components_rates_and_stop(parameters: str) -> None:
+def test_the_error_of_an_unknown_parameter_of_stream_frames_lists_all_parameters(parameters: str) -> None:
     text = error_text(f"StreamFrames {parameters}".encode())
     assert parameters.rsplit(" ", 1)[-1].lower() in text.lower()
     for word in (*ALL_COMPONENTS, *ALL_RATES, "Stop"):
@@ -219,7 +219,7 @@ def test_an_unknown_parameter_of_stream_frames_is_told_components_rates_and_stop
         ":",
     ],
 )
-def test_a_bad_rate_is_told_the_three_forms(rate: str) -> None:
+def test_the_error_of_an_invalid_rate_shows_the_three_forms(rate: str) -> None:
     text = error_text(f"StreamFrames 3D {rate}".encode())
     assert rate[:10].lower() in text.lower()
     for word in ALL_RATES:
@@ -230,7 +230,7 @@ def test_a_bad_rate_is_told_the_three_forms(rate: str) -> None:
     "parameters",
     ["Frequency:60 FrequencyDivisor:2", "AllFrames Frequency:60", "Frequency:60 3D Frequency:60"],
 )
-def test_a_second_rate_is_told_that_only_one_is_taken(parameters: str) -> None:
+def test_the_error_of_a_second_rate_says_that_one_is_allowed(parameters: str) -> None:
     text = error_text(f"StreamFrames {parameters}".encode())
     assert "one of" in text
     for word in ALL_RATES:
@@ -238,15 +238,15 @@ def test_a_second_rate_is_told_that_only_one_is_taken(parameters: str) -> None:
 
 
 @pytest.mark.parametrize("parameters", ["Stop 3D", "3D Stop", "Frequency:60 Stop", "Stop Stop"])
-def test_stop_with_another_parameter_is_no_command(parameters: str) -> None:
+def test_stop_with_another_parameter_is_an_error(parameters: str) -> None:
     assert "stop" in error_text(f"StreamFrames {parameters}".encode()).lower()
 
 
-def test_bye_takes_no_parameter() -> None:
+def test_bye_with_a_parameter_is_an_error() -> None:
     assert "no parameter" in error_text(b"Bye now")
 
 
-# Bodies that no client means -----------------------------------------------------------------
+# Bodies that are no command -------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("before", ["", "Version ", "SetByteOrder ", "SendParameters ", "SendCurrentFrame "])
@@ -261,9 +261,9 @@ def test_the_error_text_of_a_huge_or_binary_word_is_short_and_printable(before: 
 
 
 @pytest.mark.parametrize("body", [bytes(range(256)), b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc", b"\x80" * 7])
-def test_a_binary_body_is_no_command(body: bytes) -> None:
+def test_a_binary_body_is_an_error(body: bytes) -> None:
     error_text(body)
 
 
-def test_a_huge_list_of_components_is_read_as_the_few_it_names() -> None:
+def test_repeated_components_are_parsed_once_each() -> None:
     assert parse_command(b"StreamFrames" + b" 3D 6D" * 200_000) == StreamFrames(None, (MARKERS, TOOLS))

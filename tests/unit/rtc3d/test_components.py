@@ -39,7 +39,7 @@ def values_of(items: Array, field: str) -> Array:
 
 
 def items_of(vector: ComponentVector) -> Array:
-    """Return the vector's items as an array, each value put at its field's name."""
+    """Return the vector's items as an array; each value is in the field of its name."""
     dtype = SHORT_EVENT if vector is SHORT_EVENTS else ITEM_DTYPES[ComponentType(vector.type)]
     items = np.zeros(vector.num_items, dtype)
     for field, values in vector.fields.items():
@@ -51,7 +51,7 @@ def memory_of(data: bytes | memoryview) -> npt.NDArray[np.uint8]:
     return np.frombuffer(data, np.uint8)
 
 
-# What the specification and the field notes fix ----------------------------------------------
+# Constants of the specification and the field notes -------------------------------------------
 
 
 def test_types_are_numbered_and_named_as_documented() -> None:
@@ -80,17 +80,17 @@ def test_wire_order_is_3d_6d_analog_force_event() -> None:
     assert [kind.value for kind in WIRE_ORDER] == [1, 4, 2, 3, 5]
 
 
-def test_missing_has_all_bits_set() -> None:
+def test_a_missing_value_has_all_bits_set() -> None:
     assert np.asarray(MISSING).tobytes() == b"\xff\xff\xff\xff"
     assert MISSING_RELIABILITY == 999.0
 
 
-# Vectors both ways ---------------------------------------------------------------------------
+# Encoding and splitting the vectors -----------------------------------------------------------
 
 
 @both_orders
 @each_component
-def test_splits_each_component_as_documented(vector: ComponentVector, order: ByteOrder) -> None:
+def test_each_component_is_split_as_documented(vector: ComponentVector, order: ByteOrder) -> None:
     component = only_component(frame(order, vector.wire[order]), order)
     assert component.type is ComponentType(vector.type)
     assert component.frame_number == vector.frame_number
@@ -103,7 +103,7 @@ def test_splits_each_component_as_documented(vector: ComponentVector, order: Byt
 
 @both_orders
 @each_component
-def test_reads_the_items_of_each_component_as_documented(vector: ComponentVector, order: ByteOrder) -> None:
+def test_the_items_of_each_component_are_as_documented(vector: ComponentVector, order: ByteOrder) -> None:
     items = only_component(frame(order, vector.wire[order]), order).items()
     assert items.shape == (vector.num_items,)
     assert items.dtype.itemsize == vector.item_bytes
@@ -115,7 +115,7 @@ def test_reads_the_items_of_each_component_as_documented(vector: ComponentVector
 
 @both_orders
 @each_component
-def test_builds_each_component_as_documented(vector: ComponentVector, order: ByteOrder) -> None:
+def test_each_component_is_encoded_as_documented(vector: ComponentVector, order: ByteOrder) -> None:
     kind = ComponentType(vector.type)
     items = items_of(vector)
     built = encode_component(kind, vector.frame_number, vector.timestamp_us, items, order)
@@ -125,7 +125,7 @@ def test_builds_each_component_as_documented(vector: ComponentVector, order: Byt
 @both_orders
 @pytest.mark.parametrize("items_order", ["big", "little"])
 @each_component
-def test_builds_from_items_in_any_byte_order(
+def test_items_in_any_byte_order_are_encoded(
     vector: ComponentVector, items_order: ByteOrder, order: ByteOrder
 ) -> None:
     items = items_of(vector)
@@ -138,14 +138,14 @@ def test_builds_from_items_in_any_byte_order(
 
 @both_orders
 @each_component
-def test_builds_from_items_that_are_not_contiguous(vector: ComponentVector, order: ByteOrder) -> None:
+def test_items_that_are_not_contiguous_are_encoded(vector: ComponentVector, order: ByteOrder) -> None:
     items = np.repeat(items_of(vector), 2)[::2]
     kind = ComponentType(vector.type)
     built = encode_component(kind, vector.frame_number, vector.timestamp_us, items, order)
     assert built == vector.wire[order]
 
 
-def test_builds_big_endian_unless_told_otherwise() -> None:
+def test_the_default_byte_order_is_big_endian() -> None:
     kind = ComponentType(MARKERS.type)
     built = encode_component(kind, MARKERS.frame_number, MARKERS.timestamp_us, items_of(MARKERS))
     assert built == MARKERS.wire["big"]
@@ -154,9 +154,7 @@ def test_builds_big_endian_unless_told_otherwise() -> None:
 
 @both_orders
 @each_component
-def test_big_endian_content_is_that_of_the_big_endian_vector(
-    vector: ComponentVector, order: ByteOrder
-) -> None:
+def test_big_endian_content_equals_the_big_endian_vector(vector: ComponentVector, order: ByteOrder) -> None:
     component = only_component(frame(order, vector.wire[order]), order)
     assert bytes(big_endian_content(component)) == vector.wire["big"][8:]
 
@@ -180,7 +178,7 @@ def test_a_tool_out_of_view_is_all_ones(order: ByteOrder) -> None:
 
 @both_orders
 @pytest.mark.parametrize("kind", ComponentType)
-def test_a_component_without_items_is_built_and_split(kind: ComponentType, order: ByteOrder) -> None:
+def test_a_component_without_items_is_encoded_and_split(kind: ComponentType, order: ByteOrder) -> None:
     wire = encode_component(kind, -1, -1, np.empty(0, ITEM_DTYPES[kind]), order)
     size, number = (24).to_bytes(4, order), int(kind).to_bytes(4, order)
     assert wire == size + number + b"\xff" * 12 + b"\0\0\0\0"
@@ -190,19 +188,19 @@ def test_a_component_without_items_is_built_and_split(kind: ComponentType, order
     assert bytes(big_endian_content(component)) == b"\xff" * 12 + b"\0\0\0\0"
 
 
-# Items ---------------------------------------------------------------------------------------
+# Items ----------------------------------------------------------------------------------------
 
 
 @both_orders
 @each_component
-def test_items_are_a_view_of_the_content(vector: ComponentVector, order: ByteOrder) -> None:
+def test_items_share_memory_with_the_content(vector: ComponentVector, order: ByteOrder) -> None:
     body = frame(order, MARKERS.wire[order], vector.wire[order], ANALOG.wire[order])
     _, component, _ = split_frame(body, order).components
     assert np.shares_memory(component.items(), memory_of(component.content))
 
 
 @both_orders
-def test_items_cannot_be_written(order: ByteOrder) -> None:
+def test_items_are_read_only(order: ByteOrder) -> None:
     items = only_component(frame(order, ANALOG.wire[order]), order).items()
     with pytest.raises(ValueError, match="read-only"):
         items[0] = 1.0

@@ -1,4 +1,4 @@
-"""The whole text of an error, as a person reads it in a log or a client's window."""
+"""The whole texts of errors, as a person reads them in a log or in a client's window."""
 
 import pytest
 
@@ -13,14 +13,14 @@ def size_error(header: bytes) -> str:
     return str(reader.error)
 
 
-def test_a_packet_that_is_too_large() -> None:
+def test_the_error_of_a_packet_that_is_too_large() -> None:
     assert size_error(b"\0\0\0\x65\0\0\0\x03") == (
         "packet size 101 (limit 100), type 3, at byte 0 of the stream: "
         "this is not an RTC3D server, or the connection is corrupt; check host and port"
     )
 
 
-def test_a_packet_that_is_shorter_than_its_header() -> None:
+def test_the_error_of_a_packet_that_is_shorter_than_its_header() -> None:
     assert size_error(b"\0\0\0\x07\0\0\0\x01") == (
         "packet size 7 (less than the header's 8), type 1, at byte 0 of the stream: "
         "this is not an RTC3D server, or the connection is corrupt; check host and port"
@@ -57,7 +57,7 @@ def test_a_packet_that_is_shorter_than_its_header() -> None:
         ("Bye 3D", "Bye takes no parameter"),
     ],
 )
-def test_a_command_that_cannot_be_read(command: str, text: str) -> None:
+def test_the_error_of_a_command_that_cannot_be_parsed(command: str, text: str) -> None:
     with pytest.raises(CommandError) as caught:
         parse_command(command.encode("ascii"))
     assert str(caught.value) == text
@@ -68,7 +68,7 @@ def test_a_command_that_cannot_be_read(command: str, text: str) -> None:
     [("x" * 39, "x" * 39), ("x" * 40, "x" * 40), ("x" * 41, "x" * 40 + "?"), ("é", "?"), ("\x01", r"\x01")],
     ids=["39 characters", "40 characters", "41 characters", "beyond ASCII", "unprintable"],
 )
-def test_an_unknown_command_is_shown_in_40_printable_characters(word: str, shown: str) -> None:
+def test_an_unknown_command_is_quoted_with_up_to_40_printable_characters(word: str, shown: str) -> None:
     with pytest.raises(CommandError) as caught:
         parse_command(word.encode("latin-1"))
     assert str(caught.value) == (

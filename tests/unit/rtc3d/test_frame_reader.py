@@ -1,4 +1,4 @@
-"""A frame that repeats the layout of an earlier one is read as any other frame is."""
+"""Frames that repeat the layout of an earlier frame, and frames that only seem to."""
 
 import struct
 
@@ -23,7 +23,7 @@ def reader_after(*bodies: bytes, order: ByteOrder = "big") -> FrameReader:
 
 
 @bodies_of_both_orders
-def test_the_first_and_the_next_frame_of_a_layout_are_read_alike(body: bytes, order: ByteOrder) -> None:
+def test_the_first_and_the_second_frame_of_a_layout_are_read_alike(body: bytes, order: ByteOrder) -> None:
     reader = FrameReader(order)
     expected = split_frame(body, order)
     for _ in range(2):
@@ -33,7 +33,7 @@ def test_the_first_and_the_next_frame_of_a_layout_are_read_alike(body: bytes, or
         assert read.unknown_types == expected.unknown_types
 
 
-def test_numbers_times_and_items_may_differ() -> None:
+def test_frames_of_one_layout_may_differ_in_number_time_and_items() -> None:
     wire = bytearray(MARKERS.wire["big"])
     wire[8:20] = struct.pack(">iq", -7, 2**40)
     wire[24:] = bytes(len(wire) - 24)
@@ -45,14 +45,14 @@ def test_numbers_times_and_items_may_differ() -> None:
 
 # Component count, and the component's size, type and count of items.
 @pytest.mark.parametrize("offset", [3, 7, 11, 27])
-def test_a_frame_in_which_anything_else_differs_is_not_taken_for_the_same_layout(offset: int) -> None:
+def test_a_frame_that_differs_in_anything_else_does_not_have_the_layout(offset: int) -> None:
     body = bytearray(MARKERS_FRAME)
     body[offset] ^= 2
     with pytest.raises(FrameError):
         reader_after(MARKERS_FRAME).read(bytes(body))
 
 
-def test_two_layouts_of_the_same_size_are_told_apart() -> None:
+def test_two_layouts_of_the_same_size_are_distinguished() -> None:
     bodies = [
         frame("big", encode_component(kind, 1, 1, np.zeros(count, ITEM_DTYPES[kind])))
         for kind, count in ((ComponentType.MARKERS, 2), (ComponentType.TOOLS, 1))
@@ -62,7 +62,7 @@ def test_two_layouts_of_the_same_size_are_told_apart() -> None:
     assert read == [split_frame(body, "big").layout for body in bodies * 2]
 
 
-def test_any_number_of_layouts_may_follow_each_other() -> None:
+def test_any_number_of_layouts_can_be_read() -> None:
     bodies = [
         frame("big", encode_component(ComponentType.ANALOG, 1, 1, np.zeros(count, ">f4")))
         for count in range(100)
@@ -71,12 +71,12 @@ def test_any_number_of_layouts_may_follow_each_other() -> None:
     assert [reader.read(body).layout.components[0].num_items for body in bodies] == list(range(100))
 
 
-def test_a_frame_in_the_other_byte_order_is_refused() -> None:
+def test_a_frame_in_the_other_byte_order_is_an_error() -> None:
     with pytest.raises(FrameError):
         reader_after(FULL_FRAME["big"]).read(FULL_FRAME["little"])
 
 
-def test_a_frame_too_short_for_its_component_count_is_refused() -> None:
+def test_a_frame_too_short_for_its_component_count_is_an_error() -> None:
     with pytest.raises(FrameError, match="too short"):
         reader_after(EMPTY_FRAME["big"]).read(b"\0\0\0")
 

@@ -1,4 +1,4 @@
-"""Frames split into components, and built."""
+"""Frames split into components, and encoded."""
 
 import numpy as np
 import pytest
@@ -24,7 +24,7 @@ both_orders = pytest.mark.parametrize("order", ["big", "little"])
 
 
 @both_orders
-def test_splits_a_frame_of_all_five_components(order: ByteOrder) -> None:
+def test_a_frame_of_all_five_components_is_split(order: ByteOrder) -> None:
     split = split_frame(FULL_FRAME[order], order)
     assert [component.type.key for component in split.components] == ["3d", "6d", "analog", "force", "event"]
     assert [bytes(component.content) for component in split.components] == [
@@ -34,7 +34,7 @@ def test_splits_a_frame_of_all_five_components(order: ByteOrder) -> None:
 
 
 @both_orders
-def test_builds_a_frame_of_all_five_components(order: ByteOrder) -> None:
+def test_a_frame_of_all_five_components_is_encoded(order: ByteOrder) -> None:
     parts = (vector.wire[order] for vector in FULL_FRAME_COMPONENTS)
     assert encode_frame(parts, order) == FULL_FRAME[order]
 
@@ -47,7 +47,7 @@ def test_an_empty_frame_has_no_components(order: ByteOrder) -> None:
 
 
 @both_orders
-def test_an_unknown_component_is_skipped_and_named(order: ByteOrder) -> None:
+def test_an_unknown_component_is_skipped_and_its_type_listed(order: ByteOrder) -> None:
     split = split_frame(FRAME_WITH_UNKNOWN[order], order)
     assert [bytes(component.content) for component in split.components] == [
         MARKERS.wire[order][8:],
@@ -58,7 +58,7 @@ def test_an_unknown_component_is_skipped_and_named(order: ByteOrder) -> None:
 
 @both_orders
 @pytest.mark.parametrize("data_bytes", [0, 1, 12, 15, 16, 17])
-def test_an_unknown_component_may_be_of_any_size(data_bytes: int, order: ByteOrder) -> None:
+def test_an_unknown_component_may_have_any_size(data_bytes: int, order: ByteOrder) -> None:
     unknown = (8 + data_bytes).to_bytes(4, order) + (0).to_bytes(4, order) + bytes(data_bytes)
     split = split_frame(frame(order, unknown), order)
     assert (split.components, split.unknown_types) == ((), (0,))
@@ -68,7 +68,7 @@ def test_an_unknown_component_may_be_of_any_size(data_bytes: int, order: ByteOrd
 
 
 @both_orders
-def test_events_of_16_and_of_24_bytes_may_stand_in_one_frame(order: ByteOrder) -> None:
+def test_events_of_16_and_of_24_bytes_may_be_in_one_frame(order: ByteOrder) -> None:
     body = frame(order, SHORT_EVENTS.wire[order], LONG_EVENTS.wire[order])
     short, long = split_frame(body, order).components
     assert (short.item_bytes, long.item_bytes) == (16, 24)
@@ -82,7 +82,7 @@ def test_events_of_16_and_of_24_bytes_may_stand_in_one_frame(order: ByteOrder) -
     [(START_RECORDING, "little", 1), (STOP_RECORDING, "big", 0)],
     ids=["start", "stop"],
 )
-def test_reads_the_frame_that_controls_wavefronts_recording(
+def test_the_frame_that_controls_wavefronts_recording_is_split_and_encoded(
     packet: bytes, order: ByteOrder, event_id: int
 ) -> None:
     body = packet[8:]
@@ -98,5 +98,5 @@ def test_reads_the_frame_that_controls_wavefronts_recording(
 
 
 @bodies_of_both_orders
-def test_frames_laid_out_alike_have_the_same_layout(body: bytes, order: ByteOrder) -> None:
+def test_frames_with_equal_layouts_share_one_layout_object(body: bytes, order: ByteOrder) -> None:
     assert split_frame(body, order).layout is split_frame(bytes(bytearray(body)), order).layout

@@ -4,7 +4,7 @@ from gateway.errors import PacketError
 from gateway.rtc3d.packets import Packet, encode_packet
 
 
-def test_packets_of_the_same_type_and_body_are_equal_and_one_element_of_a_set() -> None:
+def test_packets_of_the_same_type_and_body_are_equal_and_have_one_hash() -> None:
     assert Packet(3, b"frame") == Packet(3, b"frame")
     assert len({Packet(3, b"frame"), Packet(3, b"frame"), Packet(4, b"frame"), Packet(3, b"other")}) == 3
 

@@ -45,12 +45,12 @@ def test_types_are_numbered_as_in_the_specification() -> None:
 
 
 @each_packet
-def test_encodes_each_packet_as_documented(vector: PacketVector) -> None:
+def test_each_packet_is_encoded_as_documented(vector: PacketVector) -> None:
     assert encode_packet(vector.type, vector.body) == vector.packet
 
 
 @each_packet
-def test_reads_each_packet_as_documented(vector: PacketVector) -> None:
+def test_each_packet_is_read_as_documented(vector: PacketVector) -> None:
     reader = PacketReader()
     assert reader.feed(vector.packet) == [Packet(vector.type, vector.body)]
     assert reader.buffered_bytes == 0
@@ -58,7 +58,7 @@ def test_reads_each_packet_as_documented(vector: PacketVector) -> None:
 
 
 @each_packet
-def test_reads_each_packet_byte_by_byte(vector: PacketVector) -> None:
+def test_each_packet_is_read_byte_by_byte(vector: PacketVector) -> None:
     reader = PacketReader()
     for count, byte in enumerate(vector.packet[:-1], start=1):
         assert reader.feed(bytes([byte])) == []
@@ -67,7 +67,7 @@ def test_reads_each_packet_byte_by_byte(vector: PacketVector) -> None:
     assert reader.buffered_bytes == 0
 
 
-def test_reads_many_packets_from_one_piece_in_order_and_keeps_the_rest() -> None:
+def test_many_packets_are_read_from_one_piece_and_the_rest_is_kept() -> None:
     reader = PacketReader()
     stream = b"".join(vector.packet for vector in PACKETS)
     assert reader.feed(stream + header(20, 1) + b"Vers") == [
@@ -91,13 +91,13 @@ def test_an_empty_piece_changes_nothing() -> None:
 
 
 @pytest.mark.parametrize("packet_type", [6, 0x01000000, 0xFFFFFFFF])
-def test_a_type_that_the_specification_does_not_know_passes_through(packet_type: int) -> None:
+def test_a_packet_of_an_unknown_type_is_read_and_encoded(packet_type: int) -> None:
     packet = header(11, packet_type) + b"new"
     assert limited_reader().feed(packet) == [Packet(packet_type, b"new")]
     assert encode_packet(packet_type, b"new") == packet
 
 
-def test_a_body_stays_as_it_was_when_more_is_fed() -> None:
+def test_a_body_does_not_change_when_more_is_fed() -> None:
     reader = PacketReader()
     reader.feed(header(12, 3))
     (packet,) = reader.feed(b"abcd" + header(12, 3))
@@ -105,12 +105,12 @@ def test_a_body_stays_as_it_was_when_more_is_fed() -> None:
     assert packet.body == b"abcd"
 
 
-# Bounds of the size field --------------------------------------------------------------------
+# Bounds of the size field ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("packet_type", [0, 1, 2, 3, 4, 6, 0xFFFFFFFF])
 @pytest.mark.parametrize("size", [8, 9, LIMIT])
-def test_accepts_sizes_from_8_to_the_limit(size: int, packet_type: int) -> None:
+def test_sizes_from_8_to_the_limit_are_accepted(size: int, packet_type: int) -> None:
     reader = limited_reader()
     assert reader.feed(header(size, packet_type) + bytes(size - 8)) == [Packet(packet_type, bytes(size - 8))]
     assert reader.error is None
@@ -118,7 +118,7 @@ def test_accepts_sizes_from_8_to_the_limit(size: int, packet_type: int) -> None:
 
 @pytest.mark.parametrize("packet_type", [0, 1, 2, 3, 4, 6, 0xFFFFFFFF])
 @pytest.mark.parametrize("size", [0, 7, LIMIT + 1, 0xFFFFFFFF])
-def test_refuses_other_sizes_at_the_header(size: int, packet_type: int) -> None:
+def test_other_sizes_are_an_error_as_soon_as_the_header_is_complete(size: int, packet_type: int) -> None:
     reader = limited_reader()
     assert reader.feed(header(size, packet_type)) == []
     error = error_of(reader)
@@ -133,19 +133,19 @@ def test_a_c3d_file_has_its_own_limit(size: int) -> None:
 
 
 @pytest.mark.parametrize("size", [7, C3D_LIMIT + 1])
-def test_refuses_a_c3d_file_beyond_its_limit(size: int) -> None:
+def test_a_c3d_file_beyond_its_limit_is_an_error(size: int) -> None:
     reader = limited_reader()
     assert reader.feed(header(size, 5)) == []
     assert (error_of(reader).size, error_of(reader).packet_type) == (size, 5)
 
 
-def test_a_c3d_limit_below_the_packet_limit_holds_too() -> None:
+def test_the_c3d_limit_may_be_below_the_packet_limit() -> None:
     reader = PacketReader(max_packet_bytes=200, max_c3d_bytes=100)
     reader.feed(header(101, 5))
     assert error_of(reader).size == 101
 
 
-def test_limits_are_16_mib_and_256_mib_unless_configured() -> None:
+def test_the_default_limits_are_16_mib_and_256_mib() -> None:
     assert DEFAULT_MAX_PACKET_BYTES == 16 * 1024 * 1024
     assert DEFAULT_MAX_C3D_BYTES == 256 * 1024 * 1024
     for packet_type, limit in [(3, DEFAULT_MAX_PACKET_BYTES), (5, DEFAULT_MAX_C3D_BYTES)]:
@@ -156,7 +156,7 @@ def test_limits_are_16_mib_and_256_mib_unless_configured() -> None:
         assert error_of(beyond).size == limit + 1
 
 
-def test_the_error_of_a_small_size_says_size_bound_type_and_offset() -> None:
+def test_the_error_of_a_small_size_has_size_bound_type_and_offset() -> None:
     reader = limited_reader()
     reader.feed(PACKETS[1].packet + header(7, 3))
     text = str(error_of(reader))
@@ -167,9 +167,9 @@ def test_the_error_of_a_small_size_says_size_bound_type_and_offset() -> None:
 
 
 @pytest.mark.parametrize(("packet_type", "limit"), [(2, LIMIT), (5, C3D_LIMIT)])
-def test_the_error_of_a_large_size_says_size_limit_type_and_offset(packet_type: int, limit: int) -> None:
+def test_the_error_of_a_large_size_has_size_limit_type_and_offset(packet_type: int, limit: int) -> None:
     reader = limited_reader()
-    # "SSH-2.0-" as a header: what another protocol's greeting looks like.
+    # "SSH-" as the size: another protocol's greeting, read as a header.
     reader.feed(header(0x5353482D, packet_type))
     text = str(error_of(reader))
     assert f"size {0x5353482D}" in text
@@ -180,7 +180,7 @@ def test_the_error_of_a_large_size_says_size_limit_type_and_offset(packet_type: 
 
 
 @pytest.mark.parametrize("piece", [8, 100])
-def test_the_error_shows_how_what_is_no_packet_begins(piece: int) -> None:
+def test_the_error_has_the_first_60_bytes(piece: int) -> None:
     reader = limited_reader()
     greeting = b"SSH-2.0-" + bytes(range(92))
     reader.feed(PACKETS[1].packet + greeting[:piece])
@@ -193,14 +193,14 @@ EARLIER_STREAM = b"".join(vector.packet for vector in EARLIER)
 EARLIER_PACKETS = [Packet(vector.type, vector.body) for vector in EARLIER]
 
 
-def test_packets_before_the_bad_one_are_returned_and_counted_in_the_offset() -> None:
+def test_packets_before_the_error_are_returned_and_counted_in_its_offset() -> None:
     reader = limited_reader()
     assert reader.feed(EARLIER_STREAM + header(0, 1) + b"rest") == EARLIER_PACKETS
     assert error_of(reader).offset == 43
 
 
 @pytest.mark.parametrize("piece", [1, 3, 8, 19, 21])
-def test_the_offset_does_not_depend_on_how_the_stream_was_cut(piece: int) -> None:
+def test_the_offset_does_not_depend_on_how_the_stream_is_split(piece: int) -> None:
     reader = limited_reader()
     stream = EARLIER_STREAM + header(LIMIT + 1, 1)
     packets = []
@@ -210,7 +210,7 @@ def test_the_offset_does_not_depend_on_how_the_stream_was_cut(piece: int) -> Non
     assert error_of(reader).offset == 43
 
 
-def test_a_bad_size_is_no_error_before_its_header_is_whole() -> None:
+def test_an_invalid_size_is_no_error_before_its_header_is_complete() -> None:
     reader = limited_reader()
     reader.feed(header(7, 1)[:7])
     assert reader.error is None
@@ -219,7 +219,7 @@ def test_a_bad_size_is_no_error_before_its_header_is_whole() -> None:
 
 
 @pytest.mark.parametrize("first", [b"", b"\0\0"], ids=["at once", "after a part of the header"])
-def test_after_the_error_nothing_more_is_returned_or_kept(first: bytes) -> None:
+def test_after_the_error_nothing_is_returned_or_kept(first: bytes) -> None:
     reader = limited_reader()
     reader.feed(first)
     reader.feed(header(7, 1)[len(first) :] + PACKETS[1].packet)
@@ -231,14 +231,14 @@ def test_after_the_error_nothing_more_is_returned_or_kept(first: bytes) -> None:
 
 
 def test_a_packet_of_4_gib_cannot_be_encoded() -> None:
-    body = bytes(0xFFFFFFFF - 7)  # of zeros that nobody looks at: it takes no memory
+    body = bytes(0xFFFFFFFF - 7)  # zeros that are never touched take no memory
     with pytest.raises(PacketError, match="4294967296") as caught:
         encode_packet(2, body)
     assert (caught.value.size, caught.value.packet_type) == (4294967296, 2)
 
 
 def test_a_packet_of_a_byte_less_can_be_encoded() -> None:
-    class Body(bytes):  # says a length that a test should not allocate
+    class Body(bytes):  # reports a length that a test should not allocate
         def __new__(cls, length: int) -> "Body":
             body = super().__new__(cls)
             body.length = length
@@ -254,10 +254,10 @@ def test_a_packet_of_a_byte_less_can_be_encoded() -> None:
         encode_packet(2, Body(0xFFFFFFFF - 7))
 
 
-# Memory --------------------------------------------------------------------------------------
+# Memory ---------------------------------------------------------------------------------------
 
 
-def test_a_header_that_claims_16_mib_takes_only_the_memory_of_what_came() -> None:
+def test_a_header_that_claims_16_mib_uses_only_the_memory_of_what_arrived() -> None:
     reader = PacketReader()
     tracemalloc.start()
     try:
@@ -270,7 +270,7 @@ def test_a_header_that_claims_16_mib_takes_only_the_memory_of_what_came() -> Non
     assert peak < 100_000
 
 
-def test_the_memory_of_a_large_packet_is_given_back() -> None:
+def test_the_memory_of_a_large_packet_is_freed() -> None:
     reader = PacketReader()
     large = header(1_000_000, 3) + bytes(999_992)
     tracemalloc.start()
@@ -284,7 +284,7 @@ def test_the_memory_of_a_large_packet_is_given_back() -> None:
     assert held < 100_000
 
 
-# Text of bodies ------------------------------------------------------------------------------
+# Text of bodies -------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -299,5 +299,5 @@ def test_the_memory_of_a_large_packet_is_given_back() -> None:
         (b"d\xe9j\xe0 vu\xff\0", "d\xe9j\xe0 vu\xff"),
     ],
 )
-def test_text_ends_before_nul_and_white_space(body: bytes, text: str) -> None:
+def test_nuls_and_white_space_at_the_end_are_not_part_of_a_text(body: bytes, text: str) -> None:
     assert decode_text(body) == text

@@ -1,4 +1,4 @@
-"""Parameters (§6): the specification's examples, malformed XML, the sins of real servers, and writing."""
+"""Parameters (§6): the specification's examples, malformed XML, faults of real servers, and encoding."""
 
 import math
 import re
@@ -38,13 +38,13 @@ from tests.spec_parameters import (
 )
 
 
-class TestTheSpecificationsExamples:
+class TestExamplesOfTheSpecification:
     @pytest.mark.parametrize("section", SECTIONS)
     def test_every_field_is_read(self, section: str) -> None:
         assert parse_parameters(spec_xml(section)).parameters == BY_SECTION[section]
 
     @pytest.mark.parametrize("section", ["general", "3d", "6d", "analog"])
-    def test_nothing_is_reported_of_those_that_are_well_formed(self, section: str) -> None:
+    def test_the_well_formed_ones_have_no_faults(self, section: str) -> None:
         assert parse_parameters(spec_xml(section)).recovered == ()
 
     def test_the_stray_end_tag_of_force_is_reported_with_its_line(self) -> None:
@@ -66,7 +66,7 @@ class TestTheSpecificationsExamples:
         assert parse_parameters(xml).parameters == ALL
 
     @pytest.mark.parametrize("section", SECTIONS)
-    def test_a_reply_says_which_section_it_holds(self, section: str) -> None:
+    def test_the_section_in_a_reply_is_found(self, section: str) -> None:
         assert sections_of(parse_parameters(spec_xml(section)).parameters) == {section}
 
 
@@ -143,7 +143,7 @@ class TestBrokenNesting:
         assert parameters.markers == Parameters3D(markers=(Marker("1", "L&R < &nbsp;"),))
         assert recovered
 
-    def test_cut_anywhere_it_is_read_in_part_and_reported_or_refused(self) -> None:
+    def test_a_truncated_document_is_read_in_part_and_reported_or_is_an_error(self) -> None:
         xml = encode_parameters(ALL).strip()
         complete = 0
         for end in range(len(xml)):
@@ -186,7 +186,7 @@ class TestRealServers:
         )
         assert markers_of(xml) == Parameters3D(100.0, "mm", (Marker("1", "a", "left arm"),))
 
-    def test_marker_ids_are_the_servers_texts_whatever_they_are(self) -> None:
+    def test_marker_ids_may_be_any_text(self) -> None:
         ids = ["0", "7", "7", "-1", "0x123456", "left arm", ""]
         markers = "".join(f"<Marker id = ' {marker_id} '></Marker>" for marker_id in ids)
         xml = in_root(f"<The_3D><Markers>{markers}<Marker/></Markers></The_3D>")
@@ -217,11 +217,11 @@ class TestRealServers:
         )
         assert recovered == ()
 
-    def test_a_reply_without_sections_holds_none(self) -> None:
+    def test_a_reply_without_sections_is_no_error(self) -> None:
         assert parse_parameters(b"<RT_Parameters Ver='1.00'></RT_Parameters>") == (Parameters(), ())
 
     @pytest.mark.parametrize("number", ["abc", "60,0", "nan", "-inf", "1e999", "0x10"])
-    def test_a_frequency_that_is_no_number_is_none_and_reported(self, number: str) -> None:
+    def test_a_frequency_that_is_not_a_number_is_none_and_reported(self, number: str) -> None:
         xml = in_root(f"<The_3D><Frequency>{number}</Frequency></The_3D>")
         assert parse_parameters(xml) == (
             Parameters(markers=Parameters3D(frequency_hz=None)),
@@ -229,14 +229,14 @@ class TestRealServers:
         )
 
     @pytest.mark.parametrize("number", ["3020.0", "9" * 400, "9" * 5000])
-    def test_a_port_that_is_no_whole_number_is_none_and_reported(self, number: str) -> None:
+    def test_a_port_that_is_not_a_whole_number_is_none_and_reported(self, number: str) -> None:
         xml = in_root(f"<General><Server><Port>{number}</Port></Server></General>")
         parameters, recovered = parse_parameters(xml)
         assert parameters == Parameters(general=General())
         assert len(recovered) == 1
         assert recovered[0].startswith(f"General/Server/Port '{number[:60]}'")
 
-    def test_a_bad_coordinate_or_matrix_cell_is_nan_in_its_place(self) -> None:
+    def test_an_unreadable_coordinate_or_matrix_cell_is_nan(self) -> None:
         xml = in_root(
             "<Force><Plates><Plate/><Plate id='2'>",
             "<Location><Corner/><Corner><Point><X>1</X><Y>?</Y><Z>3</Z></Point></Corner></Location>",
@@ -267,14 +267,14 @@ class TestRealServers:
         )
 
 
-class TestEncodings:
+class TestCharacterEncodings:
     XML = in_root("<The_3D><Unit>µm</Unit></The_3D>").decode()
 
     @pytest.mark.parametrize(
         "declaration", ["", "<?xml version='1.0'?>", "<?xml version='1.0' encoding='UTF-8'?>"]
     )
     @pytest.mark.parametrize("mark", ["", "\ufeff"])
-    def test_utf_8(self, declaration: str, mark: str) -> None:
+    def test_utf_8_is_read_with_or_without_declaration_and_mark(self, declaration: str, mark: str) -> None:
         assert markers_of((mark + declaration + self.XML).encode()).unit == "µm"
 
     @pytest.mark.parametrize("encoding", ["iso-8859-1", "windows-1252", "ISO-8859-15"])
@@ -283,12 +283,12 @@ class TestEncodings:
         assert markers_of(xml).unit == "µm"
 
     @pytest.mark.parametrize("declaration", ["", "<?xml version='1.0' encoding='utf-8'?>"])
-    def test_what_is_not_utf_8_is_read_as_latin_1_and_reported(self, declaration: str) -> None:
+    def test_bytes_that_are_not_utf_8_are_read_as_latin_1_and_reported(self, declaration: str) -> None:
         parameters, recovered = parse_parameters((declaration + self.XML).encode("latin-1"))
         assert parameters == Parameters(markers=Parameters3D(unit="µm"))
         assert recovered == ("bytes that are not UTF-8 were read as Latin-1",)
 
-    def test_malformed_latin_1(self) -> None:
+    def test_malformed_latin_1_is_read_and_reported(self) -> None:
         parameters, recovered = parse_parameters(self.XML.replace("</The_3D>", "").encode("latin-1"))
         assert parameters == Parameters(markers=Parameters3D(unit="µm"))
         assert len(recovered) == 2
@@ -300,8 +300,8 @@ class TestEncodings:
         assert "klingon" in recovered[0]
 
 
-class TestBuilding:
-    def test_it_writes_the_layout_of_the_specification(self) -> None:
+class TestEncoding:
+    def test_the_xml_has_the_layout_of_the_specification(self) -> None:
         tools = Parameters6D(60.0, (Tool("1", "Hand", "", ("12", "14")),))
         assert encode_parameters(Parameters(tools=tools)) == (
             b'<RT_Parameters Ver="1.00">\n'
@@ -332,7 +332,7 @@ class TestBuilding:
         ]  # fmt: skip
 
     @pytest.mark.parametrize("section", SECTIONS)
-    def test_its_elements_are_those_of_the_specifications_example(self, section: str) -> None:
+    def test_the_elements_are_those_of_the_example_in_the_specification(self, section: str) -> None:
         def tags(xml: bytes) -> set[bytes]:
             return set(re.findall(rb"<(\w+)", xml))
 
@@ -344,13 +344,13 @@ class TestBuilding:
             b"RT_Parameters", b"General", b"Server", b"Name", b"Ver", b"IPadd", b"Analog", b"Channels"
         }  # fmt: skip
 
-    def test_it_is_ascii_whatever_the_labels_are(self) -> None:
+    def test_the_xml_is_ascii_whatever_the_labels_are(self) -> None:
         markers = Parameters3D(unit="µm", markers=(Marker("é", "a & b < c", "日本"),))
         xml = encode_parameters(Parameters(markers=markers))
         assert xml.isascii()
         assert markers_of(xml) == markers
 
-    def test_characters_that_xml_cannot_hold_are_dropped(self) -> None:
+    def test_characters_that_xml_cannot_represent_are_dropped(self) -> None:
         markers = Parameters3D(markers=(Marker("1\0", "a\x1bb\ud800", "c\uffff\nd"),))
         xml = encode_parameters(Parameters(markers=markers))
         assert markers_of(xml).markers == (Marker("1", "ab", "c\nd"),)

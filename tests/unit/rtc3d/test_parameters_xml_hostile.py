@@ -1,4 +1,4 @@
-"""XML that is meant to bring the reader of parameters down, or is none at all."""
+"""XML that attacks the parser of parameters, and data that is not XML."""
 
 import re
 from pathlib import Path
@@ -24,17 +24,17 @@ class TestHostileXml:
             b"<a/>",
         ],
     )
-    def test_what_holds_no_section_is_refused_with_its_first_bytes(self, body: bytes) -> None:
+    def test_xml_without_a_section_is_an_error_that_quotes_its_first_bytes(self, body: bytes) -> None:
         with pytest.raises(ParametersError, match=re.escape(ascii(body.decode().strip("\0\r\n")))):
             parse_parameters(body)
 
-    def test_the_bytes_shown_are_bounded_and_printable(self) -> None:
+    def test_the_quoted_bytes_are_bounded_and_printable(self) -> None:
         with pytest.raises(ParametersError) as caught:
             parse_parameters(b"\x1b[2J\xff\0" * 1000)
         assert str(caught.value).isprintable()
         assert len(str(caught.value)) < 500
 
-    def test_entities_are_refused(self) -> None:
+    def test_entities_are_an_error(self) -> None:
         entities = "".join(f"<!ENTITY e{n} '{f'&e{n - 1};' * 10}'>" for n in range(1, 12))
         xml = (
             f"<!DOCTYPE x [<!ENTITY e0 'ha'>{entities}]>"
@@ -43,7 +43,7 @@ class TestHostileXml:
         with pytest.raises(ParametersError, match="entities"):
             parse_parameters(xml.encode())
 
-    def test_entities_that_an_encoding_hides_are_not_expanded(self) -> None:
+    def test_entities_hidden_by_an_encoding_are_not_expanded(self) -> None:
         xml = "<!DOCTYPE x [<!ENTITY e 'metre'>]>" + in_root("<The_3D><Unit>&e;</Unit></The_3D>").decode()
         parameters = parse_parameters(b"\xfe\xff" + xml.encode("utf-16-be")).parameters
         assert parameters == Parameters(markers=Parameters3D())
@@ -57,7 +57,7 @@ class TestHostileXml:
         assert markers_of(xml).markers == (Marker(id=""),)
 
     @pytest.mark.parametrize("tag", [b"a", b"Marker", b"Event", b"RT_Parameters"])
-    def test_deep_nesting_ends_at_a_bound(self, tag: bytes) -> None:
+    def test_deep_nesting_is_bounded(self, tag: bytes) -> None:
         xml = b"<RT_Parameters><The_3D><Unit>m</Unit><Markers>" + b"<%b>" % tag * 50_000
         parameters, recovered = parse_parameters(xml)
         assert parameters.markers is not None
@@ -65,12 +65,12 @@ class TestHostileXml:
         assert len(parameters.markers.markers) < 300
         assert recovered
 
-    def test_too_much_is_refused_before_it_is_parsed(self) -> None:
+    def test_a_document_above_the_limit_is_an_error_without_parsing(self) -> None:
         xml = b"<RT_Parameters>" + b" " * MAX_XML_BYTES + b"</RT_Parameters>"
         with pytest.raises(ParametersError, match=rf"{len(xml)} bytes.* limit of {MAX_XML_BYTES}"):
             parse_parameters(xml)
 
-    def test_a_great_many_faults_are_read_through(self) -> None:
+    def test_the_number_of_reported_faults_is_bounded(self) -> None:
         cells = "<Col/>" * 50_000 + "<Col>a</Col>" * 50_000
         matrix = f"<Calibration_Matrix><Row>{cells}</Row></Calibration_Matrix>"
         xml = in_root(f"<Force><Plates><Plate>{matrix}</Plate></Plates></Force>")
