@@ -1,0 +1,70 @@
+"""What the log says, word for word, when an output or a tool cannot be published on."""
+
+import logging
+
+import pytest
+
+from gateway.errors import OutputError
+from gateway.messages.stamp import Stamp
+from gateway.publish.fan_out import FanOut
+from gateway.rtc3d.components import WIRE_ORDER
+from gateway.rtc3d.parameters import Parameters, Parameters3D
+from tests.toy_output import ToyOutput
+from tests.unit.publish.test_tool_poses import publish_tools
+
+STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1)
+ALL = frozenset(WIRE_ORDER)
+
+
+def logged(caplog: pytest.LogCaptureFixture) -> list[str]:
+    return [f"{record.levelname} {record.getMessage()}" for record in caplog.records]
+
+
+def set_unit(fan_out: FanOut, unit: str) -> None:
+    fan_out.set_parameters(Parameters(markers=Parameters3D(unit=unit)))
+
+
+@pytest.mark.parametrize(
+    ("error", "text"),
+    [
+        (OutputError("no router is connected", cause="no router"), "no router is connected"),
+        (ValueError("a defect"), "ValueError: a defect"),
+    ],
+)
+def test_a_message_that_an_output_does_not_accept(
+    error: Exception, text: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    output = ToyOutput("zenoh")
+    output.error = error
+    FanOut("lab", [output]).publish_status(b"status")
+    assert logged(caplog) == [f"WARNING lab to zenoh: {text}"]
+
+
+@pytest.mark.usefixtures("no_hold")
+def test_too_many_tools_and_their_end(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gateway.publish.tool_poses")
+    fan_out = FanOut("lab", [ToyOutput()], ["toy"])
+    publish_tools(fan_out, 257)
+    publish_tools(fan_out, 3)
+    start, end = logged(caplog)
+    assert start == "WARNING lab: a frame of 257 tools, more than 256: no tool poses are published"
+    assert end.startswith("INFO lab: frames of 3 tools: tool poses are published, after ")
+
+
+def test_an_unknown_unit_and_its_end(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gateway.publish.tool_poses")
+    fan_out = FanOut("lab", [ToyOutput()], ["toy"])
+    set_unit(fan_out, "x" * 41)
+    set_unit(fan_out, "m")
+    start, end = logged(caplog)
+    assert start == (
+        f"WARNING lab: unit of length '{'x' * 40}' is unknown: no tool poses are published; "
+        "set it to mm or m in the server"
+    )
+    assert end.startswith("INFO lab: unit of length is 'm': tool poses are published, after ")
+
+
+def test_parameters_without_markers_are_in_millimetres(caplog: pytest.LogCaptureFixture) -> None:
+    fan_out = FanOut("lab", [ToyOutput()], ["toy"])
+    fan_out.set_parameters(Parameters())
+    assert not caplog.records

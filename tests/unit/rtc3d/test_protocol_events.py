@@ -1,0 +1,119 @@
+"""What each event of the client's protocol carries."""
+
+import pytest
+
+from gateway.errors import ClosedError, LinkError
+from gateway.rtc3d.client_protocol import (
+    Answered,
+    ByteOrderMismatch,
+    ClientProtocol,
+    FrameRejected,
+    ProtocolEvent,
+    Refused,
+    UnexpectedPacket,
+)
+from gateway.rtc3d.commands import (
+    Bye,
+    Command,
+    SendCurrentFrame,
+    SendParameters,
+    SetByteOrder,
+    StreamFrames,
+    Version,
+)
+from gateway.rtc3d.packets import Packet
+from tests.servers import error, ok, packet
+from tests.vectors import FULL_FRAME
+
+FRAME = FULL_FRAME["big"]
+
+
+def events_after(command: Command, reply: bytes) -> list[ProtocolEvent]:
+    connection = ClientProtocol()
+    connection.send(command)
+    _, events = connection.receive(reply)
+    return events
+
+
+@pytest.mark.parametrize(
+    ("command", "packet_type", "body"),
+    [
+        (Version(), 1, b"OK-Version 1.0"),
+        (SendParameters(), 2, b"<RT_Parameters/>"),
+        (SendCurrentFrame(), 3, FRAME),
+        (SendCurrentFrame(), 4, b"No data"),
+        (StreamFrames(), 1, b"ok-streamframes"),
+        (StreamFrames(), 3, FRAME),
+        (StreamFrames(), 4, b""),
+    ],
+)
+def test_an_answer_carries_the_command_and_the_whole_packet(
+    command: Command, packet_type: int, body: bytes
+) -> None:
+    assert events_after(command, packet(packet_type, body)) == [Answered(command, Packet(packet_type, body))]
+
+
+@pytest.mark.parametrize("packet_type", [0, 1, 2, 6])
+def test_a_packet_that_answers_nothing_is_passed_on_whole(packet_type: int) -> None:
+    _, events = ClientProtocol().receive(packet(packet_type, b"what is it"))
+    assert events == [UnexpectedPacket(Packet(packet_type, b"what is it"))]
+
+
+@pytest.mark.parametrize(
+    ("reply", "text"),
+    [
+        ("err-no such command", "err-no such command"),
+        ("", "no reason given"),
+        ("x" * 300, "x" * 300),
+        ("x" * 301, "x" * 300),
+    ],
+    ids=["a reason", "no reason", "300 bytes", "301 bytes"],
+)
+def test_a_refusal_carries_the_command_and_at_most_300_bytes_of_the_servers_text(
+    reply: str, text: str
+) -> None:
+    [refused] = events_after(Version(), error(reply))
+    assert isinstance(refused, Refused)
+    assert refused.command == Version()
+    assert str(refused.error) == text
+
+
+def test_a_rejected_frame_carries_the_contradiction() -> None:
+    _, [rejected] = ClientProtocol().receive(packet(3, b"\0\0\0"))
+    assert isinstance(rejected, FrameRejected)
+    assert str(rejected.error) == "data frame of 3 bytes: too short for its component count"
+
+
+def test_a_mismatch_carries_the_byte_order_of_the_frames() -> None:
+    _, events = ClientProtocol().receive(packet(3, FULL_FRAME["little"]))
+    assert events == [ByteOrderMismatch("little")]
+
+
+def test_a_command_that_cannot_be_sent_is_named_with_the_reason() -> None:
+    connection = ClientProtocol()
+    connection.send(Version())
+    with pytest.raises(LinkError) as waiting:
+        connection.send(SetByteOrder("little"))
+    connection.send(Bye())
+    with pytest.raises(ClosedError) as closing:
+        connection.send(Version())
+    connection.end()
+    with pytest.raises(ClosedError) as closed:
+        connection.send_recording(start=True)
+    assert [str(caught.value) for caught in (waiting, closing, closed)] == [
+        "SetByteOrder LittleEndian not sent: Version 1.0 has not been answered yet",
+        "Version 1.0 not sent: the connection is closing",
+        "recording control not sent: the connection is closed",
+    ]
+
+
+def test_a_frame_that_is_not_streamed_is_the_answer_alone() -> None:
+    connection = ClientProtocol()
+    connection.send(SendCurrentFrame())
+    frames, _ = connection.receive(packet(3, FRAME))
+    assert frames == []
+    connection.send(StreamFrames())
+    connection.receive(ok("ok"))
+    frames, events = connection.receive(packet(3, FRAME))
+    assert [frame.body for frame in frames] == [FRAME]
+    assert events == []
