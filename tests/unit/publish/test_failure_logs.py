@@ -43,7 +43,7 @@ def test_a_message_that_an_output_does_not_accept(
 @pytest.mark.usefixtures("no_hold")
 def test_too_many_tools_and_their_end(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "gateway.publish.tool_poses")
-    fan_out = FanOut("lab", [ToyOutput()], ["toy"])
+    fan_out = FanOut("lab", [ToyOutput(has_tool_poses=True)])
     publish_tools(fan_out, 257)
     publish_tools(fan_out, 3)
     start, end = logged(caplog)
@@ -53,7 +53,7 @@ def test_too_many_tools_and_their_end(caplog: pytest.LogCaptureFixture) -> None:
 
 def test_an_unknown_unit_and_its_end(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "gateway.publish.tool_poses")
-    fan_out = FanOut("lab", [ToyOutput()], ["toy"])
+    fan_out = FanOut("lab", [ToyOutput(has_tool_poses=True)])
     set_unit(fan_out, "x" * 41)
     set_unit(fan_out, "m")
     start, end = logged(caplog)
@@ -65,6 +65,6 @@ def test_an_unknown_unit_and_its_end(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_parameters_without_markers_are_in_millimetres(caplog: pytest.LogCaptureFixture) -> None:
-    fan_out = FanOut("lab", [ToyOutput()], ["toy"])
+    fan_out = FanOut("lab", [ToyOutput(has_tool_poses=True)])
     fan_out.set_parameters(Parameters())
     assert not caplog.records

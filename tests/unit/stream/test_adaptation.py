@@ -11,7 +11,7 @@ from gateway.stream.adaptation import DEMAND_POLL_S, Adaptation
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
-from tests.unit.stream.scripted_server import ScriptedServer, silent_to
+from tests.unit.stream.scripted_server import ScriptedServer, refusing, silent_to
 from tests.unit.stream.virtual_time import settle
 
 START, STOP = "StreamFrames AllFrames", "StreamFrames Stop"
@@ -100,6 +100,34 @@ async def test_lateness_is_a_warning_once_and_its_end_is_reported(caplog: pytest
     assert second.endswith("asked the server for FrequencyDivisor:4 (failure 2 in a row)")
     assert third == "lab (3d): frames arrive in time; asked the server for FrequencyDivisor:2"
     assert last.startswith("lab (3d): frames arrive in time; asked the server for AllFrames, after ")
+
+
+async def test_a_lag_of_exactly_the_maximum_is_in_time(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG, "gateway.stream.adaptation")
+    lab = Lab()
+    await lab.start()
+    for lag_s in (0.05, 0.051, 2.0):
+        lab.status.lag_measured(lag_s)
+        lab.adaptation.request_rate(1)
+        await settle()
+    assert caplog.messages == [
+        "lab (3d): frames arrive in time; asked the server for FrequencyDivisor:2",
+        "lab (3d): frames arrive 51 ms late; asked the server for FrequencyDivisor:2",
+        "lab (3d): frames arrive 2000 ms late; asked the server for FrequencyDivisor:2 (failure 2 in a row)",
+    ]
+
+
+async def test_a_server_that_only_knows_its_default_rate_is_named_so(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    lab = Lab()
+    await lab.start()
+    lab.server.answer = refusing("StreamFrames")
+    lab.status.rate_agreed("")
+    lab.status.lag_measured(0.3)
+    lab.adaptation.request_rate(1)
+    await settle()
+    assert "lab (3d): frames arrive 300 ms late; asked the server for its default rate" in caplog.messages
 
 
 async def test_the_end_of_the_connection_ends_a_change_quietly(caplog: pytest.LogCaptureFixture) -> None:

@@ -1,5 +1,6 @@
 import logging
 import time
+from types import SimpleNamespace
 
 import pytest
 
@@ -117,3 +118,20 @@ def test_the_frame_rate_is_frames_divided_by_the_time_since_the_last_update() ->
     after_s = time.monotonic()
     assert 100 / (after_s - before_s) <= rate_hz <= 100 / (asked_s - created_s)
     assert rate.update(100) == 0.0
+
+
+def test_the_frame_rate_is_exact_and_zero_if_no_time_has_passed(monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = iter([10.0, 12.0, 12.0, 13.0])
+    monkeypatch.setattr("gateway.stream.status.time", SimpleNamespace(monotonic=clock.__next__))
+    rate = FrameRate()
+    assert [rate.update(frames) for frames in (100, 150, 170)] == [50.0, 0.0, 20.0]
+
+
+def test_every_frame_that_is_lost_is_counted_by_its_cause() -> None:
+    status = StreamStatus("3d")
+    for _ in range(2):
+        status.frame_rejected("too short")
+        status.frame_skipped()
+        status.unknown_components_skipped(3)
+    assert status.drops == {"frame rejected": 2, "skipped while behind": 2, "unknown component": 6}
+    assert status.last_error == "too short"
