@@ -1,5 +1,6 @@
 """What each event of the client's protocol carries."""
 
+import numpy as np
 import pytest
 
 from gateway.errors import ClosedError, LinkError
@@ -21,6 +22,8 @@ from gateway.rtc3d.commands import (
     StreamFrames,
     Version,
 )
+from gateway.rtc3d.components import ComponentType, encode_component
+from gateway.rtc3d.frames import encode_frame
 from gateway.rtc3d.packets import Packet
 from tests.servers import error, ok, packet
 from tests.vectors import FULL_FRAME
@@ -117,3 +120,9 @@ def test_a_frame_that_is_not_streamed_is_the_answer_alone() -> None:
     frames, events = connection.receive(packet(3, FRAME))
     assert [frame.body for frame in frames] == [FRAME]
     assert events == []
+
+
+def test_a_current_frame_without_the_requested_component_is_the_answer_while_nothing_is_streamed() -> None:
+    command = SendCurrentFrame((ComponentType.MARKERS,))
+    body = encode_frame([encode_component(ComponentType.ANALOG, 1, 0, np.zeros(1, ">f4"))])
+    assert events_after(command, packet(3, body)) == [Answered(command, Packet(3, body))]

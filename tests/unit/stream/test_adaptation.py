@@ -66,6 +66,24 @@ async def test_an_on_demand_stream_stops_without_subscribers_and_resumes_with_th
     lab.adaptation.cancel()
 
 
+async def test_each_stop_and_each_start_on_demand_happens_once_and_is_logged(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO, "gateway.stream.adaptation")
+    lab = Lab(on_demand=True, idle_after_s=5.0)
+    await lab.start()
+    for has_subscribers in (False, True, False):
+        lab.has_subscribers = has_subscribers
+        await asyncio.sleep(60)
+    assert lab.requests == [STOP, START, STOP]
+    assert caplog.messages == [
+        "lab (3d): no subscribers; the stream is stopped",
+        "lab (3d): a subscriber appeared; streaming",
+        "lab (3d): no subscribers; the stream is stopped",
+    ]
+    lab.adaptation.cancel()
+
+
 async def test_a_short_absence_of_subscribers_does_not_stop_an_on_demand_stream() -> None:
     lab = Lab(on_demand=True, idle_after_s=5.0)
     await lab.start()
@@ -139,7 +157,9 @@ async def test_the_end_of_the_connection_ends_a_change_quietly(caplog: pytest.Lo
     await settle()
     lab.server.connection.end()
     await settle()
-    assert [record.levelname for record in caplog.records] == ["DEBUG"]
+    assert [(record.levelname, record.getMessage()) for record in caplog.records] == [
+        ("DEBUG", "lab (3d): the connection to 192.0.2.20:3020 was closed by the server")
+    ]
     assert lab.status.rate == "AllFrames"
 
 

@@ -135,3 +135,17 @@ def test_every_frame_that_is_lost_is_counted_by_its_cause() -> None:
         status.unknown_components_skipped(3)
     assert status.drops == {"frame rejected": 2, "skipped while behind": 2, "unknown component": 6}
     assert status.last_error == "too short"
+
+
+def test_everything_that_happens_again_and_again_is_added_up() -> None:
+    status = StreamStatus("3d")
+    for count in (3, 4):
+        status.connecting(SERVER)
+        status.connected(SERVER)
+        status.bytes_received(100 * count)
+        status.frames_received(count, 1_000 * count)
+        status.server_restarted()
+        status.disconnected("closed by the server")
+        status.reconnecting()
+    assert (status.tries, status.session, status.restarts, status.reconnects) == (2, 2, 2, 2)
+    assert (status.bytes_in, status.frames_in, status.last_frame_utime) == (700, 7, 4_000)
