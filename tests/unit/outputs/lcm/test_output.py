@@ -119,6 +119,7 @@ def test_it_is_opened_again_once_it_can_be(tmp_path: Path, caplog: pytest.LogCap
     log = tmp_path / "later" / "log"
     output = LcmOutput(LcmSettings(url=f"file://{log}?mode=w"))
     output.start()
+    wait_until(lambda: bool(caplog.records))  # a thread opens it
     assert not output.health().connected
     log.parent.mkdir()
 
