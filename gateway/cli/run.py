@@ -1,5 +1,10 @@
 """``rtc3d-gateway run``: the gateway itself."""
 
+import logging
+import os
+import sys
+from typing import NoReturn
+
 import uvloop
 
 from gateway.cli.options import (
@@ -22,3 +27,16 @@ def run(
     """Run the gateway until Ctrl-C or SIGTERM. SIGHUP reloads the configuration."""
     set_up_log(log_level, log_format)
     uvloop.run(serve(lambda: configuration_from_options(config, server).settings))
+    _exit_at_once()
+
+
+def _exit_at_once() -> NoReturn:
+    """End the process without Python's own shutdown; everything is closed by now.
+
+    Zenoh's callbacks run in daemon threads, and one that takes the GIL during that shutdown aborts the
+    process: "exception not rethrown", SIGABRT, in 5 of 80 stops under load. systemd counts that as a failure.
+    """
+    logging.shutdown()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(0)
