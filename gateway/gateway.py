@@ -142,8 +142,9 @@ class Gateway:
 
     def _publish_known_parameters(self, output: Output) -> None:
         for name, queries in self._source_queries.items():
-            if queries.parameters_xml is not None:
-                output.publish_parameters(name, ServerParameters(queries.parameters_xml, queries.session))
+            xml = queries.parameters.xml
+            if xml is not None:
+                output.publish_parameters(name, ServerParameters(xml, queries.session))
 
     async def _change_sources(self, wanted_sources: Sequence[SourceSettings]) -> list[str]:
         wanted = {settings.name: settings for settings in wanted_sources}

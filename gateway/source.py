@@ -14,7 +14,8 @@ from gateway.outputs.contract import Answer, ServerParameters
 from gateway.outputs.encodings import C3D
 from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
-from gateway.queries.source_queries import SendCommand, SourceQueries, StreamAccess
+from gateway.queries.server_requests import SendCommand, StreamAccess
+from gateway.queries.source_queries import SourceQueries
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.stream.state import StreamState
 from gateway.stream.status import FrameRate, StreamStatus
@@ -140,13 +141,13 @@ class Source:
         components = frozenset(stream.components)
 
         def on_parameters(xml: bytes, parsed: ParsedParameters) -> None:
-            self.queries.cache_parameters(xml, parsed)
+            self.queries.parameters.store(xml, parsed)
             self._share_parameters(xml, parsed)
 
         return Callbacks(
             publish=self.fan_out.publish,
             on_parameters=on_parameters,
-            on_connected=lambda: self._start(self.queries.fill_cache()),
+            on_connected=lambda: self._start(self.queries.parameters.fill()),
             on_restart=self._refresh_parameters_soon,
             on_file=self._on_file,
             has_subscribers=lambda: self.fan_out.has_subscribers(components),
@@ -155,7 +156,7 @@ class Source:
     def _on_new_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
         """Publish parameters that changed while connected, and refresh every section."""
         self._share_parameters(xml, parsed)
-        self._start(self.queries.fill_cache())
+        self._start(self.queries.parameters.fill())
 
     def _share_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
         self.fan_out.set_parameters(parsed.parameters)
@@ -170,7 +171,7 @@ class Source:
     async def _refresh_parameters(self) -> None:
         try:
             await asyncio.sleep(self.settings.fresh_interval_s)
-            await self.queries.parameters((), fresh=True, stale_ok=False)
+            await self.queries.parameters.get((), fresh=True, stale_ok=False)
         except QueryError as error:
             logger.debug("%s: parameters not refreshed: %s", self.name, error)
         finally:

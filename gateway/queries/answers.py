@@ -1,4 +1,4 @@
-"""The forms of answers: schemas, messages as they are or as JSON, parameters as JSON. No I/O, no waiting."""
+"""The payloads of answers: schemas, messages as bytes or JSON, parameters as JSON."""
 
 from collections.abc import Mapping
 from importlib.resources import files
@@ -14,30 +14,32 @@ from gateway.rtc3d.parameters import SECTIONS, Parameters
 
 
 def schema_answer(name: str) -> Answer:
-    """Return the ``.lcm`` text of a type, as lcm-gen takes it; the types it consists of come first."""
-    texts = [(files("rtc3d") / f"{each}.lcm").read_text(encoding="utf-8") for each in _with_parts(name)]
+    """Return the ``.lcm`` text of a type for lcm-gen; the types that it contains come first."""
+    texts = [
+        (files("rtc3d") / f"{each}.lcm").read_text(encoding="utf-8") for each in _with_member_types(name)
+    ]
     return Answer("\n".join(texts).encode(), TEXT)
 
 
-def _with_parts(name: str) -> list[str]:
-    """Return the names of the types that a type consists of, each once, and then its own."""
+def _with_member_types(name: str) -> list[str]:
+    """Return the names of all types that a type contains, each once, and then its own."""
     names: dict[str, None] = {}
     for type_name in getattr(rtc3d, name).__typenames__:
-        package, _, part = type_name.rpartition(".")
+        package, _, member = type_name.rpartition(".")
         if package:
-            names |= dict.fromkeys(_with_parts(part))
+            names |= dict.fromkeys(_with_member_types(member))
     return [*names, name]
 
 
 def message_answer(message: bytes, question: Question, attachment: Mapping[str, Any]) -> Answer:
-    """Return one of the gateway's messages as it is, or as JSON with NaN as null."""
+    """Return a message of the gateway as it is published, or as JSON with NaN as null."""
     if question.as_json:
         return Answer(json_bytes(to_json(decode(message))), JSON, attachment)
     return Answer(message, f"{LCM};rtc3d.{message_type(message).__name__}", attachment)
 
 
 def parameters_json(parameters: Parameters, section: str) -> bytes | None:
-    """Return the typed parameters as JSON, NaN as null: an object of all sections, or one section's.
+    """Return parameters as JSON with NaN as null: an object of all sections, or the object of one.
 
     Returns None if the parameters lack ``section``.
     """

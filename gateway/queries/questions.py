@@ -1,4 +1,4 @@
-"""The questions that peers can ask about a source, parsed from keys and options. No I/O, no waiting."""
+"""Questions about a source, parsed from the keys and options of peers' queries. No I/O, no waiting."""
 
 from collections.abc import Collection, Iterable, Mapping
 from typing import Final, Literal, NamedTuple
@@ -11,7 +11,7 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ComponentTyp
 from gateway.rtc3d.parameters import SECTIONS
 
 SCHEMA_TYPES: Final = tuple(name for name in vars(rtc3d) if name.endswith("_t"))
-"""The message types, and the types they consist of."""
+"""The message types, and the types they contain."""
 
 RECORDING: Final[KeyPath] = ("recording",)
 
@@ -29,10 +29,10 @@ _MAX_QUOTED: Final = 60  # characters of a peer's text in an error message
 
 
 class Question(NamedTuple):
-    """One question about one source. ``kind`` decides which of the other fields have a meaning.
+    """A query for one key of one source. ``kind`` decides which of the other fields are used.
 
     ``name`` is the section ("" for all), the component's key, or the type. ``set`` is start, stop, or "" if
-    the asker did not give it.
+    the query does not have it.
     """
 
     kind: Literal["parameters", "component", "status", "c3d", "schema", "recording"]
@@ -44,7 +44,7 @@ class Question(NamedTuple):
 
 
 def known_keys(components: Collection[ComponentType]) -> list[KeyPath]:
-    """Return every key that can be queried about a source with these components."""
+    """Return every key that can be queried for a source with these components."""
     return [
         ("parameters",),
         *(("parameters", section) for section in SECTIONS),
@@ -65,7 +65,7 @@ def accepted_keys(components: Collection[ComponentType], commands: Iterable[str]
 def parse_question(
     path: KeyPath, options: Mapping[str, str], components: Collection[ComponentType]
 ) -> Question:
-    """Return the question that a key and its selector's options ask.
+    """Return the question that a key and the options of its selector stand for.
 
     Raises QueryError, with what is accepted, for an unknown key, section, option or value, and for a
     component that is not configured.
@@ -87,20 +87,20 @@ def parse_questions(
 ) -> dict[KeyPath, Question]:
     """Return the questions of a selector that matches several of the ``known_keys``.
 
-    Each key takes the options that have a meaning for it. Raises QueryError for an option or value without a
-    meaning for any of them.
+    Each key gets the options that it accepts. Raises QueryError for an option or value that none of them
+    accepts, and as ``parse_question`` does.
     """
     kinds = {path: _kind_and_name(path, components)[0] for path in paths}
     _check_options(options, dict.fromkeys(kinds.values()))
-    fitting = {
+    accepted = {
         kind: {name: value for name, value in options.items() if value in _OPTIONS[kind].get(name, ())}
         for kind in kinds.values()
     }
-    return {path: parse_question(path, fitting[kind], components) for path, kind in kinds.items()}
+    return {path: parse_question(path, accepted[kind], components) for path, kind in kinds.items()}
 
 
 def _check_options(options: Mapping[str, str], kinds: Iterable[str]) -> None:
-    """Raise QueryError unless one of the kinds of questions accepts each option with its value."""
+    """Raise QueryError unless at least one of the kinds accepts each option and its value."""
     accepted: dict[str, dict[str, None]] = {}
     for kind in kinds:
         for name, values in _OPTIONS[kind].items():
@@ -118,6 +118,7 @@ def _check_options(options: Mapping[str, str], kinds: Iterable[str]) -> None:
 
 
 def _kind_and_name(path: KeyPath, components: Collection[ComponentType]) -> tuple[str, str]:
+    """Return the first two fields of the Question for a key; raises QueryError."""
     match path:
         case ("parameters",):
             return "parameters", ""
@@ -141,11 +142,11 @@ def _kind_and_name(path: KeyPath, components: Collection[ComponentType]) -> tupl
 
 
 def check_sections(sections: Iterable[str]) -> None:
-    """Raise QueryError unless every one of ``sections`` exists (§6)."""
+    """Raise QueryError if one of ``sections`` does not exist (§6)."""
     if unknown := set(sections) - set(SECTIONS):
         raise QueryError(f"unknown section {_quoted(min(unknown))}; accepted: {', '.join(SECTIONS)}")
 
 
 def _quoted(text: str) -> str:
-    """Return a word of a peer's, bounded and printable, for an error message."""
+    """Return text of a peer, quoted, printable and bounded, for an error message."""
     return ascii(text if len(text) <= _MAX_QUOTED else text[:_MAX_QUOTED] + "…")

@@ -1,4 +1,4 @@
-"""The query service: which source, or which output's own command, answers a peer's query."""
+"""The query service: it finds the source, or the output's own command, that answers a peer's query."""
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
@@ -34,7 +34,7 @@ class SourceQueryService:
         return source in self._sources
 
     def keys(self, source: str) -> list[KeyPath]:
-        """See QueryService. Nobody starts a recording by a wildcard."""
+        """See QueryService. Recording is left out, so that no wildcard starts one by accident."""
         return [path for path in known_keys(self._sources[source].components) if path != RECORDING]
 
     def accepted_keys(self, source: str) -> str:
@@ -52,26 +52,29 @@ class SourceQueryService:
     async def answer_all(
         self, source: str, paths: Sequence[KeyPath], options: Mapping[str, str]
     ) -> dict[KeyPath, Answer]:
-        """See QueryService."""
+        """See QueryService. Exceptions other than QueryError are raised in any case."""
         queries = self._sources[source]
         questions = parse_questions(paths, options, queries.components)
-        found = await asyncio.gather(*map(queries.answer, questions.values()), return_exceptions=True)
+        results = await asyncio.gather(*map(queries.answer, questions.values()), return_exceptions=True)
         answers: dict[KeyPath, Answer] = {}
-        problem: BaseException | None = None
-        for path, each in zip(questions, found, strict=True):
-            if isinstance(each, Answer):
-                answers[path] = each
-            elif problem is None or not isinstance(each, QueryError):
-                problem = each
-        if problem is not None and (not answers or not isinstance(problem, QueryError)):
-            raise problem
+        errors: list[QueryError] = []
+        for path, result in zip(questions, results, strict=True):
+            match result:
+                case Answer():
+                    answers[path] = result
+                case QueryError():
+                    errors.append(result)
+                case _:
+                    raise result
+        if errors and not answers:
+            raise errors[0]
         return answers
 
     async def parameters(self, source: str, sections: Sequence[str], *, fresh: bool) -> ServerParameters:
         """See QueryService."""
         check_sections(sections)
-        asked = tuple(section for section in SECTIONS if section in sections)
-        cached = await self._sources[source].parameters(
-            () if asked == tuple(SECTIONS) else asked, fresh=fresh, stale_ok=False
+        ordered = tuple(section for section in SECTIONS if section in sections)
+        cached = await self._sources[source].parameters.get(
+            () if ordered == tuple(SECTIONS) else ordered, fresh=fresh, stale_ok=False
         )
         return ServerParameters(cached.xml, cached.session, cached.age_s)

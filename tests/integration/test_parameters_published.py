@@ -94,7 +94,7 @@ async def test_everyone_hears_of_a_connection_and_of_a_server_that_comes_back_wi
             assert message.capture_utime <= message.utime
         async with ScriptedServer(second.script, port):
             await ears.hear(second.xml)
-            assert ears.lcm[-1].session == 2
+            assert ears.lcm[-1].session > message.session
             with asker_at(router) as asker:
                 assert (await ask(asker, KEY)).payload == second.xml
 

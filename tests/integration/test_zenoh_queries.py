@@ -208,7 +208,7 @@ async def test_questions_that_wait_too_long_for_others_are_told_so() -> None:
             *(ask(asker, f"mocap/lab/parameters/{section}?fresh=true") for section in SECTIONS)
         )
         assert {reply.code for reply in replies} == {"timeout"}
-        waited = "source 'lab': no answer within 0.3 s; questions waiting for the server: "
+        waited = "source 'lab': no answer within 0.3 s; queries waiting for the server: "
         assert all(reply.error.startswith(waited) for reply in replies)
 
 

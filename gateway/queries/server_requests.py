@@ -1,0 +1,114 @@
+"""Commands that peers' queries send to the server of one source: one at a time, and shared where equal."""
+
+import asyncio
+from collections.abc import Awaitable, Callable, Coroutine, Hashable, Sequence
+from typing import Any, NamedTuple, TypeVar
+
+from gateway.config.settings import SourceSettings
+from gateway.errors import LinkError, QueryError, ReplyTimeoutError, ServerError
+from gateway.messages.host_time import now_utime
+from gateway.rtc3d.commands import Command
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.packets import Packet
+from gateway.stream.status import StreamStatus
+
+SendCommand = Callable[[Command], Awaitable[Packet]]
+"""Sends a command to the server and returns its reply; raises ServerError, ReplyTimeoutError or LinkError."""
+
+_Result = TypeVar("_Result")
+
+
+class StreamAccess(NamedTuple):
+    """What queries need of one stream. ``sender`` returns None while there is no connection."""
+
+    components: Sequence[ComponentType]
+    status: StreamStatus
+    sender: Callable[[], SendCommand | None]
+
+
+class ServerRequests:
+    """Sends commands to the server of one source over the connections of its streams."""
+
+    def __init__(self, settings: SourceSettings, streams: Sequence[StreamAccess]) -> None:
+        self._settings = settings
+        self._streams = streams
+        self._pending: dict[Hashable, asyncio.Task[Any]] = {}
+        self._lock = asyncio.Lock()
+
+    @property
+    def session(self) -> int:
+        """A number that grows with every connection of any stream."""
+        return sum(stream.status.session for stream in self._streams)
+
+    @property
+    def is_connected(self) -> bool:
+        """Whether any stream has a connection."""
+        return any(stream.sender() is not None for stream in self._streams)
+
+    def no_connection_error(self) -> QueryError:
+        """Return the error that says why there is no connection, since when, and what to do about it."""
+        newest = max((stream.status for stream in self._streams), key=lambda status: status.last_error_utime)
+        text = f"source {self._settings.name!r} has no connection"
+        if newest.last_error:
+            problem, separator, remedy = newest.last_error.partition("; ")
+            age_s = (now_utime() - newest.last_error_utime) / 1e6
+            text += f": {problem.removeprefix('connection ')}, tried {age_s:.1f} s ago{separator}{remedy}"
+        else:
+            text += f" yet: connecting to {self._settings.host}:{self._settings.port}"
+        return QueryError(text, code="no-connection")
+
+    async def send(
+        self, command: Command, *, fallback: Command | None = None, stream: StreamAccess | None = None
+    ) -> tuple[Command, Packet]:
+        """Send a command, and ``fallback`` if the server refuses or ignores it; return the one answered.
+
+        The second value is the server's reply. Without ``stream`` any connection is used. Raises QueryError,
+        at the latest after query_timeout_s, which includes the wait for earlier requests.
+        """
+        name, timeout_s = f"source {self._settings.name!r}", self._settings.query_timeout_s
+        streams = self._streams if stream is None else [stream]
+        try:
+            async with asyncio.timeout(timeout_s), self._lock:
+                try:
+                    return command, await self._send(command, streams)
+                except QueryError as error:
+                    if fallback is None or error.code == "no-connection":
+                        raise
+                return fallback, await self._send(fallback, streams)
+        except LinkError as error:
+            raise QueryError(f"{name} has just lost its connection: {error}", code="no-connection") from error
+        except TimeoutError:
+            waiting = f"queries waiting for the server: {len(self._pending)}"
+            text = f"{name}: no answer within {timeout_s:g} s; {waiting}"
+            raise QueryError(text, code="timeout") from None
+
+    async def _send(self, command: Command, streams: Sequence[StreamAccess]) -> Packet:
+        send = next((sender for stream in streams if (sender := stream.sender()) is not None), None)
+        if send is None:
+            raise self.no_connection_error()
+        name = f"source {self._settings.name!r}"
+        try:
+            return await send(command)
+        except ServerError as error:
+            text = f"{name}: the server does not know {command}, or refuses it: {error}"
+            raise QueryError(text, code="refused") from error
+        except ReplyTimeoutError as error:
+            raise QueryError(f"{name}: {error}", code="timeout") from error
+
+    async def share(self, key: Hashable, work: Callable[[], Coroutine[Any, Any, _Result]]) -> _Result:
+        """Return the result of ``work``; callers with an equal ``key`` at the same time share one run."""
+        return await asyncio.shield(self.start(key, work))
+
+    def start(self, key: Hashable, work: Callable[[], Coroutine[Any, Any, _Result]]) -> asyncio.Task[_Result]:
+        """Start ``work`` unless it runs for an equal ``key`` already; return its task."""
+        task = self._pending.get(key)
+        if task is None:
+            task = asyncio.create_task(work())
+            task.add_done_callback(lambda done: self._finish(key, done))
+            self._pending[key] = task
+        return task
+
+    def _finish(self, key: Hashable, task: asyncio.Task[Any]) -> None:
+        del self._pending[key]
+        if not task.cancelled():
+            task.exception()  # retrieve it, even if no caller waits any more

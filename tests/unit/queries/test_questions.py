@@ -1,0 +1,85 @@
+import pytest
+
+from gateway.errors import QueryError
+from gateway.queries.questions import (
+    Question,
+    accepted_keys,
+    known_keys,
+    parse_question,
+    parse_questions,
+)
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+
+ALL = frozenset(WIRE_ORDER)
+MARKERS_ONLY = frozenset({ComponentType.MARKERS})
+
+
+@pytest.mark.parametrize(
+    ("key", "options", "question"),
+    [
+        ("parameters", {}, Question("parameters")),
+        ("parameters/6d", {}, Question("parameters", "6d")),
+        ("parameters", {"format": "json"}, Question("parameters", as_json=True)),
+        ("parameters", {"format": "xml", "fresh": "true"}, Question("parameters", fresh=True)),
+        ("parameters", {"fresh": "false", "stale": "ok"}, Question("parameters", stale_ok=True)),
+        ("3d", {}, Question("component", "3d")),
+        ("event", {"format": "json"}, Question("component", "event", as_json=True)),
+        ("6d", {"format": "lcm"}, Question("component", "6d")),
+        ("status", {"format": "json"}, Question("status", as_json=True)),
+        ("c3d", {}, Question("c3d")),
+        ("schema/markers_t", {}, Question("schema", "markers_t")),
+        ("schema/rtc3d.marker_t", {}, Question("schema", "marker_t")),
+        ("recording", {"set": "start"}, Question("recording", set="start")),
+        ("recording", {}, Question("recording")),
+    ],
+)
+def test_a_key_and_its_options_are_parsed(key: str, options: dict[str, str], question: Question) -> None:
+    assert parse_question(tuple(key.split("/")), options, ALL) == question
+
+
+@pytest.mark.parametrize(
+    "key", ["", "4d", "events", "parameters/", "parameters/event", "3d/1", "schema/../x"]
+)
+def test_an_unknown_key_is_refused(key: str) -> None:
+    with pytest.raises(QueryError, match="accepted: ") as refused:
+        parse_question(tuple(key.split("/")), {}, ALL)
+    assert refused.value.code == "bad-request"
+
+
+def test_every_known_key_is_parsed_and_listed_as_accepted() -> None:
+    for components in (ALL, MARKERS_ONLY):
+        keys = known_keys(components)
+        assert len(set(keys)) == len(keys)
+        for path in keys:
+            parse_question(path, {}, components)
+            text = "schema/TYPE" if path[0] == "schema" else "/".join(path)
+            assert text in accepted_keys(components).split(", ")
+    assert ("6d",) not in known_keys(MARKERS_ONLY)
+
+
+def test_error_messages_quote_a_bounded_part_of_the_query() -> None:
+    for options in ({"x" * 1000: ""}, {"format": "x" * 1000}):
+        with pytest.raises(QueryError) as refused:
+            parse_question(("parameters",), options, ALL)
+        assert len(str(refused.value)) < 250
+    with pytest.raises(QueryError) as refused:
+        parse_question(("parameters", "\x1b[31m" + "x" * 1000), {}, ALL)
+    assert str(refused.value).isprintable()
+    assert len(str(refused.value)) < 250
+
+
+def test_each_key_of_a_wildcard_gets_the_options_that_it_accepts() -> None:
+    keys = [("parameters",), ("3d",), ("status",)]
+    assert parse_questions(keys, {"format": "xml", "fresh": "true"}, ALL) == {
+        ("parameters",): Question("parameters", fresh=True),
+        ("3d",): Question("component", "3d"),
+        ("status",): Question("status"),
+    }
+    with_json = parse_questions(keys, {"format": "json"}, ALL)
+    assert all(question.as_json for question in with_json.values())
+
+
+@pytest.mark.parametrize("options", [{"set": "start"}, {"format": "yaml"}, {"fresh": "maybe"}])
+def test_an_option_that_no_key_of_a_wildcard_accepts_is_refused(options: dict[str, str]) -> None:
+    with pytest.raises(QueryError, match="accepted: "):
+        parse_questions([("parameters",), ("3d",)], options, ALL)

@@ -1,0 +1,114 @@
+import asyncio
+import contextlib
+import re
+
+import pytest
+
+from gateway.errors import ClosedError, QueryError, ReplyTimeoutError, ServerError
+from gateway.queries.server_requests import ServerRequests
+from gateway.rtc3d.commands import SendCurrentFrame, SendParameters
+from tests.unit.queries.fake_source import FakeSource, parameters_xml
+
+
+async def test_equal_requests_share_a_reply_and_different_ones_wait_for_each_other() -> None:
+    source = FakeSource()
+    tasks = [asyncio.create_task(source.parameters("3d", fresh=True)) for _ in range(5)]
+    tasks += [asyncio.create_task(source.parameters("6d", fresh=True)) for _ in range(5)]
+    await source.server.wait_for_commands(1)
+    await asyncio.sleep(0)
+    assert source.server.commands == ["SendParameters 3D"]  # one at a time
+    source.server.answer(parameters_xml("mm"))
+    await source.server.wait_for_commands(2)
+    source.server.answer(parameters_xml("cm"))
+    results = await asyncio.gather(*tasks)
+    assert [result.xml for result in results] == [parameters_xml("mm")] * 5 + [parameters_xml("cm")] * 5
+    assert source.server.commands == ["SendParameters 3D", "SendParameters 6D"]
+    assert len({id(result) for result in results}) == 2  # each reply is parsed once
+
+
+async def test_cancelling_one_caller_does_not_cancel_a_shared_request() -> None:
+    source = FakeSource()
+    cancelled, other = (asyncio.create_task(source.parameters()) for _ in range(2))
+    await source.server.wait_for_commands(1)
+    cancelled.cancel()
+    source.server.answer(parameters_xml("mm"))
+    assert (await other).xml == parameters_xml("mm")
+    with contextlib.suppress(asyncio.CancelledError):
+        await cancelled
+
+
+async def test_the_fallback_is_sent_if_the_command_is_refused() -> None:
+    source = FakeSource()
+    source.server.replies = {"SendParameters 3D": ServerError("err-what?"), "SendParameters": b"<a/>"}
+    requests = ServerRequests(source.queries._settings, [source.stream])
+    command, packet = await requests.send(SendParameters(("3d",)), fallback=SendParameters())
+    assert (command, packet.body) == (SendParameters(), b"<a/>")
+
+
+async def test_the_error_of_the_fallback_is_raised() -> None:
+    source = FakeSource()
+    source.server.replies = {"SendCurrentFrame 3D": ServerError("a"), "SendCurrentFrame": ServerError("b")}
+    requests = ServerRequests(source.queries._settings, [source.stream])
+    [component, _] = source.stream.components
+    with pytest.raises(QueryError, match="the server does not know SendCurrentFrame, or refuses it: b"):
+        await requests.send(SendCurrentFrame((component,)), fallback=SendCurrentFrame())
+
+
+async def test_a_command_without_a_reply_leads_to_a_timeout_error_that_is_not_cached() -> None:
+    source = FakeSource()
+    source.server.replies["SendParameters"] = ReplyTimeoutError("192.0.2.1:3020 did not answer")
+    error = await source.parameters_error()
+    assert (error.code, str(error)) == ("timeout", "source 'lab': 192.0.2.1:3020 did not answer")
+    source.server.replies["SendParameters"] = parameters_xml("mm")
+    assert (await source.parameters()).xml == parameters_xml("mm")
+
+
+async def test_a_request_waits_no_longer_than_configured() -> None:
+    source = FakeSource(query_timeout_s=0.05)
+    error = await source.parameters_error()
+    assert error.code == "timeout"
+    assert str(error) == "source 'lab': no answer within 0.05 s; queries waiting for the server: 1"
+    source.server.replies["SendParameters"] = parameters_xml("mm")
+    assert (await source.parameters()).xml == parameters_xml("mm")  # the next request is not blocked
+
+
+async def test_losing_the_connection_during_a_request_is_an_error() -> None:
+    source = FakeSource()
+    source.server.replies["SendParameters"] = ClosedError("the connection to 192.0.2.1:3020 was closed")
+    error = await source.parameters_error()
+    assert error.code == "no-connection"
+    assert str(error) == (
+        "source 'lab' has just lost its connection: the connection to 192.0.2.1:3020 was closed"
+    )
+
+
+async def test_losing_the_connection_while_waiting_for_another_request_is_an_error() -> None:
+    source = FakeSource()
+    first = asyncio.create_task(source.parameters("3d"))
+    second = asyncio.create_task(source.parameters_error("6d"))
+    await source.server.wait_for_commands(1)
+    source.server.is_connected = False
+    source.server.answer(parameters_xml("mm"))
+    await first
+    assert (await second).code == "no-connection"
+    assert source.server.commands == ["SendParameters 3D"]
+
+
+async def test_before_the_first_failure_the_error_names_the_address() -> None:
+    source = FakeSource()
+    source.server.is_connected = False
+    error = await source.parameters_error()
+    assert error.code == "no-connection"
+    assert str(error) == "source 'lab' has no connection yet: connecting to 192.0.2.1:3020"
+
+
+async def test_without_a_connection_the_error_has_reason_age_and_remedy() -> None:
+    source = FakeSource()
+    source.server.is_connected = False
+    source.status.record_error("connection refused by 192.0.2.1:3020; is the RT server running?")
+    source.status.last_error_utime -= 300_000_000
+    problem, _, remedy = str(await source.parameters_error(stale_ok=True)).partition("; ")
+    assert re.fullmatch(
+        r"source 'lab' has no connection: refused by 192.0.2.1:3020, tried 3..\.. s ago", problem
+    )
+    assert remedy == "is the RT server running?"

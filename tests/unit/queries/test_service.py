@@ -1,0 +1,83 @@
+from collections.abc import Mapping
+
+import pytest
+
+from gateway.errors import QueryError, ServerError
+from gateway.outputs.contract import Answer
+from gateway.queries.service import SourceQueryService
+from gateway.rtc3d.parameters import SECTIONS
+from tests.unit.queries.fake_source import FakeSource, parameters_xml
+
+
+async def trim(source: str, options: Mapping[str, str]) -> Answer:
+    return Answer(f"{source} {dict(options)}".encode(), "text/plain")
+
+
+def service_of(source: FakeSource) -> SourceQueryService:
+    return SourceQueryService({"lab": source.queries}, lambda: {"record/trim": trim})
+
+
+async def test_a_command_of_an_output_gets_the_source_and_the_options() -> None:
+    service = service_of(FakeSource())
+    answer = await service.answer("lab", ("record", "trim"), {"to": "5"})
+    assert answer.payload == b"lab {'to': '5'}"
+    assert service.accepted_keys("lab").endswith(", schema/TYPE, record/trim")
+
+
+async def test_a_wildcard_selects_neither_recording_nor_commands_of_outputs() -> None:
+    keys = service_of(FakeSource()).keys("lab")
+    assert ("parameters",) in keys
+    assert ("3d",) in keys
+    assert ("analog",) not in keys  # not a component of this source
+    assert ("recording",) not in keys
+    assert ("record", "trim") not in keys
+
+
+async def test_only_configured_sources_are_served() -> None:
+    service = service_of(FakeSource())
+    assert service.serves("lab")
+    assert not service.serves("hall")
+
+
+async def test_keys_without_an_answer_are_left_out_if_another_key_has_one() -> None:
+    source = FakeSource()
+    source.server.is_connected = False
+    answers = await service_of(source).answer_all("lab", [("3d",), ("c3d",), ("status",)], {})
+    assert answers.keys() == {("c3d",), ("status",)}
+
+
+async def test_the_first_error_is_raised_if_no_key_has_an_answer() -> None:
+    source = FakeSource()
+    source.server.replies = {"SendParameters": ServerError("err-no"), "SendCurrentFrame": ServerError("b")}
+    source.server.replies["SendCurrentFrame 3D"] = ServerError("a")
+    with pytest.raises(QueryError, match="SendParameters, or refuses it: err-no"):
+        await service_of(source).answer_all("lab", [("parameters",), ("3d",)], {})
+
+
+async def test_a_defect_in_one_answer_is_raised_although_others_have_an_answer() -> None:
+    source = FakeSource()
+    source.server.replies["SendParameters"] = ZeroDivisionError("a defect")
+    with pytest.raises(ZeroDivisionError):
+        await service_of(source).answer_all("lab", [("parameters",), ("c3d",)], {})
+
+
+async def test_sections_are_checked_before_the_server_is_asked() -> None:
+    source = FakeSource()
+    with pytest.raises(QueryError, match="unknown section '4d'; accepted: general, 3d"):
+        await service_of(source).parameters("lab", ["3d", "4d"], fresh=True)
+    assert source.server.commands == []
+
+
+async def test_sections_are_requested_in_the_order_of_the_specification() -> None:
+    source = FakeSource()
+    source.server.replies["SendParameters 3D Force"] = parameters_xml("mm")
+    parameters = await service_of(source).parameters("lab", ["force", "3d", "3d"], fresh=False)
+    assert (parameters.xml, parameters.session) == (parameters_xml("mm"), 1)
+
+
+@pytest.mark.parametrize("sections", [(), tuple(SECTIONS), tuple(reversed(SECTIONS))])
+async def test_a_request_for_all_sections_is_a_request_for_all_parameters(sections: tuple[str, ...]) -> None:
+    source = FakeSource()
+    source.server.replies["SendParameters"] = parameters_xml("mm")
+    await service_of(source).parameters("lab", sections, fresh=False)
+    assert source.server.commands == ["SendParameters"]
