@@ -264,7 +264,7 @@ class Session:
         if self._reply is not None and not self._reply.done():
             self._reply.set_exception(error)
         self._ended.set_exception(error)
-        self._ended.exception()  # marks it as retrieved: nobody need be waiting
+        self._ended.exception()  # marks it as retrieved, in case no task is waiting
 
     def _flush(self) -> None:
         if self._transport is not None:

@@ -146,7 +146,7 @@ class StreamStatus:
     def add_limitation(self, text: str) -> None:
         """Note something that the present connection does without; at most MAX_LIMITATIONS are kept.
 
-        Each text is logged as a WARNING once, and as DEBUG when a later connection has it, too.
+        Each text is logged as a WARNING once, and as DEBUG if a later connection has the same limitation.
         """
         if text in self.limitations or len(self.limitations) >= MAX_LIMITATIONS:
             return

@@ -111,7 +111,7 @@ class Supervisor:
             self._stream,
             self._status,
             self._callbacks.publish,
-            lambda halvings: adaptation.request_rate(halvings),  # noqa: PLW0108 - it is made below
+            lambda halvings: adaptation.request_rate(halvings),  # noqa: PLW0108 - assigned below
             self._callbacks.on_restart,
         )
         session = Session(

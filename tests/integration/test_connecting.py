@@ -37,7 +37,7 @@ def session_to(port: int, connect: Connect = open_connection) -> Session:
 
 
 class CallingProtocol(asyncio.Protocol):
-    """A session's protocol that makes a call as soon as the connection is made, before ``connect`` has it."""
+    """Wraps a session, and makes a call when the connection is made, before ``connect`` returns."""
 
     def __init__(self, session: Any, on_made: Callable[[], object]) -> None:
         self._session = session

@@ -93,7 +93,7 @@ class Connection(asyncio.Transport):
 
 
 class ScriptedServer:
-    """A server that answers each command by ``answer``; while ``refuses`` is set, nobody can connect."""
+    """A server that answers each command by ``answer``; while ``refuses`` is set, it refuses connections."""
 
     def __init__(self, answer: Answer = obliging) -> None:
         self.answer = answer
