@@ -96,20 +96,24 @@ async def test_a_changed_number_of_markers_makes_the_gateway_ask_for_parameters(
         assert [message.num_markers for message in await lab.heard("3d", 3)] == [1, 1, 2]
 
 
-async def test_a_pending_question_for_parameters_ends_with_the_source() -> None:
-    def refreshing() -> list[asyncio.Task[Any]]:
-        names = {task: getattr(task.get_coro(), "__qualname__", "") for task in asyncio.all_tasks()}
-        return [task for task, name in names.items() if name == "Source._refresh"]
+def tasks_of_sources() -> list[asyncio.Task[Any]]:
+    """Return the tasks that run a method of Source."""
+    names = {task: getattr(task.get_coro(), "__qualname__", "") for task in asyncio.all_tasks()}
+    return [task for task, name in names.items() if name.startswith("Source.")]
 
+
+async def test_a_planned_question_for_parameters_is_cancelled_with_the_source() -> None:
     server = Recorder()
     async with ScriptedServer(server.script) as listening:
         async with gateway_to(listening.port, fresh_interval_s=1000) as lab:
             await lab.until(lambda: server.count(START) == 1)
             server.stream(ORIGIN)
+            await lab.heard("3d", 1)
+            before = len(tasks_of_sources())
             server.stream(ORIGIN, ORIGIN)
-            await lab.until(refreshing)
+            await lab.until(lambda: len(tasks_of_sources()) == before + 1)
         await asyncio.sleep(0)  # lets the cancelled task run
-        assert not refreshing()
+        assert tasks_of_sources() == []
 
 
 async def test_time_stamps_that_go_back_are_a_restart_without_a_reconnect() -> None:
