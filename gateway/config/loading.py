@@ -1,4 +1,4 @@
-"""Reads settings: YAML files and environment variables to sections, and each mistake with its position."""
+"""Settings from YAML files and environment variables; every mistake is reported with its position."""
 
 import json
 import os
@@ -21,7 +21,7 @@ AnySection = TypeVar("AnySection", bound=Section)
 
 
 class Configuration(NamedTuple):
-    """The gateway's settings, and the position of each value that is not a default."""
+    """The settings, and the position of each value that is not a default."""
 
     settings: Settings
     positions: Mapping[Location, Position]
@@ -30,10 +30,10 @@ class Configuration(NamedTuple):
 def read(path: Path | None, model: type[Settings], environ: Mapping[str, str] = os.environ) -> Configuration:
     """Read the YAML file at ``path``, if any, and apply the overrides in ``environ`` (config/environment.py).
 
-    ``model`` is the whole configuration with its outputs (``settings_model``). Relative paths count from the
-    file's folder, else from the current one. Raises ConfigError with one line per mistake, ``POSITION: KEY:
-    what was found; what was expected``; the position is FILE:LINE:COLUMN or the variable. Of mistakes in the
-    YAML itself only the first is reported, because the rest cannot be read.
+    ``model`` is the whole configuration with its outputs (``settings_model``). Relative paths are relative to
+    the folder of the file, or to the current folder if there is no file. Raises ConfigError with one line per
+    mistake, ``POSITION: KEY: what was found; what is expected``. The position is FILE:LINE:COLUMN or the name
+    of the variable. If the YAML syntax is wrong, only the first mistake is reported.
     """
     if path is None:
         document = read_yaml("{}", "environment", has_lines=False)
@@ -45,7 +45,7 @@ def read(path: Path | None, model: type[Settings], environ: Mapping[str, str] = 
 def read_server(
     host: str, port: int, model: type[Settings], environ: Mapping[str, str] = os.environ
 ) -> Configuration:
-    """Return the configuration of one server as source "lab", all else as by default or in ``environ``.
+    """Return the configuration of one server as source "lab"; the rest is default or from ``environ``.
 
     Raises ConfigError as ``read`` does, with the position ``--server``.
     """
@@ -55,9 +55,9 @@ def read_server(
 
 
 def load_as(section: type[AnySection], path: Path, *, example: str) -> AnySection:
-    """Return what the YAML file at ``path`` holds; relative paths in it count from its folder.
+    """Read the YAML file at ``path`` into a section; relative paths in it are relative to its folder.
 
-    Raises ConfigError as ``read`` does. ``example`` is a file that could have been meant.
+    Raises ConfigError as ``read`` does. Its text suggests ``example`` if the file cannot be read.
     """
     document = _read_file(path, section, example)
     try:
@@ -116,13 +116,13 @@ _Mistake = tuple[Position, ConfigError]
 
 
 def _in_order(mistakes: list[_Mistake]) -> ConfigError:
-    """Return all mistakes as one error: those in the file in its order, then those in variables."""
+    """Return all mistakes as one error: those of the file by line, then those of variables."""
     ordered = sorted(mistakes, key=lambda mistake: (mistake[0].line == 0, *mistake[0], str(mistake[1])))
     return ConfigError("\n".join(str(error) for _, error in ordered))
 
 
 def _explained(document: Document, error: ValidationError) -> list[_Mistake]:
-    """Return the mistakes that the models found, each with its position."""
+    """Return the mistakes in a validation error, each with its position."""
     mistakes = []
     for details in error.errors(include_url=False):
         location, text = details["loc"], details["msg"]
@@ -135,7 +135,7 @@ def _explained(document: Document, error: ValidationError) -> list[_Mistake]:
 
 
 def _variables_in(document: Document, location: Location) -> str:
-    """Return which variables set a part of the value: the mistake may be theirs."""
+    """Return a hint that names the variables that set parts of the value; one may have the mistake."""
     names = {
         position.origin
         for other, position in document.positions.items()
@@ -145,10 +145,10 @@ def _variables_in(document: Document, location: Location) -> str:
 
 
 def _mask_secrets(document: Document, foreign: Location, safe_place: str) -> list[_Mistake]:
-    """Mask the secrets that stand in the file itself below ``foreign``, and return a mistake for each.
+    """Mask the secrets below ``foreign`` that are in the file itself, and return a mistake for each.
 
-    People show such files around and keep them under version control. Masked, no error message quotes a
-    secret.
+    Configuration files are shared and kept under version control, so they must not contain secrets. Masking
+    keeps the secrets out of later error messages.
     """
     config = document.values
     for key in foreign:
@@ -171,7 +171,7 @@ def _mask_secrets(document: Document, foreign: Location, safe_place: str) -> lis
 
 
 def _replace(config: Any, steps: Location, value: object) -> None:
-    *way, last = steps
-    for step in way:
+    *parents, last = steps
+    for step in parents:
         config = config[step]
     config[last] = value

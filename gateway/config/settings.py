@@ -1,8 +1,8 @@
-"""The gateway's configuration as frozen, validated settings.
+"""The configuration of the gateway as frozen, validated settings.
 
-The docstring under each key says what it is; ``config/gateway.yaml`` says why one would change it.
-Mistakes raise pydantic's ValidationError, each with its location and a sentence: what was found and
-what is accepted. ``gateway.config.loading`` adds file, line and column.
+The docstring under each key describes it for users; ``config/gateway.yaml`` explains when to change it.
+Mistakes raise pydantic's ValidationError. Each mistake has its location and a sentence that says what was
+found and what is expected. ``gateway.config.loading`` adds file, line and column.
 """
 
 import os
@@ -37,35 +37,35 @@ from gateway.rtc3d.ports import FIRST_PRINCIPLES_PORT
 
 
 class StreamSettings(Section):
-    """One TCP session with a source's server: these components at this rate."""
+    """One TCP session with the server of a source: its components and their rate."""
 
     components: Components = WIRE_ORDER
-    """What to ask for: [all], or a list of 3d, 6d, analog, force, event in any order."""
+    """The components to request: [all], or a list of 3d, 6d, analog, force, event in any order."""
 
     rate: StreamRate = AllFrames()
-    """How often: all, {frequency_hz: NUMBER} or {divisor: WHOLE NUMBER}."""
+    """The rate to request: all, {frequency_hz: NUMBER} or {divisor: WHOLE NUMBER}."""
 
     backlog: Backlog = "latest"
-    """While frames come late: publish the newest only, or all of them. Events are never skipped."""
+    """While frames are late: publish only the newest frame, or all frames. Events are never skipped."""
 
     on_demand: Switch = False
-    """Whether the stream runs only while somebody listens; with LCM on, somebody always may."""
+    """Whether to stream only while someone subscribes. No effect while LCM is enabled."""
 
     idle_after_s: Seconds = 5.0
-    """How long nobody must have listened before an on-demand stream is stopped."""
+    """How long an on-demand stream continues without subscribers before it stops."""
 
 
 class ReconnectSettings(Section):
-    """The waits between tries to connect: each about twice the one before, up to a maximum."""
+    """The delays between connection attempts: each about twice the previous one, up to a maximum."""
 
     first_delay_s: Seconds = 0.2
-    """The first wait."""
+    """The first delay."""
 
     max_delay_s: Seconds = 10.0
-    """The longest wait."""
+    """The longest delay."""
 
     @model_validator(mode="after")
-    def _max_is_not_below_first(self) -> Self:
+    def _check_max_delay(self) -> Self:
         if self.max_delay_s < self.first_delay_s:
             raise validation_error(
                 f"found {self.max_delay_s:g}; expected first_delay_s ({self.first_delay_s:g}) or more",
@@ -75,19 +75,19 @@ class ReconnectSettings(Section):
 
 
 class SourceSettings(Section):
-    """One RTC3D server, and how to read it."""
+    """One RTC3D server and how to stream from it."""
 
     name: SourceName
-    """What keys and channels call this source; channels in upper case, with '_' for '-'."""
+    """The name of this source in keys and channels. Channels have it in upper case, with '_' for '-'."""
 
     host: Host
-    """The server's name or address."""
+    """The host name or IP address of the server."""
 
     port: Port = FIRST_PRINCIPLES_PORT
-    """The server's TCP port: 3020 for First Principles, 3030 for WaveFront."""
+    """The TCP port of the server: 3020 for First Principles, 3030 for WaveFront."""
 
     byte_order: ServerByteOrder = "big"
-    """The byte order to ask for. What is published is the same in both."""
+    """The byte order to request. The published messages are the same in both."""
 
     streams: Annotated[
         tuple[StreamSettings, ...],
@@ -95,13 +95,13 @@ class SourceSettings(Section):
         expects("a list of streams, one or more"),
         Field(json_schema_extra={"minItems": 1}),
     ] = (StreamSettings(),)
-    """The TCP sessions with the server, each with its components and its rate."""
+    """The TCP sessions with the server, each with its components and rate."""
 
     reconnect: ReconnectSettings = ReconnectSettings()
-    """The waits between tries to connect."""
+    """The delays between connection attempts."""
 
     connect_timeout_s: Seconds = 5.0
-    """How long a try to connect may take."""
+    """How long a connection attempt may take."""
 
     reply_timeout_s: Seconds = 2.0
     """How long the server may take to answer a command."""
@@ -110,26 +110,26 @@ class SourceSettings(Section):
     """How long a stream may be silent while a measurement runs."""
 
     max_lag_ms: Milliseconds = 50.0
-    """How late frames may come before less is asked of the server."""
+    """How late frames may be before the gateway requests a lower rate."""
 
     max_packet_bytes: ByteLimit = DEFAULT_MAX_PACKET_BYTES
-    """The largest packet that is believed; C3D files have a limit of their own."""
+    """The largest accepted packet, except for C3D files."""
 
     max_c3d_bytes: ByteLimit = DEFAULT_MAX_C3D_BYTES
-    """The largest C3D file that is taken."""
+    """The largest accepted C3D file."""
 
     query_timeout_s: Seconds = 4.0
-    """How long a peer's question may wait for the server, the questions before it included."""
+    """How long a query may wait for the server, including the time for queries before it."""
 
     fresh_interval_s: Seconds = 1.0
-    """How long an answer of the server counts as fresh: no peer makes it answer more often."""
+    """How long a reply of the server counts as fresh. It limits how often peers can query the server."""
 
     remote_control: Switch = False
-    """Whether peers may start and stop the server's recording."""
+    """Whether peers may start and stop a recording on the server."""
 
     @field_validator("streams")
     @classmethod
-    def _each_component_is_in_one_stream(
+    def _check_components_are_in_one_stream(
         cls, streams: tuple[StreamSettings, ...]
     ) -> tuple[StreamSettings, ...]:
         owners: dict[ComponentType, int] = {}
@@ -145,7 +145,7 @@ class SourceSettings(Section):
         return streams
 
     @model_validator(mode="after")
-    def _frames_come_before_the_stall(self) -> Self:
+    def _check_rates_against_stall_timeout(self) -> Self:
         for index, stream in enumerate(self.streams):
             if isinstance(stream.rate, Frequency) and stream.rate.hz * self.stall_timeout_s <= 1:
                 raise validation_error(
@@ -158,26 +158,26 @@ class SourceSettings(Section):
 
 
 class OutputSettings(Section):
-    """What the sections of all outputs have in common."""
+    """The keys that all outputs have."""
 
     foreign_keys: ClassVar[Mapping[str, str]] = {}
-    """The keys that hold another program's configuration, each with a place where its secrets may stay."""
+    """The keys that hold the configuration of another program, each with a safe place for its secrets."""
 
     enabled: Switch = False
-    """Whether the output is used."""
+    """Whether to publish on this output."""
 
 
 class SpoolSettings(Section):
-    """Where complete C3D files that servers send are kept."""
+    """Storage for complete C3D files from the servers."""
 
     directory: SpoolDirectory | None = None
-    """A folder; null is c3d in the service's state directory under systemd, else in the user's."""
+    """The folder. null means c3d in the state directory of the service, or of the user without systemd."""
 
     max_files: FileLimit = 100
-    """How many files are kept; the oldest goes first."""
+    """The maximum number of files. The oldest are deleted first."""
 
     max_bytes: ByteLimit = 1024 * 1024 * 1024
-    """How many bytes they may take together; the oldest goes first."""
+    """The maximum total size of the files. The oldest are deleted first."""
 
     @property
     def effective(self) -> dict[str, Effective]:
@@ -188,7 +188,7 @@ class SpoolSettings(Section):
 
     @property
     def effective_directory(self) -> Path:
-        """The folder in use."""
+        """``directory``, or the folder that null stands for."""
         if self.directory is not None:
             return Path(self.directory)
         state = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
@@ -199,20 +199,20 @@ class SpoolSettings(Section):
 
 
 class MetricsSettings(Section):
-    """How the gateway is watched over HTTP: Prometheus' metrics on /metrics, and /healthz."""
+    """Monitoring over HTTP: Prometheus metrics on /metrics, the health check on /healthz."""
 
     enabled: Switch = True
-    """Whether HTTP is served at all."""
+    """Whether to serve HTTP."""
 
     address: Host = "127.0.0.1"
-    """Where to listen: an address of this host, 0.0.0.0 or "::" for all."""
+    """The address to listen on: one of this host, or 0.0.0.0 or "::" for all."""
 
     port: Port = 9464
     """The TCP port."""
 
 
 class Settings(Section):
-    """The whole configuration, apart from the outputs: ``settings_model`` adds a section for each."""
+    """The configuration without outputs; ``settings_model`` adds a section for each output."""
 
     sources: Annotated[
         tuple[SourceSettings, ...],
@@ -220,13 +220,13 @@ class Settings(Section):
         expects("a list of sources, one or more, each with name and host"),
         Field(json_schema_extra={"minItems": 1}),
     ]
-    """The servers."""
+    """The motion-capture servers."""
 
     spool: SpoolSettings = SpoolSettings()
-    """Where the servers' C3D files are kept."""
+    """Storage for C3D files from the servers."""
 
     metrics: MetricsSettings = MetricsSettings()
-    """How the gateway is watched."""
+    """Monitoring over HTTP."""
 
     @property
     def outputs(self) -> dict[str, OutputSettings]:
@@ -236,12 +236,12 @@ class Settings(Section):
 
     @field_validator("sources")
     @classmethod
-    def _names_make_different_channels(
+    def _check_names_have_different_channels(
         cls, sources: tuple[SourceSettings, ...]
     ) -> tuple[SourceSettings, ...]:
         owners: dict[str, int] = {}
         for index, source in enumerate(sources):
-            # As gateway.messages.topics makes channels: upper case, and everything else a single '_'.
+            # gateway.messages.topics builds channels in the same way: upper case, and one '_' for the rest.
             channel = "_".join(re.findall("[A-Z0-9]+", source.name.upper()))
             if channel in owners:
                 other = owners[channel]
@@ -254,7 +254,7 @@ class Settings(Section):
         return sources
 
     @model_validator(mode="after")
-    def _something_is_published(self) -> Self:
+    def _check_any_output_is_enabled(self) -> Self:
         outputs = self.outputs
         if outputs and not any(section.enabled for section in outputs.values()):
             *others, last = (f"{name}.enabled" for name in outputs)
@@ -264,7 +264,7 @@ class Settings(Section):
 
 
 def settings_model(outputs: Mapping[str, type[OutputSettings]]) -> type[Settings]:
-    """Return the model of whole configurations with these outputs, by the name of their section."""
+    """Return the model of the whole configuration with these outputs, by the name of their section."""
     sections: dict[str, Any] = {
         name: (section, Field(default=section(), description=f"The output {name}."))
         for name, section in outputs.items()

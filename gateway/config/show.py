@@ -1,4 +1,4 @@
-"""The configuration in effect as YAML, each value with where it is from: a file, a variable, a default."""
+"""The effective configuration as YAML, with the origin of each value: a file, a variable, a default."""
 
 import json
 import math
@@ -16,7 +16,7 @@ from gateway.config.yaml_document import Location
 
 _DEFAULT: Final = "default"
 _MAX_COLUMN: Final = 48
-"""Where the comments begin at the latest; those of longer lines follow their line at once."""
+"""The comments start here or earlier. After a longer line, the comment follows directly."""
 
 
 class _Line(NamedTuple):
@@ -25,9 +25,10 @@ class _Line(NamedTuple):
 
 
 def shown_configuration(configuration: Configuration) -> str:
-    """Return the configuration in effect as YAML, with a comment per value, and MASK for each secret.
+    """Return the effective configuration as YAML, with the origin of each value as a comment.
 
-    What depends on the environment is shown as it is here: ``lcm.url`` and ``spool.directory``.
+    Secrets are replaced by MASK. Values that depend on the environment (``lcm.url``, ``spool.directory``) are
+    shown as they are in this one.
     """
     values = mask_secrets(configuration.settings.model_dump(mode="json"))
     origins = _Origins(configuration)
@@ -40,14 +41,14 @@ def shown_configuration(configuration: Configuration) -> str:
 
 
 class _Origins:
-    """Says where each value is from."""
+    """The origin of each value."""
 
     def __init__(self, configuration: Configuration) -> None:
         self._positions = configuration.positions
         self._resolved: dict[Location, str] = {}
 
     def resolve(self, settings: Settings, values: dict[str, Any]) -> None:
-        """Set in ``values`` what the program uses where nothing is configured."""
+        """Replace keys without a value in ``values`` by the value in effect."""
         for name in type(settings).model_fields:
             section = getattr(settings, name)
             if not isinstance(section, Section):
@@ -58,9 +59,10 @@ class _Origins:
                     self._resolved[name, key] = _variable(*effective.variables)
 
     def of(self, location: Location) -> str:
+        """Return the origin of the value at ``location``, or several origins separated by commas."""
         if location in self._resolved:
             return self._resolved[location]
-        # The items of a list on one line may be from several positions.
+        # The items of a list on one line may come from several positions.
         positions = [
             position for other, position in self._positions.items() if other[: len(location)] == location
         ]
@@ -68,11 +70,12 @@ class _Origins:
 
 
 def _variable(*names: str) -> str:
+    """Return the first environment variable that is set."""
     return next((name for name in names if os.environ.get(name)), _DEFAULT)
 
 
 def _lines(key: str, value: Any, location: Location, indent: str, origins: _Origins) -> Iterator[_Line]:
-    """Yield the lines of one key: mappings and lists of them in lines of their own, all else in one."""
+    """Yield the lines of one key. Mappings, and lists that hold any, get a line per item."""
     start = f"{indent}{_flow(key)}:"
     match value:
         case Mapping() if value:

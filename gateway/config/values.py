@@ -1,4 +1,4 @@
-"""The types of the configuration's single values: what is accepted, and how YAML writes it."""
+"""The types of single values in the configuration: what they accept, and how YAML represents them."""
 
 import ipaddress
 import re
@@ -23,7 +23,7 @@ def _host(text: str) -> str:
 
 def not_empty(values: tuple[_Item, ...]) -> tuple[_Item, ...]:
     """Return ``values``; raise ValueError if there are none."""
-    # As a limit on the type, pydantic would count the valid items alone.
+    # With a minimum length on the type, pydantic would count only the valid items.
     if not values:
         raise ValueError
     return values
@@ -65,7 +65,7 @@ Host = Annotated[
     str, AfterValidator(_host), expects("a host name or an IP address; the port has its own key")
 ]
 Port = Annotated[int, Field(strict=True, ge=1, le=65535), expects("a whole number from 1 to 65535")]
-# Their lengths are such that PREFIX_NAME_PARAMETERS_REQUEST fits LCM's 63 characters.
+# The length limit lets the channel PREFIX_NAME_PARAMETERS_REQUEST fit into LCM's 63 characters.
 SourceName = Annotated[
     str,
     Field(pattern=r"^[A-Za-z0-9_-]{1,24}$"),
@@ -77,14 +77,14 @@ class FrequencyRate(Section):
     """``rate: {frequency_hz: 60}``."""
 
     frequency_hz: Hertz
-    """About so many frames per second."""
+    """The average number of frames per second."""
 
 
 class DivisorRate(Section):
     """``rate: {divisor: 4}``."""
 
     divisor: Divisor
-    """One frame of so many."""
+    """Every how many frames the server sends one."""
 
 
 def _rate(value: object) -> Rate:
@@ -102,7 +102,7 @@ def _rate(value: object) -> Rate:
     raise validation_error(f"found {describe(value)}; expected all, {{frequency_hz: 60}} or {{divisor: 4}}")
 
 
-def _rate_as_in_yaml(rate: Rate) -> str | dict[str, float] | dict[str, int]:
+def _rate_to_yaml(rate: Rate) -> str | dict[str, float] | dict[str, int]:
     match rate:
         case Frequency(hz):
             return {"frequency_hz": hz}
@@ -133,8 +133,8 @@ def _component(item: object, index: int) -> ComponentType:
             raise validation_error("found 'all' beside other components; expected [all] alone", index)
         case str() if item in COMPONENTS_BY_KEY:
             return COMPONENTS_BY_KEY[item]
-    meant = spelling_hint(item, _COMPONENT_KEYS)
-    raise validation_error(f"found {describe(item)}{meant}; expected {join_or(_COMPONENT_KEYS)}", index)
+    hint = spelling_hint(item, _COMPONENT_KEYS)
+    raise validation_error(f"found {describe(item)}{hint}; expected {join_or(_COMPONENT_KEYS)}", index)
 
 
 def _component_keys(components: tuple[ComponentType, ...]) -> list[str]:
@@ -148,14 +148,14 @@ Components = Annotated[
     ),
     PlainSerializer(_component_keys),
 ]
-"""YAML: [all] or a list of keys; kept in WIRE_ORDER."""
+"""In YAML: [all], or a list of keys. Kept in WIRE_ORDER."""
 
 StreamRate = Annotated[
     Rate,
     PlainValidator(_rate, json_schema_input_type=Literal["all"] | FrequencyRate | DivisorRate),
-    PlainSerializer(_rate_as_in_yaml),
+    PlainSerializer(_rate_to_yaml),
 ]
-"""YAML: all, {frequency_hz: NUMBER} or {divisor: WHOLE NUMBER}."""
+"""In YAML: all, {frequency_hz: NUMBER} or {divisor: WHOLE NUMBER}."""
 
 Backlog = Annotated[Literal["latest", "all"], expects("latest or all")]
 
@@ -170,8 +170,8 @@ def _max_rates(value: object) -> dict[ComponentType, float]:
     rates = {}
     for key, rate in value.items():
         if key not in COMPONENTS_BY_KEY and not isinstance(key, ComponentType):
-            meant = spelling_hint(key, _COMPONENT_KEYS)
-            raise validation_error(f"found {describe(key)}{meant}; expected {join_or(_COMPONENT_KEYS)}")
+            hint = spelling_hint(key, _COMPONENT_KEYS)
+            raise validation_error(f"found {describe(key)}{hint}; expected {join_or(_COMPONENT_KEYS)}")
         component = key if isinstance(key, ComponentType) else COMPONENTS_BY_KEY[key]
         rates[component] = _RATES.validate_python({component.key: rate})[component.key]
     return rates
@@ -182,4 +182,4 @@ MaxRates = Annotated[
     PlainValidator(_max_rates, json_schema_input_type=dict[Literal["3d", "6d", "analog", "force"], Hertz]),
     PlainSerializer(lambda rates: {component.key: rate for component, rate in rates.items()}),
 ]
-"""YAML: {3d: NUMBER, …}."""
+"""In YAML: {3d: NUMBER, …}, in Hz."""
