@@ -31,10 +31,11 @@ def check_output(
 def _check_opens(kind: OutputKind, settings: OutputSettings, seconds: float) -> Finding:
     """Open the output as the gateway does, and close it."""
     subject = Subject(kind.name)
+    default_remedy = f"Correct {kind.name} in the configuration."
     try:
         output = kind.create(settings)
     except ConfigError as error:
-        return subject.failing(OPENS, str(error), f"Correct {kind.name} in the configuration.")
+        return subject.failing(OPENS, str(error), default_remedy)
     output.start()
     deadline_s = time.monotonic() + seconds
     while not output.health().connected and time.monotonic() < deadline_s:
@@ -45,4 +46,4 @@ def _check_opens(kind: OutputKind, settings: OutputSettings, seconds: float) -> 
     if health.connected:
         return subject.passing(OPENS, "the output opens")
     found, _, remedy = health.problem.partition("; ")
-    return subject.failing(OPENS, found, f"{remedy[:1].upper()}{remedy[1:]}.")
+    return subject.failing(OPENS, found, f"{remedy[:1].upper()}{remedy[1:]}." if remedy else default_remedy)

@@ -6,6 +6,9 @@ from typing import Final
 PREFIX: Final = struct.Struct(">qqqi")
 """The fields after the fingerprint: utime, capture_utime, sequence, session."""
 
+NOT_PUBLISHED: Final = -1
+"""The sequence number of a message that answers a query and is not part of a stream."""
+
 _pack: Final = PREFIX.pack
 _NO_SEQUENCE: Final = 1 << 63  # larger than any: sequence numbers are signed and have 64 bits
 

@@ -5,8 +5,8 @@ from collections.abc import Callable, Collection, Sequence
 from functools import lru_cache
 from typing import Final
 
-from gateway.messages.splice import MESSAGE_TYPES, has_lcm_form, lcm_content
-from gateway.messages.stamp import Stamp
+from gateway.messages.splice import MESSAGE_TYPES, has_lcm_form, lcm_content, splice_content
+from gateway.messages.stamp import NOT_PUBLISHED, Stamp
 from gateway.outputs.contract import Output
 from gateway.outputs.status import OutputStatus
 from gateway.publish.routes import ComponentRoute, FrameRoute, OutputRoute
@@ -33,8 +33,14 @@ class _ComponentPlan:
     """How to publish one component of a layout: its index in the frame, and its routes."""
 
     def __init__(
-        self, component: _Component, index: int, has_lcm_form: bool, routes: list[ComponentRoute]
+        self,
+        component_type: ComponentType,
+        component: _Component,
+        index: int,
+        has_lcm_form: bool,
+        routes: list[ComponentRoute],
     ) -> None:
+        self.type = component_type
         self.component = component
         self.routes = routes
         self._index = index
@@ -158,6 +164,8 @@ class FanOut:
                 message = route.publish(content, stamp)
                 if message is not None:
                     planned.component.newest = message
+            if not planned.routes:  # every output takes whole frames; queries need a message all the same
+                planned.component.newest = splice_content(planned.type, content, stamp, NOT_PUBLISHED)
         for index in plan.tool_indices:
             self._tool_poses.publish(frame, index, stamp)
 
@@ -165,6 +173,7 @@ class FanOut:
         parts = [(index, part) for index, part in enumerate(layout.components) if part.type in wanted]
         components = [
             _ComponentPlan(
+                part.type,
                 self._components[part.type],
                 index,
                 has_lcm_form(part, layout.byte_order),

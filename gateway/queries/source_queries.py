@@ -4,13 +4,13 @@ The server gets one request at a time, and equal questions at the same time shar
 """
 
 from collections.abc import Callable, Coroutine, Mapping, Sequence
-from typing import Any, Final
+from typing import Any
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import FrameError, QueryError
 from gateway.messages.host_time import now_utime
 from gateway.messages.splice import FINGERPRINT_BYTES, splice
-from gateway.messages.stamp import PREFIX, Stamp
+from gateway.messages.stamp import NOT_PUBLISHED, PREFIX, Stamp
 from gateway.outputs.contract import Answer
 from gateway.outputs.encodings import JSON, XML, json_bytes
 from gateway.queries.answers import message_answer, schema_answer
@@ -23,9 +23,6 @@ from gateway.rtc3d.frames import detect_byte_order, split_frame
 from gateway.rtc3d.packets import PacketType
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.stream.state import StreamState
-
-NOT_PUBLISHED: Final = -1
-"""The sequence number of a frame that a peer requested and that is not part of the stream."""
 
 
 class SourceQueries:

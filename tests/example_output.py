@@ -1,0 +1,246 @@
+"""An output as somebody might add one: a module with its settings, the output, and its entry of the registry.
+
+Its "network" is this process: messages go to the subscriptions with the same address. It has every optional
+ability, so that tests can check that each of them needs nothing but this module.
+"""
+
+from collections import Counter
+from collections.abc import Mapping
+from typing import Any, Final
+
+from gateway.config.settings import OutputSettings
+from gateway.config.values import Switch
+from gateway.errors import OutputError
+from gateway.messages.stamp import Stamp
+from gateway.messages.topics import Topic
+from gateway.outputs.contract import Answer, Command, Output, QueryService, ServerParameters
+from gateway.outputs.encodings import TEXT
+from gateway.outputs.kind import DemoSide, OutputKind, Receive, SubscriptionRequest
+from gateway.outputs.status import OutputHealth
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import Frame
+
+UNREACHABLE: Final = "unreachable"
+"""The address that never opens."""
+
+
+class ExampleSettings(OutputSettings):
+    """How data goes to the example output."""
+
+    address: str = "local"
+    """Where to publish."""
+
+    whole_frames: Switch = False
+    """Whether whole frames are published instead of single components."""
+
+
+class ExampleSubscription:
+    """Receives what is published at ``address``, of all sources or of one, in the publisher's thread."""
+
+    def __init__(self, address: str, request: SubscriptionRequest, receive: Receive) -> None:
+        self.address = address
+        self._request = request
+        self._receive = receive
+        _subscriptions.append(self)
+
+    def matches(self, source: str, component: str) -> bool:
+        """Return whether the subscription includes this component."""
+        request = self._request
+        return request.source in (None, source) and request.component in (None, component)
+
+    def receive(self, name: str, message: bytes) -> None:
+        """Pass a message on."""
+        self._receive(name, message)
+
+    def close(self) -> None:
+        """Unsubscribe."""
+        _subscriptions.remove(self)
+
+
+_subscriptions: Final[list[ExampleSubscription]] = []
+
+
+class ExamplePublisher:
+    """Publishes one component of a source, or with "frame" its whole frames."""
+
+    def __init__(self, output: "ExampleOutput", source: str, component: str) -> None:
+        self._output = output
+        self._source = source
+        self._component = component
+        self._is_closed = False
+
+    @property
+    def wanted(self) -> bool:
+        """Whether somebody is subscribed."""
+        return bool(self._matching())
+
+    def _matching(self) -> list[ExampleSubscription]:
+        return [
+            each
+            for each in _subscriptions.copy()
+            if each.address == self._output.settings.address and each.matches(self._source, self._component)
+        ]
+
+    def publish(self, message: bytes) -> None:
+        """Pass a message to every subscription; raises OutputError while the output is not open."""
+        if self._is_closed:
+            raise OutputError(f"{self._source}/{self._component} is closed", cause="closed")
+        if not self._output.is_open:
+            raise OutputError(self._output.health().problem, cause="not open")
+        for subscription in self._matching():
+            subscription.receive(f"{self._source}/{self._component}", message)
+
+    def close(self) -> None:
+        """Close the publisher."""
+        self._is_closed = True
+
+
+class ExampleFramePublisher:
+    """Publishes the whole frames of a source: the sequence number in four bytes, then the frame's body."""
+
+    def __init__(self, publisher: ExamplePublisher) -> None:
+        self._publisher = publisher
+
+    @property
+    def wanted(self) -> bool:
+        """Whether somebody is subscribed."""
+        return self._publisher.wanted
+
+    def publish(
+        self, frame: Frame, _stamp: Stamp, sequence: int, _components: frozenset[ComponentType]
+    ) -> None:
+        """See FramePublisher."""
+        self._publisher.publish(sequence.to_bytes(4) + frame.body)
+
+    def close(self) -> None:
+        """Close the publisher."""
+        self._publisher.close()
+
+
+class ExampleOutput(Output):
+    """Publishes in this process, and records what the gateway calls."""
+
+    name = "example"
+    drop_causes = ("not open",)
+
+    def __init__(self, settings: ExampleSettings) -> None:
+        self.settings = settings
+        self.is_open = False
+        self.topics: list[Topic] = []
+        self.announced: set[str] = set()
+        self.streaming: set[str] = set()
+        self.parameters: list[tuple[str, ServerParameters]] = []
+        self.files: list[tuple[str, Mapping[str, Any]]] = []
+        self.num_maintained = 0
+        self._service: QueryService | None = None
+        self._results: Counter[str] = Counter()
+
+    def start(self) -> None:
+        """Open, unless the address is UNREACHABLE."""
+        self.is_open = self.settings.address != UNREACHABLE
+
+    def publisher(self, topic: Topic) -> ExamplePublisher:
+        """Return a new publisher of ``topic``."""
+        self.topics.append(topic)
+        return ExamplePublisher(self, topic.source, "/".join(topic.path))
+
+    def health(self) -> OutputHealth:
+        """Return whether the output is open."""
+        if self.is_open:
+            return OutputHealth(True)
+        problem = f"nothing answers at {self.settings.address}; correct example.address"
+        return OutputHealth(False, problem)
+
+    def close(self) -> None:
+        """Close the output."""
+        self.is_open = False
+
+    def maintain(self) -> None:
+        """Count the calls."""
+        self.num_maintained += 1
+
+    def is_configured_like(self, other: Output) -> bool:
+        """Return whether the settings are the same."""
+        return isinstance(other, ExampleOutput) and self.settings == other.settings
+
+    def drops(self, source: str) -> Mapping[str, int]:
+        """Return one ignored request for every source."""
+        return {f"request of {source} ignored": 1}
+
+    def announce(self, source: str) -> None:
+        """Serve ``source``."""
+        self.announced.add(source)
+
+    def withdraw(self, source: str) -> None:
+        """Serve ``source`` no longer."""
+        self.announced.remove(source)
+
+    def show_streaming(self, source: str, is_streaming: bool) -> None:
+        """Record whether frames of ``source`` arrive."""
+        (self.streaming.add if is_streaming else self.streaming.discard)(source)
+
+    def frame_publisher(self, source: str) -> ExampleFramePublisher | None:
+        """Return a publisher of whole frames if the settings ask for them."""
+        if not self.settings.whole_frames:
+            return None
+        return ExampleFramePublisher(ExamplePublisher(self, source, "frame"))
+
+    def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
+        """Record the parameters."""
+        self.parameters.append((source, parameters))
+
+    def announce_file(self, source: str, description: Mapping[str, Any]) -> None:
+        """Record the file."""
+        self.files.append((source, description))
+
+    def serve_queries(self, service: QueryService) -> None:
+        """Answer ``query``."""
+        self._service = service
+
+    async def stop_queries(self) -> None:
+        """Answer ``query`` no longer."""
+        self._service = None
+
+    async def query(self, key: str, **options: str) -> Answer:
+        """Do what a peer's query of SOURCE/KEY does; raises QueryError."""
+        assert self._service is not None
+        source, *path = key.split("/")
+        answer = await self._service.answer(source, tuple(path), options)
+        self._results["ok"] += 1
+        return answer
+
+    @property
+    def query_results(self) -> Mapping[str, int]:
+        """How many queries were answered."""
+        return self._results
+
+    @property
+    def commands(self) -> Mapping[str, Command]:
+        """The command "greet", which takes a name."""
+        return {"greet": _greet}
+
+
+async def _greet(source: str, options: Mapping[str, str]) -> Answer:
+    return Answer(f"{source} greets {options['name']}".encode(), TEXT)
+
+
+def _subscribe(request: SubscriptionRequest, receive: Receive) -> ExampleSubscription:
+    return ExampleSubscription(request.address or ExampleSettings().address, request, receive)
+
+
+def _demo(_use_network: bool) -> DemoSide:
+    settings = ExampleSettings(enabled=True, address="demo")
+
+    def subscribe_here(source: str, receive: Receive) -> ExampleSubscription:
+        return _subscribe(SubscriptionRequest(source, address=settings.address), receive)
+
+    return DemoSide(settings, ExampleOutput(settings), subscribe_here)
+
+
+EXAMPLE: Final = OutputKind(
+    name=ExampleOutput.name,
+    settings=ExampleSettings,
+    create=ExampleOutput,
+    subscribe=_subscribe,
+    demo=_demo,
+)

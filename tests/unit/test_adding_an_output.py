@@ -1,0 +1,375 @@
+"""Adding an output takes one module and one line in the registry: everything else finds it there."""
+
+import asyncio
+import dataclasses
+import io
+import json
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager, closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+from prometheus_client.parser import text_string_to_metric_families
+from rich.console import Console
+from typer.testing import CliRunner
+
+from gateway.cli.main import app
+from gateway.config import loading
+from gateway.config.settings import Settings
+from gateway.demo import run_demo
+from gateway.doctor.all_checks import run_checks_without_settings
+from gateway.doctor.output_checks import check_output
+from gateway.errors import ConfigError
+from gateway.findings import Finding, Result
+from gateway.gateway import Gateway
+from gateway.messages.decode import decode
+from gateway.monitoring.health import health_page
+from gateway.monitoring.loop_delay import LoopDelay
+from gateway.monitoring.metrics import metrics_page, metrics_registry
+from gateway.outputs.kind import SubscriptionRequest
+from gateway.outputs.registry import OUTPUTS, settings_type
+from gateway.outputs.status import OutputHealth
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import split_frame
+from gateway.simulator.simulator import Simulator
+from gateway.simulator.synthetic import SyntheticScene
+from gateway.stream.state import StreamState
+from tests.example_output import EXAMPLE, UNREACHABLE, ExampleOutput, ExampleSettings, ExampleSubscription
+from tests.waiting import wait_until_async
+
+OFF = {"zenoh": {"enabled": False}, "lcm": {"enabled": False}, "metrics": {"enabled": False}}
+
+
+@pytest.fixture(autouse=True)
+def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(OUTPUTS, EXAMPLE.name, EXAMPLE)
+
+
+def scene() -> SyntheticScene:
+    return SyntheticScene(markers=3, tools=1, analog=0, plates=0, rate_hz=100)
+
+
+def written(folder: Path, port: int = 3020, *, source: dict[str, Any] | None = None, **example: Any) -> Path:
+    """Return a configuration file with one source, the example and no other output."""
+    lab = {"name": "lab", "host": "127.0.0.1", "port": port} | (source or {})
+    file = folder / "lab.yaml"
+    file.write_text(json.dumps({"sources": [lab], "example": {"enabled": True} | example} | OFF))
+    return file
+
+
+def read(file: Path, **variables: str) -> Settings:
+    return loading.read(file, settings_type(), variables).settings
+
+
+def run_command(*arguments: str) -> str:
+    result = CliRunner().invoke(app, arguments, catch_exceptions=False)
+    assert result.exit_code == 0, result.output
+    return result.stdout
+
+
+class Lab:
+    """A running gateway of a simulator, and its only output."""
+
+    def __init__(self, gateway: Gateway) -> None:
+        self.gateway = gateway
+        [output] = gateway.outputs
+        assert isinstance(output, ExampleOutput)
+        self.output = output
+        [self.source] = gateway.sources
+        self.received: list[tuple[str, bytes]] = []
+
+    def subscribe(self, component: str | None = None) -> ExampleSubscription:
+        request = SubscriptionRequest("lab", component)
+        return ExampleSubscription("local", request, lambda *message: self.received.append(message))
+
+    async def messages(self, component: str, count: int = 1) -> list[bytes]:
+        """Return the messages of one component, once there are ``count`` of them."""
+
+        def found() -> list[bytes]:
+            return [message for name, message in self.received if name == f"lab/{component}"]
+
+        await wait_until_async(lambda: len(found()) >= count)
+        return found()
+
+    def metric(self, name: str, **labels: str) -> float:
+        page = metrics_page(metrics_registry(self.gateway, LoopDelay()))
+        [value] = [
+            sample.value
+            for family in text_string_to_metric_families(page.body.decode())
+            for sample in family.samples
+            if sample.name == f"rtc3d_gateway_{name}" and labels.items() <= sample.labels.items()
+        ]
+        return value
+
+    def health(self) -> Any:
+        return json.loads(health_page(self.gateway).body)
+
+
+@asynccontextmanager
+async def running(
+    folder: Path, *, source: dict[str, Any] | None = None, **example: Any
+) -> AsyncIterator[Lab]:
+    async with Simulator(scene()) as simulator:
+        gateway = Gateway(read(written(folder, simulator.port, source=source, **example)))
+        stop = asyncio.Event()
+        task = asyncio.create_task(gateway.run(stop))
+        try:
+            yield Lab(gateway)
+        finally:
+            stop.set()
+            await task
+
+
+# The configuration ---------------------------------------------------------------------------
+
+
+def test_yaml_and_environment_variables_configure_it(tmp_path: Path) -> None:
+    file = written(tmp_path, address="from-file")
+    assert read(file).outputs["example"] == ExampleSettings(enabled=True, address="from-file")
+    overridden = read(file, RTC3D_GATEWAY__EXAMPLE__ADDRESS="from-variable")
+    assert overridden.outputs["example"] == ExampleSettings(enabled=True, address="from-variable")
+
+
+def test_a_mistake_in_its_section_is_reported_with_its_position(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"lab\.yaml:1:\d+: example\.adress: .*did you mean 'address'"):
+        read(written(tmp_path, adress="typo"))
+
+
+def test_the_json_schema_describes_its_section() -> None:
+    schema = json.loads(run_command("config", "schema"))
+    assert "example" in schema["properties"]
+    section = schema["$defs"]["ExampleSettings"]["properties"]
+    assert section["address"] == {"default": "local", "description": "Where to publish.", "type": "string"}
+
+
+def test_config_show_prints_its_values_with_their_origin(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RTC3D_GATEWAY__EXAMPLE__WHOLE_FRAMES", "true")
+    file = written(tmp_path, address="from-file")
+    lines = [
+        " ".join(line.split()) for line in run_command("config", "show", "--config", str(file)).splitlines()
+    ]
+    begin = lines.index("example:")
+    assert lines[begin + 1 : begin + 4] == [
+        f"enabled: true # {file}:1",
+        f"address: from-file # {file}:1",
+        "whole_frames: true # RTC3D_GATEWAY__EXAMPLE__WHOLE_FRAMES",
+    ]
+
+
+# The commands --------------------------------------------------------------------------------
+
+
+def doctor(**settings: Any) -> list[Finding]:
+    return check_output(EXAMPLE, ExampleSettings(**settings), ["lab"], [], 0.0)
+
+
+def test_the_doctor_checks_that_it_opens() -> None:
+    [finding] = doctor(enabled=True)
+    assert (finding.subject, finding.check, finding.result) == ("example", "opens", Result.PASSING)
+
+
+def test_the_doctor_says_why_it_does_not_open() -> None:
+    [finding] = doctor(enabled=True, address=UNREACHABLE)
+    assert (finding.check, finding.result) == ("opens", Result.FAILING)
+    assert finding.found == "nothing answers at unreachable"
+    assert finding.remedy == "Correct example.address."
+
+
+def test_the_doctor_points_at_its_section_if_it_names_no_remedy() -> None:
+    class Broken(ExampleOutput):
+        def health(self) -> OutputHealth:
+            return OutputHealth(False, "it is broken")
+
+    broken = dataclasses.replace(EXAMPLE, create=Broken)
+    [finding] = check_output(broken, ExampleSettings(enabled=True), ["lab"], [], 0.0)
+    assert (finding.found, finding.remedy) == ("it is broken", "Correct example in the configuration.")
+
+
+def test_the_doctor_says_which_configuration_it_refuses() -> None:
+    def refuse(_settings: ExampleSettings) -> ExampleOutput:
+        raise ConfigError("example.address is no address")
+
+    refusing = dataclasses.replace(EXAMPLE, create=refuse)
+    [finding] = check_output(refusing, ExampleSettings(enabled=True), ["lab"], [], 0.0)
+    assert (finding.check, finding.result) == ("opens", Result.FAILING)
+    assert finding.found == "example.address is no address"
+    assert finding.remedy == "Correct example in the configuration."
+
+
+def test_the_doctor_does_not_test_it_while_it_is_disabled() -> None:
+    [finding] = doctor(enabled=False)
+    assert (finding.check, finding.result) == ("opens", Result.NOT_TESTED)
+
+
+def test_the_doctor_lists_its_check_without_a_configuration() -> None:
+    findings = list(run_checks_without_settings(ConfigError("lab.yaml: broken")))
+    assert ("example", "opens") in [(finding.subject, finding.check) for finding in findings]
+
+
+async def test_echo_prints_its_messages(tmp_path: Path) -> None:
+    async with running(tmp_path):
+        command = ("echo", "--output", "example", "--component", "3d", "--count", "3", "--json")
+        text = await asyncio.to_thread(run_command, *command)
+    messages = [json.loads(line) for line in text.splitlines()]
+    assert [message["key"] for message in messages] == ["lab/3d"] * 3
+    assert messages[0]["num_markers"] == 3
+
+
+def test_echo_lists_it_among_the_outputs_to_choose_from() -> None:
+    result = CliRunner().invoke(app, ["echo", "--output", "nosuch"], env={"COLUMNS": "200"})
+    assert result.exit_code == 2
+    assert "choose one of: zenoh, lcm, example" in result.output
+
+
+async def test_the_demo_shows_it_and_counts_its_messages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delitem(OUTPUTS, "zenoh")
+    monkeypatch.delitem(OUTPUTS, "lcm")
+    out = io.StringIO()
+    assert await run_demo(scene(), 0.2, Console(file=out, width=200), udpm=False)
+    assert "example" in out.getvalue()
+    assert "Nothing was lost." in out.getvalue()
+
+
+# Data ----------------------------------------------------------------------------------------
+
+
+async def test_it_receives_components_status_and_clock(tmp_path: Path) -> None:
+    async with running(tmp_path) as lab:
+        with closing(lab.subscribe()):
+            markers = [decode(message) for message in await lab.messages("3d", 5)]
+            await lab.messages("6d")
+            status = decode((await lab.messages("status"))[0])
+            await lab.messages("clock")
+            assert lab.output.num_maintained > 0
+        sequences = [message.sequence for message in markers]
+        assert sequences == list(range(sequences[0], sequences[0] + len(markers)))
+        assert [(output.name, bool(output.connected)) for output in status.outputs] == [("example", True)]
+    assert not lab.output.is_open
+
+
+async def test_the_metrics_and_the_health_check_show_it(tmp_path: Path) -> None:
+    async with running(tmp_path) as lab:
+        await wait_until_async(lambda: lab.metric("messages_total", output="example", component="3d") > 0)
+        assert lab.metric("output_connected", output="example") == 1
+        assert lab.metric("message_bytes_total", output="example", component="3d") > 0
+        assert lab.metric("output_drops_total", output="example", cause="not open") == 0
+        assert lab.metric("output_drops_total", output="example", cause="request of lab ignored") == 1
+        assert lab.metric("queries_total", output="example", result="ok") == 0
+        assert lab.health()["outputs"] == [{"output": "example", "problem": ""}]
+
+
+async def test_what_it_does_not_accept_is_counted_and_makes_the_gateway_unhealthy(tmp_path: Path) -> None:
+    async with running(tmp_path, address=UNREACHABLE) as lab:
+        await wait_until_async(
+            lambda: lab.metric("output_drops_total", output="example", cause="not open") > 0, timeout_s=20
+        )
+        assert lab.metric("output_connected", output="example") == 0
+        assert lab.health()["healthy"] is False
+        [output] = lab.health()["outputs"]
+        assert output["problem"] == "nothing answers at unreachable; correct example.address"
+
+
+async def test_it_may_take_whole_frames(tmp_path: Path) -> None:
+    async with running(tmp_path, whole_frames=True) as lab:
+        with closing(lab.subscribe()):
+            messages = await lab.messages("frame", 5)
+            await lab.messages("status")
+        frames = [split_frame(message[4:], "big") for message in messages]
+        assert {tuple(part.type for part in frame.components) for frame in frames} == {
+            (ComponentType.MARKERS, ComponentType.TOOLS)
+        }
+        sequences = [int.from_bytes(message[:4]) for message in messages]
+        assert sequences == list(range(sequences[0], sequences[0] + len(messages)))
+        assert [topic.path for topic in lab.output.topics] == [("status",), ("clock",)]
+        assert lab.metric("messages_total", output="example", component="frame") >= 5
+        assert lab.metric("message_bytes_total", output="example", component="frame") >= 5 * len(
+            frames[0].body
+        )
+
+
+@pytest.mark.parametrize("whole_frames", [False, True])
+async def test_its_subscribers_keep_an_on_demand_stream_running(tmp_path: Path, whole_frames: bool) -> None:
+    stream = {"on_demand": True, "idle_after_s": 0.1}
+    async with running(tmp_path, source={"streams": [stream]}, whole_frames=whole_frames) as lab:
+        [status] = lab.source.statuses
+        await wait_until_async(lambda: status.state is StreamState.IDLE and lab.source.supervisors[0].session)
+        with closing(lab.subscribe()):
+            await lab.messages("frame" if whole_frames else "3d", 30)  # more than fit into idle_after_s
+        await wait_until_async(lambda: status.state is StreamState.IDLE)
+
+
+async def test_it_shows_which_sources_are_served_and_which_stream(tmp_path: Path) -> None:
+    async with running(tmp_path) as lab:
+        assert lab.output.announced == {"lab"}
+        await wait_until_async(lambda: lab.output.streaming == {"lab"})
+        elsewhere = lab.gateway.settings.sources[0].model_copy(update={"name": "hall"})
+        await lab.gateway.opened.wait()
+        await lab.gateway.reload(lab.gateway.settings.model_copy(update={"sources": (elsewhere,)}))
+        assert lab.gateway.outputs == [lab.output]
+        assert lab.output.announced == {"hall"}
+        await wait_until_async(lambda: lab.output.streaming == {"hall"})
+
+
+async def test_it_receives_parameters_and_announcements_of_files(tmp_path: Path) -> None:
+    directory = {"spool": {"directory": str(tmp_path / "c3d")}}
+    async with Simulator(scene()) as simulator:
+        file = written(tmp_path, simulator.port)
+        file.write_text(json.dumps(json.loads(file.read_text()) | directory))
+        gateway = Gateway(read(file))
+        stop = asyncio.Event()
+        task = asyncio.create_task(gateway.run(stop))
+        lab = Lab(gateway)
+        await wait_until_async(lambda: lab.output.parameters)
+        source, parameters = lab.output.parameters[0]
+        assert (source, parameters.session) == ("lab", 1)
+        assert b"<The_3D>" in parameters.xml
+        lab.source._on_file(b"a take")
+        await wait_until_async(lambda: lab.output.files)
+        stop.set()
+        await task
+    [(source, description)] = lab.output.files
+    assert source == "lab"
+    assert description["bytes"] == 6
+
+
+# Queries -------------------------------------------------------------------------------------
+
+
+async def test_it_answers_queries_about_sources(tmp_path: Path) -> None:
+    async with running(tmp_path) as lab:
+        await wait_until_async(lambda: lab.source.supervisors[0].session)
+        assert b"<The_3D>" in (await lab.output.query("lab/parameters")).payload
+        assert decode((await lab.output.query("lab/status")).payload).source == "lab"
+        assert lab.metric("queries_total", output="example", result="ok") == 2
+
+
+@pytest.mark.parametrize("whole_frames", [False, True])
+async def test_it_answers_queries_about_the_newest_components(tmp_path: Path, whole_frames: bool) -> None:
+    async with running(tmp_path, whole_frames=whole_frames) as lab:
+        await wait_until_async(lambda: lab.source.fan_out.frames[ComponentType.MARKERS])
+        await wait_until_async(lambda: lab.source.supervisors[0].session)
+        answer = await lab.output.query("lab/3d")
+        assert len(decode(answer.payload).markers) == 3
+
+
+async def test_peers_call_its_commands(tmp_path: Path) -> None:
+    async with running(tmp_path) as lab:
+        answer = await lab.output.query("lab/greet", name="the operator")
+    assert answer.payload == b"lab greets the operator"
+
+
+# Reload --------------------------------------------------------------------------------------
+
+
+async def test_a_reload_keeps_it_while_its_settings_are_the_same(tmp_path: Path) -> None:
+    async with running(tmp_path) as lab:
+        await lab.gateway.opened.wait()
+        port = lab.source.settings.port
+        assert await lab.gateway.reload(read(written(tmp_path, port))) == []
+        changed = read(written(tmp_path, port, address="elsewhere"))
+        assert await lab.gateway.reload(changed) == ["output example changed"]
+        assert lab.gateway.outputs[0].health().connected
+        assert not lab.output.is_open
