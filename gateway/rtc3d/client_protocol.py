@@ -165,7 +165,7 @@ class ClientProtocol:
         frames: list[Frame] = []
         events: list[ProtocolEvent] = []
         for packet in self._packet_reader.feed(data):
-            if packet.type == PacketType.DATA:
+            if packet.is_data_frame:
                 self._on_data(packet, frames, events)
             else:
                 self._on_packet(packet, events)

@@ -25,8 +25,9 @@ class PacketType(IntEnum):
     C3D = 5
 
 
-# Looking these up costs 0.1 µs each, and both are needed for every packet.
+# Every packet needs these; to look them up and to compare with an IntEnum costs 0.1 µs each.
 _unpack_header: Final = PACKET_HEADER.unpack_from
+_DATA: Final = int(PacketType.DATA)
 _C3D: Final = int(PacketType.C3D)
 
 
@@ -38,6 +39,11 @@ class Packet:
     def __init__(self, packet_type: int, body: bytes) -> None:
         self.type = packet_type
         self.body = body
+
+    @property
+    def is_data_frame(self) -> bool:
+        """Whether this is a data frame (type 3)."""
+        return self.type == _DATA
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Packet) and (self.type, self.body) == (other.type, other.body)
