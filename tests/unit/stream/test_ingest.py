@@ -158,6 +158,28 @@ def test_frames_without_components_are_counted_and_not_published(lab: Lab) -> No
     assert not lab.published
 
 
+def test_a_frame_without_components_does_not_hold_up_those_behind_it(lab: Lab) -> None:
+    empty = split_frame(encode_frame([]), "big")
+    lab.receive(frame(600), empty, frame(601))
+    assert [number for number, _ in lab.published] == [600, 601]
+
+
+def test_stamps_have_the_session_and_whether_there_is_a_clock() -> None:
+    lab = Lab("all")
+    lab.status.connected("192.0.2.20:3020")
+    for number in range(3 * RATE_HZ):
+        lab.receive(frame(number))
+    first, last = lab.stamps[0], lab.stamps[-1]
+    assert (first.session, first.has_clock, first.capture_utime) == (1, False, first.utime)
+    assert (last.session, last.has_clock) == (1, True)
+
+
+def test_a_skipped_frame_has_a_stamp_of_its_own(lab: Lab) -> None:
+    lab.receive(*(frame(number, event=True) for number in range(600, 603)), late_us=200_000)
+    captured = [stamp.capture_utime - BOOT_UTIME for stamp in lab.stamps]
+    assert captured == pytest.approx([600 * PERIOD_US, 601 * PERIOD_US, 602 * PERIOD_US], abs=500)
+
+
 def test_unknown_components_are_counted_and_the_others_published(
     lab: Lab, caplog: pytest.LogCaptureFixture
 ) -> None:

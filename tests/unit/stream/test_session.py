@@ -1,6 +1,7 @@
 """One session with a scripted server: replies, silence, errors and the end."""
 
 import asyncio
+import logging
 from typing import Any
 
 import pytest
@@ -15,6 +16,7 @@ from gateway.stream.status import StreamStatus
 from tests.servers import markers_frame, packet
 from tests.unit.stream.scripted_server import Connection, ScriptedServer, obliging, refusing, silent_to
 from tests.unit.stream.virtual_time import settle
+from tests.vectors import STOP_RECORDING
 
 NO_DATA = packet(4)
 
@@ -128,6 +130,17 @@ async def test_frames_of_one_read_are_passed_on_together_with_the_time(lab: Lab)
     assert lab.status.byte_order == "big"
 
 
+async def test_the_control_of_a_recording_goes_out_at_once(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    await lab.session.connect()
+    written: list[bytes] = []
+    monkeypatch.setattr(lab.connection, "write", written.append)
+    lab.session.control_recording(start=True)
+    lab.session.control_recording(start=False)
+    start, stop = written
+    assert stop == STOP_RECORDING
+    assert start == STOP_RECORDING[:-24] + b"\0\0\0\1" + STOP_RECORDING[-20:]  # the event's id
+
+
 async def test_a_stopped_stream_is_idle_before_the_server_answers(lab: Lab) -> None:
     await lab.streaming()
     lab.connection.send_frames(1)
@@ -164,7 +177,10 @@ async def test_a_c3d_file_is_passed_on(lab: Lab) -> None:
 # --- silence
 
 
-async def test_silence_while_a_measurement_runs_ends_the_session(lab: Lab) -> None:
+async def test_silence_while_a_measurement_runs_ends_the_session(
+    lab: Lab, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
     await lab.streaming()
     lab.connection.send_frames(1)
     since_s = now_s()
@@ -172,6 +188,10 @@ async def test_silence_while_a_measurement_runs_ends_the_session(lab: Lab) -> No
         await lab.session.monitor()
     assert now_s() - since_s == pytest.approx(3)
     assert lab.status.state is StreamState.STALLED
+    assert (
+        caplog.messages[-1]
+        == "lab (3d): streaming → stalled: silence (no frame from 192.0.2.20:3020 for 3 s)"
+    )
 
 
 async def test_each_frame_restarts_the_stall_timeout(lab: Lab) -> None:
@@ -185,6 +205,18 @@ async def test_each_frame_restarts_the_stall_timeout(lab: Lab) -> None:
     with pytest.raises(SilenceError):
         await monitoring
     assert now_s() - since_s == pytest.approx(3)
+
+
+async def test_silence_is_measured_from_the_last_frame_however_soon_it_came(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    since_s = now_s()
+    monitoring = asyncio.create_task(lab.session.monitor())
+    await asyncio.sleep(0.4)
+    lab.connection.send_frames(2)
+    with pytest.raises(SilenceError):
+        await monitoring
+    assert now_s() - since_s == pytest.approx(3.4)
 
 
 async def test_silence_without_a_measurement_is_checked_by_a_command(lab: Lab) -> None:

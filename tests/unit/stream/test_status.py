@@ -102,6 +102,18 @@ def test_a_limitation_is_a_warning_once_over_all_connections(caplog: pytest.LogC
     assert status.limitations == ["no XML", "no Version", "no names"]
 
 
+def test_a_limitation_of_a_later_connection_is_logged_as_debug(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG)
+    status = StreamStatus("3d", name="lab (3d)")
+    limited(status, "no Version")
+    status.limitations.clear()
+    limited(status, "no Version")
+    assert [(record.levelname, record.getMessage()) for record in caplog.records] == [
+        ("WARNING", "lab (3d): no Version"),
+        ("DEBUG", "lab (3d): no Version"),
+    ]
+
+
 def test_limitations_are_bounded(caplog: pytest.LogCaptureFixture) -> None:
     status = StreamStatus("3d")
     limited(status, *(f"the server refused {number}" for number in range(100)))
