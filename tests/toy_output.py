@@ -37,7 +37,8 @@ class ToyOutput(Output):
     def withdraw(self, source: str) -> None:
         self.announced.remove(source)
 
-    def show_streaming(self, _source: str, is_streaming: bool) -> None:
+    def show_streaming(self, source: str, is_streaming: bool) -> None:
+        assert source in self.announced
         self.streaming.append(is_streaming)
 
     def health(self) -> OutputHealth:

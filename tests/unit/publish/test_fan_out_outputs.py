@@ -1,5 +1,6 @@
 """Changing the outputs of a fan-out while frames flow."""
 
+from gateway.errors import OutputError
 from gateway.messages.decode import decode
 from gateway.messages.stamp import Stamp
 from gateway.publish.fan_out import FanOut
@@ -45,6 +46,25 @@ def test_a_replacement_continues_numbers_and_counters() -> None:
     assert status.message_bytes["3d"] == sum(
         len(message) for topic, message in (*before.messages, *after.messages) if topic.path == ("3d",)
     )
+
+
+def test_a_replacement_continues_the_counts_of_what_was_lost() -> None:
+    before, after = ToyOutput("side"), ToyOutput("side")
+    before.error = after.error = OutputError("no router", cause="no router")
+    fan_out = FanOut("lab", [before])
+    fan_out.publish_status(b"status")
+    fan_out.use([after])
+    fan_out.publish_status(b"status")
+    [(_, status)] = fan_out.outputs
+    assert status.drops == {"no router": 2}
+
+
+def test_status_and_clock_are_counted_under_their_own_names() -> None:
+    fan_out = FanOut("lab", [ToyOutput()])
+    fan_out.publish_status(b"status")
+    fan_out.publish_clock(b"clock")
+    [(_, status)] = fan_out.outputs
+    assert (status.messages, status.message_bytes) == ({"status": 1, "clock": 1}, {"status": 6, "clock": 5})
 
 
 def test_removing_an_output_closes_everything_declared_on_it() -> None:

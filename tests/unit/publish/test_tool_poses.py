@@ -168,3 +168,10 @@ def test_an_unknown_unit_is_logged_and_no_pose_is_published(caplog: pytest.LogCa
 def test_an_unknown_unit_is_not_logged_without_tool_poses(caplog: pytest.LogCaptureFixture) -> None:
     FanOut("lab", [ToyOutput()]).set_parameters(parameters("Probe", unit="furlong"))
     assert not caplog.records
+
+
+def test_before_any_parameters_poses_are_taken_for_millimetres() -> None:
+    output = ToyOutput("toy", "tool 1", has_tool_poses=True)
+    publish_tools(FanOut("lab", [output]), 1)
+    [pose] = output.poses("tool 1")
+    assert pose.position_m == pytest.approx((0.1, 0.2, 0.3))

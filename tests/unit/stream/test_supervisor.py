@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from itertools import pairwise
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
+from gateway.log import current_log_fields
 from gateway.messages.stamp import Stamp
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
@@ -30,18 +31,23 @@ class Lab:
         self.server = ScriptedServer()
         self.status = StreamStatus("3d", name="lab (3d)")
         self.published: list[tuple[Frame, Stamp]] = []
+        self.files: list[bytes] = []
         self.has_subscribers = True
         self.restarts = self.connected = 0
-        self.supervisor = Supervisor(
+        self._stream = StreamSettings(**stream)
+        self.supervisor = self.new_supervisor()
+
+    def new_supervisor(self) -> Supervisor:
+        return Supervisor(
             SourceSettings(name="lab", host="192.0.2.20"),
-            StreamSettings(**stream),
+            self._stream,
             self.status,
             Callbacks(
                 publish=self._publish,
                 on_parameters=lambda *_: None,
                 on_connected=self._on_connected,
                 on_restart=self._on_restart,
-                on_file=lambda _: None,
+                on_file=self.files.append,
                 has_subscribers=lambda: self.has_subscribers,
             ),
             self.server.connect,
@@ -232,3 +238,54 @@ async def test_the_tasks_of_a_session_end_with_it() -> None:
         assert len(asyncio.all_tasks()) == tasks_of_one
     await settle()
     assert len(asyncio.all_tasks()) == tasks_before
+
+
+# --- the parts of a session work together
+
+
+async def test_records_carry_the_source_the_stream_and_the_server(monkeypatch: pytest.MonkeyPatch) -> None:
+    lab = Lab()
+    seen: list[Mapping[str, str]] = []
+    monkeypatch.setattr(lab, "_on_connected", lambda: seen.append(current_log_fields()))
+    lab.supervisor = lab.new_supervisor()
+    async with running(lab):
+        await until(lambda: seen)
+    assert seen == [{"source": "lab", "stream": "3d", "peer": "192.0.2.20:3020"}]
+
+
+async def test_files_and_restarts_of_the_server_are_passed_on() -> None:
+    lab = Lab()
+    async with running(lab):
+        await lab.ready()
+        lab.server.connection.send_frames(1000)
+        lab.server.connection.send_frames(1)
+        lab.server.connection.send(packet(5, b"C3D"))
+    assert (lab.restarts, lab.files) == (1, [b"C3D"])
+
+
+async def test_frames_that_stay_late_halve_the_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = asyncio.get_running_loop()
+    monkeypatch.setattr(
+        "gateway.stream.session.now_utime", lambda: 1_700_000_000_000_000 + int(1e6 * loop.time())
+    )
+    lab = Lab()
+    async with running(lab):
+        await lab.ready()
+        for time_ms in range(0, 5000, 10):
+            if time_ms == 3000:
+                await asyncio.sleep(0.2)  # from here on, every frame is 200 ms late
+            await asyncio.sleep(0.01)
+            lab.server.connection.send_frames(time_ms)
+        assert lab.server.connection.commands[3:] == ["StreamFrames FrequencyDivisor:2"]
+
+
+async def test_a_stream_on_demand_follows_its_subscribers() -> None:
+    lab = Lab(on_demand=True, idle_after_s=5.0)
+    async with running(lab):
+        await lab.ready()
+        lab.has_subscribers = False
+        await asyncio.sleep(10)
+        lab.has_subscribers = True
+        await asyncio.sleep(10)
+        streamed = [text for text in lab.server.connection.commands if text.startswith("StreamFrames")]
+        assert streamed[-2:] == ["StreamFrames Stop", "StreamFrames AllFrames"]
