@@ -8,8 +8,10 @@ pyproject.toml. This script selects the packages, prints a table and writes the 
 
 import argparse
 import shutil
+import sys
 from collections import Counter
 from collections.abc import Iterator
+from multiprocessing import Process
 from pathlib import Path
 from typing import Any, Final
 
@@ -23,7 +25,22 @@ from mutmut.workers.isolation import ForkServerRunner
 from rich.console import Console
 from rich.table import Table
 
-PACKAGES: Final = ("rtc3d", "stream", "publish", "outputs")
+TESTS: Final = {
+    "rtc3d": ("tests/unit/rtc3d", "tests/unit/rtc3d_server"),
+    "stream": ("tests/unit/stream",),
+    "publish": ("tests/unit/publish",),
+    "outputs": (
+        "tests/unit/outputs",
+        "tests/contract",
+        "tests/integration/test_zenoh_queries.py",
+        "tests/integration/test_zenoh_queries_keys.py",
+        "tests/integration/test_zenoh_selectors.py",
+        "tests/integration/test_lcm_queries.py",
+        "tests/integration/test_doctor_outputs.py",
+    ),
+}
+"""The packages that are mutated, and the tests that should notice."""
+
 OUTPUT: Final = Path("mutants")
 SURVIVORS: Final = OUTPUT / "survivors.diff"
 
@@ -39,20 +56,32 @@ does not find the test.
 
 def main() -> None:
     parser = argparse.ArgumentParser(prog="make mutants")
-    parser.add_argument("packages", nargs="*", metavar="PACKAGE", help=f"{', '.join(PACKAGES)}; default: all")
-    packages = parser.parse_args().packages or PACKAGES
-    if unknown := set(packages) - set(PACKAGES):
-        parser.error(f"unknown package {', '.join(sorted(unknown))}; known are {', '.join(PACKAGES)}")
-    config().only_mutate = [f"gateway/{package}/*" for package in packages]
+    parser.add_argument("packages", nargs="*", metavar="PACKAGE", help=f"{', '.join(TESTS)}; default: all")
+    packages = parser.parse_args().packages or list(TESTS)
+    if unknown := set(packages) - set(TESTS):
+        parser.error(f"unknown package {', '.join(sorted(unknown))}; known are {', '.join(TESTS)}")
     # Results of an earlier run would be kept although the tests have changed.
     shutil.rmtree(OUTPUT, ignore_errors=True)
     _run_fast_tests_first()
-    # One at a time: the mutants share a network, and LCM's multicast reaches every listener in it.
-    cli(["run", "--max-children", "1"], standalone_mode=False)
+    for package in packages:
+        print(f"Package {package}")
+        run = Process(target=_run, args=(package,))  # mutmut keeps its state in the process
+        run.start()
+        run.join()
+        if run.exitcode != 0:
+            sys.exit(f"mutmut ended with status {run.exitcode}")
+    config().only_mutate = [f"gateway/{package}/*" for package in packages]
     results = list(_results())
     _print_table(results)
     SURVIVORS.write_text("\n".join(_survivors(results)))
     print(f"The survivors are in {SURVIVORS}.")
+
+
+def _run(package: str) -> None:
+    config().only_mutate = [f"gateway/{package}/*"]
+    config().pytest_add_cli_args_test_selection = list(TESTS[package])
+    # One at a time: the mutants share a network, and LCM's multicast reaches every listener in it.
+    cli(["run", "--max-children", "1"], standalone_mode=False)
 
 
 def _run_fast_tests_first() -> None:

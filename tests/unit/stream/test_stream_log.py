@@ -1,0 +1,130 @@
+"""What the log says of a session, from the handshake to frames that contradict themselves, word for word."""
+
+import logging
+
+import pytest
+
+from gateway.errors import ClosedError, LinkError, PacketError
+from gateway.rtc3d.parameters_xml import parse_parameters
+from tests.servers import error, markers_frame, packet
+from tests.unit.stream import test_session, test_stream_control
+from tests.unit.stream.scripted_server import obliging, refusing
+from tests.unit.stream.virtual_time import settle
+
+SERVER = "192.0.2.20:3020"
+TOO_SHORT = packet(3, b"\0\0\0")
+
+
+@pytest.fixture(autouse=True)
+def levels(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG, "gateway.stream")
+
+
+def logged(caplog: pytest.LogCaptureFixture, module: str) -> list[str]:
+    return [
+        f"{record.levelname} {record.getMessage()}"
+        for record in caplog.records
+        if record.name == f"gateway.stream.{module}"
+    ]
+
+
+async def session_with_frames() -> test_session.Lab:
+    lab = test_session.Lab()
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    return lab
+
+
+async def test_each_state_from_connecting_to_streaming(caplog: pytest.LogCaptureFixture) -> None:
+    lab = test_stream_control.Lab()
+    await lab.start()
+    lab.server.connection.send_frames(1)
+    lab.server.connection.send(packet(4))
+    await lab.control.pause()
+    assert logged(caplog, "status") == [
+        f"DEBUG lab (3d): waiting to reconnect → connecting: connecting ({SERVER})",
+        f"DEBUG lab (3d): connecting → handshaking: connected ({SERVER})",
+        f"INFO lab (3d): handshaking → idle: handshake done ({SERVER})",
+        f"INFO lab (3d): idle → streaming: a frame arrived ({SERVER})",
+        f"INFO lab (3d): streaming → no measurement: the server reports that no measurement runs ({SERVER})",
+        f"INFO lab (3d): no measurement → idle: the gateway stopped the frames ({SERVER})",
+    ]
+
+
+@pytest.mark.usefixtures("no_hold")
+async def test_rejected_frames_are_a_warning_once_and_their_end_is_logged(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    lab = await session_with_frames()
+    caplog.clear()
+    lab.connection.send(TOO_SHORT)
+    lab.connection.send(TOO_SHORT)
+    lab.connection.send_frames(2)
+    first, second, end = logged(caplog, "session")
+    text = "lab: frame rejected: data frame of 3 bytes: too short for its component count"
+    assert first == f"WARNING {text}"
+    assert second == f"DEBUG {text} (failure 2 in a row)"
+    assert end.startswith("INFO lab: frames are valid again, after ")
+    assert lab.status.drops == {"frame rejected": 2}
+
+
+async def test_frames_in_another_byte_order_are_a_limitation() -> None:
+    lab = test_session.Lab()
+    await lab.streaming()
+    lab.connection.send(markers_frame(1, (0.0, 0.0, 0.0), order="<"))
+    assert lab.status.byte_order == "little"
+    assert lab.status.limitations == ["the server sends little-endian frames, not the byte order agreed"]
+
+
+async def test_a_packet_that_answers_nothing_is_shown_with_at_most_200_characters(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    lab = await session_with_frames()
+    caplog.clear()
+    lab.connection.send(error("x" * 201))
+    lab.connection.send(packet(77, b"new"))
+    assert logged(caplog, "session") == [
+        f"DEBUG lab: unexpected packet of type 0: {'x' * 200}",
+        "DEBUG lab: unexpected packet of type 77: new",
+    ]
+
+
+async def test_a_corrupt_stream_ends_the_session_with_its_cause() -> None:
+    lab = await session_with_frames()
+    lab.connection.send(b"HTTP/1.1 400 Bad Request\r\n")
+    with pytest.raises(ClosedError) as caught:
+        await lab.session.monitor()
+    assert str(caught.value).startswith(f"{SERVER}: packet size 1213486160 (limit ")
+    assert isinstance(caught.value.__cause__, PacketError)
+
+
+async def test_bytes_after_the_end_change_no_state() -> None:
+    lab = await session_with_frames()
+    lab.connection.end()
+    await settle()
+    lab.status.disconnected("the test")
+    state = lab.status.state
+    lab.session.data_received(packet(4))
+    assert lab.status.state is state
+
+
+async def test_each_repair_of_the_parameters_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    xml = "<RT_Parameters><The_3D><Frequency>fast</Frequency><Unit>m</The_3D></RT_Parameters>"
+    repairs = parse_parameters(xml.encode()).recovered
+    lab = test_stream_control.Lab(
+        lambda command: packet(2, xml) if command == "SendParameters" else obliging(command)
+    )
+    await lab.start()
+    assert len(repairs) > 1
+    assert logged(caplog, "stream_control") == [
+        f"INFO lab: parameters repaired: {repair}" for repair in repairs
+    ]
+
+
+async def test_a_server_that_refuses_every_form_is_named_with_what_to_check() -> None:
+    lab = test_stream_control.Lab(refusing("StreamFrames"))
+    with pytest.raises(LinkError) as caught:
+        await lab.start()
+    assert str(caught.value) == (
+        f"{SERVER} refuses to stream in every form that the protocol has; check its real-time output settings"
+    )
