@@ -9,7 +9,7 @@ from benchmarks.report import Goal, Progress, Table
 from benchmarks.stage import GATEWAY, PLAIN, RELAY, Stage
 from benchmarks.subscribers import subscribe_tcp
 from benchmarks.workloads import DENSE, cuts
-from gateway.messages.splice import CONTENT_OFFSET
+from gateway.messages.encode import CONTENT_OFFSET
 
 TITLE: Final = "Latency: from the server's send to the subscriber's callback"
 GOAL_P50: Final = 1.10

@@ -15,7 +15,7 @@ from benchmarks.processes import Program, Worker, zenoh_keys
 from benchmarks.sender import Blast, Paced, Sent, send
 from benchmarks.subscribers import Subscription, subscribe
 from benchmarks.workloads import Workload, cuts
-from gateway.messages.splice import MESSAGE_TYPES, lcm_type_name
+from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name
 from tests.networks import free_port
 
 GATEWAY: Final = "lab"

@@ -13,7 +13,7 @@ from typing import Any, Final
 import lcm
 import zenoh
 
-from gateway.messages.splice import CONTENT_OFFSET
+from gateway.messages.encode import CONTENT_OFFSET
 from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.rtc3d.packets import PACKET_HEADER, PacketType, encode_packet

@@ -6,7 +6,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from gateway.messages.splice import CONTENT_OFFSET
+from gateway.messages.encode import CONTENT_OFFSET
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import PACKET_HEADER
 from gateway.rtc3d_server.frame_builder import FrameBuilder

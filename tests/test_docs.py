@@ -19,7 +19,7 @@ import zenoh
 
 from gateway.cli.main import app
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME
-from gateway.messages.splice import ITEMS_OFFSET, MESSAGE_TYPES
+from gateway.messages.encode import ITEMS_OFFSET, MESSAGE_TYPES
 from gateway.rtc3d.components import ITEM_DTYPES
 from gateway.simulator.scenario import load_scenario
 from tests.configurations import MODEL, load

@@ -9,7 +9,7 @@ import typer
 from gateway.config.environment import VARIABLE_PREFIX
 from gateway.config.loading import Configuration, read, read_server
 from gateway.outputs.registry import settings_type
-from gateway.rtc3d.ports import FIRST_PRINCIPLES_PORT
+from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
 from gateway.service.log_format import LogFormat, LogLevel
 
 ConfigOption = Annotated[

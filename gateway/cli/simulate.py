@@ -20,7 +20,7 @@ from gateway.cli.options import (
     RateOption,
     ToolsOption,
 )
-from gateway.rtc3d.ports import FIRST_PRINCIPLES_PORT
+from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.faults.kinds import describe_kinds, parse_fault

@@ -2,8 +2,8 @@
 
 from typing import Final
 
-from gateway.doctor.described import described_items, described_labels
 from gateway.doctor.observation import ObservedComponent, ObservedStream
+from gateway.doctor.server_description import described_items, described_labels
 from gateway.findings import Finding, Subject
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters

@@ -5,7 +5,7 @@ import numpy.typing as npt
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.findings import MessageLoad
-from gateway.messages.splice import ITEMS_OFFSET
+from gateway.messages.encode import ITEMS_OFFSET
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters_xml import ParsedParameters

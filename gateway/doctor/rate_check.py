@@ -3,8 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-from gateway.doctor.described import described_rate_hz
 from gateway.doctor.observation import ObservedStream
+from gateway.doctor.server_description import described_rate_hz
 from gateway.findings import Finding, Subject
 from gateway.rtc3d.commands import Frequency, FrequencyDivisor
 from gateway.rtc3d.components import ComponentType

@@ -12,8 +12,8 @@ from gateway.doctor.observation import ObservedStream
 from gateway.doctor.rate_check import check_rate
 from gateway.errors import ConnectError, LinkError, PacketError
 from gateway.findings import Finding, MessageLoad, Result, Subject
+from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 from gateway.rtc3d.parameters import Parameters
-from gateway.rtc3d.ports import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 
 CHECKS: Final = ("name", "TCP", "protocol", "parameters", "frames", "rate", "visibility")
 """The checks in order. Each of the first three is a condition for all that follow."""

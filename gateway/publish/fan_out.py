@@ -5,7 +5,7 @@ from collections.abc import Callable, Collection, Sequence
 from functools import lru_cache
 from typing import Final
 
-from gateway.messages.splice import MESSAGE_TYPES, has_lcm_form, lcm_content, splice_content
+from gateway.messages.encode import MESSAGE_TYPES, has_lcm_form, lcm_content, splice_content
 from gateway.messages.stamp import NOT_PUBLISHED, Stamp
 from gateway.outputs.contract import Output
 from gateway.outputs.status import OutputStatus

@@ -8,7 +8,7 @@ import rtc3d
 
 from gateway.errors import OutputError
 from gateway.log import HOLD_S, FailureLog
-from gateway.messages.splice import MESSAGE_TYPES, content_timestamp_us, lcm_type_name, splice_content
+from gateway.messages.encode import MESSAGE_TYPES, content_timestamp_us, lcm_type_name, splice_content
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import FramePublisher, Output

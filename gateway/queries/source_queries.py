@@ -8,8 +8,8 @@ from typing import Any
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import FrameError, QueryError
+from gateway.messages.encode import FINGERPRINT_BYTES, splice
 from gateway.messages.host_time import now_utime
-from gateway.messages.splice import FINGERPRINT_BYTES, splice
 from gateway.messages.stamp import NOT_PUBLISHED, PREFIX, Stamp
 from gateway.outputs.contract import Answer
 from gateway.outputs.encodings import JSON, XML, json_bytes

@@ -4,16 +4,12 @@ import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 from typing import Final
 
 from gateway.errors import CommandError, FrameError
 from gateway.rtc3d.commands import (
     Bye,
     Command,
-    Frequency,
-    FrequencyDivisor,
-    Rate,
     SendCurrentFrame,
     SendParameters,
     SetByteOrder,
@@ -28,6 +24,7 @@ from gateway.rtc3d.packets import Packet, PacketType, decode_text, encode_packet
 from gateway.rtc3d.parameters import SECTIONS, Parameters
 from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.rtc3d_server.frame_builder import DataPacket, FrameBuilder
+from gateway.rtc3d_server.frame_schedule import FrameRequest, FrameSchedule
 
 VERSION: Final = "1.0"
 NO_DATA: Final = encode_packet(PacketType.NO_DATA)
@@ -51,47 +48,6 @@ class SessionCallbacks:
     """Called when the client requests frames; returns the measurement's time in µs, None if none runs."""
 
 
-@dataclass(frozen=True, slots=True)
-class _FrameRequest:
-    """A SendCurrentFrame that waits for a frame later than ``after_us``."""
-
-    builder: FrameBuilder
-    after_us: int
-
-    @property
-    def due_us(self) -> int:
-        return self.builder.time_us(self.builder.tick_after(self.after_us))
-
-
-class _Stream:
-    """The frames of a client's StreamFrames during one measurement (§5.3.5).
-
-    Frame j of the stream is that of tick ``first_tick`` + ⌈j · stride⌉.
-    """
-
-    def __init__(self, builder: FrameBuilder, rate: Rate | None, first_tick: int) -> None:
-        self.builder = builder
-        self._first_tick = first_tick
-        stride = _stride(rate, builder.rate)
-        self._numerator, self._denominator = stride.numerator, stride.denominator
-        self._num_passed = 0  # frames of this stream that were sent or dropped
-        self.tick = first_tick
-        """The tick of the next frame."""
-        self.due_us = builder.time_us(first_tick)
-        """When the next frame is due."""
-
-    def advance(self, count: int = 1) -> None:
-        """Pass over the next ``count`` frames, which were sent or dropped."""
-        self._num_passed += count
-        self.tick = self._first_tick - (-self._num_passed * self._numerator // self._denominator)
-        self.due_us = self.builder.time_us(self.tick)
-
-    def num_due(self, elapsed_us: int) -> int:
-        """Return how many frames are due."""
-        ticks = self.builder.tick_after(elapsed_us) - 1 - self._first_tick
-        return max(0, ticks * self._denominator // self._numerator + 1 - self._num_passed)
-
-
 class ClientSession:
     """The protocol with one client, independent of the transport.
 
@@ -105,8 +61,8 @@ class ClientSession:
         self.name = "client"
         """The client's name in log messages."""
         self._subscription: StreamFrames | None = None
-        self._stream: _Stream | None = None  # of the subscription, while a measurement runs
-        self._requests: deque[_FrameRequest] = deque()  # answered first in, first out
+        self._stream: FrameSchedule | None = None  # of the subscription, while a measurement runs
+        self._requests: deque[FrameRequest] = deque()  # answered first in, first out
         self._newest_us = -1  # time stamp of the newest frame that was built for this client
         self._events_from_us: int | None = None  # time of the first event to send; None: no frames requested
         self.byte_order: ByteOrder = "big"
@@ -225,7 +181,7 @@ class ClientSession:
             self._begin_stream(command, elapsed_us)
         else:
             self._requests.append(
-                _FrameRequest(self._callbacks.frame_builder(command.components), self._newest_us)
+                FrameRequest(self._callbacks.frame_builder(command.components), self._newest_us)
             )
         if self._events_from_us is None:
             self._events_from_us = elapsed_us
@@ -235,7 +191,7 @@ class ClientSession:
         builder = self._callbacks.frame_builder(command.components)
         # a frame that is due right now is sent, unless the client already has it
         first_tick = builder.tick_after(max(elapsed_us - 1, self._newest_us))
-        self._stream = _Stream(builder, command.rate, first_tick)
+        self._stream = FrameSchedule(builder, command.rate, first_tick)
 
     def _build(self, builder: FrameBuilder, tick: int) -> DataPacket:
         time_us = builder.time_us(tick)
@@ -263,17 +219,6 @@ class ClientSession:
                 "The only data frame accepted is a recording control: one event, 1 to start, 0 to stop"
             )
         ]
-
-
-def _stride(rate: Rate | None, base_rate: Fraction) -> Fraction:
-    """Return the number of ticks of ``base_rate`` from one frame to the next, at least 1 (§5.3.5)."""
-    match rate:
-        case FrequencyDivisor(divisor):
-            return Fraction(divisor)
-        case Frequency(hz):
-            return max(Fraction(1), base_rate / Fraction(hz).limit_denominator(1_000_000))
-        case _:
-            return Fraction(1)
 
 
 def error_packet(text: str) -> bytes:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
 from gateway.errors import LinkError
 from gateway.log import FailureLog, log_fields
-from gateway.stream.adaptation import Adaptation
+from gateway.stream.change_tasks import ChangeTasks
 from gateway.stream.ingest import Ingest, Publish
 from gateway.stream.session import OnFile, Session
 from gateway.stream.state import StreamState
@@ -111,7 +111,7 @@ class Supervisor:
             self._stream,
             self._status,
             self._callbacks.publish,
-            lambda halvings: adaptation.request_rate(halvings),  # noqa: PLW0108 - assigned below
+            lambda halvings: changes.request_rate(halvings),  # noqa: PLW0108 - assigned below
             self._callbacks.on_restart,
         )
         session = Session(
@@ -126,7 +126,7 @@ class Supervisor:
         control = StreamControl(
             self._source, self._stream, self._status, session, self._callbacks.on_parameters
         )
-        adaptation = Adaptation(
+        changes = ChangeTasks(
             self._source, self._stream, self._status, control, self._callbacks.has_subscribers
         )
         try:
@@ -135,8 +135,8 @@ class Supervisor:
             self._failures.succeeded(f"streaming from {session.server}")
             self._ready_session = session
             self._callbacks.on_connected()
-            adaptation.start()
+            changes.start()
             await session.monitor()
         finally:
-            adaptation.cancel()
+            changes.cancel()
             await session.close()

@@ -19,7 +19,7 @@ import atheris
 with atheris.instrument_imports(include=["gateway"]):
     from gateway.errors import CommandError, ConfigError, FrameError, ParametersError, ProtocolError
     from gateway.messages.decode import decode, to_json
-    from gateway.messages.splice import splice
+    from gateway.messages.encode import splice
     from gateway.messages.stamp import Stamp
     from gateway.messages.summary import summarise
     from gateway.rtc3d.client_protocol import ClientProtocol

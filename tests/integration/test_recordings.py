@@ -16,7 +16,7 @@ import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.gateway import Gateway
-from gateway.messages.splice import ITEMS_OFFSET
+from gateway.messages.encode import ITEMS_OFFSET
 from gateway.outputs.contract import Output
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings

@@ -8,7 +8,7 @@ from typing import Final
 
 import pytest
 
-from tests.clones import COMPILED_MODULES, ROOT
+from tests.fresh_clones import COMPILED_MODULES, ROOT
 
 _WANTED: Final = os.environ.get("RTC3D_COMPILED") == "1"
 

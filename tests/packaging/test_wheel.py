@@ -10,7 +10,7 @@ from typing import NamedTuple
 import pytest
 
 from gateway import __version__
-from tests.clones import (
+from tests.fresh_clones import (
     COMPILED_MODULES,
     ROOT,
     SYSTEM_PYTHON,

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode, to_json
-from gateway.messages.splice import splice
+from gateway.messages.encode import splice
 from gateway.messages.stamp import Stamp
 from gateway.messages.summary import summarise
 from gateway.messages.tool_pose import tool_poses

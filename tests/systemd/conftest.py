@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator, Iterator
 import pytest
 import uvloop
 
-from tests.clones import ROOT, clone_into, files_in
+from tests.fresh_clones import ROOT, clone_into, files_in
 from tests.networks import free_endpoint
 from tests.systemd.machine import CLONE, DROP_INS, Machine, Service
 from tests.systemd.page import commands

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 
 import yaml
 
-from tests.clones import ROOT, SYSTEM_PYTHON, WHEELHOUSE, pip_environment
+from tests.fresh_clones import ROOT, SYSTEM_PYTHON, WHEELHOUSE, pip_environment
 from tests.networks import zenoh_keys
 
 UNIT: Final = "rtc3d-gateway.service"

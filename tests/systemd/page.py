@@ -3,7 +3,7 @@
 import re
 from typing import Final
 
-from tests.clones import ROOT
+from tests.fresh_clones import ROOT
 
 _PAGE: Final = (ROOT / "docs/how-to/service.md").read_text()
 _AS_ROOT: Final = 'sudo() { "$@"; }; set -e\n'

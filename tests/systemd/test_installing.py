@@ -5,7 +5,7 @@ import shutil
 
 import pytest
 
-from tests.clones import skip_if_plain
+from tests.fresh_clones import skip_if_plain
 from tests.networks import free_port, zenoh_keys
 from tests.systemd.machine import CONFIG, UNIT, Machine, Service
 from tests.systemd.page import commands, exposure

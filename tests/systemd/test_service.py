@@ -15,7 +15,7 @@ from gateway.messages.decode import decode
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_pattern, open_zenoh
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.clones import ROOT
+from tests.fresh_clones import ROOT
 from tests.networks import free_endpoint, free_port, zenoh_keys
 from tests.servers import Client, ScriptedServer, ok, packet
 from tests.systemd.machine import CONFIG, UNIT, Service

@@ -4,7 +4,7 @@ from typing import Any
 
 import rtc3d
 
-from gateway.messages.splice import splice
+from gateway.messages.encode import splice
 from gateway.messages.stamp import Stamp
 from gateway.messages.tool_pose import tool_poses
 from gateway.outputs.status import OutputHealth, OutputStatus

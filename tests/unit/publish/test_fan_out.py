@@ -6,7 +6,7 @@ import pytest
 
 from gateway.errors import OutputError
 from gateway.messages.decode import decode
-from gateway.messages.splice import splice
+from gateway.messages.encode import splice
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.memory import MemoryOutput

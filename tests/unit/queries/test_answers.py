@@ -4,7 +4,7 @@ import math
 import pytest
 import rtc3d
 
-from gateway.messages.splice import splice
+from gateway.messages.encode import splice
 from gateway.messages.stamp import Stamp
 from gateway.outputs.encodings import JSON, TEXT
 from gateway.queries.answers import message_answer, parameters_json, schema_answer

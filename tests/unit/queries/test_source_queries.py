@@ -4,7 +4,7 @@ import json
 import pytest
 
 from gateway.errors import QueryError
-from gateway.messages.splice import splice
+from gateway.messages.encode import splice
 from gateway.messages.stamp import Stamp
 from gateway.outputs.encodings import JSON, XML
 from gateway.rtc3d.components import ComponentType

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import rtc3d
 
-from gateway.messages.splice import CONTENT_OFFSET, ITEMS_OFFSET, MESSAGE_TYPES, lcm_type_name, splice
+from gateway.messages.encode import CONTENT_OFFSET, ITEMS_OFFSET, MESSAGE_TYPES, lcm_type_name, splice
 from gateway.messages.stamp import Stamp
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame

@@ -17,7 +17,7 @@ DEMAND_POLL_S: Final = 0.05
 logger = logging.getLogger(__name__)
 
 
-class Adaptation:
+class ChangeTasks:
     """Changes the stream of one session, in tasks of its own, until ``cancel``.
 
     ``has_subscribers`` says whether the stream's components may have subscribers.

@@ -3,7 +3,7 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.messages.splice import MESSAGE_TYPES, splice
+from gateway.messages.encode import MESSAGE_TYPES, splice
 from gateway.messages.stamp import Stamp
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import split_frame

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.stream.adaptation import DEMAND_POLL_S, Adaptation
+from gateway.stream.change_tasks import DEMAND_POLL_S, ChangeTasks
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
@@ -30,7 +30,7 @@ class Lab:
             source, settings, self.status, lambda *_: None, lambda _: None, self.server.connect
         )
         self._control = StreamControl(source, settings, self.status, self.session, lambda *_: None)
-        self.adaptation = Adaptation(
+        self.adaptation = ChangeTasks(
             source, settings, self.status, self._control, lambda: self.has_subscribers
         )
 
@@ -69,7 +69,7 @@ async def test_an_on_demand_stream_stops_without_subscribers_and_resumes_with_th
 async def test_each_stop_and_each_start_on_demand_happens_once_and_is_logged(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    caplog.set_level(logging.INFO, "gateway.stream.adaptation")
+    caplog.set_level(logging.INFO, "gateway.stream.change_tasks")
     lab = Lab(on_demand=True, idle_after_s=5.0)
     await lab.start()
     for has_subscribers in (False, True, False):
@@ -103,7 +103,7 @@ async def test_other_streams_run_without_subscribers() -> None:
 
 
 async def test_lateness_is_a_warning_once_and_its_end_is_reported(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.DEBUG, "gateway.stream.adaptation")
+    caplog.set_level(logging.DEBUG, "gateway.stream.change_tasks")
     lab = Lab()
     await lab.start()
     for halvings, lag_s in ((1, 0.3), (2, 0.3), (1, 0.0), (0, 0.0)):
@@ -121,7 +121,7 @@ async def test_lateness_is_a_warning_once_and_its_end_is_reported(caplog: pytest
 
 
 async def test_a_lag_of_exactly_the_maximum_is_in_time(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.DEBUG, "gateway.stream.adaptation")
+    caplog.set_level(logging.DEBUG, "gateway.stream.change_tasks")
     lab = Lab()
     await lab.start()
     for lag_s in (0.05, 0.051, 2.0):
@@ -149,7 +149,7 @@ async def test_a_server_that_only_knows_its_default_rate_is_named_so(
 
 
 async def test_the_end_of_the_connection_ends_a_change_quietly(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.DEBUG, "gateway.stream.adaptation")
+    caplog.set_level(logging.DEBUG, "gateway.stream.change_tasks")
     lab = Lab()
     await lab.start()
     lab.server.answer = silent_to("StreamFrames")
