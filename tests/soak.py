@@ -27,6 +27,7 @@ from rich.console import Console
 from gateway import version_text
 from gateway.messages.decode import decode
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_pattern, open_zenoh
+from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.simulator.faults.control import Faults
 from gateway.simulator.faults.kinds import KINDS
 from gateway.simulator.simulator import Simulator
@@ -35,7 +36,7 @@ from tests.networks import free_port
 from tests.waiting import wait_until_async
 
 RATE_HZ: Final = 200.0
-COMPONENTS: Final = ("3d", "6d", "analog", "force", "event")
+COMPONENTS: Final = tuple(COMPONENTS_BY_KEY)
 BACKOFF_S: Final = 0.5
 STALL_S: Final = 1.0
 RECOVERY_LIMIT_S: Final = 30.0

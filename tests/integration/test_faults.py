@@ -13,6 +13,7 @@ from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, rule, run_state_machine_as_test
 
+from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.simulator.faults.kinds import KINDS
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
@@ -32,7 +33,7 @@ def scene() -> SyntheticScene:
 
 def assert_well_formed(lab: Running) -> None:
     """Check that every message decodes and none came twice: sequences grow by one without a gap."""
-    for component in ("3d", "6d", "analog", "force", "event"):
+    for component in COMPONENTS_BY_KEY:
         messages = lab.messages(component)  # decodes each
         if messages:
             first = messages[0].sequence
