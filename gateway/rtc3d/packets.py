@@ -128,6 +128,9 @@ class PacketReader:
         packets: list[Packet] = []
         available = len(data)
         start = 0
+        # Struct's methods return Any. Declared as int, these are compared, and cut with, in C when compiled.
+        size: int
+        packet_type: int
         while available - start >= PACKET_HEADER_BYTES:
             size, packet_type = _unpack_header(data, start)
             limit = self._max_c3d_bytes if packet_type == _C3D else self._max_packet_bytes
