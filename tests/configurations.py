@@ -12,7 +12,7 @@ MODEL: Final[Any] = settings_type()
 
 
 def make_settings(**values: Any) -> Any:
-    """Return settings; Any, because the outputs' sections are not known to a type checker."""
+    """Return settings. Their type is Any, because type checkers do not know the sections of the outputs."""
     return MODEL(**values)
 
 
@@ -25,5 +25,5 @@ def read_server(host: str, port: int, environ: Mapping[str, str] = os.environ) -
 
 
 def load(path: Path | None, environ: Mapping[str, str] = os.environ) -> Any:
-    """Return the settings that a file and the environment configure."""
+    """Return the settings from a file and the environment."""
     return read(path, environ).settings

@@ -1,6 +1,6 @@
-"""The event loop of tests, which is the gateway's; and what they need of the machine.
+"""The event loop of the tests, and checks of what they need from the machine.
 
-Without that they skip on a user's machine, and fail in CI.
+Where something is missing, tests skip on a developer's machine and fail in CI.
 """
 
 import asyncio
@@ -28,14 +28,14 @@ _NEEDS: Final = {
     ),
     "wheelhouse": (
         _WHEELHOUSE.exists(),
-        "installs from build/wheelhouse, for there is no network here: run make wheelhouse first",
+        "installs from build/wheelhouse without a network: run make wheelhouse first",
     ),
     "systemd": (
         os.geteuid() == 0 and Path("/lib/systemd/systemd").exists(),
-        "boots a systemd of its own: needs to be root, and systemd installed",
+        "boots its own systemd: needs root and an installed systemd",
     ),
 }
-"""By marker: whether the machine has it, and what to do if not."""
+"""For each marker: whether the machine has what it needs, and what to do if not."""
 
 
 def pytest_asyncio_loop_factories() -> Mapping[str, Callable[[], asyncio.AbstractEventLoop]]:
@@ -53,5 +53,5 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 
 @pytest.fixture
 def no_hold(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Have a failure be over with the first success: HOLD_S pass between any two looks at the log's clock."""
+    """Make FailureLog report a recovery at the first success: its clock advances by HOLD_S per reading."""
     monkeypatch.setattr("gateway.log.monotonic", itertools.count(0.0, HOLD_S).__next__)

@@ -1,4 +1,4 @@
-"""The documents of this repository, and what stands in their fenced blocks."""
+"""The documents of this repository and their fenced blocks."""
 
 import re
 from pathlib import Path
@@ -10,7 +10,7 @@ _FENCED: Final = re.compile(r'^```(\w+)(?: title="([^"]+)")?\n(.*?)^```$', re.MU
 
 
 class Block(NamedTuple):
-    """A fenced block; its title is a file's name, or the terminal that commands are typed in."""
+    """A fenced block. Its title is a file name, or the terminal in which to type the commands."""
 
     document: str
     line: int
@@ -24,13 +24,13 @@ class Block(NamedTuple):
 
 
 def documents() -> list[str]:
-    """Return all Markdown files, by their path from the repository's root."""
+    """Return the paths of all Markdown files, relative to the root of the repository."""
     folders = (ROOT.glob("*.md"), *(ROOT.glob(f"{name}/**/*.md") for name in ("docs", "config", "examples")))
     return sorted(str(path.relative_to(ROOT)) for paths in folders for path in paths)
 
 
 def blocks(document: str, *languages: str) -> list[Block]:
-    """Return a document's fenced blocks in these languages, or in all."""
+    """Return the fenced blocks of a document in these languages, or in all languages."""
     text = (ROOT / document).read_text(encoding="utf-8")
     found = (
         Block(document, text.count("\n", 0, match.start()) + 1, match[1], match[2] or "", match[3])

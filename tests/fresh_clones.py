@@ -1,4 +1,4 @@
-"""What tests of installing begin with: a clean copy of this repository, and packages without a network."""
+"""Helpers for tests of installing: a clean copy of this repository, and packages without a network."""
 
 import os
 import shutil
@@ -11,30 +11,30 @@ import pytest
 
 ROOT: Final = Path(__file__).parents[1]
 WHEELHOUSE: Final = ROOT / "build/wheelhouse"
-"""All that installing downloads, by ``make wheelhouse``."""
+"""All packages that installing downloads; ``make wheelhouse`` fills it."""
 
 WHEELHOUSE_PYTHON: Final = ROOT / "build/wheelhouse-venv/bin/python"
-"""SYSTEM_PYTHON with pip, which Debian's has not."""
+"""SYSTEM_PYTHON with pip, which Debian's Python does not have."""
 
 SYSTEM_PYTHON: Final = os.environ.get("SYSTEM_PYTHON", "/usr/bin/python3")
-"""The Python to install with: one that services can reach, which a developer's own is often not."""
+"""The Python to install with. Services must be able to run it, so it must not be in a home directory."""
 
 _PROJECT: Final = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 COMPILED_MODULES: Final[list[str]] = _PROJECT["tool"]["hatch"]["build"]["targets"]["wheel"]["hooks"]["mypyc"][
     "include"
 ]
-"""The files that are compiled where there is a C compiler, from ROOT."""
+"""The paths from ROOT of the modules that are compiled if there is a C compiler."""
 
 
-def skip_if_plain(said: str) -> None:
-    """Skip a test of what is compiled where make ``said`` that it cannot be, but not in CI."""
-    if "Plain Python" in said:
-        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(said)
+def skip_if_plain(make_output: str) -> None:
+    """Skip a test of compiled modules if make reported that it cannot compile; fail in CI."""
+    if "Plain Python" in make_output:
+        (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(make_output)
 
 
 def clone_into(folder: Path) -> None:
-    """Make ``folder`` what a fresh clone of this repository would be, with what has changed since."""
+    """Copy this repository to ``folder`` as a fresh clone would, with uncommitted changes."""
     git = ("git", "-c", "safe.directory=*", "-C", str(ROOT))
     listed = subprocess.check_output([*git, "ls-files", "-coz", "--exclude-standard"], text=True)
     for name in filter(None, listed.split("\0")):
@@ -45,10 +45,10 @@ def clone_into(folder: Path) -> None:
 
 
 def files_in(folder: Path) -> set[str]:
-    """Return the paths of all files in ``folder``, from there."""
+    """Return the paths of all files in ``folder``, relative to it."""
     return {str(path.relative_to(folder)) for path in folder.rglob("*") if not path.is_dir()}
 
 
 def pip_environment(wheelhouse: Path = WHEELHOUSE) -> dict[str, str]:
-    """Return the environment in which pip, however it is called, installs without a network."""
+    """Return the environment variables with which pip and pipx install without a network."""
     return {"PIP_NO_INDEX": "1", "PIP_FIND_LINKS": str(wheelhouse)}

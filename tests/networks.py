@@ -1,4 +1,4 @@
-"""Zenoh sessions, LCM addresses and routes for tests: all on this machine's loopback."""
+"""Ports, Zenoh sessions, LCM URLs and routes for tests, all on the loopback interface."""
 
 import itertools
 import json
@@ -13,18 +13,18 @@ _MULTICAST: Final = ("224.0.0.0/4", "dev", "lo")
 
 
 def free_port() -> int:
-    """Return a TCP port of 127.0.0.1 that nobody listens on."""
+    """Return a free TCP port of 127.0.0.1."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         return int(probe.getsockname()[1])
 
 
 def free_endpoint() -> str:
-    """Return a Zenoh endpoint that nobody listens on."""
+    """Return a Zenoh endpoint on a free port."""
     return f"tcp/127.0.0.1:{free_port()}"
 
 
 def zenoh_keys(mode: str, *, connect: str | None = None, listen: str | None = None) -> dict[str, Any]:
-    """Return Zenoh's configuration for one session that meets others only at these endpoints."""
+    """Return a Zenoh configuration for a session that connects only through these endpoints."""
     return {
         "mode": mode,
         "connect": {
@@ -38,21 +38,21 @@ def zenoh_keys(mode: str, *, connect: str | None = None, listen: str | None = No
 
 
 def open_zenoh(mode: str, *, connect: str | None = None, listen: str | None = None) -> zenoh.Session:
-    """Return an open session, to be closed by the caller: a process that leaves one open never ends."""
+    """Open a session. The caller must close it, because a process with an open session does not exit."""
     keys = zenoh_keys(mode, connect=connect, listen=listen)
     return zenoh.open(zenoh.Config.from_json5(json.dumps(keys)))
 
 
 def lcm_url() -> str:
-    """Return a multicast URL that no other test of this run has: they must not hear each other."""
+    """Return a multicast URL that no other test of this run uses."""
     return f"udpm://239.255.76.67:{next(_LCM_PORTS)}?ttl=0"
 
 
 def remove_multicast_route() -> None:
-    """Take away the multicast route of the network namespace (marker netns)."""
+    """Remove the multicast route of the network namespace (marker netns)."""
     subprocess.run(["ip", "route", "del", *_MULTICAST], check=True)
 
 
 def add_multicast_route() -> None:
-    """Give the network namespace its multicast route back."""
+    """Restore the multicast route of the network namespace."""
     subprocess.run(["ip", "route", "replace", *_MULTICAST], check=True)

@@ -1,6 +1,6 @@
-"""A TCP proxy that makes trouble: between a client and a server, in either direction, at any time.
+"""A TCP proxy that disturbs connections between a client and a server, in either direction.
 
-After asyncpg's TCPFuzzingProxy.
+Modelled on TCPFuzzingProxy of asyncpg.
 """
 
 import asyncio
@@ -14,8 +14,8 @@ from typing import Self
 _READ_BYTES = 16 * 1024
 
 
-class Way:
-    """One direction through the proxy, of all its connections. What is set counts from the next bytes on."""
+class Direction:
+    """One direction of all connections through the proxy. Changes apply to the next bytes."""
 
     def __init__(self, seed: int) -> None:
         self._random = random.Random(seed)
@@ -23,30 +23,30 @@ class Way:
         self._open.set()
         self.passed_bytes = 0
         self.delay_s = 0.0
-        """How late bytes pass, at least."""
+        """The minimum delay of bytes."""
         self.segment_bytes: int | None = None
-        """How many bytes are sent at once, at most."""
+        """The maximum number of bytes in one write; None for no limit."""
         self.bytes_per_s: float | None = None
-        """How fast they are read: the proxy keeps nothing, so the sender's buffers fill."""
+        """The maximum rate of reading. The proxy has no buffer, so the buffers of the sender fill."""
         self.corrupt_share = 0.0
-        """How many of the bytes are changed, at random."""
+        """The share of bytes to change, chosen at random."""
 
     def stall(self) -> None:
-        """Pass nothing until ``resume``; connections stay."""
+        """Pass nothing until ``resume``; connections stay open."""
         self._open.clear()
 
     def resume(self) -> None:
         self._open.set()
 
     def clear(self) -> None:
-        """Pass everything at once and as it is."""
+        """Pass everything at once and unchanged."""
         self.delay_s = self.corrupt_share = 0.0
         self.segment_bytes = self.bytes_per_s = None
         self.resume()
 
     @property
     def read_bytes(self) -> int:
-        """How many bytes to read at once."""
+        """The maximum number of bytes in one read."""
         if self.bytes_per_s is None:
             return _READ_BYTES
         return max(1, min(_READ_BYTES, int(self.bytes_per_s / 50)))
@@ -67,7 +67,9 @@ class Way:
             writer.write(segment)
             await writer.drain()
             if self.segment_bytes is not None:
-                await asyncio.sleep(0)  # the loop's other work goes first: nobody reads two at once
+                await asyncio.sleep(
+                    0
+                )  # let other tasks run, so that the receiver reads each segment by itself
 
     def _corrupted(self, data: bytes) -> bytes:
         if not self.corrupt_share:
@@ -79,13 +81,13 @@ class Way:
 
 
 class FuzzingProxy:
-    """Passes connections to ``port`` on to ``server_port`` of this machine, with the trouble asked for."""
+    """Forwards connections from ``port`` to ``server_port`` of this host."""
 
     def __init__(self, server_port: int, *, port: int = 0, seed: int = 1) -> None:
         self._server_port = server_port
         self.port = port
-        self.to_client = Way(seed)
-        self.to_server = Way(seed + 1)
+        self.to_client = Direction(seed)
+        self.to_server = Direction(seed + 1)
         self.num_accepted = 0
         self._connections: set[_Connection] = set()
         self._tasks: set[asyncio.Task[None]] = set()
@@ -107,29 +109,29 @@ class FuzzingProxy:
         return len(self._connections)
 
     async def listen(self) -> None:
-        """Accept connections, again on the same port after ``vanish``."""
+        """Accept connections; after ``vanish``, on the same port again."""
         self._server = await asyncio.start_server(self._serve, "127.0.0.1", self.port)
         self.port = self._server.sockets[0].getsockname()[1]
 
     def vanish(self) -> None:
-        """Cut all connections and refuse new ones."""
+        """Reset all connections and refuse new ones."""
         if self._server is not None:
             self._server.close()
             self._server = None
         self.cut(reset=True)
 
     def cut(self, *, reset: bool = False) -> None:
-        """End all connections between two bytes, by FIN after what has passed, or by RST."""
+        """Close all connections between two bytes: with FIN after all sent bytes, or with RST."""
         for connection in list(self._connections):
             connection.end(reset=reset)
 
     def cut_after(self, num_bytes: int) -> None:
-        """End each connection once so many more bytes went to its client: within a packet, well chosen."""
+        """Close each connection after ``num_bytes`` more bytes to its client, for example within a packet."""
         for connection in self._connections:
             connection.bytes_left = num_bytes
 
     def clear(self) -> None:
-        """Make both ways well."""
+        """Remove all disturbances in both directions."""
         self.to_client.clear()
         self.to_server.clear()
 
@@ -156,7 +158,7 @@ _Streams = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
 
 class _Connection:
-    """One client's connection and the one to the server that belongs to it."""
+    """The connection of one client, and the connection to the server for it."""
 
     def __init__(self, client: _Streams, server: _Streams) -> None:
         self._client = client
@@ -164,7 +166,7 @@ class _Connection:
         self._is_over = asyncio.Event()
         self.bytes_left: int | None = None
 
-    async def run(self, to_client: Way, to_server: Way) -> None:
+    async def run(self, to_client: Direction, to_server: Direction) -> None:
         pumps = [
             asyncio.create_task(self._pump(self._server[0], self._client[1], to_client, cuts=True)),
             asyncio.create_task(self._pump(self._client[0], self._server[1], to_server)),
@@ -180,7 +182,7 @@ class _Connection:
     def end(self, *, reset: bool = False) -> None:
         for _, writer in (self._client, self._server):
             if reset:
-                if not writer.is_closing():  # else its socket may be closed already
+                if not writer.is_closing():  # otherwise its socket may be closed already
                     tcp = writer.get_extra_info("socket")
                     tcp.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
                 writer.transport.abort()
@@ -189,14 +191,19 @@ class _Connection:
         self._is_over.set()
 
     async def _pump(
-        self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, way: Way, *, cuts: bool = False
+        self,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        direction: Direction,
+        *,
+        cuts: bool = False,
     ) -> None:
         with contextlib.suppress(ConnectionError):
-            while data := await reader.read(way.read_bytes):
+            while data := await reader.read(direction.read_bytes):
                 if cuts and self.bytes_left is not None:
                     data = data[: self.bytes_left]
                     self.bytes_left -= len(data)
-                await way.send(data, writer)
+                await direction.send(data, writer)
                 if cuts and self.bytes_left == 0:
                     break
         self._is_over.set()

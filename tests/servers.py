@@ -1,4 +1,4 @@
-"""RT servers that the simulator is not: scripted, as odd as the field notes tell."""
+"""Scripted RT servers, for the deviations in the field notes that the simulator does not have."""
 
 import asyncio
 import struct
@@ -21,7 +21,7 @@ def error(text: str) -> bytes:
 
 
 def markers_frame(number: int, *positions: tuple[float, float, float], order: str = ">") -> bytes:
-    """Return a type-3 packet with one 3D component: ``number`` is its frame number, and ms its time."""
+    """Return a type-3 packet with one 3D component: frame ``number``, its time stamp ``number`` ms."""
     items = b"".join(struct.pack(order + "4f", *position, 0.1) for position in positions)
     component = (
         struct.pack(order + "IIiqI", 24 + len(items), 1, number, 1000 * number, len(positions)) + items
@@ -33,36 +33,40 @@ Script = Callable[["Client"], Awaitable[None]]
 
 
 class Client:
-    """One connection, as a script sees it."""
+    """The server's side of one connection, for a script."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._reader = reader
         self._writer = writer
 
     async def command(self) -> str:
-        """Return the next command's text; raises IncompleteReadError once the client is gone."""
-        size, packet_type = struct.unpack(">II", await self._reader.readexactly(8))
-        body = await self._reader.readexactly(size - 8)
+        """Return the text of the next command; raises IncompleteReadError if the client disconnects."""
+        packet_type, body = await self.packet()
         assert packet_type == 1
         return body.decode("ascii")
+
+    async def packet(self) -> tuple[int, bytes]:
+        """Return the type and body of the next packet; raises as ``command`` does."""
+        size, packet_type = struct.unpack(">II", await self._reader.readexactly(8))
+        return packet_type, await self._reader.readexactly(size - 8)
 
     def send(self, data: bytes) -> None:
         self._writer.write(data)
 
     async def commands(self, answer: Callable[[str], bytes | None]) -> None:
-        """Answer every command with what ``answer`` returns, until the client is gone."""
+        """Send what ``answer`` returns for each command, until the client disconnects."""
         while True:
             reply = answer(await self.command())
             if reply is not None:
                 self.send(reply)
 
     def cut(self) -> None:
-        """End the connection at once."""
+        """Abort the connection."""
         self._writer.transport.abort()
 
 
 class ScriptedServer:
-    """Runs ``script`` for every connection, on a free port; ``commands`` are all that were received."""
+    """Runs ``script`` for every connection; listens on a free port if ``port`` is 0."""
 
     def __init__(self, script: Script, port: int = 0) -> None:
         self._script = script

@@ -1,4 +1,4 @@
-"""What tests of the configuration share: a source that is complete, and the mistakes in a value."""
+"""Helpers for tests of settings: a complete source, and the mistakes that a section finds."""
 
 import pytest
 from pydantic import ValidationError
@@ -7,7 +7,7 @@ from gateway.config.section import Section
 
 
 def mistakes(model: type[Section], value: object) -> list[tuple[str, str]]:
-    """Return the location and the sentence of each mistake in ``value``."""
+    """Return the location and the text of each mistake that ``model`` finds in ``value``."""
     with pytest.raises(ValidationError) as caught:
         model.model_validate(value)
     return [(".".join(map(str, item["loc"])), item["msg"]) for item in caught.value.errors()]

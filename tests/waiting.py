@@ -1,4 +1,4 @@
-"""Waiting in tests: for a condition, never for a time."""
+"""Waiting for conditions in tests."""
 
 import asyncio
 import time
@@ -8,7 +8,7 @@ _POLL_S = 0.005
 
 
 def wait_until(condition: Callable[[], object], timeout_s: float = 10) -> None:
-    """Return as soon as ``condition`` holds; raises AssertionError if it does not within ``timeout_s``."""
+    """Wait until ``condition`` holds; raises AssertionError after ``timeout_s``."""
     deadline_s = time.monotonic() + timeout_s
     while not condition():
         if time.monotonic() > deadline_s:
@@ -17,7 +17,7 @@ def wait_until(condition: Callable[[], object], timeout_s: float = 10) -> None:
 
 
 async def wait_until_async(condition: Callable[[], object], timeout_s: float = 10) -> None:
-    """Return as soon as ``condition`` holds, letting the loop run; raises as ``wait_until`` does."""
+    """Wait until ``condition`` holds while the event loop runs; raises as ``wait_until`` does."""
     deadline_s = time.monotonic() + timeout_s
     while not condition():
         if time.monotonic() > deadline_s:

@@ -17,7 +17,7 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.simulator.faults.kinds import KINDS
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.labs import Running, gateway_to
+from tests.memory_gateway import MemoryGateway, run_gateway
 from tests.networks import free_port
 from tests.proxy import FuzzingProxy
 from tests.waiting import wait_until_async
@@ -31,7 +31,7 @@ def scene() -> SyntheticScene:
     return SyntheticScene(markers=3, tools=1, analog=2, plates=1, rate_hz=200, analog_rate_hz=200)
 
 
-def assert_well_formed(lab: Running) -> None:
+def assert_well_formed(lab: MemoryGateway) -> None:
     """Check that every message decodes and none came twice: sequences grow by one without a gap."""
     for component in COMPONENTS_BY_KEY:
         messages = lab.messages(component)  # decodes each
@@ -43,11 +43,11 @@ def assert_well_formed(lab: Running) -> None:
             assert len(set(marks)) == len(marks)
 
 
-def _more_reconnects(lab: Running, than: int) -> bool:
+def _more_reconnects(lab: MemoryGateway, than: int) -> bool:
     return lab.status.reconnects > than
 
 
-async def flows_again(lab: Running) -> None:
+async def flows_again(lab: MemoryGateway) -> None:
     """Wait for more frames than may have been in transit; the limit is generous because CI is slow."""
     before = lab.status.frames_in
     await wait_until_async(lambda: lab.status.frames_in > before + LINGERING, 20)
@@ -55,8 +55,8 @@ async def flows_again(lab: Running) -> None:
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
 async def test_after_each_fault_data_flows_again(kind: str) -> None:
-    async with Simulator(scene(), port=free_port()) as simulator, gateway_to(simulator.port) as lab:
-        await lab.heard("3d", 20)
+    async with Simulator(scene(), port=free_port()) as simulator, run_gateway(simulator.port) as lab:
+        await lab.wait_for("3d", 20)
         fault = simulator.faults.begin(KINDS[kind].model_validate({}))
         # Wait until the fault has an effect: it changed something, or the gateway noticed it.
         frames = simulator.frames_sent
@@ -80,8 +80,8 @@ async def test_after_each_fault_data_flows_again(kind: str) -> None:
     ],
 )
 async def test_the_last_error_names_the_fault(kind: str, message: str) -> None:
-    async with Simulator(scene(), port=free_port()) as simulator, gateway_to(simulator.port) as lab:
-        await lab.heard("3d", 20)
+    async with Simulator(scene(), port=free_port()) as simulator, run_gateway(simulator.port) as lab:
+        await lab.wait_for("3d", 20)
         simulator.faults.begin(KINDS[kind].model_validate({}))
         await wait_until_async(lambda: message in lab.status.last_error, 15)
         await simulator.faults.clear()
@@ -92,7 +92,7 @@ async def test_connections_cut_within_packets_lose_only_the_frames_in_transit() 
     async with (
         Simulator(scene()) as simulator,
         FuzzingProxy(simulator.port) as proxy,
-        gateway_to(proxy.port) as lab,
+        run_gateway(proxy.port) as lab,
     ):
         for _ in range(5):
             await flows_again(lab)
@@ -124,8 +124,8 @@ class ManyFaults(RuleBasedStateMachine):
     async def _start(self) -> None:
         self.simulator = await self._stack.enter_async_context(Simulator(scene(), port=free_port()))
         self.proxy = await self._stack.enter_async_context(FuzzingProxy(self.simulator.port))
-        self.lab = await self._stack.enter_async_context(gateway_to(self.proxy.port))
-        await self.lab.heard("3d")
+        self.lab = await self._stack.enter_async_context(run_gateway(self.proxy.port))
+        await self.lab.wait_for("3d")
 
     @rule(kind=st.sampled_from(sorted(KINDS)))
     def begin_a_fault_of_the_server(self, kind: str) -> None:

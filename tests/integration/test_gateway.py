@@ -15,7 +15,7 @@ from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
-from tests.labs import gateway_to
+from tests.memory_gateway import run_gateway
 from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
 
 FRAME = markers_frame(7, (1.0, 2.0, 3.0))
@@ -33,7 +33,7 @@ def obliging(command: str) -> bytes:
 
 async def test_every_component_of_the_simulator_is_published() -> None:
     scene = SyntheticScene(markers=5, tools=1, analog=3, plates=1, rate_hz=200, analog_rate_hz=200)
-    async with Simulator(scene) as simulator, gateway_to(simulator.port) as running:
+    async with Simulator(scene) as simulator, run_gateway(simulator.port) as gateway:
         for component, field, count in (
             ("3d", "num_markers", 5),
             ("6d", "num_tools", 1),
@@ -41,50 +41,56 @@ async def test_every_component_of_the_simulator_is_published() -> None:
             ("force", "num_plates", 1),
             ("event", "num_events", 1),
         ):
-            messages = await running.heard(component)
+            messages = await gateway.wait_for(component)
             assert getattr(messages[0], field) == count
-        markers = await running.heard("3d", 20)
+        markers = await gateway.wait_for("3d", 20)
         assert [message.sequence for message in markers] == list(range(len(markers)))
         assert {message.session for message in markers} == {1}
-        assert running.status.state is StreamState.STREAMING
-        assert running.status.byte_order == "big"
-        assert running.status.rate == "AllFrames"
+        assert gateway.status.state is StreamState.STREAMING
+        assert gateway.status.byte_order == "big"
+        assert gateway.status.rate == "AllFrames"
 
 
-async def test_streams_have_connections_of_their_own() -> None:
+async def test_each_stream_has_its_own_connection() -> None:
     scene = SyntheticScene(markers=2, tools=0, analog=2, plates=0, rate_hz=100, analog_rate_hz=1000)
     streams = (
         StreamSettings(components=(ComponentType.MARKERS,)),
         StreamSettings(components=(ComponentType.ANALOG,)),
     )
-    async with Simulator(scene) as simulator, gateway_to(simulator.port, streams=streams) as running:
-        analog = await running.heard("analog", 100)
+    async with Simulator(scene) as simulator, run_gateway(simulator.port, streams=streams) as gateway:
+        analog = await gateway.wait_for("analog", 100)
         numbers = [message.frame_number for message in analog]
         assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
-        await running.heard("3d", 5)
+        await gateway.wait_for("3d", 5)
         assert len(simulator.connections) == 2
 
 
-async def test_the_rate_asked_for_reaches_the_server() -> None:
+async def test_the_configured_rate_is_requested() -> None:
     scene = SyntheticScene(markers=1, rate_hz=200)
     stream = StreamSettings(components=(ComponentType.MARKERS,), rate=FrequencyDivisor(4))
-    async with Simulator(scene) as simulator, gateway_to(simulator.port, streams=(stream,)) as running:
-        numbers = [message.frame_number for message in await running.heard("3d", 10)]
+    async with (
+        Simulator(scene) as simulator,
+        run_gateway(simulator.port, streams=(stream,)) as gateway,
+    ):
+        numbers = [message.frame_number for message in await gateway.wait_for("3d", 10)]
         assert {after - before for before, after in pairwise(numbers)} == {4}
-        assert running.status.rate == "FrequencyDivisor:4"
+        assert gateway.status.rate == "FrequencyDivisor:4"
 
 
-async def test_little_endian_sessions_give_the_same_messages() -> None:
+async def test_little_endian_sessions_publish_the_same_messages() -> None:
     scene = SyntheticScene(markers=3, tools=1, analog=0, plates=0, rate_hz=200)
-    async with Simulator(scene) as simulator, gateway_to(simulator.port, byte_order="little") as running:
-        for message in (await running.heard("3d", 10))[:10]:
+    async with (
+        Simulator(scene) as simulator,
+        run_gateway(simulator.port, byte_order="little") as gateway,
+    ):
+        for message in (await gateway.wait_for("3d", 10))[:10]:
             # A scene is a function of time; frames are numbered from 1.
             [expected] = scene.items(ComponentType.MARKERS, np.array([message.frame_number - 1]))
             assert [marker.x for marker in message.markers] == expected["x"].tolist()
-        assert running.status.byte_order == "little"
+        assert gateway.status.byte_order == "little"
 
 
-async def test_bye_is_said_on_the_way_out() -> None:
+async def test_the_gateway_sends_bye_when_it_stops() -> None:
     commands: list[str] = []
 
     async def script(client: Client) -> None:
@@ -95,14 +101,14 @@ async def test_bye_is_said_on_the_way_out() -> None:
         await client.commands(answer)
 
     async with ScriptedServer(script) as server:
-        async with gateway_to(server.port) as running:
-            await running.heard("3d")
-        await running.until(lambda: commands[-1:] == ["Bye"])
+        async with run_gateway(server.port) as gateway:
+            await gateway.wait_for("3d")
+        await gateway.wait_until(lambda: commands[-1:] == ["Bye"])
     assert commands[:3] == ["Version 1.0", "SendParameters", "StreamFrames AllFrames"]
     assert commands[-1] == "Bye"
 
 
-async def test_a_server_that_knows_stream_frames_alone_streams() -> None:
+async def test_a_server_that_accepts_only_stream_frames_is_used() -> None:
     commands: list[str] = []
 
     async def script(client: Client) -> None:
@@ -113,8 +119,11 @@ async def test_a_server_that_knows_stream_frames_alone_streams() -> None:
         await client.commands(answer)
 
     stream = StreamSettings(components=(ComponentType.MARKERS,))
-    async with ScriptedServer(script) as server, gateway_to(server.port, streams=(stream,)) as running:
-        await running.heard("3d")
+    async with (
+        ScriptedServer(script) as server,
+        run_gateway(server.port, streams=(stream,)) as gateway,
+    ):
+        await gateway.wait_for("3d")
         assert commands[:5] == [
             "Version 1.0",
             "SendParameters",
@@ -122,11 +131,11 @@ async def test_a_server_that_knows_stream_frames_alone_streams() -> None:
             "StreamFrames AllFrames",
             "StreamFrames FrequencyDivisor:1",
         ]
-        assert len(running.status.limitations) == 5
-        assert "the server refused Version 1.0: err-unknown command" in running.status.limitations
+        assert len(gateway.status.limitations) == 5
+        assert "the server refused Version 1.0: err-unknown command" in gateway.status.limitations
 
 
-async def test_what_a_server_lacks_is_told_loudly_once_over_all_connections(
+async def test_a_limitation_is_logged_as_warning_only_for_the_first_connection(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.DEBUG, "gateway.stream")
@@ -141,9 +150,9 @@ async def test_what_a_server_lacks_is_told_loudly_once_over_all_connections(
 
         await client.commands(answer)
 
-    async with ScriptedServer(script) as server, gateway_to(server.port) as running:
-        await running.heard("3d")
-        assert running.status.limitations == ["the server refused Version 1.0: err-unknown command"]
+    async with ScriptedServer(script) as server, run_gateway(server.port) as gateway:
+        await gateway.wait_for("3d")
+        assert gateway.status.limitations == ["the server refused Version 1.0: err-unknown command"]
     refusals = [record for record in caplog.records if "refused Version" in record.message]
     assert [record.levelname for record in refusals[:3]] == ["WARNING", "DEBUG", "DEBUG"]
 
@@ -152,32 +161,40 @@ async def test_a_server_that_answers_no_command_but_streams_is_used() -> None:
     async def script(client: Client) -> None:
         await client.commands(lambda command: FRAME if command.startswith("StreamFrames") else None)
 
-    async with ScriptedServer(script) as server, gateway_to(server.port) as running:
-        await running.heard("3d")
-        assert "the server did not answer Version 1.0" in running.status.limitations
+    async with ScriptedServer(script) as server, run_gateway(server.port) as gateway:
+        await gateway.wait_for("3d")
+        assert "the server did not answer Version 1.0" in gateway.status.limitations
 
 
-async def test_doubled_acknowledgements_do_no_harm() -> None:
+async def test_duplicate_acknowledgements_are_ignored() -> None:
     async def script(client: Client) -> None:
         await client.commands(lambda command: obliging(command) + obliging(command))
 
-    async with ScriptedServer(script) as server, gateway_to(server.port, byte_order="little") as running:
-        await running.heard("3d", 2)
-        assert running.status.session == 1
+    async with (
+        ScriptedServer(script) as server,
+        run_gateway(server.port, byte_order="little") as gateway,
+    ):
+        await gateway.wait_for("3d", 2)
+        assert gateway.status.session == 1
 
 
-async def test_an_acknowledged_and_ignored_byte_order_is_noticed(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_byte_order_that_the_server_acknowledges_and_ignores_is_detected(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     async def script(client: Client) -> None:
         await client.commands(obliging)
 
-    async with ScriptedServer(script) as server, gateway_to(server.port, byte_order="little") as running:
-        [first, *_] = await running.heard("3d")
+    async with (
+        ScriptedServer(script) as server,
+        run_gateway(server.port, byte_order="little") as gateway,
+    ):
+        [first, *_] = await gateway.wait_for("3d")
         assert (first.markers[0].x, first.markers[0].y, first.markers[0].z) == (1.0, 2.0, 3.0)
-        assert running.status.byte_order == "big"
+        assert gateway.status.byte_order == "big"
     assert sum("big-endian" in record.message for record in caplog.records) == 1
 
 
-async def test_components_that_were_not_asked_for_are_not_published() -> None:
+async def test_components_that_were_not_requested_are_not_published() -> None:
     stream = StreamSettings(components=(ComponentType.TOOLS,))
     served = asyncio.Event()
 
@@ -188,10 +205,13 @@ async def test_components_that_were_not_asked_for_are_not_published() -> None:
 
         await client.commands(answer)
 
-    async with ScriptedServer(script) as server, gateway_to(server.port, streams=(stream,)) as running:
+    async with (
+        ScriptedServer(script) as server,
+        run_gateway(server.port, streams=(stream,)) as gateway,
+    ):
         await served.wait()
-        await running.until(lambda: running.status.frames_in > 0)
-        assert running.messages("3d") == []
+        await gateway.wait_until(lambda: gateway.status.frames_in > 0)
+        assert gateway.messages("3d") == []
 
 
 @pytest.mark.usefixtures("no_hold")
@@ -207,20 +227,20 @@ async def test_bad_frames_are_counted_and_the_next_good_one_is_published(
 
         await client.commands(answer)
 
-    async with ScriptedServer(script) as server, gateway_to(server.port) as running:
-        messages = await running.heard("3d", 2)
+    async with ScriptedServer(script) as server, run_gateway(server.port) as gateway:
+        messages = await gateway.wait_for("3d", 2)
         assert [message.frame_number for message in messages] == [7, 8]
-        assert running.status.drops == {"frame rejected": 3}
+        assert gateway.status.drops == {"frame rejected": 3}
         told = [
             record
             for record in caplog.records
             if "frame" in record.message and record.name == "gateway.stream.session"
         ]
         assert [record.levelname for record in told] == ["WARNING", "DEBUG", "DEBUG", "INFO"]
-        assert "frame rejected" in running.status.last_error
+        assert "frame rejected" in gateway.status.last_error
 
 
-async def test_unknown_components_are_counted_and_told_once(caplog: pytest.LogCaptureFixture) -> None:
+async def test_unknown_components_are_counted_and_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     unknown = struct.pack(">IIII", 1, 12, 9, 0)
 
     async def script(client: Client) -> None:
@@ -229,9 +249,9 @@ async def test_unknown_components_are_counted_and_told_once(caplog: pytest.LogCa
 
         await client.commands(answer)
 
-    async with ScriptedServer(script) as server, gateway_to(server.port) as running:
-        await running.heard("3d", 2)
-        assert running.status.drops == {"unknown component": 2}
+    async with ScriptedServer(script) as server, run_gateway(server.port) as gateway:
+        await gateway.wait_for("3d", 2)
+        assert gateway.status.drops == {"unknown component": 2}
     assert sum("unknown type [9]" in record.message for record in caplog.records) == 1
 
 
@@ -246,51 +266,52 @@ async def test_unknown_components_are_counted_and_told_once(caplog: pytest.LogCa
         (b"", "the connection to"),
     ],
 )
-async def test_after_a_server_that_talks_nonsense_the_next_connection_streams(
-    first_words: bytes, reason: str
-) -> None:
+async def test_after_invalid_data_the_gateway_reconnects_and_streams(first_words: bytes, reason: str) -> None:
     async def script(client: Client) -> None:
         if server.connections == 1:
             client.send(first_words)
         else:
             await client.commands(obliging)
 
-    async with ScriptedServer(script) as server, gateway_to(server.port) as running:
-        [message, *_] = await running.heard("3d")
-        assert reason in running.status.last_error
-        assert str(server.port) in running.status.last_error
-        assert (message.session, message.sequence) == (running.status.session, 0)
-        assert running.status.reconnects >= 1
+    async with ScriptedServer(script) as server, run_gateway(server.port) as gateway:
+        [message, *_] = await gateway.wait_for("3d")
+        assert reason in gateway.status.last_error
+        assert str(server.port) in gateway.status.last_error
+        assert (message.session, message.sequence) == (gateway.status.session, 0)
+        assert gateway.status.reconnects >= 1
 
 
-async def test_a_server_that_is_not_there_is_waited_for() -> None:
+async def test_the_gateway_retries_until_the_server_is_started() -> None:
     async with ScriptedServer(lambda client: client.commands(obliging)) as taken:
         port = taken.port
-    async with gateway_to(port) as running:
-        await running.until(lambda: running.status.reconnects >= 2)
-        assert f"refused by 127.0.0.1:{port}" in running.status.last_error
+    async with run_gateway(port) as gateway:
+        await gateway.wait_until(lambda: gateway.status.reconnects >= 2)
+        assert f"refused by 127.0.0.1:{port}" in gateway.status.last_error
         async with ScriptedServer(lambda client: client.commands(obliging), port):
-            await running.heard("3d")
+            await gateway.wait_for("3d")
 
 
-async def test_a_host_that_does_not_exist_is_told_by_name() -> None:
-    async with gateway_to(3020, host="no-such-host.invalid") as running:
-        await running.until(lambda: bool(running.status.last_error))
-        assert "'no-such-host.invalid' is not known" in running.status.last_error
+async def test_the_error_for_an_unknown_host_contains_its_name() -> None:
+    async with run_gateway(3020, host="no-such-host.invalid") as gateway:
+        await gateway.wait_until(lambda: bool(gateway.status.last_error))
+        assert "'no-such-host.invalid' is not known" in gateway.status.last_error
 
 
-async def test_a_server_that_goes_silent_in_a_measurement_is_left() -> None:
+async def test_silence_during_a_measurement_ends_the_connection() -> None:
     async def script(client: Client) -> None:
         await client.commands(lambda command: obliging(command) if server.connections < 3 else None)
 
-    async with ScriptedServer(script) as server, gateway_to(server.port, stall_timeout_s=0.4) as running:
-        messages = await running.heard("3d", 2)
+    async with (
+        ScriptedServer(script) as server,
+        run_gateway(server.port, stall_timeout_s=0.4) as gateway,
+    ):
+        messages = await gateway.wait_for("3d", 2)
         assert [message.session for message in messages] == [1, 2]
         assert [message.sequence for message in messages] == [0, 1]
-        assert "although a measurement runs" in running.status.last_error
+        assert "although a measurement runs" in gateway.status.last_error
 
 
-async def test_silence_without_a_measurement_is_no_fault_if_the_server_answers() -> None:
+async def test_silence_without_a_measurement_is_accepted_if_the_server_answers() -> None:
     probes = asyncio.Event()
 
     async def script(client: Client) -> None:
@@ -304,13 +325,16 @@ async def test_silence_without_a_measurement_is_no_fault_if_the_server_answers()
 
         await client.commands(answer)
 
-    async with ScriptedServer(script) as server, gateway_to(server.port, stall_timeout_s=0.3) as running:
+    async with (
+        ScriptedServer(script) as server,
+        run_gateway(server.port, stall_timeout_s=0.3) as gateway,
+    ):
         await probes.wait()
-        assert running.status.state is StreamState.NO_MEASUREMENT
+        assert gateway.status.state is StreamState.NO_MEASUREMENT
         assert server.connections == 1
 
 
-async def test_silence_without_a_measurement_and_without_answers_is_a_fault() -> None:
+async def test_silence_without_a_measurement_and_without_answers_ends_the_connection() -> None:
     async def script(client: Client) -> None:
         streaming = False
 
@@ -323,29 +347,35 @@ async def test_silence_without_a_measurement_and_without_answers_is_a_fault() ->
 
         await client.commands(answer)
 
-    async with ScriptedServer(script) as server, gateway_to(server.port, stall_timeout_s=0.3) as running:
-        await running.until(lambda: server.connections >= 2)
-        assert "sends no frames" in running.status.last_error
+    async with (
+        ScriptedServer(script) as server,
+        run_gateway(server.port, stall_timeout_s=0.3) as gateway,
+    ):
+        await gateway.wait_until(lambda: server.connections >= 2)
+        assert "sends no frames" in gateway.status.last_error
 
 
 async def test_a_measurement_that_starts_later_is_streamed() -> None:
     scene = SyntheticScene(markers=1, rate_hz=200)
     async with Simulator(scene) as simulator:
         simulator.stop_measurement()
-        async with gateway_to(simulator.port) as running:
-            await running.until(lambda: running.status.state is StreamState.NO_MEASUREMENT)
+        async with run_gateway(simulator.port) as gateway:
+            await gateway.wait_until(lambda: gateway.status.state is StreamState.NO_MEASUREMENT)
             simulator.start_measurement()
-            await running.heard("3d", 5)
-            assert running.status.session == 1
+            await gateway.wait_for("3d", 5)
+            assert gateway.status.session == 1
 
 
-async def test_the_status_tells_what_the_gateway_knows() -> None:
+async def test_the_status_describes_streams_and_outputs() -> None:
     async def script(client: Client) -> None:
         await client.commands(obliging)
 
-    async with ScriptedServer(script) as server, gateway_to(server.port, stall_timeout_s=60) as running:
-        await running.heard("3d")
-        [status, *_] = await running.heard("status")
+    async with (
+        ScriptedServer(script) as server,
+        run_gateway(server.port, stall_timeout_s=60) as gateway,
+    ):
+        await gateway.wait_for("3d")
+        [status, *_] = await gateway.wait_for("status")
         assert isinstance(status, rtc3d.status_t)
         assert (status.source, status.server) == ("lab", f"127.0.0.1:{server.port}")
         [stream] = status.streams
@@ -356,14 +386,14 @@ async def test_the_status_tells_what_the_gateway_knows() -> None:
         assert [(count.name, count.count) for count in output.messages] == [("3d", 1)]
 
 
-async def test_a_failure_is_told_once_and_its_end(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_failure_is_logged_once_and_so_is_its_end(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
     async with ScriptedServer(lambda client: client.commands(obliging)) as taken:
         port = taken.port
-    async with gateway_to(port) as running:
-        await running.until(lambda: running.status.reconnects >= 3)
+    async with run_gateway(port) as gateway:
+        await gateway.wait_until(lambda: gateway.status.reconnects >= 3)
         async with ScriptedServer(lambda client: client.commands(obliging), port):
-            await running.heard("3d")
+            await gateway.wait_for("3d")
     refused = [record for record in caplog.records if "refused by" in record.message]
     assert [record.levelname for record in refused[:3]] == ["WARNING", "DEBUG", "DEBUG"]
     [recovered] = [record for record in caplog.records if "streaming from" in record.message]

@@ -17,7 +17,7 @@ from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.rtc3d.parameters import SECTIONS
 from tests.networks import free_port, lcm_url
-from tests.querying import LabServer, gateway_at, is_filled, queries_of
+from tests.queried_gateway import ParameterServer, output_queries, run_gateway, wait_until_cached
 from tests.servers import ScriptedServer
 from tests.spec_parameters import in_root, spec_xml
 from tests.waiting import wait_until_async
@@ -78,19 +78,19 @@ def request(
 
 
 class Lab(NamedTuple):
-    server: LabServer
+    server: ParameterServer
     gateway: Gateway
     peer: Peer
 
 
 @asynccontextmanager
-async def lab(server: LabServer | None = None, **settings: Any) -> AsyncIterator[Lab]:
-    server, url = server or LabServer(), lcm_url()
+async def lab(server: ParameterServer | None = None, **settings: Any) -> AsyncIterator[Lab]:
+    server, url = server or ParameterServer(), lcm_url()
     async with (
         ScriptedServer(server.script) as listening,
-        gateway_at(listening.port, lcm_url=url, **settings) as gateway,
+        run_gateway(listening.port, lcm_url=url, **settings) as gateway,
     ):
-        await is_filled(gateway, server)
+        await wait_until_cached(gateway, server)
         peer = Peer(url)
         try:
             yield Lab(server, gateway, peer)
@@ -98,7 +98,7 @@ async def lab(server: LabServer | None = None, **settings: Any) -> AsyncIterator
             peer.close()
 
 
-async def test_a_reply_has_the_requests_id_and_requester_the_xml_and_its_age() -> None:
+async def test_a_reply_has_id_and_requester_of_the_request_and_the_xml_with_its_age() -> None:
     async with lab() as (server, _, peer):
         peer.send(request(-(2**63), requester="Fluß, 2. Stock"))
         await wait_until_async(lambda: peer.replies)
@@ -109,14 +109,14 @@ async def test_a_reply_has_the_requests_id_and_requester_the_xml_and_its_age() -
         assert (reply.error, reply.error_code) == ("", "")
 
 
-async def test_requests_may_come_on_a_url_of_their_own() -> None:
+async def test_requests_can_use_a_separate_url() -> None:
     data_url, queries_url = lcm_url(), lcm_url()
-    server = LabServer()
+    server = ParameterServer()
     async with (
         ScriptedServer(server.script) as listening,
-        gateway_at(listening.port, lcm_url=data_url, queries_url=queries_url) as gateway,
+        run_gateway(listening.port, lcm_url=data_url, queries_url=queries_url) as gateway,
     ):
-        await is_filled(gateway, server)
+        await wait_until_cached(gateway, server)
         elsewhere, peer = Peer(data_url, data_url), Peer(data_url, queries_url)
         try:
             elsewhere.send(request(1))  # nobody is there
@@ -128,13 +128,13 @@ async def test_requests_may_come_on_a_url_of_their_own() -> None:
             peer.close()
 
 
-async def test_a_url_for_requests_that_does_not_open_stops_nothing_else(
+async def test_a_queries_url_that_does_not_open_does_not_stop_the_output(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     data_url, nobody = lcm_url(), f"tcpq://127.0.0.1:{free_port()}"
     async with (
-        ScriptedServer(LabServer().script) as listening,
-        gateway_at(listening.port, lcm_url=data_url, queries_url=nobody),
+        ScriptedServer(ParameterServer().script) as listening,
+        run_gateway(listening.port, lcm_url=data_url, queries_url=nobody),
     ):
         viewer = Peer(data_url)
         try:
@@ -145,13 +145,13 @@ async def test_a_url_for_requests_that_does_not_open_stops_nothing_else(
 
 
 @pytest.mark.parametrize("section", SECTIONS)
-async def test_each_section_comes_verbatim(section: str) -> None:
+async def test_each_section_is_answered_unchanged(section: str) -> None:
     async with lab() as (_, _, peer):
         assert (await peer.ask(1, [section])).xml.encode() == spec_xml(section)
 
 
-async def test_several_sections_are_asked_for_at_once() -> None:
-    server = LabServer()
+async def test_several_sections_are_requested_with_one_command() -> None:
+    server = ParameterServer()
     server.sections["3d force"] = both = in_root("<The_3D/>", "<Force/>")
     async with lab(server) as (_, _, peer):
         assert (await peer.ask(1, ["force", "3d", "3d"])).xml.encode() == both
@@ -162,15 +162,15 @@ async def test_several_sections_are_asked_for_at_once() -> None:
         assert server.count("SendParameters") == asked
 
 
-async def test_fresh_parameters_are_the_servers_of_now() -> None:
+async def test_fresh_parameters_are_requested_from_the_server() -> None:
     async with lab() as (server, _, peer):
         server.sections["3d"] = b"<RT_Parameters><The_3D/></RT_Parameters>"
         assert (await peer.ask(1, ["3d"])).xml.encode() == spec_xml("3d")
         assert (await peer.ask(2, ["3d"], fresh=True)).xml == "<RT_Parameters><The_3D/></RT_Parameters>"
 
 
-async def test_xml_that_is_not_utf8_and_ends_in_nuls_becomes_text() -> None:
-    server = LabServer()
+async def test_xml_in_latin1_with_trailing_nuls_is_decoded() -> None:
+    server = ParameterServer()
     server.sections["3d"] = (
         "<RT_Parameters><The_3D><Unit>µm</Unit></The_3D></RT_Parameters>".encode("latin-1") + b"\0"
     )
@@ -179,7 +179,7 @@ async def test_xml_that_is_not_utf8_and_ends_in_nuls_becomes_text() -> None:
         assert reply.xml == "<RT_Parameters><The_3D><Unit>µm</Unit></The_3D></RT_Parameters>"
 
 
-async def test_an_unknown_section_is_answered_with_those_there_are() -> None:
+async def test_the_error_for_an_unknown_section_lists_the_known_ones() -> None:
     async with lab() as (_, _, peer):
         reply = await peer.ask(1, ["3d", "Markers\x1b[31m"])
         assert reply.error_code == "bad-request"
@@ -189,9 +189,9 @@ async def test_an_unknown_section_is_answered_with_those_there_are() -> None:
         assert (reply.xml, reply.age_s) == ("", 0)
 
 
-async def test_without_a_server_the_reason_is_told_and_since_when() -> None:
+async def test_without_a_connection_the_error_has_the_reason_and_its_age() -> None:
     url, port = lcm_url(), free_port()
-    async with gateway_at(port, lcm_url=url) as gateway:
+    async with run_gateway(port, lcm_url=url) as gateway:
         [status] = gateway.sources[0].statuses
         await wait_until_async(lambda: status.last_error)
         peer = Peer(url)
@@ -208,11 +208,17 @@ async def test_without_a_server_the_reason_is_told_and_since_when() -> None:
 @pytest.mark.parametrize(
     ("attribute", "code", "text"),
     [
-        ("refused", "refused", "the server does not know SendParameters, or refuses it: err-unknown command"),
-        ("silent", "timeout", "did not answer SendParameters within 0.3 s"),
+        (
+            "refused_commands",
+            "refused",
+            "the server does not know SendParameters, or refuses it: err-unknown command",
+        ),
+        ("ignored_commands", "timeout", "did not answer SendParameters within 0.3 s"),
     ],
 )
-async def test_what_a_server_does_not_give_is_told(attribute: str, code: str, text: str) -> None:
+async def test_a_refusal_or_missing_reply_of_the_server_is_an_error(
+    attribute: str, code: str, text: str
+) -> None:
     async with lab(reply_timeout_s=0.3) as (server, _, peer):
         setattr(server, attribute, ("SendParameters",))
         reply = await peer.ask(fresh=True)
@@ -241,18 +247,18 @@ async def test_malformed_requests_are_counted_and_ignored() -> None:
         assert (await peer.ask(7)).error == ""
         await wait_until_async(lambda: peer.ignored("malformed request") == len(malformed))
         assert [reply.request_id for reply in peer.replies] == [7]
-        queries = queries_of(gateway)
+        queries = output_queries(gateway)
         assert queries.results == {"ok": 1}
 
 
-async def test_the_queue_is_bounded_and_what_is_beyond_it_is_counted() -> None:
+async def test_requests_beyond_the_queue_are_dropped_and_counted() -> None:
     async with lab(reply_timeout_s=20.0, query_timeout_s=20.0) as (server, gateway, peer):
-        queries = queries_of(gateway)
+        queries = output_queries(gateway)
 
         def waiting(count: int) -> bool:
             return len(queries._tasks) == count
 
-        server.open.clear()
+        server.may_answer.clear()
         for number in range(MAX_PENDING):
             peer.send(request(number, fresh=True))
             # LCM's own queue is bounded too: no faster than the gateway takes them out of it.
@@ -261,7 +267,7 @@ async def test_the_queue_is_bounded_and_what_is_beyond_it_is_counted() -> None:
         peer.send(request(1001))
         await wait_until_async(lambda: peer.ignored("request beyond the queue") == 2)
         before = server.count("SendParameters")
-        server.open.set()
+        server.may_answer.set()
         await wait_until_async(lambda: len(peer.replies) == MAX_PENDING)
         assert {reply.error for reply in peer.replies} == {""}
         assert server.count("SendParameters") == before
@@ -275,10 +281,12 @@ async def test_the_queue_is_bounded_and_what_is_beyond_it_is_counted() -> None:
         assert not peer.answers(1000)
 
 
-async def test_who_has_a_reply_may_ask_again_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_requester_can_send_the_next_request_as_soon_as_it_has_a_reply(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("gateway.outputs.lcm.queries.MAX_PENDING", 1)
     async with lab() as (_, gateway, peer):
-        queries = queries_of(gateway)
+        queries = output_queries(gateway)
         assert isinstance(queries, LcmQueries)
         publish, free, could_ask = queries._publish, queries._free, []
 
@@ -293,7 +301,7 @@ async def test_who_has_a_reply_may_ask_again_at_once(monkeypatch: pytest.MonkeyP
         assert could_ask == [True]
 
 
-async def test_replies_of_others_are_no_requests() -> None:
+async def test_a_reply_on_the_request_channel_is_a_malformed_request() -> None:
     async with lab() as (_, _, peer):
         reply = rtc3d.parameters_reply_t()
         peer.send(reply.encode())
@@ -301,7 +309,7 @@ async def test_replies_of_others_are_no_requests() -> None:
         assert peer.replies == []
 
 
-async def test_two_who_ask_with_the_same_number_are_told_apart() -> None:
+async def test_replies_to_requests_with_the_same_id_name_their_requester() -> None:
     async with lab() as (_, _, peer):
         peer.send(request(1, requester="one"))
         peer.send(request(1, requester="two"))
@@ -309,11 +317,11 @@ async def test_two_who_ask_with_the_same_number_are_told_apart() -> None:
         assert sorted(reply.requester for reply in peer.replies) == ["one", "two"]
 
 
-async def test_requests_under_way_end_with_the_gateway() -> None:
+async def test_pending_requests_are_cancelled_when_the_gateway_stops() -> None:
     async with lab(reply_timeout_s=20.0, query_timeout_s=20.0) as (server, gateway, peer):
-        server.silent = ("SendParameters",)
+        server.ignored_commands = ("SendParameters",)
         peer.send(request(1, fresh=True))
-        queries = queries_of(gateway)
+        queries = output_queries(gateway)
         await wait_until_async(lambda: queries._tasks)
     assert queries._tasks == set()
     assert peer.replies == []

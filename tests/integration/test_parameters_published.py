@@ -15,7 +15,14 @@ from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
-from tests.querying import LabServer, ask, asker_at, gateway_at, is_filled, parameters_of
+from tests.queried_gateway import (
+    ParameterServer,
+    parameters_xml,
+    query,
+    run_gateway,
+    wait_until_cached,
+    zenoh_peer,
+)
 from tests.servers import ScriptedServer, markers_frame
 from tests.spec_parameters import in_root
 from tests.waiting import wait_until_async
@@ -81,12 +88,10 @@ def ears(router: str, url: str) -> Iterator[Ears]:
     session.close()
 
 
-async def test_everyone_hears_of_a_connection_and_of_a_server_that_comes_back_with_other_parameters(
-    router: str, url: str, ears: Ears
-) -> None:
+async def test_parameters_are_published_for_every_connection(router: str, url: str, ears: Ears) -> None:
     port = free_port()
-    async with gateway_at(port, router=router, lcm_url=url):
-        first, second = LabServer("Marker of the morning"), LabServer("Marker of the evening")
+    async with run_gateway(port, router=router, lcm_url=url):
+        first, second = ParameterServer("Marker of the morning"), ParameterServer("Marker of the evening")
         async with ScriptedServer(first.script, port):
             await ears.hear(first.xml)
             [message, *_] = ears.lcm
@@ -95,31 +100,33 @@ async def test_everyone_hears_of_a_connection_and_of_a_server_that_comes_back_wi
         async with ScriptedServer(second.script, port):
             await ears.hear(second.xml)
             assert ears.lcm[-1].session > message.session
-            with asker_at(router) as asker:
-                assert (await ask(asker, KEY)).payload == second.xml
+            with zenoh_peer(router) as peer:
+                assert (await query(peer, KEY)).payload == second.xml
 
 
-async def test_everyone_hears_again_when_the_gateway_restarts(router: str, url: str, ears: Ears) -> None:
-    server = LabServer()
+async def test_parameters_are_published_again_after_a_restart_of_the_gateway(
+    router: str, url: str, ears: Ears
+) -> None:
+    server = ParameterServer()
     async with ScriptedServer(server.script) as listening:
-        async with gateway_at(listening.port, router=router, lcm_url=url):
+        async with run_gateway(listening.port, router=router, lcm_url=url):
             await ears.hear(server.xml)
-        server.xml = parameters_of("Changed meanwhile")
-        async with gateway_at(listening.port, router=router, lcm_url=url):
+        server.xml = parameters_xml("Changed meanwhile")
+        async with run_gateway(listening.port, router=router, lcm_url=url):
             await ears.hear(server.xml)
             assert ears.lcm[-1].session == 1
 
 
-async def test_the_first_to_come_late_hear_what_was_told(
+async def test_the_first_subscribers_get_the_parameters_although_they_are_late(
     router: str, url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(lcm_queries, "REPEAT_S", 0.05)
-    server = LabServer()
+    server = ParameterServer()
     async with (
         ScriptedServer(server.script) as listening,
-        gateway_at(listening.port, router=router, lcm_url=url) as gateway,
+        run_gateway(listening.port, router=router, lcm_url=url) as gateway,
     ):
-        await is_filled(gateway, server)
+        await wait_until_cached(gateway, server)
         asked = list(server.commands)
         session = open_zenoh("client", connect=router)
         ears = Ears(session, url)
@@ -133,24 +140,24 @@ async def test_the_first_to_come_late_hear_what_was_told(
             session.close()
 
 
-async def test_a_late_subscriber_with_a_history_hears_what_was_told_and_nobody_hears_it_again(
+async def test_only_the_late_subscriber_with_a_history_gets_the_parameters_again(
     router: str, url: str, ears: Ears
 ) -> None:
-    server = LabServer()
+    server = ParameterServer()
     async with (
         ScriptedServer(server.script) as listening,
-        gateway_at(listening.port, router=router, lcm_url=url),
+        run_gateway(listening.port, router=router, lcm_url=url),
     ):
         await ears.hear(server.xml)
         late: list[bytes] = []
         session = open_zenoh("client", connect=router)
         try:
-            with asker_at(router) as asker:
-                await ask(asker, KEY)  # what was told before has arrived everywhere
+            with zenoh_peer(router) as peer:
+                await query(peer, KEY)  # what was told before has arrived everywhere
                 told = len(ears.plain)
                 subscriber = listen_with_history(session, late)
                 await wait_until_async(lambda: late)
-                await ask(asker, KEY)
+                await query(peer, KEY)
             assert late == [server.xml]
             assert len(ears.plain) == told
             subscriber.undeclare()
@@ -158,61 +165,57 @@ async def test_a_late_subscriber_with_a_history_hears_what_was_told_and_nobody_h
             session.close()
 
 
-async def test_everyone_hears_of_parameters_that_a_fresh_question_finds_changed(
-    router: str, url: str, ears: Ears
-) -> None:
-    server = LabServer()
+async def test_a_change_found_by_a_fresh_query_is_published(router: str, url: str, ears: Ears) -> None:
+    server = ParameterServer()
     async with (
         ScriptedServer(server.script) as listening,
-        gateway_at(listening.port, router=router, lcm_url=url) as gateway,
+        run_gateway(listening.port, router=router, lcm_url=url) as gateway,
     ):
-        await is_filled(gateway, server)
+        await wait_until_cached(gateway, server)
         await ears.hear(server.xml)
-        server.xml = parameters_of("One more", "Marker 1")
-        with asker_at(router) as asker:
-            assert (await ask(asker, f"{KEY}?fresh=true")).payload == server.xml
+        server.xml = parameters_xml("One more", "Marker 1")
+        with zenoh_peer(router) as peer:
+            assert (await query(peer, f"{KEY}?fresh=true")).payload == server.xml
             await ears.hear(server.xml)
 
             await wait_until_async(lambda: not gateway.sources[0]._tasks)  # each section is known anew
-            server.xml = parameters_of("Another")
+            server.xml = parameters_xml("Another")
             server.sections["3d"] = in_root("<The_3D><Unit>cm</Unit></The_3D>")
-            assert (await ask(asker, f"{KEY}/3d?fresh=true")).payload == server.sections["3d"]
+            assert (await query(peer, f"{KEY}/3d?fresh=true")).payload == server.sections["3d"]
             await ears.hear(server.xml)  # all, though only a section was asked for
-            assert (await ask(asker, f"{KEY}/3d")).payload == server.sections["3d"]
+            assert (await query(peer, f"{KEY}/3d")).payload == server.sections["3d"]
 
 
-async def test_statistics_of_the_server_that_change_are_told_to_nobody(
-    router: str, url: str, ears: Ears
-) -> None:
-    server = LabServer()
+async def test_a_change_of_the_statistics_is_not_published(router: str, url: str, ears: Ears) -> None:
+    server = ParameterServer()
     async with (
         ScriptedServer(server.script) as listening,
-        gateway_at(listening.port, router=router, lcm_url=url) as gateway,
+        run_gateway(listening.port, router=router, lcm_url=url) as gateway,
     ):
-        await is_filled(gateway, server)
+        await wait_until_cached(gateway, server)
         await ears.hear(server.xml)
         told = len(ears.lcm), len(ears.plain)
         server.xml = server.xml.replace(b"<FramesSent>1<", b"<FramesSent>22<")
-        with asker_at(router) as asker:
-            assert b">22<" in (await ask(asker, f"{KEY}?fresh=true")).payload
-        server.xml = parameters_of("Other")
-        with asker_at(router) as asker:
-            await ask(asker, f"{KEY}?fresh=true")
+        with zenoh_peer(router) as peer:
+            assert b">22<" in (await query(peer, f"{KEY}?fresh=true")).payload
+        server.xml = parameters_xml("Other")
+        with zenoh_peer(router) as peer:
+            await query(peer, f"{KEY}?fresh=true")
         await ears.hear(server.xml)
         between = [message.xml.encode() for message in ears.lcm[told[0] :]] + ears.plain[told[1] :]
         assert not any(b">22<" in xml for xml in between)
 
 
-async def test_nothing_is_lost_while_two_hundred_questions_are_answered(router: str) -> None:
+async def test_no_frame_is_lost_while_two_hundred_queries_are_answered(router: str) -> None:
     scene = SyntheticScene(markers=10, tools=2, analog=4, plates=1, rate_hz=200, analog_rate_hz=200)
     sequences: list[int] = []
     async with Simulator(scene) as simulator:
         simulator.stop_measurement()
-        async with gateway_at(simulator.port, router=router) as gateway:
+        async with run_gateway(simulator.port, router=router) as gateway:
             [source] = gateway.sources
             await wait_until_async(lambda: source.statuses[0].state.value == "no measurement")
-            with asker_at(router) as asker:
-                asker.declare_subscriber(
+            with zenoh_peer(router) as peer:
+                peer.declare_subscriber(
                     "mocap/lab/3d",
                     lambda sample: sequences.append(decode(sample.payload.to_bytes()).sequence),
                 )
@@ -221,31 +224,31 @@ async def test_nothing_is_lost_while_two_hundred_questions_are_answered(router: 
                 keys = ("parameters?fresh=true", "parameters/3d", "6d", "*?format=json")
                 for start in range(0, 200, 20):
                     selectors = [f"mocap/lab/{keys[number % 4]}" for number in range(start, start + 20)]
-                    await asyncio.gather(*(ask_or_more(asker, selector) for selector in selectors))
+                    await asyncio.gather(*(ask_or_more(peer, selector) for selector in selectors))
                 await wait_until_async(lambda: len(sequences) > 50)
                 simulator.stop_measurement()
                 await wait_until_async(lambda: len(sequences) >= simulator.sent["3d"])
     assert sequences == list(range(simulator.sent["3d"]))
 
 
-async def ask_or_more(asker: zenoh.Session, selector: str) -> None:
-    replies = await asyncio.to_thread(lambda: list(asker.get(selector, timeout=20)))
+async def ask_or_more(peer: zenoh.Session, selector: str) -> None:
+    replies = await asyncio.to_thread(lambda: list(peer.get(selector, timeout=20)))
     assert replies
     assert all(reply.ok is not None for reply in replies)
 
 
-async def test_frames_between_a_command_and_its_reply_flow_on() -> None:
-    server, endpoint = LabServer(), free_endpoint()
+async def test_frames_between_a_command_and_its_reply_are_published() -> None:
+    server, endpoint = ParameterServer(), free_endpoint()
     async with (
         ScriptedServer(server.script) as listening,
-        gateway_at(listening.port, listen=endpoint) as gateway,
+        run_gateway(listening.port, listen=endpoint) as gateway,
     ):
-        await is_filled(gateway, server)
+        await wait_until_cached(gateway, server)
         published = gateway.sources[0].fan_out
-        with asker_at(endpoint) as asker:
-            server.open.clear()
+        with zenoh_peer(endpoint) as peer:
+            server.may_answer.clear()
             before = server.count("SendParameters")
-            asked = asyncio.create_task(ask(asker, f"{KEY}?fresh=true"))
+            asked = asyncio.create_task(query(peer, f"{KEY}?fresh=true"))
             await wait_until_async(lambda: server.count("SendParameters") > before)
             for number in range(8, 108):
                 server.send(markers_frame(number, (1.0, 2.0, 3.0)))
@@ -253,7 +256,7 @@ async def test_frames_between_a_command_and_its_reply_flow_on() -> None:
                 lambda: {decode(message).frame_number for message in published.newest.values()} == {107}
             )
             assert not asked.done()
-            server.open.set()
+            server.may_answer.set()
             assert (await asked).payload == server.xml
             [newest] = published.newest.values()
             assert decode(newest).sequence == 100  # the first frame, and one hundred

@@ -15,7 +15,7 @@ import zenoh
 from gateway.outputs.encodings import json_bytes
 from gateway.outputs.lcm import queries as lcm_queries
 from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
-from tests.querying import LabServer, gateway_at, is_filled
+from tests.queried_gateway import ParameterServer, run_gateway, wait_until_cached
 from tests.servers import ScriptedServer
 from tests.spec_parameters import spec_xml
 from tests.waiting import wait_until_async
@@ -43,7 +43,7 @@ async def run(*arguments: str) -> Completed:
 
 
 class Lab(NamedTuple):
-    server: LabServer
+    server: ParameterServer
     endpoint: str
     url: str
 
@@ -55,23 +55,23 @@ class Lab(NamedTuple):
 
 
 @asynccontextmanager
-async def lab(server: LabServer | None = None, **settings: Any) -> AsyncIterator[Lab]:
-    server, endpoint, url = server or LabServer(), free_endpoint(), lcm_url()
+async def lab(server: ParameterServer | None = None, **settings: Any) -> AsyncIterator[Lab]:
+    server, endpoint, url = server or ParameterServer(), free_endpoint(), lcm_url()
     async with (
         ScriptedServer(server.script) as listening,
-        gateway_at(listening.port, listen=endpoint, lcm_url=url, **settings) as gateway,
+        run_gateway(listening.port, listen=endpoint, lcm_url=url, **settings) as gateway,
     ):
-        await is_filled(gateway, server)
+        await wait_until_cached(gateway, server)
         yield Lab(server, endpoint, url)
 
 
 @asynccontextmanager
 async def lab_without_server() -> AsyncIterator[tuple[int, Lab]]:
     port, endpoint, url = free_port(), free_endpoint(), lcm_url()
-    async with gateway_at(port, listen=endpoint, lcm_url=url) as gateway:
+    async with run_gateway(port, listen=endpoint, lcm_url=url) as gateway:
         [status] = gateway.sources[0].statuses
         await wait_until_async(lambda: status.last_error)
-        yield port, Lab(LabServer(), endpoint, url)
+        yield port, Lab(ParameterServer(), endpoint, url)
 
 
 sides = pytest.mark.parametrize("side", ["zenoh", "lcm"])
@@ -79,7 +79,7 @@ sides = pytest.mark.parametrize("side", ["zenoh", "lcm"])
 
 @sides
 async def test_a_table_is_printed_by_default(side: str) -> None:
-    async with lab(LabServer("Left knee")) as at:
+    async with lab(ParameterServer("Left knee")) as at:
         done = await run("params", *at.options(side))
     assert (done.status, done.stderr) == (0, "")
     for text in ("lab: general", "lab: 3D, 1 marker, 100 Hz, mm", "Left knee", "lab: parameters are "):
@@ -171,7 +171,7 @@ async def test_a_gateway_without_its_server_is_status_4(side: str) -> None:
 @sides
 async def test_a_server_that_does_not_answer_is_status_5(side: str) -> None:
     async with lab(reply_timeout_s=0.3) as at:
-        at.server.silent = ("SendParameters",)
+        at.server.ignored_commands = ("SendParameters",)
         done = await run("params", "--fresh", *at.options(side))
     assert done.status == 5
     assert "did not answer SendParameters within 0.3 s" in done.stderr
@@ -180,7 +180,7 @@ async def test_a_server_that_does_not_answer_is_status_5(side: str) -> None:
 @sides
 async def test_a_gateway_that_does_not_answer_in_time_is_status_5(side: str) -> None:
     async with lab(reply_timeout_s=20.0, query_timeout_s=20.0) as at:
-        at.server.silent = ("SendParameters",)
+        at.server.ignored_commands = ("SendParameters",)
         done = await run("params", "--fresh", "--timeout", "0.2", *at.options(side))
     assert done.status == 5
     assert "within 0.2 s although a gateway is running" in done.stderr
@@ -189,7 +189,7 @@ async def test_a_gateway_that_does_not_answer_in_time_is_status_5(side: str) -> 
 @sides
 async def test_a_server_that_does_not_know_the_command_is_status_1(side: str) -> None:
     async with lab() as at:
-        at.server.refused = ("SendParameters",)
+        at.server.refused_commands = ("SendParameters",)
         done = await run("params", "--fresh", *at.options(side))
     assert done.status == 1
     assert "the server does not know SendParameters, or refuses it: err-unknown command" in done.stderr
@@ -212,15 +212,15 @@ async def test_a_wrong_command_line_is_status_2(arguments: list[str], text: str)
 
 
 async def test_a_source_without_a_server_does_not_hide_other_sources() -> None:
-    endpoint, server = free_endpoint(), LabServer()
+    endpoint, server = free_endpoint(), ParameterServer()
     router = open_zenoh("router", listen=endpoint)
     try:
         async with (
             ScriptedServer(server.script) as listening,
-            gateway_at(listening.port, router=endpoint) as gateway,
-            gateway_at(free_port(), router=endpoint, name="hall"),
+            run_gateway(listening.port, router=endpoint) as gateway,
+            run_gateway(free_port(), router=endpoint, name="hall"),
         ):
-            await is_filled(gateway, server)
+            await wait_until_cached(gateway, server)
             done = await run("params", "3d", "--json", "--connect", endpoint)
     finally:
         router.close()
@@ -230,17 +230,21 @@ async def test_a_source_without_a_server_does_not_hide_other_sources() -> None:
 
 
 async def test_sources_of_the_same_name_on_two_gateways_are_both_shown() -> None:
-    endpoint, first, second = free_endpoint(), LabServer("of the first"), LabServer("of the second")
+    endpoint, first, second = (
+        free_endpoint(),
+        ParameterServer("of the first"),
+        ParameterServer("of the second"),
+    )
     router = open_zenoh("router", listen=endpoint)
     try:
         async with (
             ScriptedServer(first.script) as a,
             ScriptedServer(second.script) as b,
-            gateway_at(a.port, router=endpoint) as one,
-            gateway_at(b.port, router=endpoint) as other,
+            run_gateway(a.port, router=endpoint) as one,
+            run_gateway(b.port, router=endpoint) as other,
         ):
-            await is_filled(one, first)
-            await is_filled(other, second)
+            await wait_until_cached(one, first)
+            await wait_until_cached(other, second)
             done = await run("params", "--json", "--connect", endpoint)
     finally:
         router.close()
@@ -252,15 +256,15 @@ async def test_sources_of_the_same_name_on_two_gateways_are_both_shown() -> None
 
 
 async def test_several_sources_are_found_on_lcm() -> None:
-    url, first, second = lcm_url(), LabServer("of the first"), LabServer("of the second")
+    url, first, second = lcm_url(), ParameterServer("of the first"), ParameterServer("of the second")
     async with (
         ScriptedServer(first.script) as a,
         ScriptedServer(second.script) as b,
-        gateway_at(a.port, lcm_url=url) as one,
-        gateway_at(b.port, lcm_url=url, name="hall-2") as other,
+        run_gateway(a.port, lcm_url=url) as one,
+        run_gateway(b.port, lcm_url=url, name="hall-2") as other,
     ):
-        await is_filled(one, first)
-        await is_filled(other, second)
+        await wait_until_cached(one, first)
+        await wait_until_cached(other, second)
         done = await run("params", "--json", "--lcm", "--url", url)
     assert (done.status, done.stderr) == (0, "")
     labels = {

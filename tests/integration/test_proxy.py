@@ -27,7 +27,7 @@ async def proxied(num_markers: int = 2) -> AsyncIterator[tuple[Simulator, Fuzzin
         yield simulator, proxy, client
 
 
-async def test_it_passes_everything_both_ways() -> None:
+async def test_the_proxy_passes_everything_in_both_directions() -> None:
     async with proxied() as (_, proxy, client):
         assert await client.ask("Version 1.0") == VERSION
         await client.ask("StreamFrames 3D")
@@ -40,7 +40,7 @@ async def test_it_passes_everything_both_ways() -> None:
         await until(lambda: proxy.num_connections == 0)
 
 
-async def test_each_client_has_a_connection_of_its_own() -> None:
+async def test_each_client_has_its_own_connection_to_the_server() -> None:
     async with proxied() as (simulator, proxy, client), connected(proxy) as other:
         assert [await client.ask("Version 1.0"), await other.ask("Version 1.0")] == [VERSION] * 2
         assert (proxy.num_accepted, len(simulator.connections)) == (2, 2)
@@ -62,7 +62,7 @@ async def test_a_cut_reaches_both_sides(reset: bool) -> None:
             assert await again.ask("Version 1.0") == VERSION
 
 
-async def test_a_cut_can_be_at_any_byte() -> None:
+async def test_a_connection_can_be_cut_after_any_byte() -> None:
     reply = packet(*VERSION)
     for num_bytes in (1, 8, len(reply) - 1, len(reply)):
         async with proxied() as (simulator, proxy, client):
@@ -85,7 +85,7 @@ async def test_a_vanished_server_refuses_connections_until_it_listens_again() ->
             assert await again.ask("Version 1.0") == VERSION
 
 
-async def test_one_way_can_stall_and_the_other_not() -> None:
+async def test_one_direction_can_stall_while_the_other_passes_bytes() -> None:
     async with proxied() as (simulator, proxy, client):
         await until(lambda: bool(simulator.connections))
         [connection] = simulator.connections
@@ -107,7 +107,7 @@ async def test_one_way_can_stall_and_the_other_not() -> None:
         assert await client.read() == VERSION
 
 
-async def test_what_is_delayed_comes_whole_and_in_order() -> None:
+async def test_delayed_bytes_arrive_complete_and_in_order() -> None:
     async with proxied() as (_, proxy, client):
         proxy.to_client.delay_s = 0.01
         await client.ask("StreamFrames 3D")
@@ -124,7 +124,7 @@ async def test_segments_can_be_small() -> None:
         assert proxy.to_client.passed_bytes == 10 * len(reply)
 
 
-async def test_bytes_can_be_corrupt_the_same_for_the_same_seed() -> None:
+async def test_the_same_seed_corrupts_the_same_bytes() -> None:
     heard = []
     for seed in (1, 1, 2):
         async with Simulator(CountingScene()) as simulator, FuzzingProxy(simulator.port, seed=seed) as proxy:
@@ -139,7 +139,7 @@ async def test_bytes_can_be_corrupt_the_same_for_the_same_seed() -> None:
     assert heard[0] == heard[1] != heard[2]
 
 
-async def test_a_slow_reader_fills_the_servers_buffers(caplog: pytest.LogCaptureFixture) -> None:
+async def test_a_slow_reader_fills_the_buffers_of_the_server(caplog: pytest.LogCaptureFixture) -> None:
     async with proxied(num_markers=5000) as (simulator, proxy, client):
         proxy.to_client.bytes_per_s = 10_000
         client.send(command("StreamFrames 3D"))
@@ -152,7 +152,7 @@ async def test_a_slow_reader_fills_the_servers_buffers(caplog: pytest.LogCapture
         await until(lambda: simulator.frames_dropped > 0)
 
 
-async def test_without_its_server_it_ends_connections_at_once() -> None:
+async def test_without_a_server_the_proxy_closes_connections_at_once() -> None:
     async with Simulator(CountingScene()) as simulator:
         port = simulator.port
     async with FuzzingProxy(port) as proxy, connected(proxy) as client:

@@ -17,43 +17,43 @@ from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.queries.service import SourceQueryService
 from gateway.queries.source_queries import SourceQueries
 from tests.networks import free_endpoint, open_zenoh
-from tests.querying import ask, asker_at, gateway_at, lab, queries_of
+from tests.queried_gateway import gateway_with_server, output_queries, query, run_gateway, zenoh_peer
 from tests.servers import packet
 from tests.waiting import wait_until_async
 
 
-async def test_a_defect_is_told_to_the_asker_and_logged(
+async def test_a_defect_is_logged_and_reported_to_the_peer(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     def fail(_desk: SourceQueries, _question: object) -> None:
         raise ZeroDivisionError("of all things")
 
-    async with lab() as (server, _, _, asker):
+    async with gateway_with_server() as (server, _, _, peer):
         monkeypatch.setattr(SourceQueries, "_recording", fail)
-        reply = await ask(asker, "mocap/lab/recording")
+        reply = await query(peer, "mocap/lab/recording")
         assert reply.code == "defect"
         assert "ZeroDivisionError('of all things')" in reply.error
         assert "ZeroDivisionError" in caplog.text
-        assert (await ask(asker, "mocap/lab/parameters")).payload == server.xml
+        assert (await query(peer, "mocap/lab/parameters")).payload == server.xml
 
 
-async def test_questions_beyond_the_limit_are_told_to_come_again(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_queries_beyond_the_limit_are_refused_as_busy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zenoh_queries, "MAX_PENDING", 2)
-    async with lab() as (server, _, gateway, asker):
-        queries = queries_of(gateway)
-        server.open.clear()
-        waiting = [asyncio.create_task(ask(asker, "mocap/lab/parameters?fresh=true")) for _ in range(2)]
+    async with gateway_with_server() as (server, _, gateway, peer):
+        queries = output_queries(gateway)
+        server.may_answer.clear()
+        waiting = [asyncio.create_task(query(peer, "mocap/lab/parameters?fresh=true")) for _ in range(2)]
         await wait_until_async(lambda: len(queries._tasks) == 2)
-        reply = await ask(asker, "mocap/lab/status")
+        reply = await query(peer, "mocap/lab/status")
         assert (reply.code, reply.error) == ("busy", "the gateway has too many queries; try again")
-        server.open.set()
+        server.may_answer.set()
         assert {reply.payload for reply in await asyncio.gather(*waiting)} == {server.xml}
-        assert (await ask(asker, "mocap/lab/status")).payload
+        assert (await query(peer, "mocap/lab/status")).payload
         # A reply can arrive before it is counted.
         await wait_until_async(lambda: queries.results == {"busy": 1, "ok": 3})
 
 
-async def test_askers_see_at_once_that_the_gateway_ends() -> None:
+async def test_queries_end_at_once_when_the_gateway_closes() -> None:
     endpoint = free_endpoint()
     router = open_zenoh("router", listen=endpoint)
     service = SilentService()
@@ -61,12 +61,12 @@ async def test_askers_see_at_once_that_the_gateway_ends() -> None:
     session = open_zenoh("client", connect=endpoint)
     try:
         queries.open(session, ["lab"])
-        with asker_at(endpoint) as asker:
+        with zenoh_peer(endpoint) as peer:
             ended = asyncio.Event()
             loop = asyncio.get_running_loop()
             replies: list[zenoh.Reply] = []
             end = zenoh.handlers.Callback(replies.append, drop=lambda: loop.call_soon_threadsafe(ended.set))
-            asker.get("mocap/lab/status", end, timeout=60)
+            peer.get("mocap/lab/status", end, timeout=60)
             await service.asked.wait()
             await queries.close()
             async with asyncio.timeout(10):
@@ -77,7 +77,7 @@ async def test_askers_see_at_once_that_the_gateway_ends() -> None:
         router.close()
 
 
-async def test_without_time_stamps_late_subscribers_must_ask_and_the_log_says_how_to_change_it(
+async def test_without_time_stamps_the_log_says_how_to_enable_the_cache_for_late_subscribers(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     endpoint = free_endpoint()
@@ -87,8 +87,8 @@ async def test_without_time_stamps_late_subscribers_must_ask_and_the_log_says_ho
         queries = ZenohQueries("mocap", SilentService(), asyncio.get_running_loop())
         queries.open(session, ["lab"])
         assert "set timestamping: {enabled: true} in Zenoh's configuration file" in caplog.text
-        with asker_at(endpoint) as asker:
-            asker.declare_subscriber(
+        with zenoh_peer(endpoint) as peer:
+            peer.declare_subscriber(
                 "mocap/lab/parameters", lambda sample: heard.append(sample.payload.to_bytes())
             )
             queries.publish_parameters("lab", b"<RT_Parameters/>")
@@ -114,7 +114,7 @@ class SilentService(SourceQueryService):
         return await never
 
 
-async def test_parameters_published_after_zenoh_has_closed_do_no_harm() -> None:
+async def test_publishing_parameters_after_zenoh_has_closed_is_ignored() -> None:
     endpoint = free_endpoint()
     session = open_zenoh("peer", listen=endpoint)
     queries = ZenohQueries("mocap", SilentService(), asyncio.get_running_loop())
@@ -126,19 +126,19 @@ async def test_parameters_published_after_zenoh_has_closed_do_no_harm() -> None:
     queries.publish_parameters("lab", b"<RT_Parameters/>")
 
 
-async def test_a_file_that_cannot_be_kept_is_logged_and_the_stream_goes_on(
+async def test_a_file_that_cannot_be_stored_is_logged_and_the_stream_continues(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     (tmp_path / "spool").write_text("a file where the folder should be")
-    async with lab(spool=tmp_path / "spool") as (server, _, _, asker):
+    async with gateway_with_server(spool=tmp_path / "spool") as (server, _, _, peer):
         server.send(packet(5, b"content"))
         await wait_until_async(lambda: "cannot be kept in" in caplog.text)
-        assert (await ask(asker, "mocap/lab/c3d")).code == "nothing-yet"
-        assert (await ask(asker, "mocap/lab/parameters?fresh=true")).payload == server.xml
+        assert (await query(peer, "mocap/lab/c3d")).code == "nothing-yet"
+        assert (await query(peer, "mocap/lab/parameters?fresh=true")).payload == server.xml
     assert any(record.levelno == logging.ERROR for record in caplog.records)
 
 
-async def test_files_that_come_faster_than_the_disk_takes_them_are_dropped_and_told(
+async def test_files_that_arrive_faster_than_the_disk_writes_are_dropped_and_logged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     disk, store = threading.Event(), Spool.store
@@ -149,7 +149,7 @@ async def test_files_that_come_faster_than_the_disk_takes_them_are_dropped_and_t
 
     monkeypatch.setattr(Spool, "store", slow)
     try:
-        async with lab(spool=tmp_path) as (server, _, _, _):
+        async with gateway_with_server(spool=tmp_path) as (server, _, _, _):
             for number in range(6):
                 server.send(packet(5, b"content %d" % number))
             await wait_until_async(lambda: caplog.text.count("4 earlier files are still being written") == 2)
@@ -161,16 +161,16 @@ async def test_files_that_come_faster_than_the_disk_takes_them_are_dropped_and_t
         disk.set()
 
 
-async def test_a_deleted_file_is_not_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async with lab(spool=tmp_path) as (_, _, gateway, _):
+async def test_a_deleted_file_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    async with gateway_with_server(spool=tmp_path) as (_, _, gateway, _):
         [source] = gateway.sources
         monkeypatch.setattr(Spool, "newest", lambda _spool, _source: tmp_path / "gone.c3d")
         with pytest.raises(QueryError, match=r"gone\.c3d cannot be read: No such file or directory"):
             await source._last_c3d()
 
 
-async def test_a_gateway_whose_zenoh_is_not_open_yet_starts_and_ends() -> None:
-    async with gateway_at(1, router=free_endpoint()) as gateway:
-        queries = queries_of(gateway)
+async def test_a_gateway_runs_and_stops_while_zenoh_is_not_open() -> None:
+    async with run_gateway(1, router=free_endpoint()) as gateway:
+        queries = output_queries(gateway)
         queries.publish_parameters("lab", b"<RT_Parameters/>")
         assert gateway.sources

@@ -33,7 +33,7 @@ from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.configurations import make_settings
 from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
-from tests.querying import LabServer, ask, ask_all, asker_at
+from tests.queried_gateway import ParameterServer, query, query_all, zenoh_peer
 from tests.servers import Client, ScriptedServer, ok, packet
 from tests.waiting import wait_until_async
 
@@ -133,7 +133,7 @@ async def test_equal_settings_change_nothing() -> None:
             assert len(server.connections) == 1
 
 
-async def test_a_source_that_changes_leaves_the_others_alone_and_goes_on_with_its_numbers() -> None:
+async def test_a_changed_source_keeps_its_numbering_and_other_sources_are_not_affected() -> None:
     site = Site()
     async with (
         simulator() as kept,
@@ -155,29 +155,29 @@ async def test_a_source_that_changes_leaves_the_others_alone_and_goes_on_with_it
             assert [session for session, _ in ears.numbers["mocap/moved/3d"]][-1] == 2
 
 
-async def test_sources_come_and_go_with_their_keys_channels_and_answers() -> None:
-    site, server, other = Site(), LabServer("of lab"), LabServer("of new")
+async def test_sources_are_added_and_removed_with_their_keys_and_queries() -> None:
+    site, server, other = Site(), ParameterServer("of lab"), ParameterServer("of new")
     async with (
         ScriptedServer(server.script) as lab,
         ScriptedServer(other.script) as new,
         running(site.settings({"lab": lab.port, "gone": lab.port})) as gateway,
     ):
-        with asker_at(site.endpoint) as asker:
+        with zenoh_peer(site.endpoint) as peer:
             await wait_until_async(lambda: server.count("SendParameters") >= 14)
             changes = await gateway.reload(site.settings({"new": new.port, "lab": lab.port}))
             assert changes == ["source gone removed", "source new added"]
             assert [source.name for source in gateway.sources] == ["new", "lab"]
             assert server.count("Bye") == 1
             await wait_until_async(lambda: other.count("SendParameters") >= 7)
-            assert b"of new" in (await ask(asker, "mocap/new/parameters")).payload
-            assert b"of lab" in (await ask(asker, "mocap/lab/parameters")).payload
-            assert await ask_all(asker, "mocap/gone/parameters") == []
-            alive = await asyncio.to_thread(lambda: list(asker.liveliness().get("mocap/*/alive", timeout=5)))
+            assert b"of new" in (await query(peer, "mocap/new/parameters")).payload
+            assert b"of lab" in (await query(peer, "mocap/lab/parameters")).payload
+            assert await query_all(peer, "mocap/gone/parameters") == []
+            alive = await asyncio.to_thread(lambda: list(peer.liveliness().get("mocap/*/alive", timeout=5)))
             keys = {str(reply.ok.key_expr) for reply in alive if reply.ok}
             assert keys == {"mocap/lab/alive", "mocap/new/alive"}
 
 
-async def test_an_output_that_changes_is_opened_anew_and_the_other_loses_nothing() -> None:
+async def test_a_changed_output_is_reopened_and_the_other_output_loses_nothing() -> None:
     site = Site()
     async with simulator() as server, running(site.settings({"lab": server.port})) as gateway:
         with ears_at(site) as ears:
@@ -193,8 +193,8 @@ async def test_an_output_that_changes_is_opened_anew_and_the_other_loses_nothing
             assert len(server.connections) == 1
 
 
-async def test_zenoh_is_opened_anew_at_the_same_address_and_tells_what_is_known() -> None:
-    site, server = Site(), LabServer("known")
+async def test_zenoh_reopens_at_the_same_address_and_publishes_cached_parameters() -> None:
+    site, server = Site(), ParameterServer("known")
     async with (
         ScriptedServer(server.script) as lab,
         running(site.settings({"lab": lab.port})) as gateway,
@@ -204,18 +204,18 @@ async def test_zenoh_is_opened_anew_at_the_same_address_and_tells_what_is_known(
         assert await gateway.reload(changed) == ["output zenoh changed"]
         await wait_until_async(lambda: gateway.outputs[0].health().connected)
         heard: list[bytes] = []
-        with asker_at(site.endpoint) as asker:
-            subscriber = asker.declare_subscriber(
+        with zenoh_peer(site.endpoint) as peer:
+            subscriber = peer.declare_subscriber(
                 "other/lab/parameters", lambda sample: heard.append(sample.payload.to_bytes())
             )
-            assert b"known" in (await ask(asker, "other/lab/parameters")).payload
+            assert b"known" in (await query(peer, "other/lab/parameters")).payload
             await wait_until_async(lambda: heard)
             assert b"known" in heard[0]
-            assert await ask_all(asker, "mocap/lab/parameters") == []
+            assert await query_all(peer, "mocap/lab/parameters") == []
             subscriber.undeclare()
 
 
-async def test_outputs_are_switched_off_and_on() -> None:
+async def test_an_output_can_be_disabled_and_enabled() -> None:
     site = Site()
     async with simulator() as server, running(site.settings({"lab": server.port})) as gateway:
         with ears_at(site) as ears:
@@ -229,7 +229,7 @@ async def test_outputs_are_switched_off_and_on() -> None:
             assert ears.numbers["MOCAP_LAB_3D"][heard][1] == ears.numbers["MOCAP_LAB_3D"][heard - 1][1] + 1
 
 
-async def test_other_contents_of_zenohs_own_file_count(tmp_path: Path) -> None:
+async def test_a_changed_zenoh_configuration_file_reopens_the_output(tmp_path: Path) -> None:
     site, file = Site(), tmp_path / "zenoh.json5"
     other = free_endpoint()
     file.write_text(json.dumps(zenoh_keys("peer", listen=site.endpoint)))
@@ -239,11 +239,11 @@ async def test_other_contents_of_zenohs_own_file_count(tmp_path: Path) -> None:
         file.write_text(json.dumps(zenoh_keys("peer", listen=other)))
         assert await gateway.reload(settings) == ["output zenoh changed"]
         await wait_until_async(lambda: gateway.outputs[0].health().connected)
-        with asker_at(other) as asker:
-            await ask(asker, "mocap/lab/status")
+        with zenoh_peer(other) as peer:
+            await query(peer, "mocap/lab/status")
 
 
-async def test_what_zenoh_refuses_is_refused_whole(tmp_path: Path) -> None:
+async def test_a_configuration_that_zenoh_refuses_changes_nothing(tmp_path: Path) -> None:
     site, file = Site(), tmp_path / "zenoh.json5"
     async with simulator() as server, running(site.settings({"lab": server.port})) as gateway:
         with ears_at(site) as ears:
@@ -257,7 +257,7 @@ async def test_what_zenoh_refuses_is_refused_whole(tmp_path: Path) -> None:
             assert [source.name for source in gateway.sources] == ["lab"]
 
 
-async def test_files_go_to_the_new_folder(tmp_path: Path) -> None:
+async def test_files_are_stored_in_the_new_folder(tmp_path: Path) -> None:
     clients: list[Client] = []
 
     async def script(client: Client) -> None:
@@ -295,7 +295,7 @@ async def test_metrics_move_to_another_port(caplog: pytest.LogCaptureFixture) ->
     await task
 
 
-async def test_a_stop_in_the_middle_of_a_reload_closes_everything() -> None:
+async def test_stopping_during_a_reload_closes_everything() -> None:
     site = Site()
     async with simulator() as first, simulator() as second:
         async with running(site.settings({"lab": first.port})) as gateway:

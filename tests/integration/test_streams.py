@@ -11,7 +11,7 @@ from gateway.config.settings import StreamSettings
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
-from tests.labs import gateway_to
+from tests.memory_gateway import run_gateway
 from tests.servers import Client, ScriptedServer, markers_frame, ok, packet
 
 XML = packet(2, "<RT_Parameters Ver='1.00'><The_3D/></RT_Parameters>")
@@ -55,27 +55,27 @@ async def test_an_on_demand_stream_runs_while_it_has_subscribers() -> None:
     stream = StreamSettings(on_demand=True, idle_after_s=0.1)
     async with (
         ScriptedServer(server.script) as listening,
-        gateway_to(listening.port, streams=(stream,)) as lab,
+        run_gateway(listening.port, streams=(stream,)) as lab,
     ):
         for rounds in (1, 2, 3):
-            await lab.until(partial(server.has, START, rounds))
+            await lab.wait_until(partial(server.has, START, rounds))
             server.stream(ORIGIN)
-            await lab.heard("3d", rounds)
+            await lab.wait_for("3d", rounds)
             lab.output.has_subscriber = False
-            await lab.until(partial(server.has, STOP, rounds))
-            await lab.until(lambda: lab.status.state is StreamState.IDLE)
+            await lab.wait_until(partial(server.has, STOP, rounds))
+            await lab.wait_until(lambda: lab.status.state is StreamState.IDLE)
             lab.output.has_subscriber = True
         assert lab.status.session == 1
 
 
 async def test_other_streams_run_without_subscribers() -> None:
     server = Recorder()
-    async with ScriptedServer(server.script) as listening, gateway_to(listening.port) as lab:
+    async with ScriptedServer(server.script) as listening, run_gateway(listening.port) as lab:
         lab.output.has_subscriber = False
-        await lab.until(lambda: server.count(START) == 1)
+        await lab.wait_until(lambda: server.count(START) == 1)
         for number in range(1, 20):
             server.stream(ORIGIN)
-            await lab.heard("3d", number)
+            await lab.wait_for("3d", number)
         assert server.count(STOP) == 0
 
 
@@ -83,17 +83,17 @@ async def test_a_changed_number_of_markers_makes_the_gateway_ask_for_parameters(
     server = Recorder()
     async with (
         ScriptedServer(server.script) as listening,
-        gateway_to(listening.port, fresh_interval_s=0.05) as lab,
+        run_gateway(listening.port, fresh_interval_s=0.05) as lab,
     ):
-        await lab.until(lambda: server.count("SendParameters Events") == 1)  # the cache is filled
+        await lab.wait_until(lambda: server.count("SendParameters Events") == 1)  # the cache is filled
         asked = server.count("SendParameters")
         server.stream(ORIGIN)
         server.stream(ORIGIN)
-        await lab.heard("3d", 2)
+        await lab.wait_for("3d", 2)
         assert server.count("SendParameters") == asked
         server.stream(ORIGIN, ORIGIN)
-        await lab.until(lambda: server.count("SendParameters") == asked + 1)
-        assert [message.num_markers for message in await lab.heard("3d", 3)] == [1, 1, 2]
+        await lab.wait_until(lambda: server.count("SendParameters") == asked + 1)
+        assert [message.num_markers for message in await lab.wait_for("3d", 3)] == [1, 1, 2]
 
 
 def tasks_of_sources() -> list[asyncio.Task[Any]]:
@@ -105,26 +105,26 @@ def tasks_of_sources() -> list[asyncio.Task[Any]]:
 async def test_a_planned_question_for_parameters_is_cancelled_with_the_source() -> None:
     server = Recorder()
     async with ScriptedServer(server.script) as listening:
-        async with gateway_to(listening.port, fresh_interval_s=1000) as lab:
-            await lab.until(lambda: server.count(START) == 1)
+        async with run_gateway(listening.port, fresh_interval_s=1000) as lab:
+            await lab.wait_until(lambda: server.count(START) == 1)
             server.stream(ORIGIN)
-            await lab.heard("3d", 1)
+            await lab.wait_for("3d", 1)
             before = len(tasks_of_sources())
             server.stream(ORIGIN, ORIGIN)
-            await lab.until(lambda: len(tasks_of_sources()) == before + 1)
+            await lab.wait_until(lambda: len(tasks_of_sources()) == before + 1)
         await asyncio.sleep(0)  # lets the cancelled task run
         assert tasks_of_sources() == []
 
 
 async def test_time_stamps_that_go_back_are_a_restart_without_a_reconnect() -> None:
     server = Recorder()
-    async with ScriptedServer(server.script) as listening, gateway_to(listening.port) as lab:
-        await lab.until(lambda: server.count(START) == 1)
+    async with ScriptedServer(server.script) as listening, run_gateway(listening.port) as lab:
+        await lab.wait_until(lambda: server.count(START) == 1)
         for _ in range(5):
             server.stream(ORIGIN)
         server.number = 0
         server.stream(ORIGIN)
-        await lab.heard("3d", 6)
+        await lab.wait_for("3d", 6)
         assert lab.status.restarts == 1
         assert lab.status.session == 1
 
@@ -133,15 +133,15 @@ async def test_states_follow_the_server_and_the_outputs_show_them(caplog: pytest
     caplog.set_level("INFO")
     async with Simulator(SyntheticScene(rate_hz=200)) as simulator:
         simulator.stop_measurement()
-        async with gateway_to(simulator.port) as lab:
-            await lab.until(lambda: lab.status.state is StreamState.NO_MEASUREMENT)
+        async with run_gateway(simulator.port) as lab:
+            await lab.wait_until(lambda: lab.status.state is StreamState.NO_MEASUREMENT)
             assert not lab.output.streaming
             simulator.start_measurement()
-            await lab.until(lambda: lab.status.state is StreamState.STREAMING)
-            await lab.until(lambda: lab.output.streaming == {"lab"})
+            await lab.wait_until(lambda: lab.status.state is StreamState.STREAMING)
+            await lab.wait_until(lambda: lab.output.streaming == {"lab"})
             simulator.stop_measurement()
-            await lab.until(lambda: lab.status.state is StreamState.NO_MEASUREMENT)
-            await lab.until(lambda: not lab.output.streaming)
+            await lab.wait_until(lambda: lab.status.state is StreamState.NO_MEASUREMENT)
+            await lab.wait_until(lambda: not lab.output.streaming)
     changes = [record.message for record in caplog.records if "→" in record.message]
     assert sum("no measurement → streaming" in change for change in changes) == 1
     assert sum("streaming → no measurement" in change for change in changes) == 1
@@ -154,8 +154,8 @@ async def test_late_frames_make_the_gateway_request_a_lower_rate_until_they_are_
     monkeypatch.setattr("gateway.stream.rate_control.FIRST_WAIT_S", 0.3)
     caplog.set_level("INFO", "gateway.stream")
     server = Recorder()
-    async with ScriptedServer(server.script) as listening, gateway_to(listening.port) as lab:
-        await lab.until(lambda: server.count(START) == 1)
+    async with ScriptedServer(server.script) as listening, run_gateway(listening.port) as lab:
+        await lab.wait_until(lambda: server.count(START) == 1)
         loop = asyncio.get_running_loop()
         start_s = loop.time()
 
@@ -172,9 +172,9 @@ async def test_late_frames_make_the_gateway_request_a_lower_rate_until_they_are_
 
         await stream_until("StreamFrames FrequencyDivisor:2", late_after_s=3)
         assert lab.status.lag_s > 0.05
-        await lab.until(lambda: lab.status.rate == "FrequencyDivisor:2")
+        await lab.wait_until(lambda: lab.status.rate == "FrequencyDivisor:2")
         await stream_until(START, late_after_s=math.inf)
-        await lab.until(lambda: lab.status.rate == "AllFrames")
+        await lab.wait_until(lambda: lab.status.rate == "AllFrames")
         logged = [(record.levelname, record.message) for record in caplog.records]
     late, in_time = [(level, text) for level, text in logged if "frames arrive" in text]
     assert late[0] == "WARNING"

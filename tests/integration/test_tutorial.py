@@ -115,7 +115,7 @@ def output_after(step: int) -> list[str]:
     return next_blocks[0].text.splitlines() if is_output else []
 
 
-def test_every_command_prints_what_the_page_shows(folder: Path, terminals: dict[str, Terminal]) -> None:
+def test_every_command_prints_the_output_on_the_page(folder: Path, terminals: dict[str, Terminal]) -> None:
     commands = []
     for step, block in enumerate(STEPS):
         if block.language in {"yaml", "python"}:

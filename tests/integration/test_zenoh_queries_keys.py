@@ -12,15 +12,21 @@ import zenoh
 
 from gateway.queries.questions import SCHEMA_TYPES
 from gateway.rtc3d.components import ComponentType
-from tests.querying import LabServer, ask, ask_all, lab, lab_without_server
+from tests.queried_gateway import (
+    ParameterServer,
+    gateway_with_server,
+    gateway_without_server,
+    query,
+    query_all,
+)
 from tests.servers import packet
 from tests.waiting import wait_until_async
 
 
 async def test_a_streaming_component_is_answered_with_its_newest_message() -> None:
-    async with lab() as (server, _, gateway, asker):
+    async with gateway_with_server() as (server, _, gateway, peer):
         await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
-        reply = await ask(asker, "mocap/lab/3d")
+        reply = await query(peer, "mocap/lab/3d")
         assert reply.payload == gateway.sources[0].fan_out.newest[ComponentType.MARKERS]
         assert reply.encoding == "application/x-lcm;rtc3d.markers_t"
         message = rtc3d.markers_t.decode(reply.payload)
@@ -29,71 +35,71 @@ async def test_a_streaming_component_is_answered_with_its_newest_message() -> No
         assert server.count("SendCurrentFrame") == 0
 
 
-async def test_without_a_stream_the_current_frame_is_asked_for() -> None:
-    server = LabServer()
-    server.measures = False
-    async with lab(server) as (_, _, _, asker):
-        server.measures = True
-        message = rtc3d.markers_t.decode((await ask(asker, "mocap/lab/3d")).payload)
+async def test_without_a_running_stream_the_current_frame_is_requested() -> None:
+    server = ParameterServer()
+    server.has_measurement = False
+    async with gateway_with_server(server) as (_, _, _, peer):
+        server.has_measurement = True
+        message = rtc3d.markers_t.decode((await query(peer, "mocap/lab/3d")).payload)
         assert (message.frame_number, message.sequence, message.session) == (7, -1, 1)
         assert server.commands[-1] == "SendCurrentFrame 3D"
 
 
-async def test_a_server_that_knows_no_component_names_is_asked_for_all() -> None:
-    server = LabServer()
-    server.measures = False
-    server.refused = ("SendCurrentFrame ",)
-    async with lab(server) as (_, _, _, asker):
-        server.measures = True
-        assert (await ask(asker, "mocap/lab/3d?format=json")).json["frame_number"] == 7
+async def test_a_server_that_refuses_component_names_is_asked_for_the_whole_frame() -> None:
+    server = ParameterServer()
+    server.has_measurement = False
+    server.refused_commands = ("SendCurrentFrame ",)
+    async with gateway_with_server(server) as (_, _, _, peer):
+        server.has_measurement = True
+        assert (await query(peer, "mocap/lab/3d?format=json")).json["frame_number"] == 7
         assert server.commands[-2:] == ["SendCurrentFrame 3D", "SendCurrentFrame"]
 
 
 async def test_without_a_measurement_there_is_no_current_frame() -> None:
-    server = LabServer()
-    server.measures = False
-    async with lab(server) as (_, _, _, asker):
-        reply = await ask(asker, "mocap/lab/3d")
+    server = ParameterServer()
+    server.has_measurement = False
+    async with gateway_with_server(server) as (_, _, _, peer):
+        reply = await query(peer, "mocap/lab/3d")
         assert (reply.code, reply.error) == ("nothing-yet", "source 'lab': no measurement runs")
 
 
-async def test_a_component_that_has_not_come_is_said_not_to_have() -> None:
-    async with lab() as (_, _, gateway, asker):
+async def test_a_component_that_has_not_arrived_is_an_error() -> None:
+    async with gateway_with_server() as (_, _, gateway, peer):
         await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
-        reply = await ask(asker, "mocap/lab/event")
+        reply = await query(peer, "mocap/lab/event")
         assert reply.code == "nothing-yet"
         assert reply.error == "no event has arrived from source 'lab' in this session"
 
 
 async def test_frames_of_an_earlier_connection_are_not_current() -> None:
-    async with lab() as (server, _, gateway, asker):
+    async with gateway_with_server() as (server, _, gateway, peer):
         await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
-        server.measures = False
+        server.has_measurement = False
         assert server.client is not None
         server.client.cut()
         [status] = gateway.sources[0].statuses
         await wait_until_async(lambda: status.session == 2 and status.state.value == "no measurement")
-        assert (await ask(asker, "mocap/lab/3d")).error == "source 'lab': no measurement runs"
+        assert (await query(peer, "mocap/lab/3d")).error == "source 'lab': no measurement runs"
 
 
-async def test_a_current_frame_that_contradicts_itself_is_told() -> None:
-    server = LabServer()
-    server.measures = False
-    async with lab(server) as (_, _, _, asker):
-        server.silent = ("SendCurrentFrame",)
-        asked = asyncio.create_task(ask(asker, "mocap/lab/3d"))
+async def test_a_current_frame_without_the_component_is_an_error() -> None:
+    server = ParameterServer()
+    server.has_measurement = False
+    async with gateway_with_server(server) as (_, _, _, peer):
+        server.ignored_commands = ("SendCurrentFrame",)
+        asked = asyncio.create_task(query(peer, "mocap/lab/3d"))
         await wait_until_async(lambda: server.count("SendCurrentFrame"))
         server.send(packet(3, b"\0\0\0\0"))  # a frame without components
         reply = await asked
         assert (reply.code, reply.error) == ("nothing-yet", "the current frame has no 3d")
 
 
-async def test_the_status_comes_as_bytes_and_as_json() -> None:
-    async with lab() as (_, port, _, asker):
-        reply = await ask(asker, "mocap/lab/status")
+async def test_the_status_is_answered_as_message_or_as_json() -> None:
+    async with gateway_with_server() as (_, port, _, peer):
+        reply = await query(peer, "mocap/lab/status")
         assert reply.encoding == "application/x-lcm;rtc3d.status_t"
         assert rtc3d.status_t.decode(reply.payload).source == "lab"
-        assert (await ask(asker, "mocap/lab/status?format=json")).json["server"] == f"127.0.0.1:{port}"
+        assert (await query(peer, "mocap/lab/status?format=json")).json["server"] == f"127.0.0.1:{port}"
 
 
 def run_with_types_of(schema: bytes, folder: Path, code: str, given: bytes = b"") -> list[str]:
@@ -107,9 +113,9 @@ def run_with_types_of(schema: bytes, folder: Path, code: str, given: bytes = b""
 
 
 @pytest.mark.parametrize("name", SCHEMA_TYPES)
-async def test_a_schema_alone_makes_a_decoder(name: str, tmp_path: Path) -> None:
-    async with lab_without_server() as (_, asker):
-        schema = await ask(asker, f"mocap/lab/schema/{name}")
+async def test_lcm_gen_makes_a_decoder_from_a_schema_alone(name: str, tmp_path: Path) -> None:
+    async with gateway_without_server() as (_, peer):
+        schema = await query(peer, f"mocap/lab/schema/{name}")
         assert schema.encoding == "text/plain"
     code = f"print(rtc3d.__file__, rtc3d.{name}._get_packed_fingerprint().hex())"
     where, fingerprint = await asyncio.to_thread(run_with_types_of, schema.payload, tmp_path, code)
@@ -117,11 +123,11 @@ async def test_a_schema_alone_makes_a_decoder(name: str, tmp_path: Path) -> None
     assert fingerprint == getattr(rtc3d, name)._get_packed_fingerprint().hex()
 
 
-async def test_a_decoder_made_from_the_network_reads_a_frame_from_the_network(tmp_path: Path) -> None:
-    async with lab() as (_, _, gateway, asker):
+async def test_a_decoder_from_a_queried_schema_reads_a_queried_frame(tmp_path: Path) -> None:
+    async with gateway_with_server() as (_, _, gateway, peer):
         await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
-        frame = await ask(asker, "mocap/lab/3d")
-        schema = await ask(asker, f"mocap/lab/schema/{frame.encoding.partition(';')[2]}")
+        frame = await query(peer, "mocap/lab/3d")
+        schema = await query(peer, f"mocap/lab/schema/{frame.encoding.partition(';')[2]}")
     code = (
         "import sys; message = rtc3d.markers_t.decode(sys.stdin.buffer.read());"
         "print(message.frame_number, *((marker.x, marker.y, marker.z) for marker in message.markers))"
@@ -130,36 +136,36 @@ async def test_a_decoder_made_from_the_network_reads_a_frame_from_the_network(tm
     assert words == ["7", "(1.0,", "2.0,", "3.0)"]
 
 
-async def test_a_c3d_file_is_kept_announced_and_given(tmp_path: Path) -> None:
+async def test_a_c3d_file_is_stored_announced_and_answered(tmp_path: Path) -> None:
     content = bytes(range(256)) * 1000
-    async with lab(spool=tmp_path) as (server, _, _, asker):
-        reply = await ask(asker, "mocap/lab/c3d")
+    async with gateway_with_server(spool=tmp_path) as (server, _, _, peer):
+        reply = await query(peer, "mocap/lab/c3d")
         assert (reply.code, reply.error) == ("nothing-yet", "source 'lab' has sent no C3D file so far")
         announced: list[zenoh.Sample] = []
-        asker.declare_subscriber("mocap/lab/c3d", announced.append)
-        await ask(asker, "mocap/lab/status")  # the subscription has arrived by now
+        peer.declare_subscriber("mocap/lab/c3d", announced.append)
+        await query(peer, "mocap/lab/status")  # the subscription has arrived by now
         server.send(packet(5, content))
         await wait_until_async(lambda: announced)
         assert str(announced[0].encoding) == "application/json"
         description = json.loads(announced[0].payload.to_bytes())
         assert description["bytes"] == len(content)
-        reply = await ask(asker, "mocap/lab/c3d")
+        reply = await query(peer, "mocap/lab/c3d")
         assert reply.payload == content
         assert reply.attachment == description
         assert (tmp_path / description["name"]).read_bytes() == content
         server.send(packet(5, b"the second"))
         await wait_until_async(lambda: len(announced) == 2)
-        assert (await ask(asker, "mocap/*/c3d")).payload == b"the second"
+        assert (await query(peer, "mocap/*/c3d")).payload == b"the second"
 
 
-async def test_recording_control_is_off_unless_configured_and_says_how_to_switch_it_on() -> None:
-    async with lab() as (server, _, _, asker):
+async def test_recording_control_is_off_by_default_and_the_error_says_how_to_switch_it_on() -> None:
+    async with gateway_with_server() as (server, _, _, peer):
         for selector in ("mocap/lab/recording?set=start", "mocap/lab/recording"):
-            reply = await ask(asker, selector)
+            reply = await query(peer, selector)
             assert reply.code == "refused"
             assert "recording control is off for source 'lab'" in reply.error
             assert "remote_control: true" in reply.error
-        await ask(asker, "mocap/lab/parameters?fresh=true")
+        await query(peer, "mocap/lab/parameters?fresh=true")
         assert server.received == []
 
 
@@ -168,32 +174,32 @@ RECORDING += "0000000000000000 ffffffff ffffffff ffffffff"
 """A type-3 packet: one event component of 48 bytes (30h), frame number -1 (field note 16); {} is the id."""
 
 
-async def test_recording_is_started_and_stopped_with_wavefronts_packet() -> None:
-    async with lab(remote_control=True) as (server, _, _, asker):
-        reply = await ask(asker, "mocap/lab/recording?set=start")
+async def test_recording_is_started_and_stopped_with_the_packet_of_wavefront() -> None:
+    async with gateway_with_server(remote_control=True) as (server, _, _, peer):
+        reply = await query(peer, "mocap/lab/recording?set=start")
         assert reply.json == {"source": "lab", "sent": "start"}
-        reply = await ask(asker, "mocap/lab/recording?set=stop")
+        reply = await query(peer, "mocap/lab/recording?set=stop")
         assert reply.json == {"source": "lab", "sent": "stop"}
         await wait_until_async(lambda: len(server.received) == 2)
         start, stop = (bytes.fromhex(RECORDING.format(event)) for event in ("00000001", "00000000"))
         assert server.received == [start, stop]
 
 
-async def test_recording_control_wants_to_know_what_to_do() -> None:
-    async with lab(remote_control=True) as (server, _, _, asker):
-        assert "accepted: set=start, set=stop" in (await ask(asker, "mocap/lab/recording")).error
-        assert "accepted: start, stop" in (await ask(asker, "mocap/lab/recording?set=pause")).error
-        reply = await ask(asker, "mocap/*/recording?set=start")
+async def test_recording_control_needs_a_valid_option_and_a_single_source() -> None:
+    async with gateway_with_server(remote_control=True) as (server, _, _, peer):
+        assert "accepted: set=start, set=stop" in (await query(peer, "mocap/lab/recording")).error
+        assert "accepted: start, stop" in (await query(peer, "mocap/lab/recording?set=pause")).error
+        reply = await query(peer, "mocap/*/recording?set=start")
         assert (
             reply.error == "recording is controlled for one source at a time; accepted: mocap/lab/recording"
         )
-        await ask_all(asker, "mocap/**?set=start")
-        await ask(asker, "mocap/lab/parameters?fresh=true")
+        await query_all(peer, "mocap/**?set=start")
+        await query(peer, "mocap/lab/parameters?fresh=true")
         assert server.received == []
 
 
-async def test_recording_control_without_a_server_says_so() -> None:
-    async with lab_without_server(remote_control=True) as (port, asker):
-        reply = await ask(asker, "mocap/lab/recording?set=start")
+async def test_recording_control_without_a_connection_is_an_error() -> None:
+    async with gateway_without_server(remote_control=True) as (port, peer):
+        reply = await query(peer, "mocap/lab/recording?set=start")
         assert reply.code == "no-connection"
         assert f"refused by 127.0.0.1:{port}" in reply.error

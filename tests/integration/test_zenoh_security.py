@@ -147,14 +147,14 @@ def alive(asker: zenoh.Session) -> list[str]:
 
 
 @pytest.mark.parametrize("block", re.findall(r"```yaml\n(.*?)```", GUIDE, re.DOTALL))
-def test_the_guides_configurations_can_be_used(block: str, tmp_path: Path) -> None:
+def test_the_configurations_of_the_guide_are_valid(block: str, tmp_path: Path) -> None:
     (tmp_path / "zenoh-mtls.json5").write_text(shipped("zenoh-mtls.json5"), encoding="utf-8")
     (tmp_path / "gateway.yaml").write_text(block, encoding="utf-8")
     environ = {PASSWORD: "geheim7"} if "usrpwd" in block else {}
     assert load(tmp_path / "gateway.yaml", environ).sources
 
 
-def test_the_guide_names_the_variable_of_the_password() -> None:
+def test_the_guide_names_the_password_variable() -> None:
     assert f"{PASSWORD}=" in GUIDE
 
 
@@ -207,7 +207,7 @@ def other_viewer(lab: Lab) -> Iterator[zenoh.Session]:
         yield opened
 
 
-def test_a_viewer_gets_data_and_answers(viewer: zenoh.Session) -> None:
+def test_a_viewer_receives_data_and_answers(viewer: zenoh.Session) -> None:
     Heard(viewer, "mocap/lab/3d").more()
     Heard(viewer, "mocap/**").more()
     assert len(asked(viewer, "mocap/lab/status")) == 1
@@ -216,7 +216,7 @@ def test_a_viewer_gets_data_and_answers(viewer: zenoh.Session) -> None:
     assert alive(viewer) == ["mocap/lab/alive"]
 
 
-def test_a_viewer_that_comes_late_gets_the_parameters(lab: Lab, viewer: zenoh.Session) -> None:
+def test_a_late_viewer_receives_the_parameters(lab: Lab, viewer: zenoh.Session) -> None:
     key = "mocap/other/parameters"
     with session(lab.client("gateway")) as second_gateway:  # as the gateway publishes them, but once only
         publisher = zenoh.ext.declare_advanced_publisher(
@@ -233,7 +233,7 @@ def test_a_viewer_that_comes_late_gets_the_parameters(lab: Lab, viewer: zenoh.Se
         wait_until(lambda: late == [b"<xml>"])
 
 
-def test_a_viewer_gets_an_answer_of_refusal(viewer: zenoh.Session) -> None:
+def test_a_viewer_receives_error_replies(viewer: zenoh.Session) -> None:
     [reply] = viewer.get("mocap/lab/no-such-thing", timeout=5)
     assert reply.err is not None
 
@@ -253,7 +253,7 @@ def test_a_viewer_cannot_publish(lab: Lab, viewer: zenoh.Session, other_viewer: 
         wait_until(lambda: FAKE in heard.payloads)
 
 
-def test_a_viewer_cannot_answer(lab: Lab, viewer: zenoh.Session, other_viewer: zenoh.Session) -> None:
+def test_a_viewer_cannot_answer_queries(lab: Lab, viewer: zenoh.Session, other_viewer: zenoh.Session) -> None:
     def lie(query: zenoh.Query) -> None:
         with query:
             query.reply(str(query.key_expr), FAKE)
@@ -268,7 +268,9 @@ def test_a_viewer_cannot_answer(lab: Lab, viewer: zenoh.Session, other_viewer: z
         wait_until(lambda: asked(other_viewer, "mocap/other/status") == [FAKE])
 
 
-def test_a_viewer_cannot_pretend_to_be_a_gateway(viewer: zenoh.Session, other_viewer: zenoh.Session) -> None:
+def test_a_viewer_cannot_declare_a_liveliness_token(
+    viewer: zenoh.Session, other_viewer: zenoh.Session
+) -> None:
     token = viewer.liveliness().declare_token("mocap/other/alive")
     assert asked(viewer, "mocap/lab/status")
     assert alive(other_viewer) == ["mocap/lab/alive"]
@@ -276,11 +278,11 @@ def test_a_viewer_cannot_pretend_to_be_a_gateway(viewer: zenoh.Session, other_vi
 
 
 @pytest.mark.parametrize("selector", ["mocap/lab/recording?set=start", "mocap/*/recording?set=start"])
-def test_a_viewer_cannot_ask_for_a_recording(viewer: zenoh.Session, selector: str) -> None:
+def test_a_viewer_cannot_control_a_recording(viewer: zenoh.Session, selector: str) -> None:
     assert list(viewer.get(selector, timeout=5)) == []
 
 
-def test_a_gateway_hears_no_other_gateway(lab: Lab, viewer: zenoh.Session) -> None:
+def test_a_gateway_receives_nothing_from_another_gateway(lab: Lab, viewer: zenoh.Session) -> None:
     with session(lab.client("gateway")) as second_gateway:
         overheard = Heard(second_gateway, "mocap/**")
         Heard(viewer, "mocap/**").more()
@@ -307,14 +309,14 @@ def stranger_file(lab: Lab, certificates: Path, who: str, *changes: Change) -> s
 
 
 @pytest.mark.parametrize("who", STRANGERS)
-def test_a_stranger_is_not_let_in(lab: Lab, strange_certificates: Path, who: str) -> None:
+def test_a_stranger_cannot_connect(lab: Lab, strange_certificates: Path, who: str) -> None:
     text = stranger_file(lab, strange_certificates, who)
     with pytest.raises(zenoh.ZError, match="Unable to connect"):
         zenoh.open(zenoh.Config.from_json5(text))
 
 
 @pytest.mark.parametrize("who", STRANGERS)
-def test_a_stranger_gets_neither_data_nor_answers_and_cannot_publish(
+def test_a_stranger_receives_no_data_or_answers_and_cannot_publish(
     lab: Lab, viewer: zenoh.Session, strange_certificates: Path, who: str
 ) -> None:
     # A peer's session opens without any link, and goes on trying: it can be used as if it had one.
@@ -335,7 +337,7 @@ def test_a_stranger_gets_neither_data_nor_answers_and_cannot_publish(
     assert FAKE not in heard.payloads
 
 
-def test_a_certificate_of_ours_with_an_unknown_name_gets_nothing(lab: Lab, viewer: zenoh.Session) -> None:
+def test_a_valid_certificate_with_an_unknown_name_has_no_access(lab: Lab, viewer: zenoh.Session) -> None:
     heard = Heard(viewer, "mocap/**")
     with session(lab.client("router")) as nobody:
         overheard = Heard(nobody, "mocap/**")
@@ -349,7 +351,7 @@ def test_a_certificate_of_ours_with_an_unknown_name_gets_nothing(lab: Lab, viewe
 
 
 @pytest.mark.parametrize("change", ["ca", "name"])
-def test_a_router_that_is_not_the_labs_is_not_believed(
+def test_a_client_rejects_a_router_with_the_wrong_authority_or_name(
     lab: Lab, strange_certificates: Path, change: str
 ) -> None:
     text = {
@@ -378,7 +380,7 @@ def test_the_plain_router_serves_everybody(tmp_path: Path) -> None:
             wait_until(lambda: FAKE in heard.payloads)
 
 
-def test_a_password_from_the_environment_opens_the_link_and_is_nowhere_to_be_seen(tmp_path: Path) -> None:
+def test_a_password_from_the_environment_is_used_and_never_shown(tmp_path: Path) -> None:
     port = free_port()
     (tmp_path / "users").write_text("gateway:geheim7\n")
     router = (

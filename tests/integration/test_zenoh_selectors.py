@@ -9,7 +9,16 @@ from gateway.queries.questions import SCHEMA_TYPES
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
 from tests.networks import free_endpoint, open_zenoh
-from tests.querying import LabServer, ask, ask_all, asker_at, gateway_at, is_filled, lab, lab_without_server
+from tests.queried_gateway import (
+    ParameterServer,
+    gateway_with_server,
+    gateway_without_server,
+    query,
+    query_all,
+    run_gateway,
+    wait_until_cached,
+    zenoh_peer,
+)
 from tests.servers import ScriptedServer, packet
 from tests.waiting import wait_until_async
 
@@ -35,92 +44,92 @@ from tests.waiting import wait_until_async
         ("*/nonsense", ["nothing of source 'lab' matches mocap/lab/*/nonsense", "parameters/3d"]),
     ],
 )  # fmt: skip
-async def test_a_bad_question_is_answered_with_what_is_accepted(selector: str, accepted: list[str]) -> None:
+async def test_the_error_for_a_bad_query_lists_what_is_accepted(selector: str, accepted: list[str]) -> None:
     streams = (StreamSettings(components=(ComponentType.MARKERS, ComponentType.EVENT)),)
-    async with lab_without_server(streams=streams) as (_, asker):
-        reply = await ask(asker, f"mocap/lab/{selector}")
+    async with gateway_without_server(streams=streams) as (_, peer):
+        reply = await query(peer, f"mocap/lab/{selector}")
         assert reply.encoding == "text/plain;bad-request"
         assert [text for text in accepted if text not in reply.error] == []
         assert "\n" not in reply.error
 
 
-async def test_the_source_alone_is_answered_with_what_is_below_it() -> None:
-    async with lab_without_server() as (_, asker):
-        reply = await ask(asker, "mocap/lab")
+async def test_a_query_for_the_source_alone_gets_a_list_of_keys() -> None:
+    async with gateway_without_server() as (_, peer):
+        reply = await query(peer, "mocap/lab")
         assert reply.code == "bad-request"
         assert "accepted below mocap/lab/: parameters, " in reply.error
 
 
-async def test_an_option_of_zenohs_own_is_not_ours() -> None:
-    async with lab() as (server, _, _, asker):
-        assert (await ask(asker, "mocap/lab/parameters?_anyke;_time=[now(-1s)..]")).payload == server.xml
+async def test_options_of_zenoh_itself_are_ignored() -> None:
+    async with gateway_with_server() as (server, _, _, peer):
+        assert (await query(peer, "mocap/lab/parameters?_anyke;_time=[now(-1s)..]")).payload == server.xml
 
 
-async def test_a_star_is_answered_by_everything_that_has_an_answer() -> None:
-    async with lab() as (server, _, gateway, asker):
+async def test_a_wildcard_is_answered_by_every_key_that_has_an_answer() -> None:
+    async with gateway_with_server() as (server, _, gateway, peer):
         await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
-        replies = {reply.key: reply for reply in await ask_all(asker, "mocap/lab/*?format=json")}
+        replies = {reply.key: reply for reply in await query_all(peer, "mocap/lab/*?format=json")}
         assert set(replies) == {"mocap/lab/parameters", "mocap/lab/3d", "mocap/lab/status"}
         assert {reply.encoding for reply in replies.values()} == {"application/json"}
         assert replies["mocap/lab/3d"].json["frame_number"] == 7
         assert server.count("SendCurrentFrame") == 0
 
 
-async def test_everything_can_be_asked_for_but_files_and_recording(tmp_path: Path) -> None:
-    async with lab(spool=tmp_path, remote_control=True) as (server, _, gateway, asker):
+async def test_a_wildcard_does_not_select_files_and_recording(tmp_path: Path) -> None:
+    async with gateway_with_server(spool=tmp_path, remote_control=True) as (server, _, gateway, peer):
         await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
         server.send(packet(5, b"a file"))
         await wait_until_async(lambda: list(tmp_path.glob("*.c3d")))
-        keys = [reply.key for reply in await ask_all(asker, "mocap/**")]
+        keys = [reply.key for reply in await query_all(peer, "mocap/**")]
         expected = ["parameters", *(f"parameters/{section}" for section in SECTIONS), "3d", "status"]
         expected += [f"schema/{name}" for name in SCHEMA_TYPES]
         assert sorted(keys) == sorted(f"mocap/lab/{key}" for key in expected)
 
 
-async def test_a_wildcard_with_no_answer_at_all_gives_the_reason() -> None:
-    async with lab_without_server() as (port, asker):
-        reply = await ask(asker, "mocap/*/3d")
+async def test_a_wildcard_without_any_answer_gets_an_error() -> None:
+    async with gateway_without_server() as (port, peer):
+        reply = await query(peer, "mocap/*/3d")
         assert reply.code == "no-connection"
         assert f"refused by 127.0.0.1:{port}" in reply.error
 
 
-async def test_every_source_answers_a_wildcard_for_sources() -> None:
+async def test_a_wildcard_for_sources_is_answered_by_every_source() -> None:
     router = free_endpoint()
     middle = open_zenoh("router", listen=router)
-    first, second = LabServer("of the first"), LabServer("of the second")
+    first, second = ParameterServer("of the first"), ParameterServer("of the second")
     try:
         async with (
             ScriptedServer(first.script) as a,
             ScriptedServer(second.script) as b,
-            gateway_at(a.port, router=router) as lab_gateway,
-            gateway_at(b.port, router=router, name="hall") as hall_gateway,
+            run_gateway(a.port, router=router) as lab_gateway,
+            run_gateway(b.port, router=router, name="hall") as hall_gateway,
         ):
-            await is_filled(lab_gateway, first)
-            await is_filled(hall_gateway, second)
-            with asker_at(router) as asker:
-                replies = {reply.key: reply for reply in await ask_all(asker, "mocap/*/parameters")}
+            await wait_until_cached(lab_gateway, first)
+            await wait_until_cached(hall_gateway, second)
+            with zenoh_peer(router) as peer:
+                replies = {reply.key: reply for reply in await query_all(peer, "mocap/*/parameters")}
                 assert replies["mocap/lab/parameters"].payload == first.xml
                 assert replies["mocap/hall/parameters"].payload == second.xml
     finally:
         middle.close()
 
 
-async def test_questions_go_through_a_router() -> None:
-    router, server = free_endpoint(), LabServer()
+async def test_queries_work_through_a_router() -> None:
+    router, server = free_endpoint(), ParameterServer()
     middle = open_zenoh("router", listen=router)
     try:
         async with (
             ScriptedServer(server.script) as listening,
-            gateway_at(listening.port, router=router) as gateway,
+            run_gateway(listening.port, router=router) as gateway,
         ):
-            await is_filled(gateway, server)
+            await wait_until_cached(gateway, server)
             await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
-            with asker_at(router) as asker:
-                assert (await ask(asker, "mocap/lab/parameters")).payload == server.xml
-                fresh = await ask(asker, "mocap/lab/parameters/3d?fresh=true;format=json")
+            with zenoh_peer(router) as peer:
+                assert (await query(peer, "mocap/lab/parameters")).payload == server.xml
+                fresh = await query(peer, "mocap/lab/parameters/3d?fresh=true;format=json")
                 assert fresh.json["markers"][0]["label"] == "marker 1"
-                assert (await ask(asker, "mocap/*/3d?format=json")).json["frame_number"] == 7
-                assert (await ask(asker, "mocap/lab/markers")).code == "bad-request"
-                assert (await ask(asker, "mocap/lab/schema/marker_t")).payload
+                assert (await query(peer, "mocap/*/3d?format=json")).json["frame_number"] == 7
+                assert (await query(peer, "mocap/lab/markers")).code == "bad-request"
+                assert (await query(peer, "mocap/lab/schema/marker_t")).payload
     finally:
         middle.close()

@@ -1,4 +1,4 @@
-"""Whether a run tests what it says: the sources, or with ``make test-compiled`` what was compiled of them."""
+"""Check which modules this run tests: the sources, or with ``make test-compiled`` the compiled modules."""
 
 import importlib
 import os
@@ -10,16 +10,16 @@ import pytest
 
 from tests.fresh_clones import COMPILED_MODULES, ROOT
 
-_WANTED: Final = os.environ.get("RTC3D_COMPILED") == "1"
+_EXPECT_COMPILED: Final = os.environ.get("RTC3D_COMPILED") == "1"
 
 
 @pytest.mark.parametrize("path", COMPILED_MODULES)
-def test_modules_are_compiled_where_that_is_tested_and_nowhere_else(path: str) -> None:
+def test_modules_are_compiled_only_in_runs_for_compiled_modules(path: str) -> None:
     module = importlib.import_module(path.removesuffix(".py").replace("/", "."))
-    assert str(module.__file__).endswith(".so") is _WANTED, f"{module.__file__}: see CONTRIBUTING.md"
+    assert str(module.__file__).endswith(".so") is _EXPECT_COMPILED, f"{module.__file__}: see CONTRIBUTING.md"
 
 
-def test_the_programs_that_tests_start_are_so_too() -> None:
+def test_programs_started_by_tests_use_the_same_modules() -> None:
     command = [sys.executable, "-m", "gateway", "--version"]
-    said = subprocess.check_output(command, cwd=ROOT, text=True)
-    assert said.endswith(" (compiled)\n") is _WANTED
+    output = subprocess.check_output(command, cwd=ROOT, text=True)
+    assert output.endswith(" (compiled)\n") is _EXPECT_COMPILED

@@ -1,4 +1,4 @@
-"""``make wheel``, and what ``pipx install`` makes of it, in folders that have nothing else."""
+"""``make wheel`` and ``pipx install`` of the wheel, in otherwise empty folders."""
 
 import subprocess
 import sys
@@ -26,57 +26,67 @@ pytestmark = [pytest.mark.wheelhouse]
 _PATH = "/usr/local/bin:/usr/bin:/bin"
 
 
-class Made(NamedTuple):
-    """A wheel, and what make said of it."""
+class BuiltWheel(NamedTuple):
+    """A wheel and the output of make."""
 
-    wheel: Path
-    said: str
+    path: Path
+    make_output: str
 
     @property
     def names(self) -> set[str]:
-        return set(zipfile.ZipFile(self.wheel).namelist())
+        return set(zipfile.ZipFile(self.path).namelist())
 
 
-def make_wheel(clone: Path, **environment: str) -> Made:
+def make_wheel(clone: Path, **environment: str) -> BuiltWheel:
     clone_into(clone)
     before = files_in(clone)
     make = ["make", "-C", str(clone), "wheel", f"PYTHON={WHEELHOUSE_PYTHON}"]
-    said = subprocess.check_output(make, env={"PATH": _PATH, **pip_environment(), **environment}, text=True)
-    [built] = clone.glob("dist/*.whl")
-    assert files_in(clone) == before | {f"dist/{built.name}"}
-    return Made(built, said)
+    output = subprocess.check_output(make, env={"PATH": _PATH, **pip_environment(), **environment}, text=True)
+    [wheel] = clone.glob("dist/*.whl")
+    assert files_in(clone) == before | {f"dist/{wheel.name}"}
+    return BuiltWheel(wheel, output)
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """The wheel as this machine makes it: compiled, if it has a compiler."""
+def compiled_wheel(tmp_path_factory: pytest.TempPathFactory) -> BuiltWheel:
+    """The wheel of this machine: compiled if there is a compiler."""
     return make_wheel(tmp_path_factory.mktemp("clone"))
 
 
 @pytest.fixture(scope="module")
-def plain(tmp_path_factory: pytest.TempPathFactory) -> Made:
-    """The wheel as a machine without a compiler makes it."""
+def plain_wheel(tmp_path_factory: pytest.TempPathFactory) -> BuiltWheel:
+    """The wheel of a machine without a compiler."""
     return make_wheel(tmp_path_factory.mktemp("clone"), CC="no-such-compiler")
 
 
 @pytest.fixture(scope="module")
-def program(made: Made, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def program(compiled_wheel: BuiltWheel, tmp_path_factory: pytest.TempPathFactory) -> Path:
     home = tmp_path_factory.mktemp("home")
     folders = {f"PIPX_{name}": str(home / name) for name in ("HOME", "BIN_DIR", "MAN_DIR")}
     environment = {"PATH": _PATH, "HOME": str(home), **folders, **pip_environment()}
-    pipx = [sys.executable, "-m", "pipx", "install", "--quiet", f"--python={SYSTEM_PYTHON}", str(made.wheel)]
+    pipx = [
+        sys.executable,
+        "-m",
+        "pipx",
+        "install",
+        "--quiet",
+        f"--python={SYSTEM_PYTHON}",
+        str(compiled_wheel.path),
+    ]
     subprocess.run(pipx, env=environment, check=True)
     return home / "BIN_DIR" / "rtc3d-gateway"
 
 
 def run(program: Path, folder: Path, *arguments: str) -> str:
-    """Run the program where nothing of the repository is, and return what it prints."""
+    """Run the program outside the repository, and return its output."""
     command = [str(program), *arguments]
     return subprocess.check_output(command, cwd=folder, env={"PATH": _PATH, "LANG": "C.UTF-8"}, text=True)
 
 
-@pytest.mark.parametrize("kind", ["made", "plain"])
-def test_the_wheel_has_message_types_and_configurations(kind: str, request: pytest.FixtureRequest) -> None:
+@pytest.mark.parametrize("kind", ["compiled_wheel", "plain_wheel"])
+def test_the_wheel_contains_message_types_and_configurations(
+    kind: str, request: pytest.FixtureRequest
+) -> None:
     names = request.getfixturevalue(kind).names
     message_types = {f"rtc3d/{path.name}" for path in (ROOT / "lcm_types/rtc3d").glob("*.lcm")}
     configurations = {f"gateway/_config/{name}" for name in files_in(ROOT / "config")}
@@ -84,24 +94,30 @@ def test_the_wheel_has_message_types_and_configurations(kind: str, request: pyte
     assert not any(name.startswith(("tests/", "benchmarks/")) for name in names)
 
 
-def test_with_a_compiler_the_straight_path_is_compiled_for_this_platform(made: Made) -> None:
-    skip_if_plain(made.said)
-    compiled = {name.partition(".")[0] + ".py" for name in made.names if name.endswith(".so") and "/" in name}
+def test_with_a_compiler_the_wheel_is_compiled_for_this_platform(compiled_wheel: BuiltWheel) -> None:
+    skip_if_plain(compiled_wheel.make_output)
+    compiled = {
+        name.partition(".")[0] + ".py"
+        for name in compiled_wheel.names
+        if name.endswith(".so") and "/" in name
+    }
     assert compiled == set(COMPILED_MODULES)
-    assert made.wheel.name.endswith(f"{sysconfig.get_platform().replace('-', '_')}.whl")
+    assert compiled_wheel.path.name.endswith(f"{sysconfig.get_platform().replace('-', '_')}.whl")
 
 
-def test_without_a_compiler_the_wheel_is_for_any_platform_and_make_says_what_is_missing(plain: Made) -> None:
-    assert not any(name.endswith(".so") for name in plain.names)
-    assert plain.wheel.name.endswith("-py3-none-any.whl")
-    [line] = [line for line in plain.said.splitlines() if "Plain Python" in line]
+def test_without_a_compiler_the_wheel_is_for_any_platform_and_make_reports_what_is_missing(
+    plain_wheel: BuiltWheel,
+) -> None:
+    assert not any(name.endswith(".so") for name in plain_wheel.names)
+    assert plain_wheel.path.name.endswith("-py3-none-any.whl")
+    [line] = [line for line in plain_wheel.make_output.splitlines() if "Plain Python" in line]
     assert "for want of no-such-compiler (Debian: apt-get install gcc python3-dev)" in line
 
 
-def test_the_program_says_its_version_and_that_it_is_compiled(
-    made: Made, program: Path, tmp_path: Path
+def test_the_program_prints_its_version_and_that_it_is_compiled(
+    compiled_wheel: BuiltWheel, program: Path, tmp_path: Path
 ) -> None:
-    skip_if_plain(made.said)
+    skip_if_plain(compiled_wheel.make_output)
     assert run(program, tmp_path, "--version") == f"rtc3d-gateway {__version__} (compiled)\n"
 
 

@@ -71,14 +71,14 @@ def table(section: type[Section]) -> str:
 
 
 @pytest.mark.parametrize("name", SECTIONS)
-def test_the_table_of_a_section_is_what_the_program_says(name: str) -> None:
+def test_the_table_of_a_section_matches_the_program(name: str) -> None:
     heading = f"## {name}\n"
     assert heading in REFERENCE
     part = REFERENCE.partition(heading)[2].partition("\n## ")[0]
     assert table(SECTIONS[name]) in part, f"put this below {heading}{table(SECTIONS[name])}"
 
 
-def test_every_section_is_there() -> None:
+def test_the_reference_has_every_section() -> None:
     def sections_in(model: Any) -> set[type[Section]]:
         found = {model}
         for field in model.model_fields.values():
@@ -92,5 +92,5 @@ def test_every_section_is_there() -> None:
 
 
 @pytest.mark.parametrize("block", re.findall(r"```yaml\n(.*?)```", REFERENCE, re.DOTALL))
-def test_its_examples_are_configurations(block: str) -> None:
+def test_the_examples_are_valid_configurations(block: str) -> None:
     assert MODEL.model_validate(yaml.safe_load(block)).sources

@@ -20,19 +20,19 @@ def test_the_shipped_schema_is_current() -> None:
     assert shipped == schema_text(MODEL), "rtc3d-gateway config schema > config/gateway.schema.json"
 
 
-def test_it_is_a_schema() -> None:
+def test_the_schema_is_valid() -> None:
     Draft202012Validator.check_schema(json.loads(schema_text(MODEL)))
 
 
 @pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.yaml")), ids=lambda path: path.name)
-def test_shipped_configurations_name_the_schema_and_fit_it(path: Path) -> None:
+def test_shipped_configurations_name_and_match_the_schema(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
     assert text.startswith("# yaml-language-server: $schema=gateway.schema.json\n")
     VALIDATOR.validate(yaml.safe_load(text))
 
 
 @given(SETTINGS)
-def test_what_the_gateway_accepts_fits_the_schema(settings: Settings) -> None:
+def test_valid_settings_match_the_schema(settings: Settings) -> None:
     VALIDATOR.validate(settings.model_dump(mode="json"))
 
 
@@ -54,5 +54,5 @@ def test_what_the_gateway_accepts_fits_the_schema(settings: Settings) -> None:
         {"sources": [{"name": "lab", "host": "lab"}], "zenoh": {"config": 1}},
     ],
 )
-def test_an_editor_sees_mistakes(values: object) -> None:
+def test_the_schema_rejects_mistakes(values: object) -> None:
     assert list(VALIDATOR.iter_errors(values))

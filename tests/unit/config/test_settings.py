@@ -19,7 +19,7 @@ MARKERS, ANALOG, FORCE = ComponentType.MARKERS, ComponentType.ANALOG, ComponentT
 TOOLS, EVENT = ComponentType.TOOLS, ComponentType.EVENT
 
 
-def test_one_server_is_enough() -> None:
+def test_a_configuration_needs_only_one_server() -> None:
     settings = MODEL.model_validate({"sources": [source()]})
     assert settings == make_settings(sources=(SourceSettings(name="lab", host="192.0.2.20"),))
     assert settings.sources[0] == SourceSettings(
@@ -41,7 +41,7 @@ def test_one_server_is_enough() -> None:
     assert settings.lcm == LcmSettings(enabled=True, prefix="MOCAP", url=None, tool_poses=False)
 
 
-def test_settings_do_not_change() -> None:
+def test_settings_are_immutable() -> None:
     settings = MODEL.model_validate({"sources": [source()]})
     with pytest.raises(ValidationError):
         settings.sources[0].port = 1
@@ -55,7 +55,7 @@ def test_the_longest_name_and_prefix_fit_a_channel() -> None:
     assert topics.lcm_channel("P" * 16, "S" * 24, "PARAMETERS_REQUEST") == channel
 
 
-def test_names_that_share_channels_are_both_named() -> None:
+def test_source_names_with_the_same_channels_are_refused() -> None:
     value = {"sources": [source(name="hall"), source(name="lab-1"), source(name="LAB_1")]}
     assert mistakes(MODEL, value) == [
         (
@@ -66,7 +66,7 @@ def test_names_that_share_channels_are_both_named() -> None:
     ]
 
 
-def test_a_component_is_in_one_stream_only() -> None:
+def test_a_component_in_two_streams_is_refused() -> None:
     streams = [{"components": ["3d"]}, {"components": ["analog"]}, {"components": ["6d", "3d"]}]
     assert mistakes(SourceSettings, source(streams=streams)) == [
         (
@@ -77,7 +77,7 @@ def test_a_component_is_in_one_stream_only() -> None:
     ]
 
 
-def test_frames_of_a_slow_rate_are_no_stall() -> None:
+def test_a_rate_slower_than_the_stall_timeout_is_refused() -> None:
     streams = [{"components": ["3d"]}, {"components": ["6d"], "rate": {"frequency_hz": 0.25}}]
     assert mistakes(SourceSettings, source(streams=streams)) == [
         (
@@ -92,7 +92,7 @@ def test_frames_of_a_slow_rate_are_no_stall() -> None:
 @pytest.mark.parametrize(
     ("value", "found"), [([], "an empty list"), ({}, "an empty mapping"), ("x", "'x'"), (None, "nothing")]
 )
-def test_sources_and_streams_are_lists_of_at_least_one(value: object, found: str) -> None:
+def test_sources_and_streams_must_be_lists_with_at_least_one_item(value: object, found: str) -> None:
     assert mistakes(MODEL, {"sources": value}) == [
         ("sources", f"found {found}; expected a list of sources, one or more, each with name and host")
     ]
@@ -101,14 +101,14 @@ def test_sources_and_streams_are_lists_of_at_least_one(value: object, found: str
     ]
 
 
-def test_the_longest_wait_is_not_below_the_first() -> None:
+def test_the_longest_delay_must_not_be_below_the_first() -> None:
     assert mistakes(ReconnectSettings, {"first_delay_s": 20}) == [
         ("max_delay_s", "found 10; expected first_delay_s (20) or more")
     ]
     assert ReconnectSettings.model_validate({"first_delay_s": 10})
 
 
-def test_no_lcm_url_is_that_of_the_environment_else_this_host(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_an_lcm_url_the_environment_or_the_default_is_used(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("LCM_DEFAULT_URL", raising=False)
     assert LcmSettings().effective_url == "udpm://239.255.76.67:7667?ttl=0"
     monkeypatch.setenv("LCM_DEFAULT_URL", "udpm://239.255.76.67:7667?ttl=1")
@@ -125,13 +125,13 @@ def test_no_lcm_url_is_that_of_the_environment_else_this_host(monkeypatch: pytes
         *((url, url) for url in ("mpudpm://", "memq://", "tcpq://lab:7700", "udpm://239.1.2.3:lcm")),
     ],
 )
-def test_requests_go_to_the_next_port_where_whoever_listens_gets_all(url: str, queries_url: str) -> None:
+def test_requests_use_the_next_port_only_for_multicast_urls(url: str, queries_url: str) -> None:
     assert lcm_queries_url(url) == queries_url
     assert LcmSettings.model_construct(url=url).effective_queries_url == queries_url
     assert LcmSettings(url="memq://", queries_url="tcpq://lab:1").effective_queries_url == "tcpq://lab:1"
 
 
-def test_one_side_must_be_on() -> None:
+def test_at_least_one_output_must_be_enabled() -> None:
     off = {"enabled": False}
     assert mistakes(MODEL, {"sources": [source()], "zenoh": off, "lcm": off}) == [
         ("lcm.enabled", "found false here and in zenoh.enabled; expected true in at least one of them")
@@ -140,7 +140,7 @@ def test_one_side_must_be_on() -> None:
     assert MODEL.model_validate({"sources": [source()], "lcm": off}).zenoh.enabled
 
 
-def test_every_mistake_is_told_at_once() -> None:
+def test_all_mistakes_are_reported_together() -> None:
     sources = [source(prt=1), {"name": "b"}]
     assert dict(mistakes(MODEL, {"sources": sources, "lcm": None, "zenho": {}})) == {
         "sources.0.prt": "unknown key (did you mean 'port'?); known keys: name, host, port, byte_order, "
@@ -154,11 +154,11 @@ def test_every_mistake_is_told_at_once() -> None:
     }
 
 
-def test_what_is_shown_is_one_bounded_line() -> None:
+def test_descriptions_of_values_are_one_bounded_line() -> None:
     assert describe("a\nb\x1b" + "x" * 1000) == repr("a\nb\x1b" + "x" * 56 + "…")
 
 
-def test_what_is_shown_has_no_password() -> None:
+def test_descriptions_of_values_contain_no_password() -> None:
     assert describe("tcpq://me:geheim@lab:7700") == "'tcpq://me:***@lab:7700'"
     assert describe("x" * 50 + "tls/lab#connect_private_key_base64=geheim").count("geheim") == 0
 

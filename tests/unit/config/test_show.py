@@ -34,7 +34,7 @@ def shown(path: Path, **variables: str) -> list[str]:
     return [" ".join(line.split()) for line in text.replace("RTC3D_GATEWAY__", "").splitlines()]
 
 
-def test_every_value_has_its_origin(file: Path) -> None:
+def test_every_value_is_shown_with_its_origin(file: Path) -> None:
     lines = shown(file, LCM__PREFIX="HALL2", ZENOH__CONFIG__CONNECT__ENDPOINTS__1="tcp/192.0.2.12:7447")
     for line in (
         "- name: lab # lab.yaml:2",
@@ -54,15 +54,13 @@ def test_every_value_has_its_origin(file: Path) -> None:
     assert [" # " in line for line in lines] == [not section for section in is_section]
 
 
-def test_what_a_variable_sets_as_a_whole_is_from_it(file: Path) -> None:
+def test_a_variable_is_the_origin_of_a_whole_list_that_it_sets(file: Path) -> None:
     lines = shown(file, SOURCES__0__STREAMS="[{rate: all}]")
     assert "rate: all # SOURCES__0__STREAMS" in lines
     assert "- components: [3d, 6d, analog, force, event] # default" in lines
 
 
-def test_what_depends_on_the_environment_is_shown_as_it_is(
-    file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_values_from_the_environment_are_shown_as_used(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file.write_text(FILE.replace("lcm: {url: memq://}", ""), encoding="utf-8")
     assert "url: udpm://239.255.76.67:7667?ttl=0 # default" in shown(file)
     monkeypatch.setenv("LCM_DEFAULT_URL", "udpm://239.255.76.68:7667?ttl=1")
@@ -72,7 +70,7 @@ def test_what_depends_on_the_environment_is_shown_as_it_is(
     assert "directory: /var/lib/lab/c3d # STATE_DIRECTORY" in lines
 
 
-def test_what_is_shown_is_a_configuration_of_the_same_effect(file: Path) -> None:
+def test_the_output_is_an_equivalent_configuration(file: Path) -> None:
     configuration = read(file, {})
     again = file.with_name("again.yaml")
     again.write_text(shown_configuration(configuration), encoding="utf-8")
@@ -83,7 +81,7 @@ def test_what_is_shown_is_a_configuration_of_the_same_effect(file: Path) -> None
     assert load(again, {}) == configuration.settings.model_copy(update={"spool": spool, "lcm": lcm})
 
 
-def test_odd_keys_and_values_stay_what_they_are(file: Path) -> None:
+def test_unusual_keys_and_values_are_quoted(file: Path) -> None:
     metadata = {"on": "off", "12": "1e3", "a: b": "x # y", "lines": "a\nb", "list": [{}, {"a": []}, "x"]}
     inline = f"mode: client, metadata: {json.dumps(metadata)}"
     file.write_text(FILE.replace("mode: client", inline), encoding="utf-8")
@@ -91,7 +89,7 @@ def test_odd_keys_and_values_stay_what_they_are(file: Path) -> None:
     assert values["zenoh"]["config"]["metadata"] == metadata
 
 
-def test_comments_stand_in_a_column_except_behind_long_lines(file: Path) -> None:
+def test_comments_are_aligned_except_after_long_lines(file: Path) -> None:
     lines = shown_configuration(read(file, {})).splitlines()
     parts = [line.partition("  # ")[0].rstrip() for line in lines if "  # " in line]
     columns = [line.index("# ") for line in lines if "  # " in line]

@@ -26,7 +26,7 @@ MARKERS, TOOLS, ANALOG = ComponentType.MARKERS, ComponentType.TOOLS, ComponentTy
         ({"a": 1}, "a mapping"),
     ],
 )
-def test_a_port_is_a_whole_number_of_16_bits(port: object, found: str) -> None:
+def test_invalid_ports_are_refused(port: object, found: str) -> None:
     assert mistakes(SourceSettings, source(port=port)) == [
         ("port", f"found {found}; expected a whole number from 1 to 65535")
     ]
@@ -34,24 +34,24 @@ def test_a_port_is_a_whole_number_of_16_bits(port: object, found: str) -> None:
 
 @pytest.mark.parametrize("value", [0, -1, True, "2", float("nan"), float("inf"), 10**400, 86401, None])
 @pytest.mark.parametrize("key", ["connect_timeout_s", "reply_timeout_s", "stall_timeout_s"])
-def test_a_time_is_a_bounded_number_of_seconds(key: str, value: object) -> None:
+def test_invalid_times_are_refused(key: str, value: object) -> None:
     [(location, text)] = mistakes(SourceSettings, source(**{key: value}))
     assert location == key
     assert text.endswith("; expected a number of seconds from 0.001 to 86400")
 
 
-def test_a_whole_number_of_seconds_is_a_number() -> None:
+def test_an_integer_number_of_seconds_is_accepted() -> None:
     assert SourceSettings.model_validate(source(stall_timeout_s=5)).stall_timeout_s == 5.0
 
 
 @pytest.mark.parametrize("value", [1023, 2**32, 1e6, True, "16 MiB"])
-def test_a_limit_fits_the_size_field(value: object) -> None:
+def test_limits_outside_the_size_field_are_refused(value: object) -> None:
     [(_, text)] = mistakes(SourceSettings, source(max_c3d_bytes=value))
     assert text.endswith("; expected a whole number of bytes from 1024 to 4294967295")
 
 
 @pytest.mark.parametrize("value", [1, 0, "yes", None])
-def test_a_switch_is_true_or_false(value: object) -> None:
+def test_a_switch_must_be_true_or_false(value: object) -> None:
     assert mistakes(ZenohSettings, {"express": value}) == [
         ("express", f"found {describe(value)}; expected true or false")
     ]
@@ -61,7 +61,7 @@ def test_a_switch_is_true_or_false(value: object) -> None:
     "host",
     ["lab", "ndi-3.example.org.", "192.0.2.20", "2001:db8::1", "fe80::1%eth0", "rt_server", "bücher.example"],
 )
-def test_a_host_is_a_name_or_an_address(host: str) -> None:
+def test_host_names_and_addresses_are_accepted(host: str) -> None:
     assert SourceSettings.model_validate(source(host=host)).host == host
 
 
@@ -80,13 +80,13 @@ def test_a_host_is_a_name_or_an_address(host: str) -> None:
         "a." * 127,
     ],
 )
-def test_what_is_no_host_is_refused(host: str) -> None:
+def test_invalid_hosts_are_refused(host: str) -> None:
     [(location, text)] = mistakes(SourceSettings, source(host=host))
     assert location == "host"
     assert text.endswith("; expected a host name or an IP address; the port has its own key")
 
 
-def test_a_number_as_a_name_wants_quotes() -> None:
+def test_the_error_for_a_number_as_name_suggests_quotes() -> None:
     assert mistakes(SourceSettings, source(name=5)) == [
         (
             "name",
@@ -97,7 +97,7 @@ def test_a_number_as_a_name_wants_quotes() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a b", "a/b", "a.b", "é", "lab\n", "a" * 25])
-def test_a_name_is_fit_for_keys_and_channels(name: str) -> None:
+def test_names_that_do_not_fit_keys_and_channels_are_refused(name: str) -> None:
     assert [location for location, _ in mistakes(SourceSettings, source(name=name))] == ["name"]
 
 
@@ -111,7 +111,7 @@ def test_a_name_is_fit_for_keys_and_channels(name: str) -> None:
         (Frequency(60.0), Frequency(60.0)),
     ],
 )
-def test_a_rate_has_three_forms(value: object, rate: Rate) -> None:
+def test_rates_are_accepted_in_three_forms(value: object, rate: Rate) -> None:
     assert StreamSettings.model_validate({"rate": value}).rate == rate
 
 
@@ -196,20 +196,20 @@ def test_other_components_are_refused(value: object, location: str, text: str) -
 
 
 @pytest.mark.parametrize("prefix", ["mocap", "a/b", "hall-2/mocap.x", "überlab"])
-def test_a_key_prefix_is_one_or_more_chunks(prefix: str) -> None:
+def test_a_key_prefix_can_have_several_chunks(prefix: str) -> None:
     assert ZenohSettings.model_validate({"prefix": prefix}).prefix == prefix
 
 
 @pytest.mark.parametrize(
     "prefix", ["", "/a", "a/", "a//b", "*", "a/**", "a$*", "a#", "a?b", "a b", "a\tb", "a\x07b", "a" * 129]
 )
-def test_a_key_prefix_without_wildcards_and_empty_chunks(prefix: str) -> None:
+def test_invalid_key_prefixes_are_refused(prefix: str) -> None:
     [(location, text)] = mistakes(ZenohSettings, {"prefix": prefix})
     assert location == "prefix"
     assert text.startswith(f"found {describe(prefix)}; expected a Zenoh key")
 
 
-def test_zenoh_reads_its_own_keys() -> None:
+def test_keys_of_zenoh_itself_are_accepted() -> None:
     config = {"mode": "client", "connect": {"endpoints": ["tcp/127.0.0.1:7447"]}}
     assert ZenohSettings.model_validate({"config": config}).config == config
 
@@ -230,7 +230,7 @@ def test_zenoh_reads_its_own_keys() -> None:
         (True, "found true; expected a JSON5 file's path or a mapping with Zenoh's own keys"),
     ],
 )
-def test_what_zenoh_refuses_is_refused(config: object, text: str) -> None:
+def test_configurations_that_zenoh_refuses_are_refused(config: object, text: str) -> None:
     [(location, found)] = mistakes(ZenohSettings, {"config": config})
     assert location == "config"
     assert found.startswith(text)
@@ -241,7 +241,7 @@ def test_what_zenoh_refuses_is_refused(config: object, text: str) -> None:
     "url",
     [DEFAULT_LCM_URL, "udpm://?ttl=1", "mpudpm://", "memq://", "tcpq://lab:7700", "file:///tmp/x?mode=w"],
 )
-def test_lcm_urls_have_a_provider_of_lcm(url: str) -> None:
+def test_urls_of_all_lcm_providers_are_accepted(url: str) -> None:
     assert LcmSettings(url=url).effective_url == url
 
 
@@ -270,5 +270,5 @@ def test_other_lcm_urls_are_refused(url: str) -> None:
 
 
 @pytest.mark.parametrize("prefix", ["", "A-B", "Ä", "A" * 17])
-def test_a_channel_prefix_is_fit_for_channels(prefix: str) -> None:
+def test_invalid_channel_prefixes_are_refused(prefix: str) -> None:
     assert [location for location, _ in mistakes(LcmSettings, {"prefix": prefix})] == ["prefix"]

@@ -1,4 +1,4 @@
-"""A whole gateway with an output in memory, for tests against any server."""
+"""A whole gateway that publishes into memory, for tests against any server."""
 
 import asyncio
 from collections.abc import AsyncIterator, Callable
@@ -13,8 +13,8 @@ from tests.configurations import make_settings
 from tests.waiting import wait_until_async
 
 
-class Running:
-    """A gateway of one source that publishes into memory."""
+class MemoryGateway:
+    """A running gateway with one source and a MemoryOutput."""
 
     def __init__(self, gateway: Gateway, output: MemoryOutput) -> None:
         self.gateway = gateway
@@ -23,21 +23,23 @@ class Running:
         self.status = self.source.statuses[0]
 
     def messages(self, component: str) -> list[Any]:
+        """Return the decoded messages of a component that were published so far."""
         return [decode(data) for topic, data in self.output.messages if topic.path == (component,)]
 
-    async def until(self, condition: Callable[[], object]) -> None:
+    async def wait_until(self, condition: Callable[[], object]) -> None:
         await wait_until_async(condition)
 
-    async def heard(self, component: str, count: int = 1) -> list[Any]:
-        await self.until(lambda: len(self.messages(component)) >= count)
+    async def wait_for(self, component: str, count: int = 1) -> list[Any]:
+        """Wait for at least ``count`` messages of a component, and return all of them."""
+        await self.wait_until(lambda: len(self.messages(component)) >= count)
         return self.messages(component)
 
 
 @asynccontextmanager
-async def gateway_to(port: int, **settings: Any) -> AsyncIterator[Running]:
-    """Run a gateway of the source "lab" on a port of this machine; ``settings`` are the source's.
+async def run_gateway(port: int, **settings: Any) -> AsyncIterator[MemoryGateway]:
+    """Run a gateway with the source "lab", whose server listens on ``port`` of this host.
 
-    It tries again at once, and waits shortly for replies.
+    It reconnects at once, and its timeouts are short. ``settings`` replaces settings of the source.
     """
     source: dict[str, Any] = {
         "name": "lab",
@@ -48,14 +50,16 @@ async def gateway_to(port: int, **settings: Any) -> AsyncIterator[Running]:
         "stall_timeout_s": 1.0,
     }
     output = MemoryOutput()
-    unwatched = MetricsSettings(enabled=False)
     gateway = Gateway(
-        make_settings(sources=(SourceSettings(**(source | settings)),), metrics=unwatched), [output]
+        make_settings(
+            sources=(SourceSettings(**(source | settings)),), metrics=MetricsSettings(enabled=False)
+        ),
+        [output],
     )
     stop = asyncio.Event()
     task = asyncio.create_task(gateway.run(stop))
     try:
-        yield Running(gateway, output)
+        yield MemoryGateway(gateway, output)
     finally:
         stop.set()
         async with asyncio.timeout(5):

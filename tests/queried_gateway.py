@@ -1,8 +1,7 @@
-"""Asking a whole gateway: a server with parameters, gateways on real Zenoh and LCM, and those who ask."""
+"""A whole gateway on real Zenoh and LCM for tests of queries: its server, itself, and a peer."""
 
 import asyncio
 import json
-import struct
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from pathlib import Path
@@ -30,69 +29,70 @@ from tests.waiting import wait_until_async
 FRAME = markers_frame(7, (1.0, 2.0, 3.0))
 
 
-class LabServer:
-    """A server to script: what it says of its parameters, what it refuses, what it does not answer.
+class ParameterServer:
+    """A server whose parameters and replies the test sets.
 
-    It sends one frame after StreamFrames, or No Data with ``measures`` off.
+    It sends one frame after StreamFrames, or No Data if ``has_measurement`` is False.
     """
 
     def __init__(self, marker: str = "Marker 1") -> None:
         self.commands: list[str] = []
         self.received: list[bytes] = []
-        """Bodies of packets that are no commands, each behind its type."""
-        self.xml = parameters_of(marker)
+        """The packets that are not commands."""
+        self.xml = parameters_xml(marker)
         self.sections = {section: spec_xml(section) for section in SECTIONS}
-        """Answers to questions about one section; ``xml`` answers all others."""
-        self.refused: tuple[str, ...] = ()
-        """What the commands begin with that get an error."""
-        self.silent: tuple[str, ...] = ()
-        self.measures = True
+        """The replies to SendParameters for one section; ``xml`` is the reply to all others."""
+        self.refused_commands: tuple[str, ...] = ()
+        """The prefixes of the commands that get an error."""
+        self.ignored_commands: tuple[str, ...] = ()
+        """The prefixes of the commands that get no reply."""
+        self.has_measurement = True
         self.client: Client | None = None
-        self.open = asyncio.Event()
-        """Answers wait until it is set."""
-        self.open.set()
+        self.may_answer = asyncio.Event()
+        """Replies wait until it is set."""
+        self.may_answer.set()
 
     async def script(self, client: Client) -> None:
         self.client = client
         while True:
-            size, packet_type = struct.unpack(">II", await client._reader.readexactly(8))
-            body = await client._reader.readexactly(size - 8)
+            packet_type, body = await client.packet()
             if packet_type != 1:
-                self.received.append(struct.pack(">II", size, packet_type) + body)
+                self.received.append(packet(packet_type, body))
                 continue
             command = body.decode("ascii")
             self.commands.append(command)
             if command == "Bye":
                 return
-            await self.open.wait()
+            await self.may_answer.wait()
             reply = self.answer(command)
             if reply is not None:
                 client.send(reply)
 
     def answer(self, command: str) -> bytes | None:
-        if command.startswith(self.silent):
+        """Return the packets that reply to a command; None for no reply."""
+        if command.startswith(self.ignored_commands):
             return None
-        if command.startswith(self.refused):
+        if command.startswith(self.refused_commands):
             return error("err-unknown command")
         parsed = parse_command(command.encode())
         if isinstance(parsed, SendParameters):
             return packet(2, self.sections.get(" ".join(parsed.sections), self.xml))
-        frame = FRAME if self.measures else packet(4)
+        frame = FRAME if self.has_measurement else packet(4)
         if command.startswith("SendCurrentFrame"):
             return frame
         return ok(f"OK-{command}") + (frame if command.startswith("StreamFrames") else b"")
 
     def count(self, command: str) -> int:
-        """Return how many commands came that begin so."""
-        return sum(each.startswith(command) for each in self.commands)
+        """Return how many received commands start with ``command``."""
+        return sum(received.startswith(command) for received in self.commands)
 
     def send(self, data: bytes) -> None:
         assert self.client is not None
         self.client.send(data)
 
 
-def parameters_of(*markers: str) -> bytes:
-    """Return the XML of all sections with markers of these labels."""
+def parameters_xml(*markers: str) -> bytes:
+    """Return the XML of all sections, with markers of these labels."""
     labels = "".join(
         f"<Marker id='{n}'><Label>{label}</Label></Marker>" for n, label in enumerate(markers, 1)
     )
@@ -104,7 +104,7 @@ def parameters_of(*markers: str) -> bytes:
 
 
 @asynccontextmanager
-async def gateway_at(
+async def run_gateway(
     port: int,
     *,
     listen: str | None = None,
@@ -114,10 +114,10 @@ async def gateway_at(
     spool: Path | None = None,
     **source: Any,
 ) -> AsyncIterator[Gateway]:
-    """Run a gateway of the source "lab", whose server is at ``port`` of this machine.
+    """Run a gateway with the source "lab", whose server listens on ``port`` of this host.
 
-    It is on Zenoh as a peer that listens at an endpoint or as a client of a router, or on LCM, or on
-    both. ``source`` has other settings of the source.
+    On Zenoh, it is a peer that listens at an endpoint, or a client of a router. On LCM, it uses the URLs.
+    ``source`` replaces settings of the source.
     """
     defaults: dict[str, Any] = {
         "name": "lab",
@@ -128,7 +128,7 @@ async def gateway_at(
         "query_timeout_s": 10.0,
         "stall_timeout_s": 60.0,
     }
-    # An interval of 0 cannot be configured: here every fresh question is one.
+    # The configuration does not accept 0. It sends every fresh query to the server.
     lab = SourceSettings(**(defaults | source)).model_copy(
         update={} if "fresh_interval_s" in source else {"fresh_interval_s": 0.0}
     )
@@ -151,22 +151,22 @@ async def gateway_at(
             await task
 
 
-def queries_of(gateway: Gateway) -> Any:
-    """Return the object that answers queries on the gateway's only output."""
+def output_queries(gateway: Gateway) -> Any:
+    """Return the object that answers queries on the only output of the gateway."""
     queries = [queries for output in gateway.outputs if (queries := getattr(output, "_queries", None))]
     [only] = queries
     return only
 
 
-async def is_filled(gateway: Gateway, server: LabServer) -> None:
-    """Wait until the gateway has asked for all parameters and each section of them."""
+async def wait_until_cached(gateway: Gateway, server: ParameterServer) -> None:
+    """Wait until the gateway has requested all parameters and each section, and has cached them."""
     await wait_until_async(lambda: server.count("SendParameters") >= 7)
     [source] = gateway.sources
     await wait_until_async(lambda: not source._tasks)
 
 
 class Reply(NamedTuple):
-    """What one get brought: data with its encoding and attachment, or an error and its code."""
+    """One reply to a query: a payload with its encoding and attachment, or an error and its code."""
 
     key: str
     payload: bytes
@@ -181,8 +181,8 @@ class Reply(NamedTuple):
 
 
 @contextmanager
-def asker_at(endpoint: str) -> Iterator[zenoh.Session]:
-    """Give a session that is a client of the endpoint."""
+def zenoh_peer(endpoint: str) -> Iterator[zenoh.Session]:
+    """Open a Zenoh session that is a client of the endpoint."""
     session = open_zenoh("client", connect=endpoint)
     try:
         yield session
@@ -190,7 +190,7 @@ def asker_at(endpoint: str) -> Iterator[zenoh.Session]:
         session.close()
 
 
-def reply_of(reply: zenoh.Reply) -> Reply:
+def to_reply(reply: zenoh.Reply) -> Reply:
     if reply.ok is None:
         assert reply.err is not None
         _, _, code = str(reply.err.encoding).partition(";")
@@ -200,45 +200,47 @@ def reply_of(reply: zenoh.Reply) -> Reply:
     return Reply(str(sample.key_expr), sample.payload.to_bytes(), str(sample.encoding), attachment)
 
 
-async def ask_all(session: zenoh.Session, selector: str) -> list[Reply]:
-    """Return all replies to a get."""
+async def query_all(session: zenoh.Session, selector: str) -> list[Reply]:
+    """Send a query and return all replies."""
     replies = await asyncio.to_thread(lambda: list(session.get(selector, timeout=20)))
-    return [reply_of(reply) for reply in replies]
+    return [to_reply(reply) for reply in replies]
 
 
-async def ask(session: zenoh.Session, selector: str) -> Reply:
-    """Return the one reply to a get."""
-    [reply] = await ask_all(session, selector)
+async def query(session: zenoh.Session, selector: str) -> Reply:
+    """Send a query and return its only reply."""
+    [reply] = await query_all(session, selector)
     return reply
 
 
-class Lab(NamedTuple):
-    server: LabServer
+class QuerySetup(NamedTuple):
+    server: ParameterServer
     port: int
     gateway: Gateway
-    asker: zenoh.Session
+    peer: zenoh.Session
 
 
 @asynccontextmanager
-async def lab(server: LabServer | None = None, **settings: Any) -> AsyncIterator[Lab]:
-    """Give a server, a gateway that has asked it for everything, and a peer who asks the gateway."""
-    server = server or LabServer()
+async def gateway_with_server(
+    server: ParameterServer | None = None, **settings: Any
+) -> AsyncIterator[QuerySetup]:
+    """Run a server, a gateway that has cached its parameters, and a Zenoh peer."""
+    server = server or ParameterServer()
     endpoint = free_endpoint()
     async with (
         ScriptedServer(server.script) as listening,
-        gateway_at(listening.port, listen=endpoint, **settings) as gateway,
+        run_gateway(listening.port, listen=endpoint, **settings) as gateway,
     ):
-        await is_filled(gateway, server)
-        with asker_at(endpoint) as asker:
-            yield Lab(server, listening.port, gateway, asker)
+        await wait_until_cached(gateway, server)
+        with zenoh_peer(endpoint) as peer:
+            yield QuerySetup(server, listening.port, gateway, peer)
 
 
 @asynccontextmanager
-async def lab_without_server(**settings: Any) -> AsyncIterator[tuple[int, zenoh.Session]]:
-    """Give the port on which no server is, and a peer of a gateway that has tried it."""
+async def gateway_without_server(**settings: Any) -> AsyncIterator[tuple[int, zenoh.Session]]:
+    """Run a gateway that has failed to connect to the yielded port, and a Zenoh peer."""
     endpoint, port = free_endpoint(), free_port()
-    async with gateway_at(port, listen=endpoint, **settings) as gateway:
+    async with run_gateway(port, listen=endpoint, **settings) as gateway:
         [status] = gateway.sources[0].statuses
         await wait_until_async(lambda: status.last_error)
-        with asker_at(endpoint) as asker:
-            yield port, asker
+        with zenoh_peer(endpoint) as peer:
+            yield port, peer
