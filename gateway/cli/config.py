@@ -1,4 +1,4 @@
-"""``rtc3d-gateway config``: show the configuration in effect, or its schema."""
+"""``rtc3d-gateway config``: show the effective configuration, or the JSON schema."""
 
 import typer
 
@@ -7,12 +7,12 @@ from gateway.config.schema import schema_text
 from gateway.config.show import shown_configuration
 from gateway.outputs.registry import settings_type
 
-app = typer.Typer(no_args_is_help=True, help="Show the configuration in effect, or the JSON schema.")
+app = typer.Typer(no_args_is_help=True, help="Show the effective configuration, or the JSON schema.")
 
 
 @app.command()
 def show(config: ConfigOption = None, server: ServerOption = None) -> None:
-    """Print the configuration in effect and the origin of each value. Secrets are masked."""
+    """Print the effective configuration and where each value comes from. Secrets are masked."""
     print(shown_configuration(configuration_from_options(config, server)), end="")
 
 

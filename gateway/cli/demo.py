@@ -23,7 +23,7 @@ from gateway.simulator.synthetic import SyntheticScene
 
 
 def demo(
-    seconds: Annotated[float, typer.Option(min=0.1, help="How long to run.")] = 10.0,
+    seconds: Annotated[float, typer.Option(min=0.1, help="How many seconds to run.")] = 10.0,
     udpm: Annotated[
         bool, typer.Option("--udpm", help="Use real multicast for LCM instead of LCM in memory.")
     ] = False,

@@ -1,4 +1,4 @@
-"""``rtc3d-gateway doctor``: find what keeps data from flowing."""
+"""``rtc3d-gateway doctor``: find out why no data arrives."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -20,11 +20,12 @@ def doctor(
     config: ConfigOption = None,
     server: ServerOption = None,
     seconds: Annotated[
-        float, typer.Option(min=0.1, max=3600, help="How long to watch each source, and to wait for Zenoh.")
+        float,
+        typer.Option(min=0.1, max=3600, help="How many seconds to watch each source and to wait for Zenoh."),
     ] = 3.0,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
-    """Find what keeps data from flowing, layer by layer. Exit status 1 if a check fails.
+    """Find out why no data arrives, layer by layer. Exit status 1 if a check fails.
 
     Without options, it uses the installed configuration, /etc/rtc3d-gateway/gateway.yaml.
     """

@@ -15,25 +15,31 @@ from gateway.outputs.kind import SubscriptionRequest
 from gateway.outputs.registry import OUTPUTS
 
 QUEUE_MESSAGES: Final = 10_000
+
 """How many messages may wait to be printed."""
 
 Messages = queue.Queue[tuple[str, bytes]]
 """Messages, each with its Zenoh key or LCM channel."""
 
 
+def _output_names() -> str:
+    return ", ".join(name for name, kind in OUTPUTS.items() if kind.subscribe is not None)
+
+
 def echo(
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Subscribe on Zenoh (the default).")] = False,
     lcm: Annotated[bool, typer.Option("--lcm", help="Subscribe on LCM.")] = False,
     output: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Subscribe to this output of the gateway.")
+        str | None,
+        typer.Option(metavar="NAME", help=f"Subscribe on this output, one of: {_output_names()}."),
     ] = None,
     source: SourceOption = None,
     component: Annotated[
         str | None,
-        typer.Option(help="Only 3d, 6d, analog, force, event, status, clock, parameters or c3d."),
+        typer.Option(help="Only this: 3d, 6d, analog, force, event, status, clock, parameters or c3d."),
     ] = None,
     count: Annotated[int | None, typer.Option(min=1, help="Stop after this number of messages.")] = None,
-    seconds: Annotated[float | None, typer.Option(min=0, help="Stop after this time.")] = None,
+    seconds: Annotated[float | None, typer.Option(min=0, help="Stop after this many seconds.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")] = False,
     connect: ConnectOption = None,
     url: UrlOption = None,
@@ -59,8 +65,9 @@ def subscribed(output: str, request: SubscriptionRequest) -> Iterator[Messages]:
     """Provide a queue of the messages of an output; raises OutputError if it does not open."""
     subscribe = OUTPUTS[output].subscribe if output in OUTPUTS else None
     if subscribe is None:
-        known = ", ".join(name for name, kind in OUTPUTS.items() if kind.subscribe is not None)
-        raise typer.BadParameter(f"no messages to print from output {output!r}; choose one of: {known}")
+        raise typer.BadParameter(
+            f"no messages to print from output {output!r}; choose one of: {_output_names()}"
+        )
     messages: Messages = queue.Queue(QUEUE_MESSAGES)
     subscription = subscribe(request, lambda *message: _put(messages, *message))
     try:

@@ -15,7 +15,7 @@ from gateway.service.log_format import LogFormat, LogLevel
 ConfigOption = Annotated[
     Path | None,
     typer.Option(
-        help="The configuration file, YAML; see config/gateway.yaml. Environment variables "
+        help="The configuration file (YAML); see config/gateway.yaml. Environment variables "
         f"{VARIABLE_PREFIX}… override it or replace it."
     ),
 ]
@@ -25,11 +25,14 @@ ServerOption = Annotated[
 ]
 
 LogLevelOption = Annotated[
-    LogLevel, typer.Option(case_sensitive=False, help="The lowest level of messages to log.")
+    LogLevel,
+    typer.Option(case_sensitive=False, help="The lowest level to log: debug, info, warning or error."),
 ]
 LogFormatOption = Annotated[
     LogFormat,
-    typer.Option(case_sensitive=False, help="auto means the journal under systemd, text elsewhere."),
+    typer.Option(
+        case_sensitive=False, help="text, json or journal; auto means journal under systemd, otherwise text."
+    ),
 ]
 
 MarkersOption = Annotated[int, typer.Option(min=0, max=10_000, help="Markers in the synthetic scene.")]
@@ -44,13 +47,13 @@ C3dOption = Annotated[
     Path | None, typer.Option("--c3d", help="Play this C3D file instead of a synthetic scene.")
 ]
 
-SourceOption = Annotated[str | None, typer.Option(help="Only this source.")]
+SourceOption = Annotated[str | None, typer.Option(help="Only this source; the default is all sources.")]
 ConnectOption = Annotated[
     str | None,
     typer.Option(help="Zenoh endpoint of the gateway or router, for example tcp/192.0.2.5:7447."),
 ]
 UrlOption = Annotated[
-    str | None, typer.Option(help="LCM URL; the default is $LCM_DEFAULT_URL, else LCM's own default.")
+    str | None, typer.Option(help="LCM URL; the default is $LCM_DEFAULT_URL, else LCM's default URL.")
 ]
 PrefixOption = Annotated[
     str | None, typer.Option(help="The gateway's prefix; the default is mocap on Zenoh, MOCAP on LCM.")

@@ -1,4 +1,4 @@
-"""``rtc3d-gateway params``: ask gateways for the parameters of their servers."""
+"""``rtc3d-gateway params``: query the parameters of servers through their gateways."""
 
 import sys
 from typing import Annotated, Final
@@ -21,26 +21,27 @@ def params(
         list[str] | None,
         typer.Argument(metavar="SECTION", help=f"Any of {', '.join(SECTIONS)}; the default is all."),
     ] = None,
-    zenoh: Annotated[bool, typer.Option("--zenoh", help="Ask on Zenoh (the default).")] = False,
-    lcm: Annotated[bool, typer.Option("--lcm", help="Ask on LCM.")] = False,
+    zenoh: Annotated[bool, typer.Option("--zenoh", help="Query on Zenoh (the default).")] = False,
+    lcm: Annotated[bool, typer.Option("--lcm", help="Query on LCM.")] = False,
     source: SourceOption = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print one JSON object, with the sources as keys.")
     ] = False,
     as_xml: Annotated[bool, typer.Option("--xml", help="Print the server's XML unchanged.")] = False,
     fresh: Annotated[
-        bool, typer.Option("--fresh", help="Make the gateway ask the server now instead of using its cache.")
+        bool,
+        typer.Option("--fresh", help="Make the gateway query the server now instead of using its cache."),
     ] = False,
     connect: ConnectOption = None,
     url: UrlOption = None,
     queries_url: Annotated[
         str | None,
-        typer.Option(metavar="URL", help="LCM URL for requests, the gateway's lcm.queries_url."),
+        typer.Option(metavar="URL", help="LCM URL of requests and replies: the gateway's lcm.queries_url."),
     ] = None,
     prefix: PrefixOption = None,
     timeout: Annotated[float, typer.Option(min=0.1, help="How many seconds to wait for replies.")] = 5.0,
 ) -> None:
-    """Ask gateways for the parameters of their servers: markers, tools, channels, plates, events.
+    """Query the parameters of servers through their gateways: markers, tools, channels, plates, events.
 
     Exit status 3: no gateway found; 4: its server is not connected; 5: no reply in time; 1: anything else.
     """

@@ -41,7 +41,8 @@ def simulate(
         int, typer.Option(min=0, max=65535, help="The port to listen on; 0 picks a free one.")
     ] = FIRST_PRINCIPLES_PORT,
     seconds: Annotated[
-        float | None, typer.Option(min=0, help="Stop after this time; the default is to run until Ctrl-C.")
+        float | None,
+        typer.Option(min=0, help="Stop after this many seconds; the default is to run until Ctrl-C."),
     ] = None,
     markers: MarkersOption = 24,
     tools: ToolsOption = 4,

@@ -35,10 +35,10 @@ class SceneSettings(Section):
     """The number of force plates."""
 
     rate_hz: Rate = 200.0
-    """SampleNumbers per second of markers and tools."""
+    """Samples per second of markers and tools."""
 
     analog_rate_hz: Rate = 2000.0
-    """SampleNumbers per second of analog channels and force plates."""
+    """Samples per second of analog channels and force plates."""
 
     marker_label: Label = "Marker"
     """The text before the number in the markers' labels."""

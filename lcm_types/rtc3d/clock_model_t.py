@@ -8,7 +8,10 @@ from io import BytesIO
 import struct
 
 class clock_model_t(object):
-    """ How the server's time stamps map to the gateway's clock: utime = offset + timestamp * (1 + drift). """
+    """
+    How the server's time stamps map to the gateway's clock: a frame with time stamp t, near the newest frame, was
+    captured at t + offset_us. offset_us changes by drift_ppm µs per second.
+    """
 
     __slots__ = ["has_clock", "offset_us", "drift_ppm", "uncertainty_us", "samples"]
 
@@ -25,7 +28,7 @@ class clock_model_t(object):
 
         self.offset_us = 0
         """
-        The current estimate of the time, in µs since the Unix epoch, at which the server's time stamp is 0.
+        The time on the gateway's clock, in µs since the Unix epoch, minus the server's time stamp, at the newest frame.
         LCM Type: int64_t
         """
 
@@ -36,7 +39,11 @@ class clock_model_t(object):
         """
 
         self.uncertainty_us = 0.0
-        """ LCM Type: double """
+        """
+        The estimated error in µs, without the constant delay.
+        LCM Type: double
+        """
+
         self.samples = 0
         """
         Number of frames that the model is based on.

@@ -39,7 +39,7 @@ class clock_t(object):
 
         self.session = 0
         """
-        Grows by one with each connection to the server.
+        The sum of the session numbers of all streams.
         LCM Type: int32_t
         """
 

@@ -28,7 +28,7 @@ class parameters_request_t(object):
 
         self.requester = ""
         """
-        The name of the requester, at most 128 bytes. No other requester may use it.
+        The name of the requester, at most 128 bytes. It must be unique.
         LCM Type: string
         """
 
@@ -42,7 +42,7 @@ class parameters_request_t(object):
         """ LCM Type: string[num_sections] """
         self.fresh = False
         """
-        True: query the server now; false: use the cache of the gateway.
+        True: the gateway queries the server now; false: it may use its cache.
         LCM Type: boolean
         """
 

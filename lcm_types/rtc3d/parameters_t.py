@@ -37,7 +37,7 @@ class parameters_t(object):
 
         self.session = 0
         """
-        Grows by one with each connection to the server.
+        The sum of the session numbers of all streams.
         LCM Type: int32_t
         """
 

@@ -85,7 +85,7 @@ class stream_status_t(object):
         """ LCM Type: rtc3d.count_t[num_drops] """
         self.num_limitations = 0
         """
-        What this connection does without because the server refused it.
+        What the gateway works around on this connection, for example a command that the server refused.
         LCM Type: int32_t
         """
 

@@ -21,7 +21,7 @@ def _lcm_url(text: str) -> str:
     provider, separator, rest = text.partition("://")
     if provider not in LCM_PROVIDERS or not separator or not text.isprintable() or " " in text:
         raise ValueError
-    if "@" in rest.partition("/")[0]:  # LCM knows no password, and says the whole URL in the log
+    if "@" in rest.partition("/")[0]:  # LCM has no passwords, and logs the whole URL
         raise ValueError
     return text
 
@@ -42,23 +42,24 @@ LcmUrl = Annotated[
 
 
 def effective_lcm_url(url: str | None) -> str:
-    """Return ``url``, else the environment's LCM_DEFAULT_URL, else DEFAULT_LCM_URL.
+    """Return ``url``, else $LCM_DEFAULT_URL, else DEFAULT_LCM_URL.
 
-    The environment's is not checked here: LCM itself says what it cannot use.
+    The environment variable is not checked here: LCM itself reports a URL that it cannot use.
     """
     return url or os.environ.get("LCM_DEFAULT_URL") or DEFAULT_LCM_URL
 
 
 def lcm_queries_url(url: str) -> str:
-    """Return where requests go unless told otherwise: to the next port, where a URL is multicast's.
+    """Return the default URL of requests: ``url``, with the next port if it is a multicast URL.
 
-    Whoever listens on a multicast URL is sent all that anybody sends there, the gateway its own messages
-    too: that would double what LCM costs it, and more. Others pass on only what is subscribed to.
+    A program that listens on a multicast URL receives everything that is sent there. On ``url`` itself, the
+    gateway would receive its own messages, which more than doubles what LCM costs it. The other providers
+    deliver only messages on subscribed channels.
     """
     parts = urlsplit(url)
     try:
         port = parts.port or 7667
-    except ValueError:  # LCM itself refuses it
+    except ValueError:  # LCM itself rejects it
         return url
     if parts.scheme != "udpm":
         return url
@@ -68,25 +69,25 @@ def lcm_queries_url(url: str) -> str:
 
 
 class LcmSettings(OutputSettings):
-    """How data and answers go to LCM."""
+    """The settings of the LCM output."""
 
     enabled: Switch = True
-    """Whether anything is published, and answered, on LCM."""
+    """Whether to publish, and to answer requests, on LCM."""
 
     prefix: ChannelPrefix = "MOCAP"
-    """What all channels begin with."""
+    """The beginning of all channels."""
 
     url: LcmUrl | None = None
-    """Where to publish; null is the environment's LCM_DEFAULT_URL, else LCM's own, on this host only."""
+    """Where to publish; null means $LCM_DEFAULT_URL, else LCM's default URL, which stays on this host."""
 
     queries_url: LcmUrl | None = None
-    """Where requests are awaited and answered; null is the port after that of url."""
+    """The URL of requests and replies; null means url, with the next port if url begins with udpm."""
 
     max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
-    """The highest rate of each component named; frames beyond it are left out, evenly."""
+    """The highest rate of some components, in Hz; the gateway leaves out further frames at even intervals."""
 
     tool_poses: Switch = False
-    """Whether each tool's pose is published on a channel of its own."""
+    """Whether to publish the pose of each tool on its own channel."""
 
     @property
     def effective(self) -> dict[str, Effective]:
@@ -96,10 +97,10 @@ class LcmSettings(OutputSettings):
 
     @property
     def effective_url(self) -> str:
-        """What ``effective_lcm_url`` makes of ``url``."""
+        """The URL in use: see ``effective_lcm_url``."""
         return effective_lcm_url(self.url)
 
     @property
     def effective_queries_url(self) -> str:
-        """``queries_url``, else what belongs to ``effective_url``."""
+        """``queries_url``, else the default for ``effective_url``."""
         return self.queries_url or lcm_queries_url(self.effective_url)

@@ -68,26 +68,26 @@ ZenohConfig = Annotated[
 
 
 class ZenohSettings(OutputSettings):
-    """How data and answers go to Zenoh."""
+    """The settings of the Zenoh output."""
 
     foreign_keys: ClassVar[Mapping[str, str]] = {
         "config": "zenoh.config as the path of a JSON5 file that only the gateway may read"
     }
 
     enabled: Switch = True
-    """Whether anything is published, and answered, on Zenoh."""
+    """Whether to publish, and to answer queries, on Zenoh."""
 
     prefix: KeyPrefix = "mocap"
-    """What all keys begin with."""
+    """The beginning of all keys."""
 
     config: ZenohConfig = Field(default_factory=dict, repr=False)  # it may hold a password
-    """Zenoh's own configuration: the path of a JSON5 file, or its keys inline; without secrets."""
+    """The configuration of Zenoh itself: the path of a JSON5 file, or its keys inline, without secrets."""
 
     express: Switch = False
-    """Whether each message is sent at once instead of in batches."""
+    """Whether to send each message at once instead of in batches."""
 
     max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
-    """The highest rate of each component named; frames beyond it are left out, evenly."""
+    """The highest rate of some components, in Hz; the gateway leaves out further frames at even intervals."""
 
     tool_poses: Switch = False
-    """Whether each tool's pose is published on a key of its own, while someone listens."""
+    """Whether to publish the pose of each tool on its own key, while someone subscribes to it."""

@@ -8,7 +8,7 @@ GUIDE = (Path(__file__).parents[3] / "docs/how-to/troubleshoot.md").read_text(en
 
 
 def test_the_guide_lists_every_check_in_order() -> None:
-    table = GUIDE.partition("## What is checked")[2].partition("\n## ")[0]
+    table = GUIDE.partition("## What doctor checks")[2].partition("\n## ")[0]
     checks = re.findall(r"^\| [^|]*\| (\w+) \|", table, re.MULTILINE)
     expected = [
         "file",
