@@ -1,9 +1,8 @@
-"""The example programs, run like a user runs them."""
+"""The example programs, run as a user runs them."""
 
 import os
 import re
 import shutil
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ import pytest
 
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.synthetic import SyntheticScene
+from tests.networks import free_port
 
 pytestmark = pytest.mark.netns
 
@@ -24,8 +24,8 @@ PROGRAM = [sys.executable, "-m", "gateway"]
 
 
 @contextmanager
-def running(*command: str, ready: str) -> Iterator[subprocess.Popen[str]]:
-    """Run a program until the block ends. The block starts when ``ready`` appears in its output."""
+def run_program(*command: str, ready: str) -> Iterator[subprocess.Popen[str]]:
+    """Start a program, wait for ``ready`` in its output, and end it after the block."""
     environment = {**os.environ, "LCM_DEFAULT_URL": LCM_URL}
     with subprocess.Popen(
         command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
@@ -42,14 +42,9 @@ def running(*command: str, ready: str) -> Iterator[subprocess.Popen[str]]:
             process.terminate()
 
 
-def free_port() -> int:
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
-
-
 @pytest.fixture(scope="module")
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
-    """The Zenoh endpoint of a gateway; it and its simulator run as separate programs."""
+    """The Zenoh endpoint of a gateway that runs, like its simulator, as a separate program."""
     port, endpoint = free_port(), f"tcp/127.0.0.1:{free_port()}"
     config = tmp_path_factory.mktemp("gateway") / "gateway.yaml"
     config.write_text(
@@ -61,12 +56,15 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     )
     simulate = [*PROGRAM, "simulate", "--port", str(port), "--markers", "20", "--rate", "100"]
     gateway = [*PROGRAM, "run", "--config", str(config), "--log-level", "debug"]
-    with running(*simulate, ready="RTC3D server on"), running(*gateway, ready="zenoh: the session is open"):
+    with (
+        run_program(*simulate, ready="RTC3D server on"),
+        run_program(*gateway, ready="zenoh: the session is open"),
+    ):
         yield endpoint
 
 
 def printed_positions(text: str) -> list[tuple[int, list[float]]]:
-    """Return frame number and first position of each printed frame."""
+    """Return the frame number and the first position of each printed frame."""
     found = re.findall(
         r"frame (\d+):[^\n]*?(?:\n[^#\n]*?)?(-?\d+\.\d+),\s?(-?\d+\.\d+),\s?(-?\d+\.\d+)", text
     )
@@ -83,7 +81,7 @@ def assert_positions_match_the_scene(text: str, at_least: int) -> None:
         assert position == pytest.approx([first["x"], first["y"], first["z"]], abs=6e-4)
 
 
-def test_the_c_example(endpoint: str, tmp_path: Path) -> None:  # noqa: ARG001
+def test_the_c_example_prints_positions_from_lcm(endpoint: str, tmp_path: Path) -> None:  # noqa: ARG001
     if shutil.which("cc") is None or shutil.which("make") is None:
         pytest.skip("no C compiler here (cc, make)")
     build = subprocess.run(
@@ -91,19 +89,19 @@ def test_the_c_example(endpoint: str, tmp_path: Path) -> None:  # noqa: ARG001
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert build.returncode == 0, build.stderr
-    with running(str(tmp_path / "subscriber"), "LAB", "20", ready="listening") as program:
+    with run_program(str(tmp_path / "subscriber"), "LAB", "20", ready="listening") as program:
         text = program.communicate(timeout=30)[0]
     assert_positions_match_the_scene(text.replace(" missing", ""), 15)
     assert program.returncode == 0
 
 
-def test_the_python_lcm_example(endpoint: str) -> None:  # noqa: ARG001
+def test_the_python_example_prints_positions_from_lcm(endpoint: str) -> None:  # noqa: ARG001
     command = [sys.executable, str(ROOT / "examples/subscriber_lcm.py"), "LAB", "20"]
-    with running(*command, ready="listening") as program:
+    with run_program(*command, ready="listening") as program:
         assert_positions_match_the_scene(program.communicate(timeout=30)[0], 15)
 
 
-def test_the_python_zenoh_example(endpoint: str) -> None:
+def test_the_python_example_prints_positions_from_zenoh(endpoint: str) -> None:
     command = [
         sys.executable,
         str(ROOT / "examples/subscriber_zenoh.py"),
@@ -112,5 +110,5 @@ def test_the_python_zenoh_example(endpoint: str) -> None:
         "--count",
         "20",
     ]
-    with running(*command, ready="listening") as program:
+    with run_program(*command, ready="listening") as program:
         assert_positions_match_the_scene(program.communicate(timeout=30)[0], 15)

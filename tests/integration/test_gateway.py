@@ -1,4 +1,4 @@
-"""A whole gateway with an output in memory, against servers as the field notes tell of them."""
+"""A whole gateway that publishes into memory, against servers with deviations from the field notes."""
 
 import asyncio
 import logging
@@ -22,8 +22,8 @@ FRAME = markers_frame(7, (1.0, 2.0, 3.0))
 XML = packet(2, "<RT_Parameters Ver='1.00'><The_3D><Frequency>100</Frequency></The_3D></RT_Parameters>")
 
 
-def obliging(command: str) -> bytes:
-    """Answer as a server that knows everything, with one frame after StreamFrames."""
+def accept(command: str) -> bytes:
+    """Reply as a server that accepts every command and sends one frame after StreamFrames."""
     if command.startswith("SendParameters"):
         return XML
     if command.startswith("StreamFrames"):
@@ -96,7 +96,7 @@ async def test_the_gateway_sends_bye_when_it_stops() -> None:
     async def script(client: Client) -> None:
         def answer(command: str) -> bytes | None:
             commands.append(command)
-            return None if command == "Bye" else obliging(command)
+            return None if command == "Bye" else accept(command)
 
         await client.commands(answer)
 
@@ -146,7 +146,7 @@ async def test_a_limitation_is_logged_as_warning_only_for_the_first_connection(
                 return error("err-unknown command")
             if command.startswith("StreamFrames") and server.connections < 3:
                 client.cut()
-            return obliging(command)
+            return accept(command)
 
         await client.commands(answer)
 
@@ -168,7 +168,7 @@ async def test_a_server_that_answers_no_command_but_streams_is_used() -> None:
 
 async def test_duplicate_acknowledgements_are_ignored() -> None:
     async def script(client: Client) -> None:
-        await client.commands(lambda command: obliging(command) + obliging(command))
+        await client.commands(lambda command: accept(command) + accept(command))
 
     async with (
         ScriptedServer(script) as server,
@@ -182,7 +182,7 @@ async def test_a_byte_order_that_the_server_acknowledges_and_ignores_is_detected
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async def script(client: Client) -> None:
-        await client.commands(obliging)
+        await client.commands(accept)
 
     async with (
         ScriptedServer(script) as server,
@@ -201,7 +201,7 @@ async def test_components_that_were_not_requested_are_not_published() -> None:
     async def script(client: Client) -> None:
         def answer(command: str) -> bytes:
             served.set()
-            return obliging(command)
+            return accept(command)
 
         await client.commands(answer)
 
@@ -222,8 +222,8 @@ async def test_bad_frames_are_counted_and_the_next_good_one_is_published(
 
     async def script(client: Client) -> None:
         def answer(command: str) -> bytes:
-            broken = packet(3, FRAME[8:-4]) + packet(3, b"\xff" * 12) + packet(3, b"")
-            return obliging(command) + (broken + markers_frame(8) if "Stream" in command else b"")
+            invalid = packet(3, FRAME[8:-4]) + packet(3, b"\xff" * 12) + packet(3, b"")
+            return accept(command) + (invalid + markers_frame(8) if "Stream" in command else b"")
 
         await client.commands(answer)
 
@@ -231,12 +231,12 @@ async def test_bad_frames_are_counted_and_the_next_good_one_is_published(
         messages = await gateway.wait_for("3d", 2)
         assert [message.frame_number for message in messages] == [7, 8]
         assert gateway.status.drops == {"frame rejected": 3}
-        told = [
+        records = [
             record
             for record in caplog.records
             if "frame" in record.message and record.name == "gateway.stream.session"
         ]
-        assert [record.levelname for record in told] == ["WARNING", "DEBUG", "DEBUG", "INFO"]
+        assert [record.levelname for record in records] == ["WARNING", "DEBUG", "DEBUG", "INFO"]
         assert "frame rejected" in gateway.status.last_error
 
 
@@ -245,7 +245,7 @@ async def test_unknown_components_are_counted_and_logged_once(caplog: pytest.Log
 
     async def script(client: Client) -> None:
         def answer(command: str) -> bytes:
-            return obliging(command) + (2 * packet(3, unknown) + FRAME if "Stream" in command else b"")
+            return accept(command) + (2 * packet(3, unknown) + FRAME if "Stream" in command else b"")
 
         await client.commands(answer)
 
@@ -256,22 +256,22 @@ async def test_unknown_components_are_counted_and_logged_once(caplog: pytest.Log
 
 
 @pytest.mark.parametrize(
-    ("first_words", "reason"),
+    ("data", "reason"),
     [
         (b"HTTP/1.1 400 Bad Request\r\n\r\n", "not an RTC3D server"),
         (b"SSH-2.0-OpenSSH_9.2\r\n", "not an RTC3D server"),
         (b"\0\0\0\0\0\0\0\0", "less than the header"),
-        (packet(3)[:4] + b"\0\0", "the connection to"),  # cut in the middle of a header
-        (b"\0\xff\0\0\0\0\0\3" + b"x" * 50, "the connection to"),  # cut in the middle of a body
+        (packet(3)[:4] + b"\0\0", "the connection to"),  # ends within a header
+        (b"\0\xff\0\0\0\0\0\3" + b"x" * 50, "the connection to"),  # ends within a body
         (b"", "the connection to"),
     ],
 )
-async def test_after_invalid_data_the_gateway_reconnects_and_streams(first_words: bytes, reason: str) -> None:
+async def test_after_invalid_data_the_gateway_reconnects_and_streams(data: bytes, reason: str) -> None:
     async def script(client: Client) -> None:
         if server.connections == 1:
-            client.send(first_words)
+            client.send(data)
         else:
-            await client.commands(obliging)
+            await client.commands(accept)
 
     async with ScriptedServer(script) as server, run_gateway(server.port) as gateway:
         [message, *_] = await gateway.wait_for("3d")
@@ -282,12 +282,12 @@ async def test_after_invalid_data_the_gateway_reconnects_and_streams(first_words
 
 
 async def test_the_gateway_retries_until_the_server_is_started() -> None:
-    async with ScriptedServer(lambda client: client.commands(obliging)) as taken:
-        port = taken.port
+    async with ScriptedServer(lambda client: client.commands(accept)) as stopped:
+        port = stopped.port
     async with run_gateway(port) as gateway:
         await gateway.wait_until(lambda: gateway.status.reconnects >= 2)
         assert f"refused by 127.0.0.1:{port}" in gateway.status.last_error
-        async with ScriptedServer(lambda client: client.commands(obliging), port):
+        async with ScriptedServer(lambda client: client.commands(accept), port):
             await gateway.wait_for("3d")
 
 
@@ -299,7 +299,7 @@ async def test_the_error_for_an_unknown_host_contains_its_name() -> None:
 
 async def test_silence_during_a_measurement_ends_the_connection() -> None:
     async def script(client: Client) -> None:
-        await client.commands(lambda command: obliging(command) if server.connections < 3 else None)
+        await client.commands(lambda command: accept(command) if server.connections < 3 else None)
 
     async with (
         ScriptedServer(script) as server,
@@ -312,16 +312,16 @@ async def test_silence_during_a_measurement_ends_the_connection() -> None:
 
 
 async def test_silence_without_a_measurement_is_accepted_if_the_server_answers() -> None:
-    probes = asyncio.Event()
+    probed = asyncio.Event()
 
     async def script(client: Client) -> None:
-        seen: list[str] = []
+        commands: list[str] = []
 
         def answer(command: str) -> bytes:
-            seen.append(command)
-            if seen.count("Version 1.0") == 3:
-                probes.set()
-            return packet(4) if command.startswith("StreamFrames") else obliging(command)
+            commands.append(command)
+            if commands.count("Version 1.0") == 3:
+                probed.set()
+            return packet(4) if command.startswith("StreamFrames") else accept(command)
 
         await client.commands(answer)
 
@@ -329,7 +329,7 @@ async def test_silence_without_a_measurement_is_accepted_if_the_server_answers()
         ScriptedServer(script) as server,
         run_gateway(server.port, stall_timeout_s=0.3) as gateway,
     ):
-        await probes.wait()
+        await probed.wait()
         assert gateway.status.state is StreamState.NO_MEASUREMENT
         assert server.connections == 1
 
@@ -343,7 +343,7 @@ async def test_silence_without_a_measurement_and_without_answers_ends_the_connec
             if streaming:
                 return None
             streaming = command.startswith("StreamFrames")
-            return packet(4) if streaming else obliging(command)
+            return packet(4) if streaming else accept(command)
 
         await client.commands(answer)
 
@@ -368,7 +368,7 @@ async def test_a_measurement_that_starts_later_is_streamed() -> None:
 
 async def test_the_status_describes_streams_and_outputs() -> None:
     async def script(client: Client) -> None:
-        await client.commands(obliging)
+        await client.commands(accept)
 
     async with (
         ScriptedServer(script) as server,
@@ -388,11 +388,11 @@ async def test_the_status_describes_streams_and_outputs() -> None:
 
 async def test_a_failure_is_logged_once_and_so_is_its_end(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG)
-    async with ScriptedServer(lambda client: client.commands(obliging)) as taken:
-        port = taken.port
+    async with ScriptedServer(lambda client: client.commands(accept)) as stopped:
+        port = stopped.port
     async with run_gateway(port) as gateway:
         await gateway.wait_until(lambda: gateway.status.reconnects >= 3)
-        async with ScriptedServer(lambda client: client.commands(obliging), port):
+        async with ScriptedServer(lambda client: client.commands(accept), port):
             await gateway.wait_for("3d")
     refused = [record for record in caplog.records if "refused by" in record.message]
     assert [record.levelname for record in refused[:3]] == ["WARNING", "DEBUG", "DEBUG"]

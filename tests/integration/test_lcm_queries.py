@@ -1,4 +1,4 @@
-"""Questions over LCM's multicast: requests, replies, and what strangers send."""
+"""Parameter requests over LCM multicast: replies, errors and malformed requests."""
 
 import struct
 from collections.abc import AsyncIterator, Sequence
@@ -26,28 +26,28 @@ pytestmark = pytest.mark.netns
 REQUEST, REPLY = "MOCAP_LAB_PARAMETERS_REQUEST", "MOCAP_LAB_PARAMETERS_REPLY"
 
 
-class Peer:
-    """A program on LCM that asks, and hears all replies and statuses."""
+class LcmPeer:
+    """A program on LCM that sends requests and receives all replies and status messages."""
 
     def __init__(self, url: str, queries_url: str | None = None) -> None:
         self._lcm = open_lcm(queries_url or lcm_queries_url(url))
         self.replies: list[rtc3d.parameters_reply_t] = []
         self.statuses: list[rtc3d.status_t] = []
-        self._listeners = [
-            LcmSubscriber(self._lcm, REPLY, self._take),
-            LcmSubscriber(open_lcm(url), "MOCAP_LAB_STATUS", self._take),
+        self._subscribers = [
+            LcmSubscriber(self._lcm, REPLY, self._append),
+            LcmSubscriber(open_lcm(url), "MOCAP_LAB_STATUS", self._append),
         ]
 
-    def _take(self, channel: str, data: bytes) -> None:
-        heard: list[Any] = self.replies if channel == REPLY else self.statuses
-        heard.append(decode(data))
+    def _append(self, channel: str, data: bytes) -> None:
+        messages: list[Any] = self.replies if channel == REPLY else self.statuses
+        messages.append(decode(data))
 
     def send(self, data: bytes) -> None:
         self._lcm.publish(REQUEST, data)
 
-    async def ask(self, number: int = 1, sections: Sequence[str] = (), *, fresh: bool = False) -> Any:
-        """Send one request and return the reply to it."""
-        self.send(request(number, sections, fresh=fresh))
+    async def request(self, number: int = 1, sections: Sequence[str] = (), *, fresh: bool = False) -> Any:
+        """Send a request and return its reply."""
+        self.send(encode_request(number, sections, fresh=fresh))
         await wait_until_async(lambda: self.answers(number))
         [reply] = self.answers(number)
         return reply
@@ -56,18 +56,18 @@ class Peer:
         return [reply for reply in self.replies if reply.request_id == number]
 
     def ignored(self, cause: str) -> int:
-        """Return how many requests the newest status says were ignored for this cause."""
+        """Return how many requests were ignored for this cause, from the newest status."""
         if not self.statuses:
             return 0
         [output] = self.statuses[-1].outputs
         return sum(count.count for count in output.drops if count.name == cause)
 
     def close(self) -> None:
-        for listener in self._listeners:
-            listener.close()
+        for subscriber in self._subscribers:
+            subscriber.close()
 
 
-def request(
+def encode_request(
     number: int, sections: Sequence[str] = (), *, fresh: bool = False, requester: str = "test"
 ) -> bytes:
     message = rtc3d.parameters_request_t()
@@ -77,33 +77,35 @@ def request(
     return encoded
 
 
-class Lab(NamedTuple):
+class LcmSetup(NamedTuple):
     server: ParameterServer
     gateway: Gateway
-    peer: Peer
+    peer: LcmPeer
 
 
 @asynccontextmanager
-async def lab(server: ParameterServer | None = None, **settings: Any) -> AsyncIterator[Lab]:
+async def gateway_with_lcm_peer(
+    server: ParameterServer | None = None, **settings: Any
+) -> AsyncIterator[LcmSetup]:
     server, url = server or ParameterServer(), lcm_url()
     async with (
         ScriptedServer(server.script) as listening,
         run_gateway(listening.port, lcm_url=url, **settings) as gateway,
     ):
         await wait_until_cached(gateway, server)
-        peer = Peer(url)
+        peer = LcmPeer(url)
         try:
-            yield Lab(server, gateway, peer)
+            yield LcmSetup(server, gateway, peer)
         finally:
             peer.close()
 
 
 async def test_a_reply_has_id_and_requester_of_the_request_and_the_xml_with_its_age() -> None:
-    async with lab() as (server, _, peer):
-        peer.send(request(-(2**63), requester="Fluß, 2. Stock"))
+    async with gateway_with_lcm_peer() as (server, _, peer):
+        peer.send(encode_request(-(2**63), requester="Käfig, 2"))
         await wait_until_async(lambda: peer.replies)
         [reply] = peer.replies
-        assert (reply.request_id, reply.requester) == (-(2**63), "Fluß, 2. Stock")
+        assert (reply.request_id, reply.requester) == (-(2**63), "Käfig, 2")
         assert reply.xml.encode() == server.xml
         assert 0 <= reply.age_s < 60
         assert (reply.error, reply.error_code) == ("", "")
@@ -117,14 +119,14 @@ async def test_requests_can_use_a_separate_url() -> None:
         run_gateway(listening.port, lcm_url=data_url, queries_url=queries_url) as gateway,
     ):
         await wait_until_cached(gateway, server)
-        elsewhere, peer = Peer(data_url, data_url), Peer(data_url, queries_url)
+        wrong_url_peer, peer = LcmPeer(data_url, data_url), LcmPeer(data_url, queries_url)
         try:
-            elsewhere.send(request(1))  # nobody is there
-            assert (await peer.ask(2)).xml.encode() == server.xml
+            wrong_url_peer.send(encode_request(1))  # on the URL for data
+            assert (await peer.request(2)).xml.encode() == server.xml
             assert not peer.answers(1)
-            assert not elsewhere.replies
+            assert not wrong_url_peer.replies
         finally:
-            elsewhere.close()
+            wrong_url_peer.close()
             peer.close()
 
 
@@ -136,7 +138,7 @@ async def test_a_queries_url_that_does_not_open_does_not_stop_the_output(
         ScriptedServer(ParameterServer().script) as listening,
         run_gateway(listening.port, lcm_url=data_url, queries_url=nobody),
     ):
-        viewer = Peer(data_url)
+        viewer = LcmPeer(data_url)
         try:
             await wait_until_async(lambda: viewer.statuses)
         finally:
@@ -146,27 +148,28 @@ async def test_a_queries_url_that_does_not_open_does_not_stop_the_output(
 
 @pytest.mark.parametrize("section", SECTIONS)
 async def test_each_section_is_answered_unchanged(section: str) -> None:
-    async with lab() as (_, _, peer):
-        assert (await peer.ask(1, [section])).xml.encode() == spec_xml(section)
+    async with gateway_with_lcm_peer() as (_, _, peer):
+        assert (await peer.request(1, [section])).xml.encode() == spec_xml(section)
 
 
 async def test_several_sections_are_requested_with_one_command() -> None:
     server = ParameterServer()
     server.sections["3d force"] = both = in_root("<The_3D/>", "<Force/>")
-    async with lab(server) as (_, _, peer):
-        assert (await peer.ask(1, ["force", "3d", "3d"])).xml.encode() == both
+    async with gateway_with_lcm_peer(server) as (_, _, peer):
+        assert (await peer.request(1, ["force", "3d", "3d"])).xml.encode() == both
         assert server.commands[-1] == "SendParameters 3D Force"
-        asked = server.count("SendParameters")
-        assert (await peer.ask(2, list(SECTIONS))).xml.encode() == server.xml  # all there are is all
-        assert (await peer.ask(3, ["3d", "force"])).xml.encode() == both
-        assert server.count("SendParameters") == asked
+        num_requests = server.count("SendParameters")
+        # A request for all sections is one for all parameters.
+        assert (await peer.request(2, list(SECTIONS))).xml.encode() == server.xml
+        assert (await peer.request(3, ["3d", "force"])).xml.encode() == both
+        assert server.count("SendParameters") == num_requests
 
 
 async def test_fresh_parameters_are_requested_from_the_server() -> None:
-    async with lab() as (server, _, peer):
+    async with gateway_with_lcm_peer() as (server, _, peer):
         server.sections["3d"] = b"<RT_Parameters><The_3D/></RT_Parameters>"
-        assert (await peer.ask(1, ["3d"])).xml.encode() == spec_xml("3d")
-        assert (await peer.ask(2, ["3d"], fresh=True)).xml == "<RT_Parameters><The_3D/></RT_Parameters>"
+        assert (await peer.request(1, ["3d"])).xml.encode() == spec_xml("3d")
+        assert (await peer.request(2, ["3d"], fresh=True)).xml == "<RT_Parameters><The_3D/></RT_Parameters>"
 
 
 async def test_xml_in_latin1_with_trailing_nuls_is_decoded() -> None:
@@ -174,14 +177,14 @@ async def test_xml_in_latin1_with_trailing_nuls_is_decoded() -> None:
     server.sections["3d"] = (
         "<RT_Parameters><The_3D><Unit>µm</Unit></The_3D></RT_Parameters>".encode("latin-1") + b"\0"
     )
-    async with lab(server) as (_, _, peer):
-        reply = await peer.ask(1, ["3d"])
+    async with gateway_with_lcm_peer(server) as (_, _, peer):
+        reply = await peer.request(1, ["3d"])
         assert reply.xml == "<RT_Parameters><The_3D><Unit>µm</Unit></The_3D></RT_Parameters>"
 
 
 async def test_the_error_for_an_unknown_section_lists_the_known_ones() -> None:
-    async with lab() as (_, _, peer):
-        reply = await peer.ask(1, ["3d", "Markers\x1b[31m"])
+    async with gateway_with_lcm_peer() as (_, _, peer):
+        reply = await peer.request(1, ["3d", "Markers\x1b[31m"])
         assert reply.error_code == "bad-request"
         assert reply.error == (
             r"unknown section 'Markers\x1b[31m'; accepted: general, 3d, 6d, analog, force, events"
@@ -194,9 +197,9 @@ async def test_without_a_connection_the_error_has_the_reason_and_its_age() -> No
     async with run_gateway(port, lcm_url=url) as gateway:
         [status] = gateway.sources[0].statuses
         await wait_until_async(lambda: status.last_error)
-        peer = Peer(url)
+        peer = LcmPeer(url)
         try:
-            reply = await peer.ask()
+            reply = await peer.request()
             assert reply.error_code == "no-connection"
             assert reply.error.startswith(
                 f"source 'lab' has no connection: refused by 127.0.0.1:{port}, tried "
@@ -219,15 +222,15 @@ async def test_without_a_connection_the_error_has_the_reason_and_its_age() -> No
 async def test_a_refusal_or_missing_reply_of_the_server_is_an_error(
     attribute: str, code: str, text: str
 ) -> None:
-    async with lab(reply_timeout_s=0.3) as (server, _, peer):
+    async with gateway_with_lcm_peer(reply_timeout_s=0.3) as (server, _, peer):
         setattr(server, attribute, ("SendParameters",))
-        reply = await peer.ask(fresh=True)
+        reply = await peer.request(fresh=True)
         assert reply.error_code == code
         assert text in reply.error
 
 
 async def test_malformed_requests_are_counted_and_ignored() -> None:
-    good = request(1)
+    good = encode_request(1)
     fingerprint, rest = good[:8], good[8:]
     malformed = [
         b"",
@@ -236,15 +239,15 @@ async def test_malformed_requests_are_counted_and_ignored() -> None:
         good[:-1],
         bytes(8) + rest,
         fingerprint + struct.pack(">qI", 2, 0xFFFFFFFF),  # a requester of 4 GB
-        request(3, requester="x" * (MAX_REQUESTER_BYTES + 1)),
-        request(4, ["general"] * 1000),
-        request(5) + bytes(MAX_REQUEST_BYTES),
-        request(6)[:-5] + struct.pack(">i", 2**31 - 1) + b"\1",  # two thousand million sections
+        encode_request(3, requester="x" * (MAX_REQUESTER_BYTES + 1)),
+        encode_request(4, ["general"] * 1000),
+        encode_request(5) + bytes(MAX_REQUEST_BYTES),
+        encode_request(6)[:-5] + struct.pack(">i", 2**31 - 1) + b"\1",  # 2³¹ - 1 sections
     ]
-    async with lab() as (_, gateway, peer):
+    async with gateway_with_lcm_peer() as (_, gateway, peer):
         for data in malformed:
             peer.send(data)
-        assert (await peer.ask(7)).error == ""
+        assert (await peer.request(7)).error == ""
         await wait_until_async(lambda: peer.ignored("malformed request") == len(malformed))
         assert [reply.request_id for reply in peer.replies] == [7]
         queries = output_queries(gateway)
@@ -252,7 +255,7 @@ async def test_malformed_requests_are_counted_and_ignored() -> None:
 
 
 async def test_requests_beyond_the_queue_are_dropped_and_counted() -> None:
-    async with lab(reply_timeout_s=20.0, query_timeout_s=20.0) as (server, gateway, peer):
+    async with gateway_with_lcm_peer(reply_timeout_s=20.0, query_timeout_s=20.0) as (server, gateway, peer):
         queries = output_queries(gateway)
 
         def waiting(count: int) -> bool:
@@ -260,11 +263,11 @@ async def test_requests_beyond_the_queue_are_dropped_and_counted() -> None:
 
         server.may_answer.clear()
         for number in range(MAX_PENDING):
-            peer.send(request(number, fresh=True))
-            # LCM's own queue is bounded too: no faster than the gateway takes them out of it.
+            peer.send(encode_request(number, fresh=True))
+            # Wait for each request, because the queue of LCM is bounded too.
             await wait_until_async(partial(waiting, number + 1))
-        peer.send(request(1000))
-        peer.send(request(1001))
+        peer.send(encode_request(1000))
+        peer.send(encode_request(1001))
         await wait_until_async(lambda: peer.ignored("request beyond the queue") == 2)
         before = server.count("SendParameters")
         server.may_answer.set()
@@ -273,7 +276,8 @@ async def test_requests_beyond_the_queue_are_dropped_and_counted() -> None:
         assert server.count("SendParameters") == before
 
         def answered() -> object:
-            peer.send(request(2000))  # again and again: so many replies at once can cost LCM a message
+            # Send it repeatedly, because LCM can lose a message among so many replies.
+            peer.send(encode_request(2000))
             return peer.answers(2000)
 
         await wait_until_async(answered)
@@ -285,24 +289,24 @@ async def test_a_requester_can_send_the_next_request_as_soon_as_it_has_a_reply(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("gateway.outputs.lcm.queries.MAX_PENDING", 1)
-    async with lab() as (_, gateway, peer):
+    async with gateway_with_lcm_peer() as (_, gateway, peer):
         queries = output_queries(gateway)
         assert isinstance(queries, LcmQueries)
-        publish, free, could_ask = queries._publish, queries._free, []
+        publish, free, is_slot_free = queries._publish, queries._free, []
 
-        def publish_and_look(connection: Any, source: str, name: str, message: Any) -> None:
+        def publish_and_check(connection: Any, source: str, name: str, message: Any) -> None:
             publish(connection, source, name, message)
             if name == "PARAMETERS_REPLY":
-                could_ask.append(free.acquire(blocking=False))
+                is_slot_free.append(free.acquire(blocking=False))
                 free.release()
 
-        monkeypatch.setattr(queries, "_publish", publish_and_look)
-        assert (await peer.ask(1)).error == ""
-        assert could_ask == [True]
+        monkeypatch.setattr(queries, "_publish", publish_and_check)
+        assert (await peer.request(1)).error == ""
+        assert is_slot_free == [True]
 
 
 async def test_a_reply_on_the_request_channel_is_a_malformed_request() -> None:
-    async with lab() as (_, _, peer):
+    async with gateway_with_lcm_peer() as (_, _, peer):
         reply = rtc3d.parameters_reply_t()
         peer.send(reply.encode())
         await wait_until_async(lambda: peer.ignored("malformed request") == 1)
@@ -310,17 +314,17 @@ async def test_a_reply_on_the_request_channel_is_a_malformed_request() -> None:
 
 
 async def test_replies_to_requests_with_the_same_id_name_their_requester() -> None:
-    async with lab() as (_, _, peer):
-        peer.send(request(1, requester="one"))
-        peer.send(request(1, requester="two"))
+    async with gateway_with_lcm_peer() as (_, _, peer):
+        peer.send(encode_request(1, requester="one"))
+        peer.send(encode_request(1, requester="two"))
         await wait_until_async(lambda: len(peer.replies) == 2)
         assert sorted(reply.requester for reply in peer.replies) == ["one", "two"]
 
 
 async def test_pending_requests_are_cancelled_when_the_gateway_stops() -> None:
-    async with lab(reply_timeout_s=20.0, query_timeout_s=20.0) as (server, gateway, peer):
+    async with gateway_with_lcm_peer(reply_timeout_s=20.0, query_timeout_s=20.0) as (server, gateway, peer):
         server.ignored_commands = ("SendParameters",)
-        peer.send(request(1, fresh=True))
+        peer.send(encode_request(1, fresh=True))
         queries = output_queries(gateway)
         await wait_until_async(lambda: queries._tasks)
     assert queries._tasks == set()

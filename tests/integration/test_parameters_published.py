@@ -1,4 +1,4 @@
-"""Parameters that are told unasked: to those who listen already, and to those who come late."""
+"""Parameters published without a query, to present and to late subscribers."""
 
 import asyncio
 from collections.abc import Iterator
@@ -31,8 +31,8 @@ pytestmark = pytest.mark.netns
 KEY = "mocap/lab/parameters"
 
 
-class Ears:
-    """Whoever can listen: a plain subscriber, one with a history, and a program on LCM."""
+class Subscribers:
+    """A plain Zenoh subscriber, a Zenoh subscriber with a history, and an LCM subscriber."""
 
     def __init__(self, session: zenoh.Session, url: str) -> None:
         self._session = session
@@ -42,26 +42,28 @@ class Ears:
         self._subscribers = [
             session.declare_subscriber(KEY, lambda sample: self.plain.append(sample.payload.to_bytes()))
         ]
-        self._advanced = listen_with_history(session, self.with_history)
-        self._listener = LcmSubscriber(
+        self._advanced = subscribe_with_history(session, self.with_history)
+        self._lcm_subscriber = LcmSubscriber(
             open_lcm(url), "MOCAP_LAB_PARAMETERS", lambda _channel, data: self.lcm.append(decode(data))
         )
 
-    async def hear(self, xml: bytes) -> None:
-        """Wait until the newest that everyone heard is this."""
+    async def wait_for(self, xml: bytes) -> None:
+        """Wait until ``xml`` is the newest message that each subscriber has received."""
         await wait_until_async(lambda: self.plain and self.plain[-1] == xml)
         await wait_until_async(lambda: self.with_history and self.with_history[-1] == xml)
         await wait_until_async(lambda: self.lcm and self.lcm[-1].xml.encode() == xml)
 
     def close(self) -> None:
-        self._listener.close()
+        self._lcm_subscriber.close()
 
 
-def listen_with_history(session: zenoh.Session, heard: list[bytes]) -> zenoh.ext.AdvancedSubscriber[None]:
+def subscribe_with_history(
+    session: zenoh.Session, received: list[bytes]
+) -> zenoh.ext.AdvancedSubscriber[None]:
     return zenoh.ext.declare_advanced_subscriber(
         session,
         KEY,
-        lambda sample: heard.append(sample.payload.to_bytes()),
+        lambda sample: received.append(sample.payload.to_bytes()),
         history=zenoh.ext.HistoryConfig(detect_late_publishers=True),
     )
 
@@ -80,41 +82,43 @@ def router() -> Iterator[str]:
 
 
 @pytest.fixture
-def ears(router: str, url: str) -> Iterator[Ears]:
+def subscribers(router: str, url: str) -> Iterator[Subscribers]:
     session = open_zenoh("client", connect=router)
-    ears = Ears(session, url)
-    yield ears
-    ears.close()
+    subscribers = Subscribers(session, url)
+    yield subscribers
+    subscribers.close()
     session.close()
 
 
-async def test_parameters_are_published_for_every_connection(router: str, url: str, ears: Ears) -> None:
+async def test_parameters_are_published_for_every_connection(
+    router: str, url: str, subscribers: Subscribers
+) -> None:
     port = free_port()
     async with run_gateway(port, router=router, lcm_url=url):
-        first, second = ParameterServer("Marker of the morning"), ParameterServer("Marker of the evening")
+        first, second = ParameterServer("Marker before"), ParameterServer("Marker after")
         async with ScriptedServer(first.script, port):
-            await ears.hear(first.xml)
-            [message, *_] = ears.lcm
+            await subscribers.wait_for(first.xml)
+            [message, *_] = subscribers.lcm
             assert (message.sequence, message.session) == (0, 1)
             assert message.capture_utime <= message.utime
         async with ScriptedServer(second.script, port):
-            await ears.hear(second.xml)
-            assert ears.lcm[-1].session > message.session
+            await subscribers.wait_for(second.xml)
+            assert subscribers.lcm[-1].session > message.session
             with zenoh_peer(router) as peer:
                 assert (await query(peer, KEY)).payload == second.xml
 
 
 async def test_parameters_are_published_again_after_a_restart_of_the_gateway(
-    router: str, url: str, ears: Ears
+    router: str, url: str, subscribers: Subscribers
 ) -> None:
     server = ParameterServer()
     async with ScriptedServer(server.script) as listening:
         async with run_gateway(listening.port, router=router, lcm_url=url):
-            await ears.hear(server.xml)
+            await subscribers.wait_for(server.xml)
         server.xml = parameters_xml("Changed meanwhile")
         async with run_gateway(listening.port, router=router, lcm_url=url):
-            await ears.hear(server.xml)
-            assert ears.lcm[-1].session == 1
+            await subscribers.wait_for(server.xml)
+            assert subscribers.lcm[-1].session == 1
 
 
 async def test_the_first_subscribers_get_the_parameters_although_they_are_late(
@@ -127,83 +131,89 @@ async def test_the_first_subscribers_get_the_parameters_although_they_are_late(
         run_gateway(listening.port, router=router, lcm_url=url) as gateway,
     ):
         await wait_until_cached(gateway, server)
-        asked = list(server.commands)
+        commands = list(server.commands)
         session = open_zenoh("client", connect=router)
-        ears = Ears(session, url)
+        subscribers = Subscribers(session, url)
         try:
-            await ears.hear(server.xml)
-            sequences = [message.sequence for message in ears.lcm]
+            await subscribers.wait_for(server.xml)
+            sequences = [message.sequence for message in subscribers.lcm]
             assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
-            assert server.commands == asked
+            assert server.commands == commands
         finally:
-            ears.close()
+            subscribers.close()
             session.close()
 
 
 async def test_only_the_late_subscriber_with_a_history_gets_the_parameters_again(
-    router: str, url: str, ears: Ears
+    router: str, url: str, subscribers: Subscribers
 ) -> None:
     server = ParameterServer()
     async with (
         ScriptedServer(server.script) as listening,
         run_gateway(listening.port, router=router, lcm_url=url),
     ):
-        await ears.hear(server.xml)
+        await subscribers.wait_for(server.xml)
         late: list[bytes] = []
         session = open_zenoh("client", connect=router)
         try:
             with zenoh_peer(router) as peer:
-                await query(peer, KEY)  # what was told before has arrived everywhere
-                told = len(ears.plain)
-                subscriber = listen_with_history(session, late)
+                await query(peer, KEY)  # its reply arrives after everything published before
+                num_before = len(subscribers.plain)
+                subscriber = subscribe_with_history(session, late)
                 await wait_until_async(lambda: late)
                 await query(peer, KEY)
             assert late == [server.xml]
-            assert len(ears.plain) == told
+            assert len(subscribers.plain) == num_before
             subscriber.undeclare()
         finally:
             session.close()
 
 
-async def test_a_change_found_by_a_fresh_query_is_published(router: str, url: str, ears: Ears) -> None:
+async def test_a_change_found_by_a_fresh_query_is_published(
+    router: str, url: str, subscribers: Subscribers
+) -> None:
     server = ParameterServer()
     async with (
         ScriptedServer(server.script) as listening,
         run_gateway(listening.port, router=router, lcm_url=url) as gateway,
     ):
         await wait_until_cached(gateway, server)
-        await ears.hear(server.xml)
+        await subscribers.wait_for(server.xml)
         server.xml = parameters_xml("One more", "Marker 1")
         with zenoh_peer(router) as peer:
             assert (await query(peer, f"{KEY}?fresh=true")).payload == server.xml
-            await ears.hear(server.xml)
+            await subscribers.wait_for(server.xml)
 
-            await wait_until_async(lambda: not gateway.sources[0]._tasks)  # each section is known anew
+            # Wait until the gateway has requested each section again.
+            await wait_until_async(lambda: not gateway.sources[0]._tasks)
             server.xml = parameters_xml("Another")
             server.sections["3d"] = in_root("<The_3D><Unit>cm</Unit></The_3D>")
             assert (await query(peer, f"{KEY}/3d?fresh=true")).payload == server.sections["3d"]
-            await ears.hear(server.xml)  # all, though only a section was asked for
+            await subscribers.wait_for(server.xml)  # all parameters, although the query was for one section
             assert (await query(peer, f"{KEY}/3d")).payload == server.sections["3d"]
 
 
-async def test_a_change_of_the_statistics_is_not_published(router: str, url: str, ears: Ears) -> None:
+async def test_a_change_of_the_statistics_is_not_published(
+    router: str, url: str, subscribers: Subscribers
+) -> None:
     server = ParameterServer()
     async with (
         ScriptedServer(server.script) as listening,
         run_gateway(listening.port, router=router, lcm_url=url) as gateway,
     ):
         await wait_until_cached(gateway, server)
-        await ears.hear(server.xml)
-        told = len(ears.lcm), len(ears.plain)
+        await subscribers.wait_for(server.xml)
+        num_lcm, num_plain = len(subscribers.lcm), len(subscribers.plain)
         server.xml = server.xml.replace(b"<FramesSent>1<", b"<FramesSent>22<")
         with zenoh_peer(router) as peer:
             assert b">22<" in (await query(peer, f"{KEY}?fresh=true")).payload
         server.xml = parameters_xml("Other")
         with zenoh_peer(router) as peer:
             await query(peer, f"{KEY}?fresh=true")
-        await ears.hear(server.xml)
-        between = [message.xml.encode() for message in ears.lcm[told[0] :]] + ears.plain[told[1] :]
-        assert not any(b">22<" in xml for xml in between)
+        await subscribers.wait_for(server.xml)
+        published = [message.xml.encode() for message in subscribers.lcm[num_lcm:]]
+        published += subscribers.plain[num_plain:]
+        assert not any(b">22<" in xml for xml in published)
 
 
 async def test_no_frame_is_lost_while_two_hundred_queries_are_answered(router: str) -> None:
@@ -224,14 +234,15 @@ async def test_no_frame_is_lost_while_two_hundred_queries_are_answered(router: s
                 keys = ("parameters?fresh=true", "parameters/3d", "6d", "*?format=json")
                 for start in range(0, 200, 20):
                     selectors = [f"mocap/lab/{keys[number % 4]}" for number in range(start, start + 20)]
-                    await asyncio.gather(*(ask_or_more(peer, selector) for selector in selectors))
+                    await asyncio.gather(*(expect_replies(peer, selector) for selector in selectors))
                 await wait_until_async(lambda: len(sequences) > 50)
                 simulator.stop_measurement()
                 await wait_until_async(lambda: len(sequences) >= simulator.sent["3d"])
     assert sequences == list(range(simulator.sent["3d"]))
 
 
-async def ask_or_more(peer: zenoh.Session, selector: str) -> None:
+async def expect_replies(peer: zenoh.Session, selector: str) -> None:
+    """Send a query; it must have replies and no error."""
     replies = await asyncio.to_thread(lambda: list(peer.get(selector, timeout=20)))
     assert replies
     assert all(reply.ok is not None for reply in replies)
@@ -259,4 +270,4 @@ async def test_frames_between_a_command_and_its_reply_are_published() -> None:
             server.may_answer.set()
             assert (await asked).payload == server.xml
             [newest] = published.newest.values()
-            assert decode(newest).sequence == 100  # the first frame, and one hundred
+            assert decode(newest).sequence == 100  # one frame before, then one hundred

@@ -1,4 +1,4 @@
-"""The troublemaking proxy of the tests: it does what it says, or tests of the gateway mean nothing."""
+"""The proxy that other tests use to disturb connections."""
 
 import asyncio
 from collections.abc import AsyncIterator
@@ -125,18 +125,18 @@ async def test_segments_can_be_small() -> None:
 
 
 async def test_the_same_seed_corrupts_the_same_bytes() -> None:
-    heard = []
+    received = []
     for seed in (1, 1, 2):
         async with Simulator(CountingScene()) as simulator, FuzzingProxy(simulator.port, seed=seed) as proxy:
             proxy.to_client.corrupt_share = 0.3
             async with connected(proxy) as client:
                 client.send(command("Version 1.0"))
-                heard.append(await client.exactly(len(packet(*VERSION))))
+                received.append(await client.exactly(len(packet(*VERSION))))
                 proxy.clear()
                 assert await client.ask("Version 1.0") == VERSION
-    differing = [byte != sent for byte, sent in zip(heard[0], packet(*VERSION), strict=True)]
+    differing = [byte != sent for byte, sent in zip(received[0], packet(*VERSION), strict=True)]
     assert 0 < sum(differing) < len(differing)
-    assert heard[0] == heard[1] != heard[2]
+    assert received[0] == received[1] != received[2]
 
 
 async def test_a_slow_reader_fills_the_buffers_of_the_server(caplog: pytest.LogCaptureFixture) -> None:

@@ -1,4 +1,4 @@
-"""What goes wrong around questions and files, and that the gateway says so and goes on."""
+"""Failures around queries and files: the gateway reports them and continues."""
 
 import asyncio
 import logging
@@ -25,14 +25,14 @@ from tests.waiting import wait_until_async
 async def test_a_defect_is_logged_and_reported_to_the_peer(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def fail(_desk: SourceQueries, _question: object) -> None:
-        raise ZeroDivisionError("of all things")
+    def fail(_queries: SourceQueries, _question: object) -> None:
+        raise ZeroDivisionError("a defect")
 
     async with gateway_with_server() as (server, _, _, peer):
         monkeypatch.setattr(SourceQueries, "_recording", fail)
         reply = await query(peer, "mocap/lab/recording")
         assert reply.code == "defect"
-        assert "ZeroDivisionError('of all things')" in reply.error
+        assert "ZeroDivisionError('a defect')" in reply.error
         assert "ZeroDivisionError" in caplog.text
         assert (await query(peer, "mocap/lab/parameters")).payload == server.xml
 
@@ -67,7 +67,7 @@ async def test_queries_end_at_once_when_the_gateway_closes() -> None:
             replies: list[zenoh.Reply] = []
             end = zenoh.handlers.Callback(replies.append, drop=lambda: loop.call_soon_threadsafe(ended.set))
             peer.get("mocap/lab/status", end, timeout=60)
-            await service.asked.wait()
+            await service.received_query.wait()
             await queries.close()
             async with asyncio.timeout(10):
                 await ended.wait()
@@ -81,35 +81,35 @@ async def test_without_time_stamps_the_log_says_how_to_enable_the_cache_for_late
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     endpoint = free_endpoint()
-    session = open_zenoh("peer", listen=endpoint)  # Zenoh's own default: no time stamps
-    heard: list[bytes] = []
+    session = open_zenoh("peer", listen=endpoint)  # without time stamps, the default of Zenoh
+    received: list[bytes] = []
     try:
         queries = ZenohQueries("mocap", SilentService(), asyncio.get_running_loop())
         queries.open(session, ["lab"])
         assert "set timestamping: {enabled: true} in Zenoh's configuration file" in caplog.text
         with zenoh_peer(endpoint) as peer:
             peer.declare_subscriber(
-                "mocap/lab/parameters", lambda sample: heard.append(sample.payload.to_bytes())
+                "mocap/lab/parameters", lambda sample: received.append(sample.payload.to_bytes())
             )
             queries.publish_parameters("lab", b"<RT_Parameters/>")
-            await wait_until_async(lambda: heard)
+            await wait_until_async(lambda: received)
         await queries.close()
     finally:
         session.close()
-    assert set(heard) == {b"<RT_Parameters/>"}
+    assert set(received) == {b"<RT_Parameters/>"}
 
 
 class SilentService(SourceQueryService):
-    """Has the source "lab", and never answers."""
+    """Serves the source "lab" and never answers."""
 
     def __init__(self) -> None:
-        self.asked = asyncio.Event()
+        self.received_query = asyncio.Event()
 
     def serves(self, source: str) -> bool:
         return source == "lab"
 
     async def answer(self, _source: str, _path: KeyPath, _options: Mapping[str, str]) -> Answer:
-        self.asked.set()
+        self.received_query.set()
         never: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
         return await never
 
@@ -129,7 +129,7 @@ async def test_publishing_parameters_after_zenoh_has_closed_is_ignored() -> None
 async def test_a_file_that_cannot_be_stored_is_logged_and_the_stream_continues(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    (tmp_path / "spool").write_text("a file where the folder should be")
+    (tmp_path / "spool").write_text("a file in place of the folder")
     async with gateway_with_server(spool=tmp_path / "spool") as (server, _, _, peer):
         server.send(packet(5, b"content"))
         await wait_until_async(lambda: "cannot be kept in" in caplog.text)

@@ -1,4 +1,4 @@
-"""A gateway that is given other settings while it runs, on real Zenoh and LCM."""
+"""Reloading the configuration of a running gateway, on real Zenoh and LCM."""
 
 import asyncio
 import json
@@ -44,15 +44,15 @@ def simulator() -> Simulator:
     return Simulator(SyntheticScene(markers=1, tools=0, analog=0, plates=0, rate_hz=200))
 
 
-class Site:
-    """What settings of these tests have in common: addresses that nobody else has."""
+class SettingsBuilder:
+    """Builds settings with a Zenoh endpoint and an LCM URL that no other test uses."""
 
     def __init__(self) -> None:
         self.endpoint = free_endpoint()
         self.url = lcm_url()
 
     def settings(self, sources: Mapping[str, int], **sections: Any) -> Any:
-        """Return settings with sources by name and port; other sections stand over those here."""
+        """Return settings with sources by name and port; ``sections`` replace the default sections."""
         reconnect = ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05)
         return make_settings(
             sources=tuple(
@@ -88,83 +88,85 @@ async def running(settings: Settings) -> AsyncIterator[Gateway]:
             await task
 
 
-class Ears:
-    """What subscribers heard of markers: (session, sequence) by key or channel, in order."""
+class ReceivedMarkers:
+    """The (session, sequence) of received marker messages, in order, by key or channel."""
 
     def __init__(self) -> None:
         self.numbers: defaultdict[str, list[tuple[int, int]]] = defaultdict(list)
 
-    def take(self, name: str, message: bytes) -> None:
+    def append(self, name: str, message: bytes) -> None:
         markers = decode(message)
         self.numbers[name].append((markers.session, markers.sequence))
 
-    async def more(self, name: str, count: int = 20) -> None:
+    async def wait_for_more(self, name: str, count: int = 20) -> None:
+        """Wait for ``count`` more messages on a key or channel."""
         wanted = len(self.numbers[name]) + count
         await wait_until_async(lambda: len(self.numbers[name]) >= wanted)
 
-    def assert_whole(self, name: str) -> None:
+    def assert_gapless(self, name: str) -> None:
         sequences = [sequence for _, sequence in self.numbers[name]]
         assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
 
 
 @contextmanager
-def ears_at(site: Site) -> Iterator[Ears]:
-    ears = Ears()
-    session = open_zenoh(site.endpoint)
-    ZenohSubscriber(session, "*/*/3d", ears.take)
-    listener = LcmSubscriber(open_lcm(site.url), ".*_3D", ears.take)
+def subscribed(builder: SettingsBuilder) -> Iterator[ReceivedMarkers]:
+    """Subscribe to the markers of all sources on Zenoh and LCM."""
+    received = ReceivedMarkers()
+    session = open_zenoh(builder.endpoint)
+    ZenohSubscriber(session, "*/*/3d", received.append)
+    lcm_subscriber = LcmSubscriber(open_lcm(builder.url), ".*_3D", received.append)
     try:
-        yield ears
+        yield received
     finally:
-        listener.close()
+        lcm_subscriber.close()
         session.close()
 
 
 async def test_equal_settings_change_nothing() -> None:
-    site = Site()
-    async with simulator() as server, running(site.settings({"lab": server.port})) as gateway:
-        with ears_at(site) as ears:
-            await ears.more("mocap/lab/3d")
+    builder = SettingsBuilder()
+    async with simulator() as server, running(builder.settings({"lab": server.port})) as gateway:
+        with subscribed(builder) as received:
+            await received.wait_for_more("mocap/lab/3d")
             [source], outputs = gateway.sources, gateway.outputs
-            assert await gateway.reload(site.settings({"lab": server.port})) == []
+            assert await gateway.reload(builder.settings({"lab": server.port})) == []
             assert (list(gateway.sources), gateway.outputs) == ([source], outputs)
-            await ears.more("mocap/lab/3d")
-            ears.assert_whole("mocap/lab/3d")
+            await received.wait_for_more("mocap/lab/3d")
+            received.assert_gapless("mocap/lab/3d")
             assert len(server.connections) == 1
 
 
 async def test_a_changed_source_keeps_its_numbering_and_other_sources_are_not_affected() -> None:
-    site = Site()
+    builder = SettingsBuilder()
     async with (
         simulator() as kept,
         simulator() as first,
         simulator() as second,
-        running(site.settings({"kept": kept.port, "moved": first.port})) as gateway,
+        running(builder.settings({"kept": kept.port, "moved": first.port})) as gateway,
     ):
-        with ears_at(site) as ears:
+        with subscribed(builder) as received:
             names = ("mocap/kept/3d", "MOCAP_KEPT_3D", "mocap/moved/3d", "MOCAP_MOVED_3D")
             for name in names:
-                await ears.more(name)
-            changes = await gateway.reload(site.settings({"kept": kept.port, "moved": second.port}))
+                await received.wait_for_more(name)
+            changes = await gateway.reload(builder.settings({"kept": kept.port, "moved": second.port}))
             assert changes == ["source moved changed"]
             assert not first.connections
             for name in names:
-                await ears.more(name)
-                ears.assert_whole(name)
-            assert {session for session, _ in ears.numbers["mocap/kept/3d"]} == {1}
-            assert [session for session, _ in ears.numbers["mocap/moved/3d"]][-1] == 2
+                await received.wait_for_more(name)
+                received.assert_gapless(name)
+            assert {session for session, _ in received.numbers["mocap/kept/3d"]} == {1}
+            assert [session for session, _ in received.numbers["mocap/moved/3d"]][-1] == 2
 
 
 async def test_sources_are_added_and_removed_with_their_keys_and_queries() -> None:
-    site, server, other = Site(), ParameterServer("of lab"), ParameterServer("of new")
+    builder, server, other = SettingsBuilder(), ParameterServer("of lab"), ParameterServer("of new")
     async with (
-        ScriptedServer(server.script) as lab,
-        ScriptedServer(other.script) as new,
-        running(site.settings({"lab": lab.port, "gone": lab.port})) as gateway,
+        ScriptedServer(server.script) as lab_server,
+        ScriptedServer(other.script) as new_server,
+        running(builder.settings({"lab": lab_server.port, "gone": lab_server.port})) as gateway,
     ):
-        with zenoh_peer(site.endpoint) as peer:
+        with zenoh_peer(builder.endpoint) as peer:
             await wait_until_async(lambda: server.count("SendParameters") >= 14)
-            changes = await gateway.reload(site.settings({"new": new.port, "lab": lab.port}))
+            changes = await gateway.reload(builder.settings({"new": new_server.port, "lab": lab_server.port}))
             assert changes == ["source gone removed", "source new added"]
             assert [source.name for source in gateway.sources] == ["new", "lab"]
             assert server.count("Bye") == 1
@@ -178,62 +180,63 @@ async def test_sources_are_added_and_removed_with_their_keys_and_queries() -> No
 
 
 async def test_a_changed_output_is_reopened_and_the_other_output_loses_nothing() -> None:
-    site = Site()
-    async with simulator() as server, running(site.settings({"lab": server.port})) as gateway:
-        with ears_at(site) as ears:
-            await ears.more("mocap/lab/3d")
-            await ears.more("MOCAP_LAB_3D")
-            changed = site.settings({"lab": server.port}, lcm=site.lcm(prefix="OTHER"))
+    builder = SettingsBuilder()
+    async with simulator() as server, running(builder.settings({"lab": server.port})) as gateway:
+        with subscribed(builder) as received:
+            await received.wait_for_more("mocap/lab/3d")
+            await received.wait_for_more("MOCAP_LAB_3D")
+            changed = builder.settings({"lab": server.port}, lcm=builder.lcm(prefix="OTHER"))
             assert await gateway.reload(changed) == ["output lcm changed"]
-            await ears.more("OTHER_LAB_3D")
-            await ears.more("mocap/lab/3d")
-            ears.assert_whole("mocap/lab/3d")
-            before, after = ears.numbers["MOCAP_LAB_3D"], ears.numbers["OTHER_LAB_3D"]
+            await received.wait_for_more("OTHER_LAB_3D")
+            await received.wait_for_more("mocap/lab/3d")
+            received.assert_gapless("mocap/lab/3d")
+            before, after = received.numbers["MOCAP_LAB_3D"], received.numbers["OTHER_LAB_3D"]
             assert after[0][1] > before[-1][1]
             assert len(server.connections) == 1
 
 
 async def test_zenoh_reopens_at_the_same_address_and_publishes_cached_parameters() -> None:
-    site, server = Site(), ParameterServer("known")
+    builder, server = SettingsBuilder(), ParameterServer("known")
     async with (
-        ScriptedServer(server.script) as lab,
-        running(site.settings({"lab": lab.port})) as gateway,
+        ScriptedServer(server.script) as lab_server,
+        running(builder.settings({"lab": lab_server.port})) as gateway,
     ):
         await wait_until_async(lambda: server.count("SendParameters") >= 7)
-        changed = site.settings({"lab": lab.port}, zenoh=site.zenoh(prefix="other"))
+        changed = builder.settings({"lab": lab_server.port}, zenoh=builder.zenoh(prefix="other"))
         assert await gateway.reload(changed) == ["output zenoh changed"]
         await wait_until_async(lambda: gateway.outputs[0].health().connected)
-        heard: list[bytes] = []
-        with zenoh_peer(site.endpoint) as peer:
+        payloads: list[bytes] = []
+        with zenoh_peer(builder.endpoint) as peer:
             subscriber = peer.declare_subscriber(
-                "other/lab/parameters", lambda sample: heard.append(sample.payload.to_bytes())
+                "other/lab/parameters", lambda sample: payloads.append(sample.payload.to_bytes())
             )
             assert b"known" in (await query(peer, "other/lab/parameters")).payload
-            await wait_until_async(lambda: heard)
-            assert b"known" in heard[0]
+            await wait_until_async(lambda: payloads)
+            assert b"known" in payloads[0]
             assert await query_all(peer, "mocap/lab/parameters") == []
             subscriber.undeclare()
 
 
 async def test_an_output_can_be_disabled_and_enabled() -> None:
-    site = Site()
-    async with simulator() as server, running(site.settings({"lab": server.port})) as gateway:
-        with ears_at(site) as ears:
-            await ears.more("MOCAP_LAB_3D")
-            off = site.settings({"lab": server.port}, lcm=site.lcm(enabled=False))
+    builder = SettingsBuilder()
+    async with simulator() as server, running(builder.settings({"lab": server.port})) as gateway:
+        with subscribed(builder) as received:
+            await received.wait_for_more("MOCAP_LAB_3D")
+            off = builder.settings({"lab": server.port}, lcm=builder.lcm(enabled=False))
             assert await gateway.reload(off) == ["output lcm removed"]
             assert [output.name for output in gateway.outputs] == ["zenoh"]
-            heard = len(ears.numbers["MOCAP_LAB_3D"])
-            assert await gateway.reload(site.settings({"lab": server.port})) == ["output lcm added"]
-            await ears.more("MOCAP_LAB_3D")
-            assert ears.numbers["MOCAP_LAB_3D"][heard][1] == ears.numbers["MOCAP_LAB_3D"][heard - 1][1] + 1
+            num_before = len(received.numbers["MOCAP_LAB_3D"])
+            assert await gateway.reload(builder.settings({"lab": server.port})) == ["output lcm added"]
+            await received.wait_for_more("MOCAP_LAB_3D")
+            (_, last), (_, next_) = received.numbers["MOCAP_LAB_3D"][num_before - 1 : num_before + 1]
+            assert next_ == last + 1
 
 
 async def test_a_changed_zenoh_configuration_file_reopens_the_output(tmp_path: Path) -> None:
-    site, file = Site(), tmp_path / "zenoh.json5"
+    builder, file = SettingsBuilder(), tmp_path / "zenoh.json5"
     other = free_endpoint()
-    file.write_text(json.dumps(zenoh_keys("peer", listen=site.endpoint)))
-    settings = site.settings({"lab": free_port()}, zenoh=site.zenoh(config=file))
+    file.write_text(json.dumps(zenoh_keys("peer", listen=builder.endpoint)))
+    settings = builder.settings({"lab": free_port()}, zenoh=builder.zenoh(config=file))
     async with running(settings) as gateway:
         assert await gateway.reload(settings) == []
         file.write_text(json.dumps(zenoh_keys("peer", listen=other)))
@@ -244,16 +247,16 @@ async def test_a_changed_zenoh_configuration_file_reopens_the_output(tmp_path: P
 
 
 async def test_a_configuration_that_zenoh_refuses_changes_nothing(tmp_path: Path) -> None:
-    site, file = Site(), tmp_path / "zenoh.json5"
-    async with simulator() as server, running(site.settings({"lab": server.port})) as gateway:
-        with ears_at(site) as ears:
-            await ears.more("mocap/lab/3d")
+    builder, file = SettingsBuilder(), tmp_path / "zenoh.json5"
+    async with simulator() as server, running(builder.settings({"lab": server.port})) as gateway:
+        with subscribed(builder) as received:
+            await received.wait_for_more("mocap/lab/3d")
             file.write_text("{no_such_key: 1}")
-            refused = site.settings({"other": server.port}, zenoh=site.zenoh(config=file))
+            refused = builder.settings({"other": server.port}, zenoh=builder.zenoh(config=file))
             with pytest.raises(ConfigError, match="no_such_key"):
                 await gateway.reload(refused)
-            await ears.more("mocap/lab/3d")
-            ears.assert_whole("mocap/lab/3d")
+            await received.wait_for_more("mocap/lab/3d")
+            received.assert_gapless("mocap/lab/3d")
             assert [source.name for source in gateway.sources] == ["lab"]
 
 
@@ -264,11 +267,11 @@ async def test_files_are_stored_in_the_new_folder(tmp_path: Path) -> None:
         clients.append(client)
         await client.commands(lambda command: ok(f"OK-{command}"))
 
-    site, before, after = Site(), tmp_path / "before", tmp_path / "after"
+    builder, before, after = SettingsBuilder(), tmp_path / "before", tmp_path / "after"
     async with ScriptedServer(script) as server:
-        settings = site.settings({"lab": server.port}, spool=SpoolSettings(directory=str(before)))
+        settings = builder.settings({"lab": server.port}, spool=SpoolSettings(directory=str(before)))
         async with running(settings) as gateway:
-            changed = site.settings({"lab": server.port}, spool=SpoolSettings(directory=str(after)))
+            changed = builder.settings({"lab": server.port}, spool=SpoolSettings(directory=str(after)))
             await wait_until_async(lambda: clients)
             assert await gateway.reload(changed) == ["spool changed"]
             clients[0].send(packet(5, b"a file"))
@@ -279,8 +282,8 @@ async def test_files_are_stored_in_the_new_folder(tmp_path: Path) -> None:
 
 async def test_metrics_move_to_another_port(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
-    site, before, after = Site(), free_port(), free_port()
-    first = site.settings({"lab": free_port()}, metrics=MetricsSettings(port=before))
+    builder, before, after = SettingsBuilder(), free_port(), free_port()
+    first = builder.settings({"lab": free_port()}, metrics=MetricsSettings(port=before))
     settings = [first.model_copy(update={"metrics": MetricsSettings(port=after)})]
     daemon = Daemon(settings.pop, Gateway(first))
     task = asyncio.create_task(daemon.run())
@@ -296,11 +299,11 @@ async def test_metrics_move_to_another_port(caplog: pytest.LogCaptureFixture) ->
 
 
 async def test_stopping_during_a_reload_closes_everything() -> None:
-    site = Site()
+    builder = SettingsBuilder()
     async with simulator() as first, simulator() as second:
-        async with running(site.settings({"lab": first.port})) as gateway:
+        async with running(builder.settings({"lab": first.port})) as gateway:
             await wait_until_async(lambda: first.connections)
-            reloading = asyncio.create_task(gateway.reload(site.settings({"lab": second.port})))
+            reloading = asyncio.create_task(gateway.reload(builder.settings({"lab": second.port})))
             await wait_until_async(lambda: not first.connections)
         assert await reloading == ["source lab changed"]
         await wait_until_async(lambda: not second.connections)

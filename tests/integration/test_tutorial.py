@@ -1,4 +1,4 @@
-"""Types every command of the tutorial into its terminal, in order, and compares output with the page."""
+"""Run every command of the tutorial in its terminal, in order, and compare the output with the page."""
 
 import os
 import re
@@ -26,13 +26,13 @@ NUMBER: Final = re.compile(r"-?\d+(?:\\\.\d+)?")
 
 
 def pattern(line: str) -> str:
-    """Return a pattern for a printed line in which numbers, white space and ``…`` may differ."""
+    """Return a pattern that matches a line with other numbers, other white space, and any text for ``…``."""
     escaped = re.escape(" ".join(line.split())).replace(r"\ ", r"\s+").replace(re.escape("…"), ".*")
     return NUMBER.sub(r"-?\\d+(?:\\.\\d+)?", escaped.replace(r"\-", "-"))
 
 
 class Terminal:
-    """A terminal in which one command runs at a time. ``text`` is its output so far."""
+    """A terminal that runs one command at a time. ``text`` is the output of the command so far."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -40,7 +40,7 @@ class Terminal:
         self.text = ""
 
     def type(self, command: str) -> None:
-        """Start a command in the virtual environment that the page activates."""
+        """Start a command in the activated virtual environment."""
         assert self._process is None, "the previous command is still running"
         self.text = ""
         self._process = subprocess.Popen(
@@ -57,7 +57,7 @@ class Terminal:
         return re.search(r"\s*?\n(?:.*\n)*?\s*".join(patterns), self.text) is not None
 
     def wait_for(self, lines: list[str]) -> None:
-        """Read until the output contains these lines; raises AssertionError if they do not appear in time."""
+        """Read until the output contains these lines; raises AssertionError after TIMEOUT_S."""
         assert self._process is not None
         assert self._process.stdout is not None
         deadline_s = time.monotonic() + TIMEOUT_S
@@ -68,7 +68,7 @@ class Terminal:
             self.text += data.decode()
 
     def end(self, number: signal.Signals | None = None) -> int:
-        """Send signal ``number`` to the command if given, wait for its end, and return its exit status."""
+        """Wait for the end of the command, after signal ``number`` if given; return its exit status."""
         assert self._process is not None
         process, self._process = self._process, None
         if number is not None:
@@ -109,7 +109,7 @@ def terminals(folder: Path) -> Iterator[dict[str, Terminal]]:
 
 
 def output_after(step: int) -> list[str]:
-    """Return the output that the page shows for the command; [] if it shows none."""
+    """Return the output that the page shows after a command; [] if it shows none."""
     next_blocks: list[Block] = STEPS[step + 1 : step + 2]
     is_output = next_blocks and next_blocks[0].language == "text"
     return next_blocks[0].text.splitlines() if is_output else []

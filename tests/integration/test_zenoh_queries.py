@@ -1,4 +1,4 @@
-"""Parameters asked for over real Zenoh sessions, of servers of every kind, and of none."""
+"""Queries for parameters over real Zenoh sessions, with and without a server."""
 
 import asyncio
 from functools import partial
@@ -36,12 +36,12 @@ async def test_parameters_are_answered_with_the_xml_of_the_server() -> None:
 
 @pytest.mark.parametrize("section", SECTIONS)
 async def test_each_section_is_answered_as_unchanged_xml_or_as_json(section: str) -> None:
-    # The specification's own examples of force and events are not well-formed.
+    # The examples of force and events in the specification are not well-formed.
     async with gateway_with_server() as (_, _, _, peer):
         assert (await query(peer, f"mocap/lab/parameters/{section}")).payload == spec_xml(section)
         reply = await query(peer, f"mocap/lab/parameters/{section}?format=json")
         assert reply.encoding == "application/json"
-        [expected] = [part for part in to_json(BY_SECTION[section]).values() if part is not None]
+        [expected] = [value for value in to_json(BY_SECTION[section]).values() if value is not None]
         assert reply.json == expected
         assert bool(reply.attachment["recovered"]) == (section in {"force", "events"})
 
@@ -84,12 +84,12 @@ async def test_a_thousand_simultaneous_queries_cause_one_command() -> None:
         payloads: list[bytes] = []
         ended: list[int] = []
 
-        def take(reply: zenoh.Reply) -> None:
+        def append(reply: zenoh.Reply) -> None:
             assert reply.ok is not None
             payloads.append(reply.ok.payload.to_bytes())
 
         for number in range(1000):
-            end = zenoh.handlers.Callback(take, drop=partial(ended.append, number))
+            end = zenoh.handlers.Callback(append, drop=partial(ended.append, number))
             peer.get("mocap/lab/parameters?fresh=true", end, timeout=30)
         queries = output_queries(gateway)
         await wait_until_async(lambda: len(queries._tasks) == 1000)
@@ -183,11 +183,11 @@ async def test_the_refusal_of_send_parameters_is_reported_and_cached() -> None:
             assert reply.error == (
                 "source 'lab': the server does not know SendParameters, or refuses it: err-unknown command"
             )
-            asked = server.count("SendParameters")
+            num_requests = server.count("SendParameters")
             assert (await query(peer, "mocap/lab/parameters")).error == reply.error
-            assert server.count("SendParameters") == asked  # remembered as long as the connection
+            assert server.count("SendParameters") == num_requests  # cached for the connection
             assert (await query(peer, "mocap/lab/parameters?fresh=true")).error == reply.error
-            assert server.count("SendParameters") == asked + 1
+            assert server.count("SendParameters") == num_requests + 1
             frame = await query(peer, "mocap/lab/3d?format=json")
             assert frame.json["markers"][0]["x"] == 1
 
@@ -215,12 +215,12 @@ async def test_queries_that_wait_too_long_for_others_get_a_timeout_error() -> No
 async def test_losing_the_connection_during_a_query_is_an_error() -> None:
     async with gateway_with_server() as (server, _, _, peer):
         server.may_answer.clear()
-        asked = asyncio.create_task(query(peer, "mocap/lab/parameters?fresh=true"))
+        reply_task = asyncio.create_task(query(peer, "mocap/lab/parameters?fresh=true"))
         before = server.count("SendParameters")
         await wait_until_async(lambda: server.count("SendParameters") > before)
         assert server.client is not None
         server.client.cut()
-        reply = await asked
+        reply = await reply_task
         assert reply.code == "no-connection"
         assert "source 'lab' has just lost its connection: the connection to 127.0.0.1:" in reply.error
         server.may_answer.set()

@@ -1,4 +1,4 @@
-"""All keys but parameters, asked over real Zenoh sessions: frames, status, schemas, files, recording."""
+"""Queries for frames, status, schemas, files and recording over real Zenoh sessions."""
 
 import asyncio
 import json
@@ -87,10 +87,10 @@ async def test_a_current_frame_without_the_component_is_an_error() -> None:
     server.has_measurement = False
     async with gateway_with_server(server) as (_, _, _, peer):
         server.ignored_commands = ("SendCurrentFrame",)
-        asked = asyncio.create_task(query(peer, "mocap/lab/3d"))
+        reply_task = asyncio.create_task(query(peer, "mocap/lab/3d"))
         await wait_until_async(lambda: server.count("SendCurrentFrame"))
         server.send(packet(3, b"\0\0\0\0"))  # a frame without components
-        reply = await asked
+        reply = await reply_task
         assert (reply.code, reply.error) == ("nothing-yet", "the current frame has no 3d")
 
 
@@ -102,14 +102,14 @@ async def test_the_status_is_answered_as_message_or_as_json() -> None:
         assert (await query(peer, "mocap/lab/status?format=json")).json["server"] == f"127.0.0.1:{port}"
 
 
-def run_with_types_of(schema: bytes, folder: Path, code: str, given: bytes = b"") -> list[str]:
-    """Make types of a schema's text as a peer would; return the words that the code prints with them."""
+def run_with_types_of(schema: bytes, folder: Path, code: str, stdin: bytes = b"") -> list[str]:
+    """Generate types from a schema with lcm-gen, run ``code`` with them, and return the words it prints."""
     (folder / "schema.lcm").write_bytes(schema)
     lcm_gen = Path(sys.executable).with_name("lcm-gen")
     subprocess.run([lcm_gen, "--python", "--ppath", folder, folder / "schema.lcm"], check=True)
     command, environment = [sys.executable, "-c", f"import rtc3d; {code}"], {"PYTHONPATH": str(folder)}
-    done = subprocess.run(command, env=environment, input=given, capture_output=True, check=True)
-    return done.stdout.decode().split()
+    process = subprocess.run(command, env=environment, input=stdin, capture_output=True, check=True)
+    return process.stdout.decode().split()
 
 
 @pytest.mark.parametrize("name", SCHEMA_TYPES)
@@ -143,7 +143,7 @@ async def test_a_c3d_file_is_stored_announced_and_answered(tmp_path: Path) -> No
         assert (reply.code, reply.error) == ("nothing-yet", "source 'lab' has sent no C3D file so far")
         announced: list[zenoh.Sample] = []
         peer.declare_subscriber("mocap/lab/c3d", announced.append)
-        await query(peer, "mocap/lab/status")  # the subscription has arrived by now
+        await query(peer, "mocap/lab/status")  # its reply arrives after the subscription is active
         server.send(packet(5, content))
         await wait_until_async(lambda: announced)
         assert str(announced[0].encoding) == "application/json"
@@ -171,7 +171,7 @@ async def test_recording_control_is_off_by_default_and_the_error_says_how_to_swi
 
 RECORDING = "0000003c 00000003 00000001 00000030 00000005 ffffffff 0000000000000000 00000001 {} "
 RECORDING += "0000000000000000 ffffffff ffffffff ffffffff"
-"""A type-3 packet: one event component of 48 bytes (30h), frame number -1 (field note 16); {} is the id."""
+"""A data packet with one event component of 48 bytes (30h), frame -1; {} is the id (field note 16)."""
 
 
 async def test_recording_is_started_and_stopped_with_the_packet_of_wavefront() -> None:

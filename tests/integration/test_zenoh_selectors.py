@@ -1,4 +1,4 @@
-"""Selectors over real Zenoh sessions: what is asked wrongly, wildcards, several sources, a router between."""
+"""Selectors over real Zenoh sessions: mistakes, wildcards, several sources, a router."""
 
 from pathlib import Path
 
@@ -95,14 +95,14 @@ async def test_a_wildcard_without_any_answer_gets_an_error() -> None:
 
 async def test_a_wildcard_for_sources_is_answered_by_every_source() -> None:
     router = free_endpoint()
-    middle = open_zenoh("router", listen=router)
+    router_session = open_zenoh("router", listen=router)
     first, second = ParameterServer("of the first"), ParameterServer("of the second")
     try:
         async with (
-            ScriptedServer(first.script) as a,
-            ScriptedServer(second.script) as b,
-            run_gateway(a.port, router=router) as lab_gateway,
-            run_gateway(b.port, router=router, name="hall") as hall_gateway,
+            ScriptedServer(first.script) as first_server,
+            ScriptedServer(second.script) as second_server,
+            run_gateway(first_server.port, router=router) as lab_gateway,
+            run_gateway(second_server.port, router=router, name="hall") as hall_gateway,
         ):
             await wait_until_cached(lab_gateway, first)
             await wait_until_cached(hall_gateway, second)
@@ -111,12 +111,12 @@ async def test_a_wildcard_for_sources_is_answered_by_every_source() -> None:
                 assert replies["mocap/lab/parameters"].payload == first.xml
                 assert replies["mocap/hall/parameters"].payload == second.xml
     finally:
-        middle.close()
+        router_session.close()
 
 
 async def test_queries_work_through_a_router() -> None:
     router, server = free_endpoint(), ParameterServer()
-    middle = open_zenoh("router", listen=router)
+    router_session = open_zenoh("router", listen=router)
     try:
         async with (
             ScriptedServer(server.script) as listening,
@@ -132,4 +132,4 @@ async def test_queries_work_through_a_router() -> None:
                 assert (await query(peer, "mocap/lab/markers")).code == "bad-request"
                 assert (await query(peer, "mocap/lab/schema/marker_t")).payload
     finally:
-        middle.close()
+        router_session.close()
