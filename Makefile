@@ -1,17 +1,18 @@
-# Two commands do everything on a fresh machine: `make demo` and `make test`.
+# `make demo` and `make test` need no preparation: each creates .venv first.
 PYTHON ?= python3
 BIN := .venv/bin
 
-# Where `make install` puts things. Units in /etc/systemd/system would be the administrator's, and could not be masked.
+# Where `make install` puts its files. Units in /etc/systemd/system belong to the administrator and cannot be masked, so
+# they go to $(LIB)/systemd/system.
 PREFIX := /opt/rtc3d-gateway
 CONFIG := /etc/rtc3d-gateway
 LIB := /usr/local/lib
 UNITS := rtc3d-gateway.service rtc3d-gateway@.service
 
-# What tests of installing use; sudo finds this one, and the service can reach it.
+# The Python for tests of the installation. It must be one that sudo finds and that the service can read.
 SYSTEM_PYTHON ?= /usr/bin/python3
 
-# What a wheel is made of.
+# What a wheel is built from.
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
 .PHONY: demo test test-compiled check lint types contracts generated docs lcm-types fuzz soak mutants bench bench-quick zenohd \
@@ -23,17 +24,15 @@ demo: .venv/installed
 test: .venv/installed
 	SYSTEM_PYTHON=$(SYSTEM_PYTHON) tests/with-netns $(BIN)/pytest $(ARGS)
 
-# The tests of what is compiled, and of what stands on it, with the compiled modules in place of the sources.
-# What rate.py waits cannot be shortened there, and takes 14 s; nor can bytes say another length than theirs.
-COMPILED_TESTS := tests/packaging/test_compiled.py tests/contract tests/unit/rtc3d tests/unit/outputs tests/unit/queries \
-    tests/integration/test_faults.py::test_several_faults_at_once \
-    $(foreach name,clock components client_protocol fanout gateway intake message pacing packets rate streams, \
-        $(wildcard tests/*/test_$(name)*.py)) \
-    --deselect tests/integration/test_streams.py::test_late_frames_make_the_gateway_request_a_lower_rate_until_they_are_in_time \
-    --deselect tests/unit/rtc3d/test_packets.py::test_a_packet_of_a_byte_less_can_be_encoded
+# The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
+# Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.
+COMPILED_TESTS := tests/packaging/test_compiled.py tests/contract tests/property tests/unit/test_log.py \
+    $(addprefix tests/unit/,messages outputs publish queries rtc3d stream) \
+    tests/integration/test_gateway.py tests/integration/test_streams.py \
+    tests/integration/test_faults.py::test_several_faults_at_once
 
 test-compiled: build/compiled/complete
-	$(COMPILED) RTC3D_COMPILED=1 tests/with-netns $(BIN)/pytest $(or $(ARGS),$(COMPILED_TESTS))
+	$(COMPILED) RTC3D_COMPILED=1 tests/with-netns $(BIN)/pytest -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
 
 check: lint types contracts generated docs wheelhouse test test-compiled
 
@@ -47,45 +46,45 @@ types: .venv/installed
 contracts: .venv/installed
 	$(BIN)/lint-imports
 
-# The committed Python types are those that lcm-gen makes of the .lcm files today.
+# Check that the committed Python types equal what lcm-gen generates from the .lcm files.
 generated: .venv/installed
 	rm -rf build/lcm_types && mkdir -p build/lcm_types
 	$(BIN)/lcm-gen --python --ppath build/lcm_types lcm_types/rtc3d/*.lcm
 	diff -r --exclude='*.lcm' --exclude=__pycache__ build/lcm_types lcm_types
 
-# The site, in build/site; a link that leads nowhere ends it. (With --quiet, mkdocs would not see its own warnings.)
+# Build the site in build/site; a broken link is an error. (With --quiet, --strict would not count mkdocs' warnings.)
 docs: .venv/installed
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-# lcm-gen appends to an existing __init__.py, so the old files go first.
+# lcm-gen appends to an existing __init__.py, so delete the old files first.
 lcm-types: .venv/installed
 	rm -f lcm_types/rtc3d/*.py
 	$(BIN)/lcm-gen --python --ppath lcm_types lcm_types/rtc3d/*.lcm
 
-# What is missing for compiling with a Python: the C compiler that it would call, its headers.
+# Print what the compilation for a Python lacks: the C compiler that it would call, or its headers.
 MISSING = import os, shutil, sysconfig; \
     compiler = (os.environ.get("CC") or sysconfig.get_config_var("CC")).split()[0]; \
     header = sysconfig.get_path("include") + "/Python.h"; \
     print(" and ".join([compiler] * (not shutil.which(compiler)) + [header] * (not os.path.exists(header))))
 
-# $(call pip,PYTHON,WHAT TO DO[,EXTRAS]): build the gateway and do with it what pip is told, compiled if that can be.
-# The compiler writes beside the sources, and what it wrote would be imported in place of them: so it has a copy.
-# Modules compiled together call each other directly if other libraries cannot see them (visibility), and Python's own
-# functions without a stub in between (no-plt): 3 % fewer instructions a frame.
+# $(call pip,PYTHON,PIP COMMAND[,EXTRAS]): run a pip command on the gateway, compiled if possible.
+# mypyc writes its output beside the sources, and Python would import that output instead of the sources. It therefore
+# compiles a copy. The flags save 3 % of the instructions per frame: with hidden visibility, compiled modules call each
+# other directly, and with no-plt they call Python's own functions without a stub.
 define pip
 @set -e; copy=$$(mktemp -d); trap 'rm -rf "$$copy"' EXIT; cp -R $(SOURCES) "$$copy"; \
 missing=$$($(1) -c '$(MISSING)'); \
 if [ -z "$$missing" ]; then export HATCH_BUILD_HOOK_ENABLE_MYPYC=1 CFLAGS="$$CFLAGS -fvisibility=hidden -fno-plt"; \
-else echo "Plain Python, for want of $$missing (Debian: apt-get install gcc python3-dev):" \
-    "the gateway works the same, with more CPU time for each frame."; fi; \
+else echo "Not compiled; missing: $$missing (Debian: apt-get install gcc python3-dev)." \
+    "The gateway works the same but needs more CPU time per frame."; fi; \
 $(1) -m pip $(2) "$$copy$(3)"
 endef
 
-# For `pipx install dist/*.whl`.
+# Build a wheel for `pipx install dist/*.whl`.
 wheel:
 	$(call pip,$(PYTHON),wheel --quiet --no-deps --wheel-dir dist)
 
-# The gateway compiled, to be tested and measured; programs run with $(COMPILED) find it before the sources.
+# The compiled gateway, for tests and measurements. Programs run with $(COMPILED) import it instead of the sources.
 COMPILED := PYTHONSAFEPATH=1 PYTHONPATH=$(CURDIR)/build/compiled
 
 compiled: build/compiled/complete
@@ -95,10 +94,10 @@ build/compiled/complete: .venv/installed $(shell find $(SOURCES) ! -path '*__pyc
 	$(call pip,$(BIN)/python,install --quiet --no-deps --target build/compiled)
 	touch $@
 
-# As root. The service runs as a user that cannot enter homes, so its Python must not be in one.
+# Run as root. The service's user cannot read home directories, so its Python must not be in one.
 install:
 	@$(PYTHON) -c 'import sys; home = sys.base_prefix.startswith(("/home/", "/root/")); \
-	    sys.exit(f"{sys.base_prefix} is in a home, where the service cannot read; give make PYTHON=/usr/bin/python3" if home else 0)'
+	    sys.exit(f"the service cannot read {sys.base_prefix}, which is in a home directory; run make with PYTHON=/usr/bin/python3" if home else 0)'
 	$(PYTHON) -m venv $(PREFIX)/venv
 	$(call pip,$(PREFIX)/venv/bin/python,install --quiet --upgrade,[systemd])
 	install -d $(LIB)/systemd/system $(LIB)/sysusers.d $(LIB)/tmpfiles.d /usr/local/bin
@@ -111,10 +110,10 @@ install:
 	install -m 644 config/gateway.schema.json $(CONFIG)/gateway.schema.json
 	ln -sfn $(PREFIX)/venv/bin/rtc3d-gateway /usr/local/bin/rtc3d-gateway
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
-	@echo 'Name your server in $(CONFIG)/gateway.yaml; then: systemctl enable --now rtc3d-gateway'
+	@echo 'Enter your server in $(CONFIG)/gateway.yaml; then: systemctl enable --now rtc3d-gateway'
 
-# As root. What stays: the configurations in $(CONFIG), the C3D files in /var/lib/rtc3d-gateway, and the user that
-# they belong to.
+# Run as root. This keeps the configurations in $(CONFIG), the C3D files in /var/lib/rtc3d-gateway, and the user that
+# owns them.
 uninstall:
 	[ ! -d /run/systemd/system ] || systemctl stop rtc3d-gateway.service 'rtc3d-gateway@*.service'
 	[ ! -d /run/systemd/system ] || systemctl disable $(UNITS)
@@ -124,7 +123,7 @@ uninstall:
 	-rmdir $(PREFIX)
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
 
-# All that installing downloads, for its tests: they have no network.
+# Download the packages that an installation needs: its tests have no network.
 BUILD_REQUIRES = import tomllib; project = tomllib.load(open("pyproject.toml", "rb")); \
     hook = project["tool"]["hatch"]["build"]["targets"]["wheel"]["hooks"]["mypyc"]; \
     print(*project["build-system"]["requires"], *hook["dependencies"])
@@ -171,8 +170,9 @@ mutants: .venv/installed
 	$(BIN)/pip install --quiet --group mutants
 	tests/with-netns $(BIN)/python -P tests/mutants.py $(PACKAGES)
 
-# Measures against bare Zenoh and LCM, into benchmarks/results.json and docs/performance.md: half an hour, on a
-# quiet machine. PARTS="ceiling loss" measures these only; bench-quick is rough, and leaves the document alone.
+# Compare the gateway with a bare relay to Zenoh and LCM, and write benchmarks/results.json and docs/performance.md.
+# This takes half an hour and needs an idle machine. PARTS="ceiling loss" measures only these parts. bench-quick takes
+# two minutes, gives rough figures, and does not change the document.
 PARTS ?=
 
 bench: .venv/bench build/compiled/complete zenohd
@@ -185,12 +185,12 @@ bench-quick: .venv/bench build/compiled/complete
 	$(BIN)/pip install --quiet --group bench
 	touch $@
 
-# The real router, of the version of eclipse-zenoh, for the benchmarks: five minutes, once. Without cargo they
-# do with a Python session as the router, and say so.
+# Build the router for the benchmarks, in the version of eclipse-zenoh; this takes five minutes, once. Without cargo,
+# the benchmarks use a Python session as the router and report that.
 zenohd: .venv/installed
 	version=$$($(BIN)/python -c 'from importlib.metadata import version; print(version("eclipse-zenoh"))'); \
 	cargo install zenohd --quiet --version $$version --locked --root build/zenohd \
-	|| echo 'no zenohd: a Python session will be the router'
+	|| echo 'zenohd not built: the benchmarks use a Python session as the router'
 
 clean:
 	rm -rf .venv build dist mutants

@@ -147,6 +147,7 @@ async def test_states_follow_the_server_and_the_outputs_show_them(caplog: pytest
     assert sum("streaming → no measurement" in change for change in changes) == 1
 
 
+@pytest.mark.interpreted
 async def test_late_frames_make_the_gateway_request_a_lower_rate_until_they_are_in_time(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:

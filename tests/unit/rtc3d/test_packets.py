@@ -237,6 +237,7 @@ def test_a_packet_of_4_gib_cannot_be_encoded() -> None:
     assert (caught.value.size, caught.value.packet_type) == (4294967296, 2)
 
 
+@pytest.mark.interpreted
 def test_a_packet_of_a_byte_less_can_be_encoded() -> None:
     class Body(bytes):  # reports a length that a test should not allocate
         def __new__(cls, length: int) -> "Body":

@@ -132,6 +132,7 @@ def test_the_frame_rate_is_frames_divided_by_the_time_since_the_last_update() ->
     assert rate.update(100) == 0.0
 
 
+@pytest.mark.interpreted
 def test_the_frame_rate_is_exact_and_zero_if_no_time_has_passed(monkeypatch: pytest.MonkeyPatch) -> None:
     clock = iter([10.0, 12.0, 12.0, 13.0])
     monkeypatch.setattr("gateway.stream.status.time", SimpleNamespace(monotonic=clock.__next__))

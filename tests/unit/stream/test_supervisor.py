@@ -263,6 +263,7 @@ async def test_files_and_restarts_of_the_server_are_passed_on() -> None:
     assert (lab.restarts, lab.files) == (1, [b"C3D"])
 
 
+@pytest.mark.interpreted
 async def test_frames_that_stay_late_halve_the_rate(monkeypatch: pytest.MonkeyPatch) -> None:
     loop = asyncio.get_running_loop()
     monkeypatch.setattr(
