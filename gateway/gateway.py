@@ -133,7 +133,7 @@ class Gateway:
         for output in new:
             output.serve_queries(self._query_service)
         for source in self._sources.values():
-            source.fan_out.use(outputs)
+            source.fan_out.set_outputs(outputs)
         await asyncio.gather(*map(_close, removed))  # first, because a new one may listen at the same address
         for output in new:
             output.start()

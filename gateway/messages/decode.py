@@ -1,4 +1,4 @@
-"""Decoding of the gateway's LCM messages, and their form in JSON."""
+"""Decoding LCM messages of the gateway, and converting them to JSON."""
 
 import math
 from typing import Any, Final
@@ -23,7 +23,7 @@ MESSAGE_TYPES_BY_NAME: Final[dict[str, type[Any]]] = {
         rtc3d.parameters_reply_t,
     )
 }
-"""The types of all messages that the gateway publishes, and of the requests it receives on LCM."""
+"""The types of all messages that the gateway publishes, and of the requests that it receives on LCM."""
 
 _MESSAGE_TYPES_BY_FINGERPRINT: Final = {
     message_type._get_packed_fingerprint(): message_type  # noqa: SLF001 - lcm-gen offers no other way
@@ -32,9 +32,9 @@ _MESSAGE_TYPES_BY_FINGERPRINT: Final = {
 
 
 def message_type(message: bytes) -> type[Any]:
-    """Return the message's LCM type, found by its fingerprint.
+    """Return the LCM type that the message's fingerprint stands for.
 
-    Raises ProtocolError if the fingerprint is not of one of the gateway's types.
+    Raises ProtocolError if it is not one of the gateway's types.
     """
     found = _MESSAGE_TYPES_BY_FINGERPRINT.get(message[:8])
     if found is None:
@@ -48,13 +48,13 @@ def message_type(message: bytes) -> type[Any]:
 def decode(message: bytes) -> Any:
     """Return the message as an object of its LCM type.
 
-    Raises ProtocolError if its type is not one of the gateway's, or if it is truncated.
+    Raises ProtocolError if its type is not one of the gateway's, or its length is wrong.
     """
     lcm_type = message_type(message)
     try:
         decoded = lcm_type.decode(message)
-        # lcm-gen's decoders read a truncated string as a shorter one, so messages with strings are encoded
-        # again and compared. Only a signalling NaN would differ, and types with strings hold none.
+        # lcm-gen's decoders read a truncated string as a shorter one. So messages with strings are encoded
+        # again and compared. This fails for signalling NaNs only, and types with strings contain none.
         is_whole = "string" not in lcm_type.__typenames__ or decoded.encode() == message
     except Exception as error:  # lcm-gen's decoders raise many kinds of exceptions
         raise ProtocolError(f"a {lcm_type.__name__} message of {len(message)} bytes is truncated") from error
@@ -64,7 +64,7 @@ def decode(message: bytes) -> Any:
 
 
 def to_json(value: Any) -> Any:
-    """Return an LCM object, or a list or value in one, as values for ``json``.
+    """Return an LCM object, or a list or value in one, as values that ``json`` can write.
 
     NaN and infinity become None.
     """

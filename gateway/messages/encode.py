@@ -1,7 +1,9 @@
-"""Component → LCM message: the type's fingerprint, the gateway's prefix, the component's own bytes.
+"""From a component to its LCM message: the type's fingerprint, the gateway's prefix, the component's content.
 
-LCM writes big-endian without padding and RTC3D sends big-endian, so the message types of lcm_types/
-have the component's own fields in its own order, and no value is decoded or encoded.
+LCM writes big-endian without padding, and RTC3D sends big-endian. The message types in lcm_types/ have the
+component's own fields in the same order, so the content is copied and no value is decoded or encoded.
+
+A content in *LCM form* can be copied: it is big-endian, with events of 24 bytes (field note 6).
 """
 
 import struct
@@ -34,10 +36,10 @@ MESSAGE_TYPES: Final[dict[ComponentType, type[Any]]] = {
 FINGERPRINT_BYTES: Final = 8
 
 CONTENT_OFFSET: Final = FINGERPRINT_BYTES + PREFIX.size
-"""36: where the component's own bytes begin in a message."""
+"""36: the offset of the component's content in a message."""
 
 ITEMS_OFFSET: Final = CONTENT_OFFSET + 16
-"""52: where the items begin in a message, after frame number, time stamp and count."""
+"""52: the offset of the items in a message, after frame number, time stamp and count."""
 
 _FINGERPRINTS: Final[dict[ComponentType, bytes]] = {
     component: message_type._get_packed_fingerprint()  # noqa: SLF001 - lcm-gen offers no other way
@@ -46,30 +48,27 @@ _FINGERPRINTS: Final[dict[ComponentType, bytes]] = {
 
 
 def lcm_type_name(message_type: type[Any]) -> str:
-    """Return the LCM type's name as in Zenoh's encodings: "rtc3d.markers_t"."""
+    """Return the LCM type's name as in the encoding of Zenoh samples: "rtc3d.markers_t"."""
     return f"rtc3d.{message_type.__name__}"
 
 
-def splice(component: Component, stamp: Stamp, sequence: int) -> bytes:
-    """Return the component's LCM message. Sizes and counts were checked when its frame was split."""
-    return splice_content(component.type, lcm_content(component), stamp, sequence)
+def encode_message(component: Component, stamp: Stamp, sequence: int) -> bytes:
+    """Return the component's LCM message; ``split_frame`` has checked its size and count."""
+    return encode_content(component.type, lcm_content(component), stamp, sequence)
 
 
-def splice_content(component_type: ComponentType, content: bytes, stamp: Stamp, sequence: int) -> bytes:
+def encode_content(component_type: ComponentType, content: bytes, stamp: Stamp, sequence: int) -> bytes:
     """Return the LCM message of a component whose content is in LCM form."""
     return b"%b%b%b" % (_FINGERPRINTS[component_type], stamp.prefix(sequence), content)
 
 
 def has_lcm_form(layout: ComponentLayout, byte_order: ByteOrder) -> bool:
-    """Return whether the content of such a component goes into a message unchanged.
-
-    LCM form is big-endian, with events of 24 bytes (field note 6).
-    """
+    """Return whether a component with this layout has its content in LCM form already."""
     return byte_order == "big" and layout.item_bytes == ITEM_DTYPES[layout.type].itemsize
 
 
 def lcm_content(component: Component) -> bytes:
-    """Return the component's content in LCM form; short events get the component's time stamp."""
+    """Return the component's content in LCM form; events of 16 bytes get the component's time stamp."""
     if component.type is not ComponentType.EVENT or component.item_bytes != SHORT_EVENT.itemsize:
         return big_endian_content(component)
     short = component.items()
@@ -82,5 +81,5 @@ def lcm_content(component: Component) -> bytes:
 
 
 def content_timestamp_us(content: bytes) -> int:
-    """Return the server's time stamp, in µs, of a content in LCM form."""
+    """Return the server's time stamp, in µs, from a content in LCM form."""
     return int.from_bytes(content[4:12], "big", signed=True)

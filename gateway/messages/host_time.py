@@ -1,9 +1,9 @@
-"""The host's time, as messages carry it."""
+"""The host's clock in the unit of the messages."""
 
 import time
 from typing import Final
 
-_time_ns: Final = time.time_ns  # mypyc looks up a Final directly, a module's attribute by name at every call
+_time_ns: Final = time.time_ns  # for mypyc, which looks up a module's attribute by name at every call
 
 
 def now_utime() -> int:

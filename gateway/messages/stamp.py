@@ -1,4 +1,4 @@
-"""The prefix of every message: times, sequence number and session of its frame."""
+"""The prefix of every message: times, sequence number and session."""
 
 import struct
 from typing import Final
@@ -7,18 +7,18 @@ PREFIX: Final = struct.Struct(">qqqi")
 """The fields after the fingerprint: utime, capture_utime, sequence, session."""
 
 NOT_PUBLISHED: Final = -1
-"""The sequence number of a message that answers a query and is not part of a stream."""
+"""The sequence number of a message that only answers a query and is published on no output."""
 
 _pack: Final = PREFIX.pack
-_NO_SEQUENCE: Final = 1 << 63  # larger than any: sequence numbers are signed and have 64 bits
+_NO_SEQUENCE: Final = 1 << 63  # larger than any sequence number: those are signed 64-bit integers
 
 
 class Stamp:
-    """What the messages of one frame have in common in their prefixes.
+    """The part of the prefix that all messages of one frame share.
 
     ``utime`` is when the frame arrived and ``capture_utime`` when the server captured it, both in µs since
-    the Unix epoch; ``session`` is the number of the connection. ``has_clock`` is False where the server's
-    time stamps cannot be used as a clock.
+    the Unix epoch. ``session`` is the number of the connection. ``has_clock`` is False if the server's time
+    stamps cannot be used as a clock; then both times are equal.
     """
 
     __slots__ = ("_prefix", "_sequence", "capture_utime", "has_clock", "session", "utime")
@@ -32,9 +32,9 @@ class Stamp:
         self._prefix = b""
 
     def prefix(self, sequence: int) -> bytes:
-        """Return the prefix of a message with this sequence number: 28 bytes.
+        """Return the prefix, 28 bytes, of a message with this sequence number.
 
-        Most messages of a frame have the same number, so the last prefix is kept: benchmarks/own_cost.py.
+        Most messages of a frame have the same number, so it caches the last prefix (benchmarks/own_cost.py).
         """
         if sequence != self._sequence:
             self._sequence = sequence

@@ -1,4 +1,4 @@
-"""Messages in one line of text, for people."""
+"""Summaries of messages, one line each, for people."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -10,11 +10,11 @@ from gateway.errors import ParametersError
 from gateway.rtc3d.parameters_xml import parse_parameters
 
 _MAX_SHOWN: Final = 4
-"""How many channels, plates or events a line shows."""
+"""The maximum number of channels, plates or events in a line."""
 
 
 def summarise(message: Any) -> str:
-    """Return a decoded LCM message in one line: what a person wants to see first."""
+    """Return a line about a decoded LCM message, with what a person wants to see first."""
     match message:
         case rtc3d.status_t():
             return _status(message)
@@ -34,7 +34,7 @@ def summarise(message: Any) -> str:
 
 
 def summarise_xml(xml: bytes) -> str:
-    """Return in a few words what a server's XML contains (§6)."""
+    """Return what a server's XML (§6) contains: its size and the number of markers, tools and so on."""
     size = f"{len(xml)} bytes of XML"
     try:
         parameters = parse_parameters(xml).parameters
@@ -82,7 +82,7 @@ def _visibility(items: Sequence[Any]) -> str:
 
 
 def _first(items: Sequence[Any], text: Callable[[Any], str], separator: str) -> str:
-    """Return the first _MAX_SHOWN items as text, and "…" for the others."""
+    """Return the first _MAX_SHOWN items as text, and "…" if there are more."""
     texts = [text(item) for item in items[:_MAX_SHOWN]]
     if len(items) > _MAX_SHOWN:
         texts.append("…")

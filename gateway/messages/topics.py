@@ -6,18 +6,18 @@ from typing import NamedTuple
 from urllib.parse import quote
 
 MAX_CHANNEL_LENGTH = 63
-"""LCM's limit: its ``publish`` refuses longer names."""
+"""LCM's ``publish`` refuses longer names."""
 
 MAX_LABEL_LENGTH = 200
-"""Limit on a tool's label, which the server chooses: Zenoh panics over keys of 64 kB."""
+"""A tool's label comes from the server and becomes part of a key; Zenoh panics over keys of 64 kB."""
 
 
 class Topic(NamedTuple):
-    """One stream of messages of one LCM type from ``source``.
+    """A series of messages of one LCM type from ``source``, with a key on Zenoh and a channel on LCM.
 
-    ``path`` names the messages within the source, in keys and channels. It is one of ("3d",), ("6d",),
-    ("analog",), ("force",), ("event",), ("status",), ("clock",), or ("6d", label) for the pose of one tool.
-    ``type_name`` is the LCM type: "rtc3d.markers_t".
+    ``path`` is the part of the key below the source: ("3d",), ("6d",), ("analog",), ("force",), ("event",),
+    ("status",), ("clock",), or ("6d", label) for the pose of one tool. ``type_name`` is the name of the LCM
+    type, such as "rtc3d.markers_t".
     """
 
     source: str
@@ -26,12 +26,12 @@ class Topic(NamedTuple):
 
 
 def zenoh_key(prefix: str, source: str, *path: str) -> str:
-    """Return the key ``prefix/source/path…`` with every element of ``path`` escaped."""
+    """Return the key ``prefix/source/path…`` with each chunk of ``path`` escaped."""
     return "/".join([prefix, source, *(escape_key_chunk(name) for name in path)])
 
 
 def escape_key_chunk(label: str) -> str:
-    """Return ``label`` as one chunk of a key expression, without loss.
+    """Return ``label`` as one chunk of a key expression (a part between slashes), without loss.
 
     Letters, digits and ``_ . - ~`` stay; everything else is percent-escaped (UTF-8), including ``/ * $ # ?``
     of Zenoh's syntax. ``urllib.parse.unquote`` returns the label. An empty label becomes ``%``, which is
@@ -51,9 +51,9 @@ def lcm_channel(prefix: str, source: str, *path: str) -> str:
 
 
 def unique_name(name: str, taken: Container[str], max_length: int = MAX_CHANNEL_LENGTH) -> str:
-    """Return ``name`` if it is not ``taken``, else the first free of ``name_2``, ``name_3``, …
+    """Return ``name`` if it is not ``taken``, otherwise the first free one of ``name_2``, ``name_3``, …
 
-    The result is cut to ``max_length`` characters; its number is kept.
+    The result has at most ``max_length`` characters; if necessary, the name is cut, not the number.
     """
     candidate, number = name[:max_length], 1
     while candidate in taken:

@@ -1,11 +1,11 @@
-"""From one source's frames to every output."""
+"""Publishing one source's frames on every output."""
 
 import logging
 from collections.abc import Callable, Collection, Sequence
 from functools import lru_cache
 from typing import Final
 
-from gateway.messages.encode import MESSAGE_TYPES, has_lcm_form, lcm_content, splice_content
+from gateway.messages.encode import MESSAGE_TYPES, encode_content, has_lcm_form, lcm_content
 from gateway.messages.stamp import NOT_PUBLISHED, Stamp
 from gateway.outputs.contract import Output
 from gateway.outputs.status import OutputStatus
@@ -16,13 +16,13 @@ from gateway.rtc3d.frames import Frame, FrameLayout
 from gateway.rtc3d.parameters import Parameters
 
 _MAX_PLANS: Final = 256
-"""How many plans are kept. The server chooses the layouts: every number of events makes another one."""
+"""How many plans are cached. The server determines the layouts: each number of events is another one."""
 
 logger = logging.getLogger(__name__)
 
 
-class _Component:
-    """What FanOut counts of one component: the frames that had it, and the newest message."""
+class _ComponentRecord:
+    """The number of frames that contained one component, and its newest message."""
 
     def __init__(self) -> None:
         self.frames = 0
@@ -35,13 +35,13 @@ class _ComponentPlan:
     def __init__(
         self,
         component_type: ComponentType,
-        component: _Component,
+        record: _ComponentRecord,
         index: int,
         has_lcm_form: bool,
         routes: list[ComponentRoute],
     ) -> None:
         self.type = component_type
-        self.component = component
+        self.record = record
         self.routes = routes
         self._index = index
         self._has_lcm_form = has_lcm_form
@@ -54,9 +54,9 @@ class _ComponentPlan:
 
 
 class _Plan:
-    """How to publish the ``wanted`` components of a layout; made once per layout, not for every frame.
+    """How to publish the ``wanted`` components of a layout. Made once per layout, not for every frame.
 
-    ``tool_indices`` are the indices of components whose tools have messages of their own, and ``num_items``
+    ``tool_indices`` are the indices of 6D components whose poses are published per tool. ``num_items`` are
     the numbers of markers, tools, channels and plates.
     """
 
@@ -72,17 +72,17 @@ class _Plan:
         self.components = components
         self.tool_indices = tool_indices
         self.num_items = {
-            part.type: part.num_items
-            for part in layout.components
-            if part.type in wanted and part.type is not ComponentType.EVENT
+            component.type: component.num_items
+            for component in layout.components
+            if component.type in wanted and component.type is not ComponentType.EVENT
         }
 
 
 class FanOut:
     """Publishes the frames, status and clock of one source on every output.
 
-    ``on_items_changed`` is called when the number of markers, tools, channels or plates changes; it may be
-    replaced.
+    It calls ``on_items_changed``, which may be assigned later, when the number of markers, tools, channels
+    or plates changes.
     """
 
     def __init__(
@@ -93,19 +93,19 @@ class FanOut:
     ) -> None:
         self.on_items_changed = on_items_changed
         self._source = source
-        self._components = {component: _Component() for component in MESSAGE_TYPES}
+        self._records = {component: _ComponentRecord() for component in MESSAGE_TYPES}
         self._routes: list[OutputRoute] = []
         self._frame_routes: list[FrameRoute] = []
-        self._last_routes: dict[str, OutputRoute] = {}  # by the output's name; closed ones too
+        self._last_routes: dict[str, OutputRoute] = {}  # by the output's name, including closed ones
         self._tool_poses = ToolPoses(source)
         self._plan_for = lru_cache(_MAX_PLANS)(self._new_plan)
         self._plan: _Plan | None = None  # of the previous frame
         self._num_items: dict[ComponentType, int] = {}
         self._is_streaming = False
-        self.use(outputs)
+        self.set_outputs(outputs)
 
-    def use(self, outputs: Sequence[Output]) -> None:
-        """Publish on these outputs from now on; those already in use are not disturbed.
+    def set_outputs(self, outputs: Sequence[Output]) -> None:
+        """Publish on these outputs from now on. Routes to outputs that stay are not touched.
 
         An output that replaces another of the same name continues its sequence numbers and counters.
         """
@@ -115,7 +115,7 @@ class FanOut:
                 route.close()
         self._routes = [open_routes.get(output) or self._open_route(output) for output in outputs]
         self._frame_routes = [route.frame_route for route in self._routes if route.frame_route is not None]
-        self._tool_poses.use([route for route in self._routes if route.output.has_tool_poses])
+        self._tool_poses.set_routes([route for route in self._routes if route.output.has_tool_poses])
         self._plan_for.cache_clear()
         self._plan = None
 
@@ -127,20 +127,20 @@ class FanOut:
         return route
 
     def close(self) -> None:
-        """Close every route; nothing of the source stays declared on an output."""
+        """Close every route, so that no output announces the source any more."""
         if self._is_streaming:
             self.show_streaming(False)
-        self.use(())
+        self.set_outputs(())
 
     @property
     def frames(self) -> dict[ComponentType, int]:
-        """How many frames with each component arrived here, including those the pacers left out."""
-        return {component: each.frames for component, each in self._components.items()}
+        """The number of frames with each component, including those that a pacer left out."""
+        return {component: record.frames for component, record in self._records.items()}
 
     @property
     def newest(self) -> dict[ComponentType, bytes]:
         """The newest message of each component."""
-        newest = {component: each.newest for component, each in self._components.items()}
+        newest = {component: record.newest for component, record in self._records.items()}
         return {component: message for component, message in newest.items() if message is not None}
 
     @property
@@ -149,8 +149,8 @@ class FanOut:
         return [(route.output, route.status) for route in self._routes]
 
     def publish(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
-        """Publish the ``wanted`` components of a frame; an output that fails raises nothing here."""
-        # The inner loop of the gateway: benchmarks/own_cost.py measures it.
+        """Publish the ``wanted`` components of a frame. Raises nothing if an output fails."""
+        # This is the inner loop of the gateway; benchmarks/own_cost.py measures it.
         plan = self._plan
         if plan is None or plan.layout is not frame.layout or plan.wanted is not wanted:
             self._plan = plan = self._plan_for(frame.layout, wanted)
@@ -159,33 +159,33 @@ class FanOut:
             frame_route.publish(frame, stamp, wanted)
         for planned in plan.components:
             content = planned.content(frame)
-            planned.component.frames += 1
+            planned.record.frames += 1
             for route in planned.routes:
                 message = route.publish(content, stamp)
                 if message is not None:
-                    planned.component.newest = message
-            if not planned.routes:  # every output takes whole frames; queries need a message all the same
-                planned.component.newest = splice_content(planned.type, content, stamp, NOT_PUBLISHED)
+                    planned.record.newest = message
+            if not planned.routes:  # every output takes whole frames, but queries need a message
+                planned.record.newest = encode_content(planned.type, content, stamp, NOT_PUBLISHED)
         for index in plan.tool_indices:
             self._tool_poses.publish(frame, index, stamp)
 
     def _new_plan(self, layout: FrameLayout, wanted: frozenset[ComponentType]) -> _Plan:
-        parts = [(index, part) for index, part in enumerate(layout.components) if part.type in wanted]
-        components = [
+        indexed = [pair for pair in enumerate(layout.components) if pair[1].type in wanted]
+        plans = [
             _ComponentPlan(
-                part.type,
-                self._components[part.type],
+                component.type,
+                self._records[component.type],
                 index,
-                has_lcm_form(part, layout.byte_order),
-                [route.components[part.type] for route in self._routes if route.frame_route is None],
+                has_lcm_form(component, layout.byte_order),
+                [route.components[component.type] for route in self._routes if route.frame_route is None],
             )
-            for index, part in parts
+            for index, component in indexed
         ]
-        tools = [index for index, part in parts if part.type is ComponentType.TOOLS]
-        return _Plan(layout, wanted, components, tools if self._tool_poses.is_used else [])
+        tools = [index for index, component in indexed if component.type is ComponentType.TOOLS]
+        return _Plan(layout, wanted, plans, tools if self._tool_poses.is_used else [])
 
     def _check_item_counts(self, plan: _Plan) -> None:
-        """Log and report every component whose number of items is not the same as before."""
+        """Log and report every component whose number of items has changed."""
         for component, num_items in plan.num_items.items():
             before = self._num_items.get(component)
             self._num_items[component] = num_items
@@ -197,7 +197,7 @@ class FanOut:
                 self.on_items_changed()
 
     def has_subscribers(self, components: Collection[ComponentType]) -> bool:
-        """Return whether any output may have a subscriber to one of the components."""
+        """Return whether any output may have a subscriber to any of ``components``."""
         return any(route.publisher.wanted for route in self._frame_routes) or any(
             route.components[component].publisher.wanted
             for route in self._routes
@@ -206,7 +206,7 @@ class FanOut:
         )
 
     def show_streaming(self, is_streaming: bool) -> None:
-        """Show on every output whether frames of the source flow."""
+        """Show on every output whether frames of the source arrive."""
         self._is_streaming = is_streaming
         for route in self._routes:
             route.output.show_streaming(self._source, is_streaming)
@@ -222,5 +222,5 @@ class FanOut:
             route.clock_route.send(message)
 
     def set_parameters(self, parameters: Parameters) -> None:
-        """Set the labels (§6.3) and the unit of length (§6.2) of the messages per tool."""
+        """Set the labels (§6.3) and the unit of length (§6.2) for the poses per tool."""
         self._tool_poses.set_parameters(parameters)

@@ -8,7 +8,7 @@ import rtc3d
 
 from gateway.errors import OutputError
 from gateway.log import HOLD_S, FailureLog
-from gateway.messages.encode import MESSAGE_TYPES, content_timestamp_us, lcm_type_name, splice_content
+from gateway.messages.encode import MESSAGE_TYPES, content_timestamp_us, encode_content, lcm_type_name
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import FramePublisher, Output
@@ -21,7 +21,7 @@ logger = logging.getLogger(__name__)
 
 
 class SentCounter:
-    """How many messages of one kind an output accepted from one source, and how many bytes they had."""
+    """The number of messages of one kind that an output accepted from one source, and their bytes."""
 
     def __init__(self) -> None:
         self.messages = 0
@@ -29,23 +29,23 @@ class SentCounter:
 
 
 class OutputRoute:
-    """Everything one source publishes on one output.
+    """Everything that one source publishes on one output.
 
-    With ``predecessor``, an earlier route to an output of the same name, it continues that route's sequence
-    numbers and counters.
+    It continues the sequence numbers and counters of ``predecessor``, an earlier route to an output of the
+    same name.
     """
 
     def __init__(self, source: str, output: Output, predecessor: "OutputRoute | None" = None) -> None:
         self.source = source
         self.output = output
         self.sent: dict[str, SentCounter] = {} if predecessor is None else predecessor.sent
-        """By component key; "status", "clock" and "6d/tool" are counted as components of their own."""
+        """By component key, or by "status", "clock", "6d/tool" or "frame" (a whole frame)."""
         self.drops: Counter[str] = Counter() if predecessor is None else predecessor.drops
         """By cause."""
         self._failures = FailureLog(logger, f"{source} to {output.name}", HOLD_S)
         frame_publisher = output.frame_publisher(source)
         self.frame_route: FrameRoute | None = None
-        """The route of whole frames; an output that takes them gets no single components."""
+        """For whole frames. An output that takes them gets no single components."""
         if frame_publisher is not None:
             self.frame_route = FrameRoute(
                 self, frame_publisher, None if predecessor is None else predecessor.frame_route
@@ -62,7 +62,7 @@ class OutputRoute:
 
     @property
     def status(self) -> OutputStatus:
-        """What was sent so far, and the drops, with those that the output counted itself."""
+        """The messages sent so far, and the drops, including those that the output counts itself."""
         sent = {name: counter for name, counter in self.sent.items() if counter.messages}
         return OutputStatus(
             self.output.name,
@@ -78,7 +78,7 @@ class OutputRoute:
         self._failures.failed(str(error) if isinstance(error, OutputError) else f"{cause}: {error}")
 
     def note_success(self) -> None:
-        """Log that a failure is over, if one was logged."""
+        """Log the recovery if a failure was logged."""
         self._failures.recovered("sending again")
 
     def close(self) -> None:
@@ -87,12 +87,12 @@ class OutputRoute:
             route.close()
         if self.frame_route is not None:
             self.frame_route.close()
-        self.drops.update(self.output.drops(self.source))  # for the successor
+        self.drops.update(self.output.drops(self.source))  # which the successor continues
         self.output.withdraw(self.source)
 
 
 class TopicRoute:
-    """One topic on one output; its messages are counted under ``counted_as``."""
+    """The route of one topic to one output. Its messages are counted under ``counted_as``."""
 
     def __init__(
         self, output_route: OutputRoute, path: tuple[str, ...], message_type: type[Any], counted_as: str
@@ -119,44 +119,44 @@ class TopicRoute:
 
 
 class ComponentRoute(TopicRoute):
-    """One component on one output: paced, and with its own sequence numbers."""
+    """The route of one component to one output, with pacing and its own sequence numbers."""
 
     def __init__(
         self, output_route: OutputRoute, component: ComponentType, predecessor: "ComponentRoute | None"
     ) -> None:
         super().__init__(output_route, (component.key,), MESSAGE_TYPES[component], component.key)
         max_rate_hz = output_route.output.max_rate_hz.get(component)
-        if component is ComponentType.EVENT:  # events are never skipped
+        if component is ComponentType.EVENT:  # events are never left out
             max_rate_hz = None
         self._component = component
         self._pacer = None if max_rate_hz is None else Pacer(max_rate_hz)
         self.sequence: int = 0 if predecessor is None else predecessor.sequence
-        """Of the next message."""
+        """The sequence number of the next message."""
 
     def publish(self, content: bytes, stamp: Stamp) -> bytes | None:
-        """Publish a content in LCM form unless the pacer leaves it out; return the message, if any.
+        """Publish a content in LCM form and return the message; return None if the pacer leaves it out.
 
-        A message that the output does not accept uses up its sequence number, so that the loss shows.
+        A message that the output does not accept uses up a sequence number, so that subscribers see the loss.
         """
         if self._pacer is not None:
             timestamp_us = content_timestamp_us(content) if stamp.has_clock else None
             if not self._pacer.due(timestamp_us, stamp.utime):
                 return None
-        message = splice_content(self._component, content, stamp, self.sequence)
+        message = encode_content(self._component, content, stamp, self.sequence)
         self.sequence += 1
         self.send(message)
         return message
 
 
 class FrameRoute:
-    """The whole frames of one source on one output that takes them, with their own sequence numbers."""
+    """The route of whole frames to an output that takes them, with their own sequence numbers."""
 
     def __init__(
         self, output_route: OutputRoute, publisher: FramePublisher, predecessor: "FrameRoute | None"
     ) -> None:
         self.publisher = publisher
         self.sequence: int = 0 if predecessor is None else predecessor.sequence
-        """Of the next frame."""
+        """The sequence number of the next frame."""
         self._output_route = output_route
         self._sent = output_route.sent.setdefault("frame", SentCounter())
 

@@ -37,7 +37,7 @@ def status_message(
 ) -> rtc3d.status_t:
     """Return the status of one source.
 
-    ``server`` is HOST:PORT. Each stream comes with its frame rate in Hz, and each output with its health.
+    ``server`` is HOST:PORT. ``streams`` are pairs of a stream's status and its frame rate in Hz.
     """
     message = rtc3d.status_t()
     message.utime = message.capture_utime = now_utime()
@@ -54,7 +54,7 @@ def status_message(
 
 
 def clock_message(session: int, sequence: int, stream: StreamStatus) -> rtc3d.clock_t:
-    """Return the clock of one stream; ``session`` counts the connections of all streams."""
+    """Return the clock of one stream; ``session`` is the number of connections of all streams so far."""
     message = rtc3d.clock_t()
     message.utime = message.capture_utime = now_utime()
     message.sequence = sequence
@@ -65,7 +65,7 @@ def clock_message(session: int, sequence: int, stream: StreamStatus) -> rtc3d.cl
 
 
 def clock_model(clock: ServerClock) -> rtc3d.clock_model_t:
-    """Return the model of a server's clock, empty if there is none."""
+    """Return the model of a server's clock; without a clock, all fields but ``samples`` are 0."""
     model = rtc3d.clock_model_t()
     model.has_clock = clock.has_clock
     if clock.has_clock:

@@ -1,4 +1,4 @@
-"""Poses per tool: one topic for each tool's label, on the outputs that ask for them."""
+"""Poses per tool: one topic per tool, named after its label, on the outputs that are configured for it."""
 
 import logging
 from collections.abc import Sequence
@@ -16,20 +16,20 @@ from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import Parameters
 
 _MAX_TOOLS: Final = 256
-"""How many tools can have topics of their own; the server chooses the number of tools in a frame."""
+"""How many tools can have topics of their own. The server determines the number of tools in a frame."""
 
 logger = logging.getLogger(__name__)
 
 
 class _Tool:
-    """One tool's topic: its name, and the route to each output that gets it."""
+    """One tool's topic: its name, and its route to each output."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.routes: dict[OutputRoute, TopicRoute] = {}
 
-    def use(self, output_routes: Sequence[OutputRoute]) -> None:
-        """Open the routes that are missing and close those to other outputs."""
+    def set_routes(self, output_routes: Sequence[OutputRoute]) -> None:
+        """Open the routes that are missing, and close those to other outputs."""
         path = (ComponentType.TOOLS.key, self.name)
         for output_route in self.routes.keys() - set(output_routes):
             self.routes.pop(output_route).close()
@@ -44,7 +44,7 @@ class ToolPoses:
     def __init__(self, source: str) -> None:
         self._output_routes: Sequence[OutputRoute] = ()
         self._labels: tuple[str, ...] = ()
-        self._metres: float | None = 1e-3  # per unit of length; None while the server's unit is unknown
+        self._unit_m: float | None = 1e-3  # the unit of length in metres; None if it is unknown
         self._tools: list[_Tool] = []
         self._sequences: dict[str, int] = {}  # by the tools' names
         self._too_many = FailureLog(logger, source, HOLD_S)
@@ -52,14 +52,14 @@ class ToolPoses:
 
     @property
     def is_used(self) -> bool:
-        """Whether any output gets poses per tool."""
+        """Whether any output publishes poses per tool."""
         return bool(self._output_routes)
 
-    def use(self, output_routes: Sequence[OutputRoute]) -> None:
-        """Publish on these outputs from now on; topics on those already in use stay open."""
+    def set_routes(self, output_routes: Sequence[OutputRoute]) -> None:
+        """Publish on these outputs from now on. Topics on outputs that stay are not touched."""
         self._output_routes = output_routes
         for tool in self._tools:
-            tool.use(output_routes)
+            tool.set_routes(output_routes)
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Set the tools' labels (§6.3) and the unit of length (§6.2)."""
@@ -68,19 +68,19 @@ class ToolPoses:
             self._labels = labels
             self._close_topics()
         unit = "mm" if parameters.markers is None else parameters.markers.unit
-        self._metres = metres_per_unit(unit)
-        if self._metres is None and self.is_used:
-            # A robot that moves by a guessed unit is worse than one that waits.
+        self._unit_m = metres_per_unit(unit)
+        if self._unit_m is None and self.is_used:
+            # Publish nothing: a robot that waits is better than one that moves by a guessed unit.
             self._unknown_unit.failed(
                 f"unit of length {unit[:40]!r} is unknown: no tool poses are published; "
                 "set it to mm or m in the server"
             )
-        elif self._metres is not None:
+        elif self._unit_m is not None:
             self._unknown_unit.recovered(f"unit of length is {unit!r}: tool poses are published")
 
     def publish(self, frame: Frame, index: int, stamp: Stamp) -> None:
-        """Publish the pose of each tool in the frame's component at ``index``, if anyone subscribes."""
-        if self._metres is None:
+        """Publish the pose of each tool in the frame's component at ``index``, if there are subscribers."""
+        if self._unit_m is None:
             self._count_drop("unknown unit")
             return
         num_tools = frame.layout.components[index].num_items
@@ -95,12 +95,12 @@ class ToolPoses:
         if num_tools > len(self._tools):
             self._open_topics(num_tools)
         if any(route.publisher.wanted for tool in self._tools for route in tool.routes.values()):
-            self._send(frame.component(index), stamp, self._metres)
+            self._send(frame.component(index), stamp, self._unit_m)
 
-    def _send(self, component: Component, stamp: Stamp, metres: float) -> None:
+    def _send(self, component: Component, stamp: Stamp, unit_m: float) -> None:
         tools = self._tools[: component.num_items]
         sequences = [self._sequences[tool.name] for tool in tools]
-        messages = tool_poses(component, stamp, sequences, metres)
+        messages = tool_poses(component, stamp, sequences, unit_m)
         for tool, message in zip(tools, messages, strict=True):
             for route in tool.routes.values():
                 if route.publisher.wanted:
@@ -112,7 +112,7 @@ class ToolPoses:
             output_route.drops[cause] += 1
 
     def _open_topics(self, num_tools: int) -> None:
-        """Open topics for ``num_tools`` tools. A name that had a topic before continues its numbers."""
+        """Open topics for ``num_tools`` tools. A name that had a topic before continues counting."""
         self._close_topics()
         before, self._sequences = self._sequences, {}
         for index in range(num_tools):
@@ -120,10 +120,10 @@ class ToolPoses:
             name = unique_name(label or f"tool {index + 1}", self._sequences, MAX_LABEL_LENGTH)
             self._sequences[name] = before.get(name, 0)
             tool = _Tool(name)
-            tool.use(self._output_routes)
+            tool.set_routes(self._output_routes)
             self._tools.append(tool)
 
     def _close_topics(self) -> None:
         for tool in self._tools:
-            tool.use(())
+            tool.set_routes(())
         self._tools.clear()

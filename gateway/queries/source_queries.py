@@ -8,7 +8,7 @@ from typing import Any
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import FrameError, QueryError
-from gateway.messages.encode import FINGERPRINT_BYTES, splice
+from gateway.messages.encode import FINGERPRINT_BYTES, encode_message
 from gateway.messages.host_time import now_utime
 from gateway.messages.stamp import NOT_PUBLISHED, PREFIX, Stamp
 from gateway.outputs.contract import Answer
@@ -110,7 +110,7 @@ class SourceQueries:
                 ("frame", component), lambda: self._current_frame(component, stream)
             )
             utime = now_utime()
-            message = splice(current, Stamp(utime, utime, session), NOT_PUBLISHED)
+            message = encode_message(current, Stamp(utime, utime, session), NOT_PUBLISHED)
         return message_answer(message, question, {"session": session})
 
     async def _current_frame(self, component: ComponentType, stream: StreamAccess) -> Component:

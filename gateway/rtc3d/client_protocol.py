@@ -29,7 +29,7 @@ from gateway.rtc3d.packets import (
 from gateway.rtc3d.protocol_state import ProtocolInput, ProtocolState, next_state
 from gateway.rtc3d.reply_matcher import ANSWERING_TYPES, ReplyMatcher
 
-_MAX_ERROR_BYTES: Final = 300  # of the server's error text, which goes into logs and every status message
+_MAX_ERROR_BYTES: Final = 300  # of a server's error text, which goes into logs and status messages
 _UNUSED_PARAMETER: Final = -1  # of an event (§7.7)
 
 
@@ -48,7 +48,7 @@ class Refused(NamedTuple):
 
 
 class FrameRejected(NamedTuple):
-    """A data frame contradicts itself and is lost; the next one may be good."""
+    """A data frame contradicts itself and is lost. Later frames are not affected."""
 
     error: FrameError
 
@@ -60,7 +60,7 @@ class FileReceived(NamedTuple):
 
 
 class UnexpectedPacket(NamedTuple):
-    """A packet that answers nothing: a duplicate or late reply, or a type that §4.2 does not define."""
+    """A packet that answers no command: a duplicate or late reply, or a type that §4.2 does not define."""
 
     packet: Packet
 
@@ -83,11 +83,11 @@ ProtocolEvent = (
 
 
 class ClientProtocol:
-    """One connection, from its first byte to its last. Use once.
+    """The state of one connection. Use a new object for the next connection.
 
     ``send`` sends a command, ``receive`` takes the server's bytes, and ``bytes_to_send`` returns the bytes
-    to write to the server. A reply accepts or refuses a command by its packet type, never by its text
-    (field note 1); ReplyMatcher decides which command it answers.
+    to write to the server. The packet type of a reply decides whether a command is accepted or refused,
+    never its text (field note 1). ReplyMatcher decides which command a reply answers.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class ClientProtocol:
         """Send ``command``, which is then pending until it is answered.
 
         Raises ClosedError after Bye or the end of the connection, and LinkError while another command is
-        pending: it must be answered, or given up, first. ``Bye`` may be sent while a command is pending.
+        pending; ``Bye`` is allowed then. ``give_up`` ends a command that is not answered.
         """
         self._check_open(str(command))
         if isinstance(command, Bye):
@@ -142,11 +142,11 @@ class ClientProtocol:
         self._outgoing += encode_packet(PacketType.DATA, encode_frame([component], self._agreed_byte_order))
 
     def give_up(self) -> None:
-        """Stop waiting for the pending command; a late reply to it will answer nothing."""
+        """Stop waiting for the pending command. A late reply to it answers no command."""
         self._replies.give_up()
 
     def bytes_to_send(self) -> bytes:
-        """Return the bytes to write to the server that were not returned before."""
+        """Return the bytes to write to the server, each of them once."""
         data = bytes(self._outgoing)
         self._outgoing.clear()
         return data
@@ -158,9 +158,9 @@ class ClientProtocol:
     def receive(self, data: bytes) -> tuple[list[Frame], list[ProtocolEvent]]:
         """Take bytes from the server; return the frames and the other events that they complete.
 
-        Each list is in the order of arrival. How frames and events alternated within ``data`` is lost:
-        handle the events first, so that a ByteOrderMismatch is reported before the first frame is used.
-        ``state`` is the state after all of them. StreamCorrupted is always the last event. Never raises.
+        Each list is in the order of arrival, but the order between frames and events is lost. Handle the
+        events first, so that a ByteOrderMismatch is reported before the first frame is used. ``state`` is
+        the state after all of them. StreamCorrupted is always the last event. Never raises.
         """
         frames: list[Frame] = []
         events: list[ProtocolEvent] = []
@@ -176,11 +176,12 @@ class ClientProtocol:
         return frames, events
 
     def _check_open(self, unsent: str) -> None:
+        """Raise ClosedError, which names ``unsent``, after Bye or the end of the connection."""
         if self.state in {ProtocolState.CLOSING, ProtocolState.CLOSED}:
             raise ClosedError(f"{unsent} not sent: the connection is {self.state.value}")
 
-    def _apply(self, reason: ProtocolInput) -> None:
-        self.state = next_state(self.state, reason)
+    def _apply(self, protocol_input: ProtocolInput) -> None:
+        self.state = next_state(self.state, protocol_input)
 
     def _on_data(self, packet: Packet, frames: list[Frame], events: list[ProtocolEvent]) -> None:
         try:
@@ -194,7 +195,7 @@ class ClientProtocol:
             events.append(Answered(pending, packet))
         if self.state is not ProtocolState.STREAMING:
             if isinstance(pending, SendCurrentFrame):
-                return  # Frames are not being streamed, so this one is only the answer.
+                return  # No frames are streamed yet, so this one is only the answer.
             self._apply(ProtocolInput.FRAME_RECEIVED)
         frames.append(frame)
 
@@ -212,7 +213,7 @@ class ClientProtocol:
     def _is_answered_by(self, frame: Frame, pending: Command) -> bool:
         match pending:
             case StreamFrames():
-                # While frames are streamed, a frame does not show that a new rate was accepted.
+                # In other states frames arrive anyway, so they do not show that a new rate was accepted.
                 return self.state is ProtocolState.REQUESTED
             case SendCurrentFrame() if self.state is not ProtocolState.STREAMING:
                 return True

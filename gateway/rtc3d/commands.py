@@ -1,4 +1,4 @@
-"""Commands (§5): typed, and encoded to and parsed from their texts."""
+"""Commands (§5) as typed objects: encoding them as text, and parsing them."""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -22,7 +22,7 @@ _KNOWN_COMMANDS: Final = (
 )
 _Named = TypeVar("_Named")
 _NUMBER: Final = re.compile(r"\d{1,9}(\.\d{1,20})?", re.ASCII)
-_MIN_HZ: Final = 1e-6  # the lowest frequency that Frequency can write, with its six decimals
+_MIN_HZ: Final = 1e-6  # the lowest frequency that str(Frequency), with six decimals, can represent
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Frequency:
 
 @dataclass(frozen=True, slots=True)
 class FrequencyDivisor:
-    """A rate: every ``divisor``-th real-time frame."""
+    """A rate: every ``divisor``-th real-time frame that the server processes."""
 
     divisor: int
 
@@ -88,7 +88,7 @@ class SendParameters:
 
 @dataclass(frozen=True, slots=True)
 class SendCurrentFrame:
-    """§5.3.4. () as components means all. NDI's client may name Events too (field note 14)."""
+    """§5.3.4. () as components means all. NDI's client may request Events, too (field note 14)."""
 
     components: tuple[ComponentType, ...] = ()
 
@@ -98,7 +98,7 @@ class SendCurrentFrame:
 
 @dataclass(frozen=True, slots=True)
 class StreamFrames:
-    """§5.3.5. None as rate lets the server send every frame; () as components means all."""
+    """§5.3.5. None as rate means the server's default, () as components means all."""
 
     rate: Rate | None = None
     components: tuple[ComponentType, ...] = ()
@@ -118,7 +118,7 @@ class StopStreaming:
 
 @dataclass(frozen=True, slots=True)
 class Bye:
-    """§5.3.6."""
+    """§5.3.6: the client disconnects."""
 
     def __str__(self) -> str:
         return "Bye"
@@ -141,8 +141,8 @@ def encode_command(command: Command) -> bytes:
 def parse_command(body: bytes) -> Command:
     """Return the command in a type-1 packet's body.
 
-    Case is ignored, as are NUL, LF and white space at the end (§5.2, field note 13). Raises
-    CommandError, whose text tells the client what is wrong and what is accepted.
+    Ignores case, and NUL, LF and white space at the end (§5.2, field note 13). Raises CommandError, whose
+    text says what is wrong and what is accepted; the server can send it to the client.
     """
     words = decode_text(body).split()
     if not words:
@@ -200,7 +200,7 @@ def _parse_stream_frames(parameters: Sequence[str]) -> StreamFrames | StopStream
 
 
 def _parse_rate(word: str) -> Rate | None:
-    """Return the rate in a lower-case parameter, None if it is not a rate parameter."""
+    """Return the rate in a lower-case parameter; None if it is not a rate parameter."""
     if word == "allframes":
         return AllFrames()
     name, colon, value = word.partition(":")
@@ -220,9 +220,9 @@ def _parse_rate(word: str) -> Rate | None:
 def _parse_names(
     words: Sequence[str], known: dict[str, _Named], noun: str, others: Sequence[str] = ()
 ) -> tuple[_Named, ...]:
-    """Return what the words name in ``known``, each once, in the order given; () for All or no words.
+    """Return the values of ``known`` that ``words`` name, each once, in order; () for All or no words.
 
-    ``others`` are the other parameters of the command, for the error's text.
+    ``noun`` and ``others``, the other parameters of the command, are for the error text.
     """
     by_word = {word.lower(): named for word, named in known.items()}
     named: dict[_Named, None] = {}

@@ -1,4 +1,4 @@
-"""The five components of data frames (§7.3 to §7.7): their names, their items as numpy arrays, encoding."""
+"""The five components of data frames (§7.3 to §7.7): names, items as numpy arrays, encoding."""
 
 import struct
 from enum import IntEnum
@@ -30,7 +30,7 @@ class ComponentType(IntEnum):
 
     @property
     def key(self) -> str:
-        """The name in the gateway's keys, channels and configuration: 3d, 6d, analog, force or event."""
+        """The name in keys, in channels (upper-case) and in settings: 3d, 6d, analog, force or event."""
         return _NAMES[self].key
 
     @property
@@ -58,7 +58,7 @@ WIRE_ORDER: Final = tuple(_NAMES)
 COMPONENTS_BY_KEY: Final = {component.key: component for component in WIRE_ORDER}
 
 MISSING: Final = np.uint32(0xFFFFFFFF).view(np.float32)
-"""A float of a missing marker or tool: all 32 bits set, a negative quiet NaN (§7.3, field note 7)."""
+"""Each coordinate of a missing marker or tool: all 32 bits set, a negative quiet NaN (§7.3, field note 7)."""
 
 MISSING_RELIABILITY: Final = 999.0
 """The Reliability of a missing marker (field note 7)."""
@@ -74,7 +74,7 @@ SHORT_EVENT: Final = np.dtype([("id", ">i4"), ("param1", ">i4"), ("param2", ">i4
 LONG_EVENT: Final = np.dtype(
     [("id", ">i4"), ("timestamp", ">i8"), ("param1", ">i4"), ("param2", ">i4"), ("param3", ">i4")]
 )
-"""An event as NDI's own code writes it: 24 bytes, with its own time stamp in µs (field note 6)."""
+"""An event as NDI's own code writes it: 24 bytes, with a time stamp in µs per event (field note 6)."""
 
 ITEM_DTYPES: Final[dict[ComponentType, np.dtype[Any]]] = {
     ComponentType.MARKERS: _floats("x", "y", "z", "reliability"),
@@ -86,7 +86,7 @@ ITEM_DTYPES: Final[dict[ComponentType, np.dtype[Any]]] = {
 """The dtype of one item of each component: big-endian (§7.3 to §7.7), 4-byte packing (§3.2)."""
 
 COMPONENT_HEADER: Final = {"big": struct.Struct(">IIiqI"), "little": struct.Struct("<IIiqI")}
-"""The fields before a component's items: size, type, frame number, time stamp in µs (§7.1), item count."""
+"""The fields before a component's items (§7.1): size, type, frame number, time stamp in µs, item count."""
 COMPONENT_HEADER_BYTES: Final = 24
 
 FRAME_NUMBER_AND_TIMESTAMP: Final = {"big": struct.Struct(">iq"), "little": struct.Struct("<iq")}
@@ -97,9 +97,9 @@ _ITEMS_OFFSET: Final = 16  # of the items in Component.content
 class Component(NamedTuple):
     """One component of a frame.
 
-    ``timestamp_us`` is in µs since the server's start. ``content`` is what follows the size and type
-    fields (frame number, time stamp, count, items), in ``byte_order``. ``item_bytes`` is 16 or 24 for
-    events; every other component has items of one size.
+    ``timestamp_us`` is the server's time stamp, "microseconds from start" (§7.1). ``content`` is the part
+    after the size and type fields (frame number, time stamp, count, items), in ``byte_order``.
+    ``item_bytes`` is 16 or 24 for events, and the size in ITEM_DTYPES for other components.
     """
 
     type: ComponentType
@@ -111,9 +111,9 @@ class Component(NamedTuple):
     content: bytes
 
     def items(self) -> Items:
-        """Return the items, shape (num_items,), as a read-only view of ``content`` in its own byte order.
+        """Return the items, shape (num_items,), as a read-only view of ``content``.
 
-        The dtype has the fields of ITEM_DTYPES (SHORT_EVENT for events of 16 bytes).
+        The dtype is that of ITEM_DTYPES (SHORT_EVENT for events of 16 bytes) in ``byte_order``.
         """
         is_short_event = self.type is ComponentType.EVENT and self.item_bytes == SHORT_EVENT.itemsize
         dtype = SHORT_EVENT if is_short_event else ITEM_DTYPES[self.type]

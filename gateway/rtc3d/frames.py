@@ -1,4 +1,4 @@
-"""Data frames (§7.1): split into components, and encoded from them."""
+"""Data frames (§7.1): splitting them into components, and encoding them."""
 
 import struct
 from collections.abc import Iterable, Iterator
@@ -26,7 +26,10 @@ _MAX_CACHED_LAYOUTS: Final = 256
 
 
 class ComponentLayout(NamedTuple):
-    """The layout of one known component; ``item_bytes`` is 16 or 24 for events, else the item's only size."""
+    """The layout of one component of a known type.
+
+    ``item_bytes`` is the size of one item: 16 or 24 for events, the size in ITEM_DTYPES for the others.
+    """
 
     type: ComponentType
     num_items: int
@@ -34,7 +37,7 @@ class ComponentLayout(NamedTuple):
 
 
 class LayoutField(NamedTuple):
-    """The size and type of one component, and its layout, which is None for an unknown type."""
+    """The size in bytes and the type of one component, and its layout; None if the type is unknown."""
 
     size: int
     type: int
@@ -44,22 +47,23 @@ class LayoutField(NamedTuple):
 class FrameLayout:
     """What all frames with the same components and item counts have in common.
 
-    ``components`` are the known components in their order, ``unknown_types`` the types of the components
-    that are skipped. Equal layouts are one object, so that they can be compared with ``is``.
+    ``components`` are the components of known type in the order of the frame, ``unknown_types`` the types
+    of the others, which are skipped. Callers may compare layouts with ``is`` for speed: ``split_frame``
+    returns the same object for equal layouts while it is cached.
     """
 
     def __init__(self, byte_order: ByteOrder, fields: tuple[LayoutField, ...]) -> None:
         self.byte_order: ByteOrder = byte_order
         self.fields = fields
-        """All components, those of unknown type included."""
+        """All components, including those of unknown type."""
         self.components = tuple(field.component for field in fields if field.component is not None)
         self.first_component_type = self.components[0].type if self.components else None
-        """The type of the first known component; None in a frame without any."""
+        """The type of the first known component; None if there is none."""
         self.unknown_types = tuple(field.type for field in fields if field.component is None)
         self.unpack_number_and_timestamp = FRAME_NUMBER_AND_TIMESTAMP[byte_order].unpack_from
-        """Returns the frame number and the time stamp in µs of a component's content."""
+        """Returns (frame number, time stamp in µs) from a buffer and the offset of a component's content."""
         self.content_spans = tuple(_content_spans(fields))
-        """Where in the body each known component's content begins and ends."""
+        """The (start, end) of each known component's content in the body."""
 
 
 def _content_spans(fields: tuple[LayoutField, ...]) -> Iterator[tuple[int, int]]:
@@ -75,10 +79,10 @@ _layout = lru_cache(_MAX_CACHED_LAYOUTS)(FrameLayout)
 
 
 class Frame:
-    """A data frame: its layout and its packet's ``body``, from which contents are cut on request.
+    """A data frame: its layout, and the ``body`` of its packet. Its methods cut components from the body.
 
-    A component's content is what follows its size and type: frame number, time stamp, count and items,
-    in the layout's byte order. Indices count the known components.
+    A component's content is the part after its size and type: frame number, time stamp, count and items,
+    in the layout's byte order. An ``index`` counts the known components from 0.
     """
 
     __slots__ = ("body", "layout")
@@ -99,7 +103,7 @@ class Frame:
 
     @property
     def number_and_timestamp(self) -> tuple[int, int]:
-        """Frame number and time stamp in µs of the first known component; there must be one."""
+        """Frame number and time stamp in µs of the first known component; raises IndexError without one."""
         layout = self.layout
         return layout.unpack_number_and_timestamp(self.body, layout.content_spans[0][0])
 
@@ -125,15 +129,15 @@ class Frame:
 
     @property
     def unknown_types(self) -> tuple[int, ...]:
-        """The types of the components that were skipped as unknown."""
+        """The types of the components whose type is unknown (§7.2)."""
         return self.layout.unknown_types
 
 
 def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
     """Split a type-3 packet's body into components (§7.1).
 
-    Components of unknown type are skipped by their size. Raises FrameError if a size or count
-    contradicts another one or the body's length; then nothing in the frame can be trusted.
+    Components of unknown type are skipped by their size. Raises FrameError if sizes and counts
+    contradict each other or the body's length: then no part of the frame can be trusted.
     """
     total = len(body)
     if total < _COUNT_BYTES:
@@ -143,9 +147,9 @@ def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
     start = _COUNT_BYTES
     for index in range(component_count):
         if total - start >= COMPONENT_HEADER_BYTES:
-            size, kind, _, _, count = COMPONENT_HEADER[byte_order].unpack_from(body, start)
+            size, type_number, _, _, count = COMPONENT_HEADER[byte_order].unpack_from(body, start)
         elif total - start >= _SIZE_AND_TYPE_BYTES:
-            size, kind = _SIZE_AND_TYPE[byte_order].unpack_from(body, start)
+            size, type_number = _SIZE_AND_TYPE[byte_order].unpack_from(body, start)
             count = 0
         else:
             raise FrameError(
@@ -154,35 +158,35 @@ def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
         end = start + size
         if size < _SIZE_AND_TYPE_BYTES or end > total:
             raise FrameError(
-                f"component {index + 1} of {component_count} (type {kind}) has size {size}; "
+                f"component {index + 1} of {component_count} (type {type_number}) has size {size}; "
                 f"{total - start} bytes are left in the frame"
             )
-        fields.append(LayoutField(size, kind, _component_layout(kind, size, count)))
+        fields.append(LayoutField(size, type_number, _component_layout(type_number, size, count)))
         start = end
     if start != total:
         raise FrameError(f"{total - start} bytes follow the last of the frame's {component_count} components")
     return Frame(_layout(byte_order, tuple(fields)), body)
 
 
-def _component_layout(kind: int, size: int, count: int) -> ComponentLayout | None:
-    """Return the layout of a component, None if its type is unknown.
+def _component_layout(type_number: int, size: int, count: int) -> ComponentLayout | None:
+    """Return the layout of a component; None if its type is unknown.
 
-    Raises FrameError if the size does not fit the item count.
+    Raises FrameError if the size contradicts the item count.
     """
-    known = _ITEM_BYTES.get(kind)
+    known = _ITEM_BYTES.get(type_number)
     if known is None:
         return None
     component, item_bytes = known
     if size == COMPONENT_HEADER_BYTES + count * item_bytes:
         return ComponentLayout(component, count, item_bytes)
-    # Events may have the specification's size instead of the usual one (field note 6).
+    # Events have 24 bytes from NDI's servers, but 16 in the specification (field note 6).
     if component is ComponentType.EVENT and size == COMPONENT_HEADER_BYTES + count * SHORT_EVENT.itemsize:
         return ComponentLayout(component, count, SHORT_EVENT.itemsize)
     raise FrameError(f"{component.key} component of {size} bytes announces {count} items")
 
 
 def detect_byte_order(body: bytes, expected: ByteOrder) -> ByteOrder:
-    """Return the byte order in which the frame makes sense, ``expected`` if it does in both.
+    """Return the byte order in which the frame makes sense; ``expected`` if it makes sense in both.
 
     Some servers acknowledge a byte order and then ignore it (field note 4). Raises the FrameError of
     ``expected`` if the frame makes sense in neither.
@@ -200,6 +204,6 @@ def detect_byte_order(body: bytes, expected: ByteOrder) -> ByteOrder:
 
 
 def encode_frame(components: Iterable[bytes], byte_order: ByteOrder = "big") -> bytes:
-    """Return a type-3 packet's body from the components that ``encode_component`` returned."""
+    """Return the body of a type-3 packet from the results of ``encode_component``."""
     encoded = list(components)
     return _COUNT[byte_order].pack(len(encoded)) + b"".join(encoded)

@@ -1,4 +1,4 @@
-"""General-purpose packets (§4.1): an 8-byte header, size and type, always big-endian, then the body."""
+"""General-purpose packets (§4.1): a header with size and type, 8 bytes, always big-endian; then the body."""
 
 import struct
 from enum import IntEnum
@@ -11,7 +11,7 @@ PACKET_HEADER_BYTES: Final = 8
 DEFAULT_MAX_PACKET_BYTES: Final = 16 * 1024 * 1024
 DEFAULT_MAX_C3D_BYTES: Final = 256 * 1024 * 1024
 _MAX_SIZE: Final = 0xFFFFFFFF
-_SHOWN_BYTES: Final = 60  # of data that is not a packet, kept for the error
+_MAX_BEGIN_BYTES: Final = 60  # of PacketError.begin
 
 
 class PacketType(IntEnum):
@@ -25,7 +25,7 @@ class PacketType(IntEnum):
     C3D = 5
 
 
-# Every packet needs these; to look them up and to compare with an IntEnum costs 0.1 µs each.
+# These save time for every packet: an attribute look-up or a comparison with an IntEnum takes 0.1 µs.
 _unpack_header: Final = PACKET_HEADER.unpack_from
 _DATA: Final = int(PacketType.DATA)
 _C3D: Final = int(PacketType.C3D)
@@ -82,9 +82,9 @@ def decode_text(body: bytes) -> str:
 class PacketReader:
     """Cuts a byte stream into packets, however the stream is split into reads.
 
-    ``max_packet_bytes`` bounds every packet's size field, ``max_c3d_bytes`` that of a complete C3D
-    file (type 5). The memory used is what has arrived of the packet in progress, never what its
-    size field claims.
+    ``max_c3d_bytes`` limits the size field of a complete C3D file (type 5), ``max_packet_bytes`` that of
+    every other packet. The reader allocates memory for the bytes that have arrived, never for the size
+    that a header claims.
     """
 
     def __init__(
@@ -94,15 +94,15 @@ class PacketReader:
     ) -> None:
         self._max_packet_bytes = max_packet_bytes
         self._max_c3d_bytes = max_c3d_bytes
-        self._offset = 0  # where in the stream the next packet begins
+        self._offset = 0  # of the next packet in the stream
         self._partial = bytearray()
-        self._partial_goal = 0  # how many bytes _partial needs before it can be cut
+        self._partial_goal = 0  # how many bytes _partial needs before it is worth cutting
         self.error: PacketError | None = None
         """Set when a size field is below 8 or above its limit; the stream then has no further packets."""
 
     @property
     def buffered_bytes(self) -> int:
-        """How many bytes of an incomplete packet are held."""
+        """The number of bytes held of an incomplete packet."""
         return len(self._partial)
 
     def feed(self, data: bytes) -> list[Packet]:
@@ -124,7 +124,7 @@ class PacketReader:
         return packets
 
     def _cut(self, data: bytes) -> tuple[list[Packet], int]:
-        """Return the complete packets at the start of ``data`` and how many bytes of it are used up."""
+        """Return the complete packets at the start of ``data``, and how many of its bytes they take."""
         packets: list[Packet] = []
         available = len(data)
         start = 0
@@ -135,8 +135,8 @@ class PacketReader:
             size, packet_type = _unpack_header(data, start)
             limit = self._max_c3d_bytes if packet_type == _C3D else self._max_packet_bytes
             if not PACKET_HEADER_BYTES <= size <= limit:
-                shown = data[start : start + _SHOWN_BYTES]
-                self.error = _size_error(size, packet_type, self._offset + start, limit, shown)
+                begin = data[start : start + _MAX_BEGIN_BYTES]
+                self.error = _size_error(size, packet_type, self._offset + start, limit, begin)
                 return packets, available
             end = start + size
             if end > available:

@@ -1,7 +1,7 @@
 """The parameters of §6 as typed, frozen objects; ``parameters_xml`` reads and writes them.
 
-A text that the server did not send is "", a number None. Ids are the server's own texts: they may be
-numbered from anything (field note 9), and an event's id may be hexadecimal.
+A text that the server did not send is "" (or its default in §6, such as mm), a number is None. Ids are the
+server's own texts: numbers may start anywhere (field note 9), and an event's id may be hexadecimal.
 """
 
 from dataclasses import dataclass

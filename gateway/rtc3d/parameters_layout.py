@@ -1,6 +1,6 @@
 """The XML layout of the parameters (§6): which element or attribute holds each field.
 
-Reading, writing and repairing of XML all use this one table.
+The reader, the writer and the repair of XML all use this table.
 """
 
 from collections.abc import Iterator
@@ -29,9 +29,9 @@ ROOT: Final = "RT_Parameters"
 
 
 class Field(NamedTuple):
-    """The path to a dataclass's field, from the dataclass's element.
+    """The place of a dataclass's field in XML: ``path`` leads there from the dataclass's element.
 
-    A step of ``path`` that ends in * is repeated, and the field is a tuple; @id is the attribute.
+    If a step of ``path`` ends in *, the element is repeated and the field is a tuple. @id is the attribute.
     ``kind`` is str, int, float or a dataclass in LAYOUT.
     """
 
@@ -114,7 +114,7 @@ LAYOUT: Final[dict[type, tuple[Field, ...]]] = {
 
 
 def _child_and_parent_tags(kind: type, tag: str) -> Iterator[tuple[str, str]]:
-    """Yield the tag of each element of §6 and of its parent, for a ``kind`` in an element ``tag``."""
+    """Yield (tag, parent's tag) of every element below an element ``tag`` that holds a ``kind``."""
     for field in LAYOUT[kind]:
         parent = tag
         for step in field.path.replace("*", "").split("/"):

@@ -1,4 +1,4 @@
-"""XML parameters (§6): parsed liberally into the typed objects of ``parameters``, and encoded."""
+"""XML parameters (§6): parsing them liberally into the typed objects of ``parameters``, and encoding them."""
 
 import math
 import re
@@ -12,13 +12,13 @@ from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_layout import LAYOUT, PARENT_TAGS, ROOT, TAGS
 
 MAX_XML_BYTES: Final = 1024 * 1024
-"""Larger documents are not parsed. This is enough for some 8000 markers; parsing takes seconds at worst."""
+"""Larger documents are not parsed. This is enough for about 8000 markers; parsing takes seconds at worst."""
 MAX_RECOVERED: Final = 20
 """The highest number of entries in ``ParsedParameters.recovered``."""
 _MAX_NOTE_CHARACTERS: Final = 200
 _MAX_QUOTED_CHARACTERS: Final = 60
 
-# A stray end tag makes libxml2 close one element too many, in the end the root, and drop what follows.
+# Each stray end tag makes libxml2 close one element too many. Once it closes the root, it drops the rest.
 # This many extra roots around a malformed document prevent that (libxml2 allows a depth of 256).
 _EXTRA_ROOTS: Final = 64
 # After its first error libxml2 drops every named entity, even &amp;, but no numeric character reference.
@@ -35,7 +35,7 @@ _NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010f
 
 
 class ParsedParameters(NamedTuple):
-    """The content of an XML reply, and one line for each fault that was repaired or left out."""
+    """The content of an XML reply, and one line for each fault that was repaired or skipped."""
 
     parameters: Parameters
     recovered: tuple[str, ...]
@@ -46,9 +46,9 @@ def parse_parameters(xml: bytes) -> ParsedParameters:
 
     Parses liberally (field note 9): unknown elements and text between elements are ignored, sections may
     be absent, NULs at the end and white space around texts are dropped, and the case of tags is ignored.
-    A field that is absent or cannot be read gets its default, a cell of a calibration matrix NaN. XML that
-    is not well-formed, such as the specification's own examples of §6.5 and §6.6, is read as a human reads
-    it. ``recovered`` has a line for each fault found, up to MAX_RECOVERED.
+    A field that is absent or cannot be read gets its default; a cell of a calibration matrix gets NaN. XML
+    that is not well-formed, such as the specification's own examples in §6.5 and §6.6, is repaired as a
+    human would read it. ``recovered`` has a line for each fault, up to MAX_RECOVERED.
 
     Raises ParametersError, and nothing else, if the XML has no parameters, declares entities, or is larger
     than MAX_XML_BYTES.
@@ -59,7 +59,7 @@ def parse_parameters(xml: bytes) -> ParsedParameters:
             f"the server's parameters take {len(body)} bytes, above the limit of {MAX_XML_BYTES}: "
             "this is not an RTC3D server, or it is faulty; check host and port"
         )
-    # libxml2 bounds the expansion of entities, but with unresolved entities texts would be incomplete.
+    # Entities are never resolved (see _parse), so texts that contain them would be incomplete.
     if b"<!ENTITY" in body:
         raise ParametersError(
             "the server's parameters declare XML entities, which RTC3D does not have, so they are not read; "
@@ -71,8 +71,8 @@ def parse_parameters(xml: bytes) -> ParsedParameters:
 
 
 def _parse_tree(body: bytes, notes: list[str]) -> etree._Element:
-    """Return a tree of the elements of §6 in ``body``, with the root RT_Parameters."""
-    encoding = None  # the declared one, else UTF-8
+    """Return the elements of §6 in ``body`` as a tree below RT_Parameters; raises ParametersError."""
+    encoding = None  # the declared encoding, otherwise UTF-8
     root, errors = _parse(body, encoding)
     if errors and not _is_utf8(body):
         encoding = "iso-8859-1"
@@ -91,8 +91,8 @@ def _parse_tree(body: bytes, notes: list[str]) -> etree._Element:
         _copy_elements(root, tree, repair=bool(errors) or not is_parameters)
     if not is_parameters and len(tree) == 0:
         raise ParametersError(
-            "the server's XML has no parameters, it begins with "
-            f"{_quote(body.decode('latin-1'))}; check host and port, and that this is an RTC3D server"
+            f"the server's XML has no parameters but begins with {_quote(body.decode('latin-1'))}; "
+            "check host and port, and that this is an RTC3D server"
         )
     return tree
 
@@ -106,7 +106,7 @@ def _is_utf8(body: bytes) -> bool:
 
 
 def _parse(body: bytes, encoding: str | None) -> tuple[etree._Element | None, list[str]]:
-    """Return the root element, None if there is none, and a line for each error in the XML."""
+    """Return the root element (None if there is none) and a line for each error in the XML."""
     parser = etree.XMLParser(
         encoding=encoding,
         recover=True,
@@ -126,15 +126,15 @@ def _parse(body: bytes, encoding: str | None) -> tuple[etree._Element | None, li
 
 
 def _tag(element: etree._Element) -> str | None:
-    """Return the element's tag in the spelling of §6, None if §6 does not have it."""
+    """Return the element's tag in the spelling of §6; None if §6 does not define it."""
     return TAGS.get(element.tag.rpartition("}")[2].lower())
 
 
 def _copy_elements(root: etree._Element, tree: etree._Element, *, repair: bool) -> None:
     """Copy the elements of §6 below ``root`` into ``tree``, in document order, with parents as in §6.
 
-    A missing or stray end tag makes everything after it nested wrongly. An element whose parent cannot
-    have it by §6 is left out, or, with ``repair``, goes to the last element before it that can have it.
+    After a missing or stray end tag, all elements are nested wrongly. An element whose parent cannot contain
+    it by §6 is skipped or, with ``repair``, moved to the last element before it that can contain it.
     """
     copies: dict[etree._Element | None, etree._Element] = {root: tree}
     latest: dict[str, tuple[int, etree._Element]] = {ROOT: (0, tree)}
@@ -159,17 +159,17 @@ def _copy_elements(root: etree._Element, tree: etree._Element, *, repair: bool) 
 
 
 def _read(kind: type, element: etree._Element, notes: list[str]) -> Any:
-    """Return the ``kind`` that ``element`` describes; absent fields keep the dataclass's defaults."""
+    """Return the dataclass ``kind`` that ``element`` describes; absent fields have their defaults."""
     values = {field.name: _value(element, field.path, field.kind, notes) for field in LAYOUT[kind]}
     return kind(**{name: value for name, value in values.items() if value is not None})
 
 
 def _value(element: etree._Element, path: str, kind: type, notes: list[str]) -> Any:
-    """Return the value at ``path`` below ``element``, None if it is absent or cannot be read."""
+    """Return the value at ``path`` below ``element``; None if it is absent or cannot be read."""
     head, star, rest = path.partition("*")
     if star:
         items = (_value(item, rest.removeprefix("/"), kind, notes) for item in element.iterfind(head))
-        # Only a number can be None here; NaN keeps its place in the row.
+        # Only a number can be None here; NaN takes its place in the row.
         return tuple(math.nan if item is None else item for item in items)
     if path == "@id":
         return element.get("id", "").strip()
@@ -183,6 +183,7 @@ def _value(element: etree._Element, path: str, kind: type, notes: list[str]) -> 
 
 
 def _number(element: etree._Element, text: str, kind: type, notes: list[str]) -> Any:
+    """Return ``text`` as a finite int or float; None if it is neither."""
     if not text:
         return None
     try:
@@ -200,7 +201,7 @@ def _number(element: etree._Element, text: str, kind: type, notes: list[str]) ->
 def encode_parameters(parameters: Parameters) -> bytes:
     """Return the XML of the sections that are not None, in §6's layout and in ASCII (§4.2).
 
-    Characters that XML cannot represent are dropped, and numbers that are None are left out.
+    Leaves out characters that XML cannot represent, and numbers that are None.
     """
     root = etree.Element(ROOT, Ver="1.00")
     _write(parameters, root)
@@ -243,7 +244,7 @@ def _xml_text(text: str) -> str:
 
 
 def _quote(text: str) -> str:
-    """Return a text from the server for a message: quoted, shortened and printable."""
+    """Return a server's text for use in an error text: quoted, shortened and printable."""
     return ascii(text[:_MAX_QUOTED_CHARACTERS]) + ("…" if len(text) > _MAX_QUOTED_CHARACTERS else "")
 
 

@@ -1,6 +1,6 @@
 """The states of a client's connection to an RT server, and every transition between them.
 
-This is the only transition table in the gateway: the state of a stream is derived from it.
+This is the only table of transitions in the gateway. The state of a stream is derived from these states.
 """
 
 from enum import Enum
@@ -8,7 +8,7 @@ from typing import Final
 
 
 class ProtocolState(Enum):
-    """What the client has requested, and what the server last sent."""
+    """The states: what the client has requested, and what the server sends."""
 
     IDLE = "idle"
     REQUESTED = "requested"  # StreamFrames was sent; neither a frame nor No Data has arrived yet
@@ -19,7 +19,7 @@ class ProtocolState(Enum):
 
 
 class ProtocolInput(Enum):
-    """What can change the state of a connection."""
+    """The inputs that can change the state of a connection."""
 
     REQUEST_SENT = "StreamFrames sent"
     REQUEST_REFUSED = "StreamFrames refused"
@@ -48,6 +48,6 @@ _TRANSITIONS: Final[dict[tuple[ProtocolState, ProtocolInput], ProtocolState]] = 
 }
 
 
-def next_state(state: ProtocolState, event: ProtocolInput) -> ProtocolState:
-    """Return the state that follows ``state``; an input that the table lacks does not change it."""
-    return _TRANSITIONS.get((state, event), state)
+def next_state(state: ProtocolState, protocol_input: ProtocolInput) -> ProtocolState:
+    """Return the state after ``protocol_input``; an input that is not in the table changes nothing."""
+    return _TRANSITIONS.get((state, protocol_input), state)

@@ -1,14 +1,14 @@
-"""Matching the server's replies to the client's commands.
+"""Finds the command that a reply from the server answers.
 
 A reply carries no number that says which command it answers. The client therefore has at most one
 pending command, and the matcher remembers earlier commands whose replies may still arrive. The rules:
 
-- Only a packet of the right type answers a command: ``ANSWERING_TYPES``. An acknowledgement ahead of XML
-  or of a frame (field note 3) is skipped.
-- A text that names another command than the pending one is a duplicate or a late reply; it answers
-  nothing. A text that names no command goes to the oldest command whose reply is outstanding.
-- When the client gives up on a command, its reply stays outstanding until a later command has been
-  answered, because a server answers in order.
+- Only a packet of the right type answers a command: see ``ANSWERING_TYPES``. An acknowledgement that
+  precedes XML or a frame (field note 3) is ignored.
+- A text that names another command than the pending one is a duplicate or late reply and answers no
+  command. A text that names no command replies to the oldest command whose reply is outstanding.
+- After the client gives up on a command, its reply stays outstanding until a later command has been
+  answered, because servers answer in order.
 """
 
 import re
@@ -48,7 +48,7 @@ _ACKNOWLEDGED: Final = re.compile(
 """The command at the start of an acknowledgement's text, as all known servers write it (field note 1)."""
 
 _MAX_REMEMBERED: Final = 8
-"""How many outstanding and how many answered commands are remembered."""
+"""The maximum number of outstanding commands, and of answered commands, that are remembered."""
 
 
 class ReplyMatcher:
@@ -60,26 +60,26 @@ class ReplyMatcher:
         self._outstanding: deque[Command] = deque(maxlen=_MAX_REMEMBERED)
         """Earlier commands whose replies may still arrive, oldest first."""
         self._answered: deque[Command] = deque(maxlen=_MAX_REMEMBERED)
-        """The last commands answered; another reply to one of them is a duplicate."""
+        """The commands answered last. Another reply to one of them is a duplicate."""
 
     def give_up(self) -> None:
-        """Stop waiting for the pending command; a late reply to it will answer nothing."""
+        """Stop waiting for the pending command. A late reply to it answers no command."""
         if self.pending is not None:
             self._outstanding.append(self.pending)
             self.pending = None
 
     def match_text(self, packet: Packet) -> Command | None:
         """Return the pending command if a type 0 or 1 packet replies to it, otherwise None."""
-        return self._if_pending(self._command_of_text(packet))
+        return self._settle(self._command_of_text(packet))
 
     def match_xml(self, packet: Packet) -> Command | None:
         """Return the pending command if a type 2 packet answers it, otherwise None."""
-        return self._if_pending(self._command_of_xml(packet))
+        return self._settle(self._command_of_xml(packet))
 
     def finish_by_reply(self) -> None:
         """End the pending command, which a text or XML has answered."""
-        # A server answers in order, so replies to earlier commands will not come. Exception: if an equal
-        # command is outstanding, this may be the reply to that one, and another may follow.
+        # Servers answer in order, so replies to earlier commands do not follow any more. But if an equal
+        # command is outstanding, this may be the late reply to that one, and another reply may follow.
         if self.pending not in self._outstanding:
             self._outstanding.clear()
         self._finish()
@@ -95,8 +95,8 @@ class ReplyMatcher:
             self._answered.append(self.pending)
             self.pending = None
 
-    def _if_pending(self, command: Command | None) -> Command | None:
-        """Return ``command`` if it is the pending one; otherwise its late reply has now arrived."""
+    def _settle(self, command: Command | None) -> Command | None:
+        """Return ``command`` if it is pending; otherwise its reply is no longer outstanding: return None."""
         if command is None or command is self.pending:
             return command
         if command in self._outstanding:
@@ -104,7 +104,7 @@ class ReplyMatcher:
         return None
 
     def _command_of_text(self, packet: Packet) -> Command | None:
-        """Return the command to which a text replies: pending, outstanding or answered before."""
+        """Return the command to which a text replies: the pending, an outstanding or an answered one."""
         text = decode_text(packet.body).lower()
         pending = [] if self.pending is None else [self.pending]
         echoed = [
@@ -124,7 +124,7 @@ class ReplyMatcher:
         return None
 
     def _command_of_xml(self, packet: Packet) -> Command | None:
-        """Return the SendParameters that the XML answers: pending or outstanding."""
+        """Return the SendParameters that the XML answers: the pending or an outstanding one."""
         pending = [self.pending] if isinstance(self.pending, SendParameters) else []
         outstanding = [
             command
@@ -132,7 +132,7 @@ class ReplyMatcher:
             if isinstance(command, SendParameters) and command not in pending
         ]
         if not outstanding:
-            # Accept any sections: a server may always send all of them, or leave some out.
+            # Accept any sections: some servers always send all of them, some leave sections out.
             return pending[0] if pending else None
         sections = _sections_in(packet.body)
         return max((*outstanding, *pending), key=lambda command: _similarity(sections, command))
@@ -146,7 +146,7 @@ def _sections_in(xml: bytes) -> frozenset[str]:
 
 
 def _similarity(received: frozenset[str], command: SendParameters) -> int:
-    """Return how well the received sections fit those requested: 2 exactly, 1 some are missing, 0 not.
+    """Return how well the received sections fit those requested: 2 if equal, 1 if some are missing, else 0.
 
     Servers leave out sections that they do not have (field note 9).
     """

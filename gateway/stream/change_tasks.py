@@ -1,4 +1,4 @@
-"""Adapts a running stream to the network and to its subscribers: its rate, and whether it runs."""
+"""Changes to a running stream: a lower rate while frames are late, a pause while there are no subscribers."""
 
 import asyncio
 import logging
@@ -12,15 +12,15 @@ from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
 
 DEMAND_POLL_S: Final = 0.05
-"""How often an on-demand stream checks for subscribers. Polling cannot miss a notification."""
+"""How often an on-demand stream checks for subscribers. It polls because a notification could be missed."""
 
 logger = logging.getLogger(__name__)
 
 
 class ChangeTasks:
-    """Changes the stream of one session, in tasks of its own, until ``cancel``.
+    """The tasks that change the stream of one session, until ``cancel``.
 
-    ``has_subscribers`` says whether the stream's components may have subscribers.
+    ``has_subscribers`` returns whether the stream's components may have subscribers.
     """
 
     def __init__(
@@ -40,25 +40,25 @@ class ChangeTasks:
         self._tasks: set[asyncio.Task[None]] = set()
 
     def start(self) -> None:
-        """Begin to follow the demand, if the stream is on demand; call it after the handshake."""
+        """Start to follow the demand if the stream is on demand. Call it after the handshake."""
         if self._stream.on_demand:
             self._start_task(self._follow_demand())
 
     def request_rate(self, halvings: int) -> None:
-        """Ask the server for the configured rate halved so many times; returns at once."""
+        """Start to request the configured rate, halved ``halvings`` times; return at once."""
         self._start_task(self._change_rate(halvings))
 
     def cancel(self) -> None:
-        """Cancel whatever is under way."""
+        """Cancel all tasks."""
         for task in self._tasks:
             task.cancel()
 
     def _start_task(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.create_task(self._until_link_error(work))
+        task = asyncio.create_task(self._run_until_link_error(work))
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _until_link_error(self, work: Coroutine[Any, Any, None]) -> None:
+    async def _run_until_link_error(self, work: Coroutine[Any, Any, None]) -> None:
         try:
             await work
         except LinkError as error:

@@ -1,26 +1,26 @@
 """A model of the server's clock, learned only from the frames' time stamps and arrival times.
 
 A frame arrives at ``offset + (1 + drift) * time stamp + delay``, and its delay is never less than that of
-an idle network. So only the frames with the least delay give information about the clocks; all others
+an idle network. So only the frames with the least delay give information about the clocks. All others
 show only that they were late.
 
-1. Minimum filtering: of every half second the frame with the least delay is kept, for 30 s. A mean would
-   follow the jitter.
-2. The clock is the line below all kept frames with the least sum of distances to them: the most likely one
-   if delays are exponential. Its slope is that of the edge of their lower convex hull above their mean
-   time stamp (Zhang, Liu, Xia, "Clock synchronization algorithms for network measurements", INFOCOM 2002;
-   before it the linear programme of Moon, Skelly, Towsley, INFOCOM 1999; for sensors Olson, "A passive
-   solution to the sensor synchronization problem", IROS 2010). Over less than 5 s, drift cannot be
-   distinguished from jitter; until then the drift keeps its last value.
-3. A frame that arrives before the line disproves the line, which moves down to that frame at once. A frame
-   far before it means that a clock was set: all kept frames become invalid. The drift stays, because
-   setting a clock does not change the rate of its crystal.
-4. A late frame proves nothing: the cause can be a pause, congestion, or a clock that was set. Half seconds
-   in which every frame is late are kept apart. They replace the others once they have been equally late for
-   two seconds, which rules out congestion that grows or clears, or once they have been late for 30 s.
-5. If a time stamp or frame number goes back, the server has a new time base: a new line starts at that
-   frame. A time stamp that is just 2^32 µs too small has wrapped around, and the line continues (field
-   note 11). Time stamps that do not change, or that run at a rate which no crystal has, are no clock.
+1. Minimum filtering: the frame with the least delay in each window of half a second becomes a sample and is
+   kept for 30 s. A mean of all frames would follow the jitter.
+2. The clock is the line below all samples with the least sum of distances to them. This is the most likely
+   line if delays are exponentially distributed. Its slope is that of the edge of the samples' lower convex
+   hull that spans their mean time stamp (Zhang, Liu, Xia, "Clock synchronization algorithms for network
+   measurements", INFOCOM 2002; earlier as a linear programme by Moon, Skelly, Towsley, INFOCOM 1999; for
+   sensors by Olson, "A passive solution to the sensor synchronization problem", IROS 2010). Over less than
+   5 s, drift cannot be distinguished from jitter; until then the drift keeps its last value.
+3. A frame that arrives before the line disproves the line, so the line moves down to that frame at once. If
+   the frame arrives far before the line, somebody has set a clock, and all samples become invalid. The drift
+   stays, because setting a clock does not change the rate of its crystal.
+4. A late frame proves nothing: the cause can be a pause, congestion, or a clock that was set. Samples of
+   windows in which every frame was late are kept apart. They replace the other samples once they have been
+   equally late for two seconds, which rules out congestion that grows or clears, or late for 30 s.
+5. If a time stamp or frame number goes back, the server has a new time base, and a new line starts at that
+   frame. A time stamp that goes back by almost 2^32 µs has wrapped around, and the line continues (field
+   note 11). Time stamps that do not change, or whose rate no crystal has, are not a clock.
 
 The least delay itself cannot be measured from one side: every time computed here includes it.
 """
@@ -32,47 +32,51 @@ from itertools import islice, pairwise
 from typing import Final, NamedTuple
 
 MAX_DRIFT: Final = 500e-6
-"""Crystals are within 100e-6 of their rate. With more drift, the time stamps are not µs of a clock."""
+"""Crystals are within 100e-6 of their rate. With more drift than this, time stamps are not µs of a clock."""
 
 _WINDOW_US: Final = 500_000
-"""The frame with the least delay in each window is kept: 15 frames at 30 Hz are enough to choose from."""
+"""The length of a window. Even at 30 Hz it has 15 frames to choose from."""
 
 _KEPT_WINDOWS: Final = 60
-"""More would be better for a constant drift, and worse for one that follows the room's temperature."""
+"""The number of samples, one per window. More are better for a constant drift, but worse for one that varies
+with the room's temperature."""
 
 _MIN_SAMPLES: Final = 3
-"""There is always a line through two frames; only a third one can contradict it."""
+"""A line always fits two samples. Only a third can contradict it."""
 
 _DRIFT_SPAN_US: Final = 5_000_000
-"""In this time a drift of 100 ppm makes 0.5 ms: more than the least delays of half seconds differ."""
+"""The drift is computed from this span on. In it, a drift of 100 ppm makes 0.5 ms, more than the least delays
+of windows differ."""
 
 _RATE_TOLERANCE_US: Final = 10_000
-"""How much least delays may differ: over a span, this allows the slope to exceed MAX_DRIFT."""
+"""Least delays of windows may differ by this much, so over a short span the slope may exceed MAX_DRIFT."""
 
 _STEP_US: Final = 2_000
-"""The smallest step that counts as a clock that was set; smaller ones disappear with the kept frames."""
+"""A clock that was set by less is not detected; the error disappears as new samples replace the old ones."""
 
 _STEP_WINDOWS: Final = 4
+"""The number of windows that must be equally late to prove that a clock was set."""
+
 _ROUNDING_US: Final = 2.0  # time stamps and arrivals are whole µs
-_FROZEN_US: Final = 500_000
-_WRAP_US: Final = 1 << 32
-_WRAP_TOLERANCE_US: Final = 1_000_000
+_FROZEN_US: Final = 500_000  # a time stamp that is repeated for longer is not that of a clock
+_WRAP_US: Final = 1 << 32  # 32-bit time stamps start again at 0
+_WRAP_TOLERANCE_US: Final = 1_000_000  # between the arrival times and the time stamps around a wrap
 _NO_TIMESTAMP_US: Final = 1 << 63  # larger than any time stamp: those are signed 64-bit integers
 
 
 class Sample(NamedTuple):
-    """The frame with the least delay of its window: its time stamp, and its arrival minus that."""
+    """The frame with the least delay in its window: its time stamp, and its arrival time minus that."""
 
     timestamp_us: int
     offset_us: int
 
 
 class ServerClock:
-    """The clock of one server, learned from its frames as the module's text describes.
+    """The clock of one server, learned from its frames as the module's docstring describes.
 
     While ``has_clock`` is False (in the first 1.5 s, and whenever time stamps are unusable),
-    ``capture_utime`` is the time of arrival. Within a time base, ``capture_utime`` never decreases from frame
-    to frame unless the arrival times do; two frames may have the same.
+    ``capture_utime`` is the time of arrival. Within one time base, ``capture_utime`` never decreases from
+    frame to frame unless the arrival times do; it may stay equal.
     """
 
     def __init__(self) -> None:
@@ -80,15 +84,15 @@ class ServerClock:
         self._samples: deque[Sample] = deque(maxlen=_KEPT_WINDOWS)
         self._late_samples: deque[Sample] = deque(maxlen=_KEPT_WINDOWS)
         self._scatter_us = math.inf
-        # The line: the host time of one time stamp, and the slope there minus 1.
+        # The line: one time stamp, its host time, and the slope minus 1.
         self._line_timestamp_us = self._line_utime = 0
         self._drift = 0.0
         # The previous frame.
         self._timestamp_us = _NO_TIMESTAMP_US
         self._frame_number = self._arrival_utime = self._capture_utime = 0
-        # What 32-bit time stamps have lost by wrapping around; line and samples include it.
+        # The sum that 32-bit time stamps have lost by wrapping around. Line and samples include it.
         self._wrapped_us = 0
-        # The time stamp that was last repeated, and when it first arrived.
+        # The time stamp that was repeated last, and when it first arrived.
         self._repeated_us = _NO_TIMESTAMP_US
         self._repeated_utime = 0
         # The current window, and the frame with the least delay in it.
@@ -98,7 +102,7 @@ class ServerClock:
 
     @property
     def offset_us(self) -> int:
-        """Host time minus server time at the last frame, µs; 0 without a clock."""
+        """Host time minus server time at the last frame, in µs; 0 without a clock."""
         if not self.has_clock:
             return 0
         elapsed_us = self._timestamp_us + self._wrapped_us - self._line_timestamp_us
@@ -107,34 +111,34 @@ class ServerClock:
 
     @property
     def drift_ppm(self) -> float:
-        """How much faster the host's clock runs than the server's; 0 without a clock."""
+        """How much faster the host's clock runs than the server's, in ppm; 0 without a clock."""
         return self._drift * 1e6 if self.has_clock else 0.0
 
     @property
     def uncertainty_us(self) -> float:
-        """How much the least delays of half seconds differ; errors rarely exceed it.
+        """How much the least delays of the windows differ, in µs; errors rarely exceed it.
 
-        It is inf without a clock and during the first three half seconds. It does not include the network's
-        least delay, which all frames have in common.
+        It is inf without a clock and during the first three windows. It does not include the network's least
+        delay, which all frames have in common.
         """
         return self._scatter_us if self.has_clock else math.inf
 
     @property
     def samples(self) -> int:
-        """The number of frames that determine the line, at most 60."""
+        """The number of samples that determine the line, at most 60."""
         return len(self._samples)
 
     def observe(self, timestamp_us: int, frame_number: int, arrival_utime: int) -> tuple[int, float, bool]:
         """Learn from one frame; return its (capture_utime, lag_s, restarted).
 
-        Call it once per frame, in order of arrival. ``arrival_utime`` is µs since the Unix epoch.
-        ``timestamp_us`` and ``frame_number`` are those of one of its components (§7.1), preferably always of
-        the same type: servers may count types apart, and a number that goes back is a restart.
+        Call it once per frame, in the order of arrival. ``arrival_utime`` is in µs since the Unix epoch.
+        ``timestamp_us`` and ``frame_number`` are those of one of the frame's components (§7.1). The frame
+        numbers must be of one type of component, because servers may number each type separately, and a
+        number that goes back is a restart.
 
-        ``capture_utime`` is when the frame was captured, µs since the Unix epoch, and never later than it
-        arrived. ``lag_s`` is how much later it arrived than a frame without delay would have, at least 0; it
-        is 0 without a clock. ``restarted`` is True if the server's time or frame numbers began again
-        with this frame.
+        ``capture_utime`` is when the frame was captured, in µs since the Unix epoch, never after its arrival.
+        ``lag_s`` is how much later it arrived than a frame with the least delay would have; it is 0 without a
+        clock. ``restarted`` is True if the server's time or frame numbers started again with this frame.
         """
         restarted = False
         if timestamp_us <= self._timestamp_us or frame_number < self._frame_number:
@@ -162,14 +166,14 @@ class ServerClock:
         if not self.has_clock:
             self._capture_utime = arrival_utime
             return arrival_utime, 0.0, restarted
-        # A new line may be below the previous one; subscribers must not see time go back because of that.
+        # A new line may be below the previous one. Subscribers must not see time go back because of that.
         if capture_utime < self._capture_utime:
             capture_utime = min(self._capture_utime, arrival_utime)
         self._capture_utime = capture_utime
         return capture_utime, lag_us * 1e-6, restarted
 
     def _handle_irregular(self, timestamp_us: int, frame_number: int, arrival_utime: int) -> bool:
-        """Handle a frame that is the first or does not follow the last; return whether it is a restart."""
+        """Handle the first frame, or one that does not follow the last; return whether it is a restart."""
         if self._timestamp_us == _NO_TIMESTAMP_US:
             self._start(timestamp_us, arrival_utime, has_clock=False)
             return False
@@ -182,7 +186,7 @@ class ServerClock:
             if advance_us > 0 and abs(advance_us - elapsed_us) < _WRAP_TOLERANCE_US:
                 self._wrapped_us += _WRAP_US
                 return False
-        # Trust a server that had a clock to have one again, unless it restarts all the time.
+        # A server that had a clock probably still has one, unless it restarts again within its first window.
         self._start(timestamp_us, arrival_utime, has_clock=self.has_clock and len(self._samples) > 0)
         return True
 
@@ -203,29 +207,30 @@ class ServerClock:
         self._least_lag_us = math.inf
 
     def _handle_repeated(self, timestamp_us: int, arrival_utime: int) -> None:
-        # Doubled frames and coarse time stamps are still a clock; a frozen time stamp is none.
+        # Duplicate frames and coarse time stamps still come from a clock; a frozen time stamp does not.
         if timestamp_us != self._repeated_us:
             self._repeated_us, self._repeated_utime = timestamp_us, self._arrival_utime
         if arrival_utime - self._repeated_utime > _FROZEN_US:
             self._start(timestamp_us, arrival_utime, has_clock=False)
 
     def _close_window(self, arrival_utime: int) -> None:
-        """Decide what to do with the sample of the window that ends, and fit the line again."""
+        """End the current window: keep its sample, or keep it apart as a late one, and fit the line again."""
         lag_us = self._least_lag_us
         least = Sample(self._least_timestamp_us, self._least_offset_us)
         self._begin_window(arrival_utime)
-        doubt_us = _STEP_US + 4 * self._scatter_us
-        if lag_us < doubt_us:
+        late_us = _STEP_US + 4 * self._scatter_us
+        if lag_us < late_us:
             self._samples.append(least)
         else:
             self._late_samples.append(least)
-            if not self._stays_late(min(lag_us / 4, doubt_us)):
+            if not self._stays_late(min(lag_us / 4, late_us)):
                 return
             self._samples = self._late_samples.copy()
         self._late_samples.clear()
         self._fit_line()
 
     def _stays_late(self, tolerance_us: float) -> bool:
+        """Return whether the late samples show that a clock was set: point 4 of the module's docstring."""
         late = self._late_samples
         if len(late) < _STEP_WINDOWS:
             return False
@@ -234,7 +239,7 @@ class ServerClock:
         return spread_us < tolerance_us or len(late) == _KEPT_WINDOWS
 
     def _fit_line(self) -> None:
-        """Fit the line to the samples, and decide whether its slope is that of a clock."""
+        """Fit the line to the samples, and check whether its slope can be that of a clock."""
         samples = self._samples
         last = samples[-1]
         span_us = last.timestamp_us - samples[0].timestamp_us
@@ -252,7 +257,7 @@ class ServerClock:
         self._line_timestamp_us = last.timestamp_us
         self._line_utime = last.timestamp_us + last.offset_us + math.floor(least_us)
         if enough:
-            # The line touches two of the samples by construction: they do not count towards the scatter.
+            # The line touches two of the samples by construction, so they do not count.
             scatter_us = sum(height_us - least_us for height_us in heights_us) / (len(samples) - 2)
             self._scatter_us = max(scatter_us, _ROUNDING_US)
 
@@ -260,8 +265,8 @@ class ServerClock:
 def envelope_slope(samples: Sequence[Sample]) -> float:
     """Return the slope of the line below all samples with the least sum of distances to them.
 
-    ``samples`` are at least two, with strictly increasing time stamps. The line through the edge of the
-    lower convex hull that spans the mean time stamp has the least sum.
+    ``samples`` are at least two, with strictly increasing time stamps. The line is the edge of their lower
+    convex hull that spans their mean time stamp.
     """
     hull: list[Sample] = []
     for sample in samples:

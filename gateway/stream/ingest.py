@@ -1,4 +1,4 @@
-"""From received frames to the fan-out: when each was captured, how late it is, which are skipped."""
+"""From the session to the fan-out: when each frame was captured, how late it is, whether it is skipped."""
 
 from collections.abc import Callable
 from typing import Final
@@ -11,7 +11,7 @@ from gateway.stream.rate_control import LagControl
 from gateway.stream.status import StreamStatus
 
 Publish = Callable[[Frame, Stamp, frozenset[ComponentType]], None]
-"""Takes a frame, its times, and which of its components are to be published."""
+"""Takes a frame, its stamp, and the types of the components to publish."""
 
 _EVENTS: Final = frozenset({ComponentType.EVENT})
 
@@ -19,8 +19,8 @@ _EVENTS: Final = frozenset({ComponentType.EVENT})
 class Ingest:
     """Takes the frames of one session, in the batches in which they arrive from the network.
 
-    ``request_rate`` is called with the number of halvings when the server should be asked for another rate;
-    ``on_restart`` when the server's frame numbers or time stamps begin again within the session.
+    It calls ``request_rate`` with the number of halvings when the server should send at another rate, and
+    ``on_restart`` when the server's frame numbers or time stamps start again within the session.
     """
 
     def __init__(
@@ -39,17 +39,17 @@ class Ingest:
         self._publish = publish
         self._request_rate = request_rate
         self._on_restart = on_restart
-        self._clock = status.clock  # outlives sessions: it detects by itself that the server was restarted
-        self._numbered_type: ComponentType | None = None
-        self._frame_number = 0  # the newest of _numbered_type
+        self._clock = status.clock  # outlives the session: it detects a restart of the server by itself
+        self._followed_type: ComponentType | None = None
+        self._frame_number = 0  # the newest of a component of _followed_type
         self._lag = LagControl(source.max_lag_ms / 1000)
 
     def receive(self, frames: list[Frame], utime: int, now_s: float) -> None:
         """Take frames that arrived together, oldest first.
 
-        ``utime`` is when they arrived, µs since the Unix epoch; ``now_s`` is the same by the monotonic clock.
-        With ``backlog: latest``, while frames are late, only the newest is published whole. Of the others
-        only events are published, which are never skipped, and the frame counts as skipped.
+        ``utime`` is when they arrived, in µs since the Unix epoch; ``now_s`` is the same moment on the
+        monotonic clock. While frames are late, ``backlog: latest`` publishes only the newest frame whole. Of
+        the other frames it publishes the events, which are never skipped, and counts the frames as skipped.
         """
         status = self._status
         status.frames_received(len(frames), utime)
@@ -68,7 +68,7 @@ class Ingest:
 
     def _stamp(self, frame: Frame, utime: int, now_s: float) -> Stamp:
         frame_number, timestamp_us = frame.number_and_timestamp
-        self._follow_number(frame.layout.first_component_type, frame_number)
+        self._follow_frame_number(frame.layout.first_component_type, frame_number)
         clock = self._clock
         capture_utime, lag_s, restarted = clock.observe(timestamp_us, self._frame_number, utime)
         if restarted:
@@ -81,14 +81,15 @@ class Ingest:
                 self._request_rate(self._lag.halvings)
         return Stamp(utime, capture_utime, self._status.session, clock.has_clock)
 
-    def _follow_number(self, first_component_type: ComponentType | None, frame_number: int) -> None:
-        """Follow the frame numbers of one component type only, because servers may count types apart.
+    def _follow_frame_number(self, first_component_type: ComponentType | None, frame_number: int) -> None:
+        """Keep ``frame_number`` if the followed type comes first in the frame.
 
-        That is the first type that arrives; events are followed only until another type arrives.
+        Servers may number each type separately, so only one is followed: the first type that arrives, or
+        the first after it if that was the event type.
         """
-        followed = self._numbered_type
+        followed = self._followed_type
         if first_component_type is followed or followed is None or followed is ComponentType.EVENT:
-            self._numbered_type = first_component_type
+            self._followed_type = first_component_type
             self._frame_number = frame_number
 
     def _skip_unknown(self, types: tuple[int, ...]) -> None:

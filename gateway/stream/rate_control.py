@@ -1,4 +1,4 @@
-"""The rate to request from a server: alternatives if it refuses, and lower rates while frames are late."""
+"""The rate to request from a server: alternatives if it refuses, lower rates if frames are late."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -23,8 +23,8 @@ def stream_requests(
     """Return the StreamFrames commands to try, in order, beginning with the configured rate and components.
 
     Some servers know neither ``Frequency:n`` nor ``AllFrames`` nor component names (field note 2). The
-    alternatives are: the same rate without names, a frequency as the nearest divisor of ``server_rate_hz``
-    (the rate in the parameters, if any), and finally the server's default.
+    alternatives are: the same rate without names; instead of a frequency, the nearest divisor of
+    ``server_rate_hz`` (the rate in the parameters, if any); finally the server's default.
     """
     names = () if set(components) == set(WIRE_ORDER) else tuple(components)
     rates: list[Rate] = [rate]
@@ -37,7 +37,7 @@ def stream_requests(
 
 
 def halved(rate: Rate | None, times: int) -> Rate | None:
-    """Return ``rate`` halved ``times`` times; None, the server's default, counts as all frames."""
+    """Return ``rate`` halved ``times`` times. None, the server's default, is taken for all frames."""
     if times == 0:
         return rate
     match rate:
@@ -50,12 +50,13 @@ def halved(rate: Rate | None, times: int) -> Rate | None:
 
 
 class LagControl:
-    """Decides how often the configured rate is halved, from how late the frames are.
+    """Decides how often to halve the configured rate, from how late the frames are.
 
-    After BEHIND_S of late frames it halves the rate once more. After ``wait_s`` of frames in time it takes
-    one halving back, never above the configured rate. If a step up fails, that is, if it is taken back
-    within its own wait, the next wait doubles, up to MAX_WAIT_S; a step up that lasts resets the wait to
-    FIRST_WAIT_S. This avoids retrying the full rate again and again on a link that carries half of it.
+    After BEHIND_S of late frames it halves the rate once more (a step down). After ``wait_s`` of frames in
+    time it undoes one halving (a step up), until the rate is as configured. A step up fails if a step down
+    follows within ``wait_s``; then ``wait_s`` doubles, up to MAX_WAIT_S. If a step down follows later,
+    ``wait_s`` returns to FIRST_WAIT_S. Otherwise a link that carries half of the full rate would see it
+    retried again and again.
     """
 
     def __init__(self, max_lag_s: float) -> None:
@@ -64,7 +65,7 @@ class LagControl:
         self.behind = False
         """Whether the newest frame was late."""
         self.wait_s = FIRST_WAIT_S
-        self._since_s: float | None = None  # since when frames are late, or in time, without interruption
+        self._since_s: float | None = None  # since when frames are late, or in time, at the current rate
         self._stepped_up_s: float | None = None
 
     def observe(self, now_s: float, lag_s: float) -> bool:
@@ -80,7 +81,7 @@ class LagControl:
         return held_s >= self.wait_s and self.halvings > 0 and self._step_up(now_s)
 
     def restart(self) -> None:
-        """Forget how late frames were; the next frames do not continue the previous ones."""
+        """Forget how late the previous frames were, because the next ones do not continue them."""
         self.behind = False
         self._since_s = None
 

@@ -35,7 +35,7 @@ _BYE_S: Final = 0.5
 """How long a server may take to close after Bye; some never do (field note 10)."""
 
 OnFrames = Callable[[list[Frame], int, float], None]
-"""Takes frames that arrived together, oldest first, and when: µs since the Unix epoch, monotonic s."""
+"""Takes frames that arrived together, oldest first, and when: in µs since the Unix epoch, in monotonic s."""
 
 OnFile = Callable[[bytes], None]
 """Takes a complete C3D file."""
@@ -46,11 +46,11 @@ logger = logging.getLogger(__name__)
 class Session:
     """One connection of one stream: ``connect``, then ``ask`` and ``monitor``, then ``close``.
 
-    ``on_frames`` and ``on_file`` are called from the event loop and must not wait. ``connect`` opens the
-    connection, ``monotonic`` is the clock by which silence is measured.
+    The event loop calls ``on_frames`` and ``on_file``, which must not block. ``connect`` opens the
+    connection, ``monotonic`` is the clock that measures silence.
 
-    The first error ends the session, and so does ``close``. Every method that waits, or is called later,
-    raises that first error, whatever goes wrong after it.
+    The first error ends the session, and so does ``close``. Every call that is waiting then, and every later
+    call, raises that first error; later errors change nothing.
     """
 
     def __init__(
@@ -74,26 +74,26 @@ class Session:
         self._protocol = ClientProtocol(source.max_packet_bytes, source.max_c3d_bytes)
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
-        self._error: LinkError | None = None
-        self._ended: asyncio.Future[None] = self._loop.create_future()
-        self._lost = asyncio.Event()
+        self._error: LinkError | None = None  # why the session ended
+        self._ended = asyncio.Event()  # _error is set
+        self._lost = asyncio.Event()  # the transport is closed
         self._asking = asyncio.Lock()
-        self._reply: asyncio.Future[Packet] | None = None
-        self._quiet_since_s = 0.0
+        self._reply: asyncio.Future[Packet] | None = None  # to the command being asked
+        self._quiet_since_s = 0.0  # when the stall time-out last started
         self._rejected = FailureLog(logger, source.name, HOLD_S)
 
     @property
     def is_open(self) -> bool:
-        """Whether the connection is made and has not ended."""
+        """Whether the session is connected and has not ended."""
         return self._transport is not None and self._error is None
 
     @property
     def protocol_state(self) -> ProtocolState:
-        """What the server was asked for, and what it sends."""
+        """What the gateway has requested, and what the server sends."""
         return self._protocol.state
 
     async def connect(self) -> None:
-        """Connect to the server; raises ConnectError with the reason and what to check."""
+        """Connect to the server. Raises ConnectError with the reason and what to check."""
         self._status.connecting(self.server)
         self._transport = await self._connect(self._source, self)
         self._quiet_since_s = self._monotonic()
@@ -125,29 +125,28 @@ class Session:
                 self._reply = None
 
     def control_recording(self, *, start: bool) -> None:
-        """Start or stop the server's recording (field note 16); raises LinkError after the end."""
+        """Start or stop the server's recording (field note 16). Raises LinkError if the session has ended."""
         self._check_open()
         self._protocol.send_recording(start=start)
         self._flush()
 
     async def monitor(self) -> None:
-        """Wait until the connection ends or the server falls silent; raises LinkError with the reason."""
+        """Wait until the session ends or the server is silent; then raise LinkError with the reason."""
         while True:
+            self._check_open()
             wait_s = self._source.stall_timeout_s - (self._monotonic() - self._quiet_since_s)
             if wait_s <= 0:
                 await self._check_silence()
                 continue
-            try:
+            with contextlib.suppress(TimeoutError):
                 async with asyncio.timeout(wait_s):
-                    await asyncio.shield(self._ended)
-            except TimeoutError:
-                continue
+                    await self._ended.wait()
 
     async def _check_silence(self) -> None:
-        """Decide what it means that no frame arrived for stall_timeout_s; raises SilenceError for a fault.
+        """Check the server after stall_timeout_s without a frame; raise SilenceError if it is at fault.
 
-        While a measurement runs, it is a fault, unless only events were requested: those are rare.
-        Otherwise a harmless command shows whether the server is alive: any reply does.
+        While a measurement runs, silence is a fault, unless the stream has only events, which are rare.
+        Otherwise send a harmless command: any reply shows that the server is alive.
         """
         if self._protocol.state is ProtocolState.STREAMING and not self._only_events:
             text = f"no frame from {self.server} for {self._source.stall_timeout_s:g} s"
@@ -162,9 +161,9 @@ class Session:
         self._quiet_since_s = self._monotonic()
 
     async def close(self) -> None:
-        """Say Bye, and close the connection half a second later at the latest.
+        """Send Bye, and close the connection when the server does, or after 0.5 s.
 
-        If the session has ended already, it only releases the connection.
+        If the session has ended already, only release the connection.
         """
         if self._transport is None:
             return
@@ -172,27 +171,27 @@ class Session:
             self._protocol.send(Bye())
             self._flush()
             self._end(ClosedError(f"the connection to {self.server} was closed by the gateway"))
-            # Go on reading: closing with unread data would reset the connection, and the server might
-            # never see the Bye.
+            # Continue to read: closing a socket with unread data resets the connection, and the server might
+            # never read the Bye.
             with contextlib.suppress(TimeoutError):
                 self._transport.write_eof()
                 async with asyncio.timeout(_BYE_S):
                     await self._lost.wait()
         self._transport.abort()
 
-    # Called by the event loop, as the methods of an asyncio.Protocol.
+    # The methods of an asyncio.Protocol, which the event loop calls.
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Let the kernel detect a server that has vanished. The event loop has turned Nagle off (§2.1).
+        """Let the kernel detect a server that has disappeared. The event loop has turned Nagle off (§2.1).
 
-        ``connect`` keeps the transport, not this method: if ``connect`` is cancelled meanwhile, uvloop
-        closes the transport without calling ``connection_lost``.
+        This method does not store the transport; ``connect`` does. If ``connect`` is cancelled, uvloop closes
+        the transport without calling ``connection_lost``.
         """
         sock = transport.get_extra_info("socket")
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
 
     def data_received(self, data: bytes) -> None:
-        """Take the bytes of one read. From here to the outputs there are only calls, no tasks."""
+        """Process the bytes of one read. From here to the outputs there are only plain calls, no tasks."""
         utime = now_utime()
         self._status.bytes_received(len(data))
         state_before = self._protocol.state
@@ -207,7 +206,7 @@ class Session:
             self._rejected.recovered("frames are valid again")
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Note that the connection is gone, whichever side closed it."""
+        """End the session, unless it has ended already: the connection is closed, by either side."""
         self._protocol.end()
         reason = f"broke: {exc}" if exc else "was closed by the server"
         self._fail(ClosedError(f"the connection to {self.server} {reason}"))
@@ -241,30 +240,30 @@ class Session:
                 )  # fmt: skip
 
     def _report_protocol(self) -> None:
-        """Report the protocol's new state, and start the stall time-out again."""
+        """Report the protocol's new state, and restart the stall time-out."""
         self._quiet_since_s = self._monotonic()
         self._status.protocol_changed(self._protocol.state, self._protocol.byte_order or "", self.server)
 
     def _check_open(self) -> None:
+        """Raise the session's error if it has ended, ClosedError if it is not connected."""
         if self._error is not None:
             raise self._error
         if self._transport is None:
             raise ClosedError(f"{self.server}: not connected")
 
     def _fail(self, error: LinkError) -> None:
-        """End the session because of an error, and drop the connection; later errors change nothing."""
+        """End the session with ``error`` and drop the connection, unless it has ended already."""
         if self._error is None:
             self._end(error)
             if self._transport is not None:
                 self._transport.abort()
 
     def _end(self, error: LinkError) -> None:
-        """Make ``error`` the reason that everybody gets who waits or calls later."""
+        """End the session: waiting and later calls raise ``error``."""
         self._error = error
+        self._ended.set()
         if self._reply is not None and not self._reply.done():
             self._reply.set_exception(error)
-        self._ended.set_exception(error)
-        self._ended.exception()  # marks it as retrieved, in case no task is waiting
 
     def _flush(self) -> None:
         if self._transport is not None:

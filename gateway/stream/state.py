@@ -17,7 +17,7 @@ class Phase(Enum):
 
 
 class StreamState(Enum):
-    """The states of a stream, with the texts that logs, status messages and metrics show."""
+    """The states of a stream. The values appear in logs, status messages and metrics."""
 
     CONNECTING = "connecting"
     HANDSHAKING = "handshaking"
@@ -40,13 +40,13 @@ _BY_PHASE: Final = {
 def stream_state(phase: Phase, protocol_state: ProtocolState) -> StreamState:
     """Return the state of a stream.
 
-    Two facts decide it, and each has one owner. ``phase`` is that of the connection; session and supervisor
-    report it. ``protocol_state`` is what was requested and what the server sends; the ClientProtocol of the
-    connection knows it.
+    It follows from two inputs, and each has one owner. ``phase`` is the phase of the connection, which
+    session and supervisor report. ``protocol_state`` says what was requested and what the server sends; it
+    belongs to the connection's ClientProtocol.
 
-    - On a usable connection, what the server sends decides: frames or No Data. This holds during the
-      handshake, too, because a frame may arrive before StreamFrames is acknowledged (field note 3).
-    - Otherwise the phase decides. A connection that is ready and receives neither is idle.
+    - While the connection is usable, frames or No Data from the server decide. This includes the handshake,
+      because a frame may arrive before StreamFrames is acknowledged (field note 3).
+    - Otherwise the phase decides. A ready connection that receives neither is idle.
     """
     if phase in {Phase.HANDSHAKING, Phase.READY}:
         if protocol_state is ProtocolState.STREAMING:

@@ -13,10 +13,10 @@ from gateway.stream.clock import ServerClock
 from gateway.stream.state import Phase, StreamState, stream_state
 
 MAX_ERROR_LENGTH: Final = 500
-"""Where the text of an error is cut: it may quote a server, and every status message carries it."""
+"""Longer error texts are cut: they may quote a server, and every status message contains the last one."""
 
 MAX_LIMITATIONS: Final = 20
-"""How many limitations are kept of one connection, and how many logged ones are remembered."""
+"""How many limitations of a connection are kept, and how many logged ones are remembered."""
 
 _RECONNECTING: Final = (StreamState.CONNECTING, StreamState.HANDSHAKING, StreamState.WAITING)
 
@@ -25,7 +25,7 @@ _PROTOCOL_EVENTS: Final = {
     ProtocolState.NO_MEASUREMENT: "the server reports that no measurement runs",
     ProtocolState.IDLE: "the gateway stopped the frames",
 }
-"""What brought the protocol into a state, for the log."""
+"""Why the protocol entered a state, for the log."""
 
 logger = logging.getLogger(__name__)
 
@@ -34,15 +34,15 @@ logger = logging.getLogger(__name__)
 class StreamStatus:
     """The status of one stream, over all its connections.
 
-    Only the methods of this class change it. Each of them is called when something happens and is named
-    after that; everybody else reads.
+    Only the methods of this class change it, except for ``clock``, which Ingest updates with every frame.
+    Most methods are named after the event that they report.
 
-    ``components`` is as configured, space-separated. ``name`` begins the stream's log lines. ``on_state`` is
-    called with each new state. ``clock`` keeps itself up to date: the ingest shows it every frame.
-    ``last_frame_utime`` is when the newest frame arrived, µs since the Unix epoch, 0 before the first.
-    ``tries`` counts the tries to connect since the last handshake that was completed. ``restarts`` counts
-    how often the server's time or frame numbers began again within a connection. ``drops`` counts what
-    arrived and was not published, by cause. ``limitations`` lists what the present connection lacks.
+    ``components`` are the configured components, separated by spaces. ``name`` begins the stream's log
+    lines. ``on_state`` is called with each new state. ``last_frame_utime`` is when the newest frame arrived,
+    in µs since the Unix epoch, 0 before the first. ``tries`` counts the attempts to connect since the last
+    completed handshake, ``reconnects`` all attempts except the first. ``restarts`` counts how often the
+    server's time or frame numbers started again within a connection. ``drops`` counts by cause what arrived
+    and was not published. ``limitations`` lists what the current connection lacks.
     """
 
     components: str
@@ -67,28 +67,28 @@ class StreamStatus:
     _phase: Phase = field(default=Phase.WAITING, init=False)
     _logged_limitations: deque[str] = field(default_factory=lambda: deque(maxlen=MAX_LIMITATIONS), init=False)
 
-    # The life of a connection: what session and supervisor report.
+    # Reports of session and supervisor about the connection.
 
     def connecting(self, server: str) -> None:
-        """Count a try to connect."""
+        """Count an attempt to connect."""
         self.tries += 1
         self._enter(Phase.CONNECTING, "connecting", server)
 
     def connected(self, server: str) -> None:
-        """Count a new session and forget what was agreed in the last one."""
+        """Count a new session, and forget what was agreed in the previous one."""
         self.session += 1
         self.limitations.clear()
         self.byte_order = self.rate = ""
         self._enter(Phase.HANDSHAKING, "connected", server)
 
     def handshake_done(self, protocol_state: ProtocolState, server: str) -> None:
-        """Note that the server agreed to stream; frames may have arrived before."""
+        """Note that the server agreed to stream; frames may have arrived already."""
         self.tries = 0
         self._phase = Phase.READY
         self._update_state(protocol_state, "handshake done", server)
 
     def protocol_changed(self, protocol_state: ProtocolState, byte_order: str, server: str) -> None:
-        """Note what the server sends now; ``byte_order`` is empty while that is unknown."""
+        """Note the new state of the protocol; ``byte_order`` is empty while it is unknown."""
         self.byte_order = byte_order
         self._update_state(protocol_state, _PROTOCOL_EVENTS.get(protocol_state, "frames requested"), server)
 
@@ -97,22 +97,22 @@ class StreamStatus:
         self._enter(Phase.SILENT, "silence", text)
 
     def disconnected(self, error: str) -> None:
-        """Note that the connection ended, or could not be made, and why."""
+        """Note why the connection ended or could not be opened."""
         self.record_error(error)
         self._enter(Phase.WAITING, "the connection ended", error)
 
     def reconnecting(self) -> None:
-        """Count a connection that follows another one."""
+        """Count an attempt to connect after the first."""
         self.reconnects += 1
 
-    # What arrives.
+    # Reports about arriving data.
 
     def bytes_received(self, count: int) -> None:
         """Count the bytes of one read."""
         self.bytes_in += count
 
     def frames_received(self, count: int, utime: int) -> None:
-        """Count frames that arrived together at ``utime``, µs since the Unix epoch."""
+        """Count frames that arrived together at ``utime``, in µs since the Unix epoch."""
         self.frames_in += count
         self.last_frame_utime = utime
 
@@ -121,7 +121,7 @@ class StreamStatus:
         self.lag_s = lag_s
 
     def server_restarted(self) -> None:
-        """Count that the server's time or frame numbers began again."""
+        """Count a restart of the server's time or frame numbers."""
         self.restarts += 1
 
     def frame_rejected(self, error: str) -> None:
@@ -134,19 +134,19 @@ class StreamStatus:
         self.drops["skipped while behind"] += 1
 
     def unknown_components_skipped(self, count: int) -> None:
-        """Count components of one frame whose types §7.2 does not know."""
+        """Count components of one frame whose types §7.2 does not define."""
         self.drops["unknown component"] += count
 
-    # What server and gateway agreed on.
+    # What the server and the gateway agreed on, and errors.
 
     def rate_agreed(self, rate: str) -> None:
         """Note the rate at which the server streams; empty for its default, or while it does not stream."""
         self.rate = rate
 
     def add_limitation(self, text: str) -> None:
-        """Note something that the present connection does without; at most MAX_LIMITATIONS are kept.
+        """Add something that the current connection lacks, unless there are MAX_LIMITATIONS already.
 
-        Each text is logged as a WARNING once, and as DEBUG if a later connection has the same limitation.
+        Each text is logged as WARNING once, and as DEBUG if a later connection has the same limitation.
         """
         if text in self.limitations or len(self.limitations) >= MAX_LIMITATIONS:
             return
@@ -163,7 +163,7 @@ class StreamStatus:
         self.last_error_utime = now_utime()
 
     def _enter(self, phase: Phase, event: str, cause: str) -> None:
-        """Enter a phase in which nothing that the server sent before counts."""
+        """Enter a phase in which earlier frames or No Data from the server do not matter."""
         self._phase = phase
         self._update_state(ProtocolState.IDLE, event, cause)
 
@@ -172,21 +172,21 @@ class StreamStatus:
         before, self.state = self.state, stream_state(self._phase, protocol_state)
         if self.state is before:
             return
-        # While a server is away, these states alternate: the supervisor logs that as one failure.
+        # While a server is away, these states alternate. The supervisor logs this as one failure.
         level = logging.DEBUG if self.state in _RECONNECTING else logging.INFO
         logger.log(level, "%s: %s → %s: %s (%s)", self.name, before.value, self.state.value, event, cause)
         self.on_state(self.state)
 
 
 class FrameRate:
-    """Frames per second between one call of ``update`` and the next."""
+    """The frame rate between two calls of ``update``."""
 
     def __init__(self) -> None:
         self._frames = 0
         self._time_s = time.monotonic()
 
     def update(self, frames: int) -> float:
-        """Return the mean rate since the last call, in Hz, given the count of frames so far."""
+        """Return the mean rate in Hz since the last call; ``frames`` is the number of frames so far."""
         now_s = time.monotonic()
         elapsed_s = now_s - self._time_s
         rate_hz = (frames - self._frames) / elapsed_s if elapsed_s > 0 else 0.0

@@ -1,4 +1,4 @@
-"""Agrees with the server on what it streams: handshake, rate, pause."""
+"""Requests to the server about its stream: handshake, rate, pause."""
 
 import logging
 from collections.abc import Callable
@@ -22,16 +22,16 @@ from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 
 OnParameters = Callable[[bytes, ParsedParameters], None]
-"""Takes the server's XML as it arrived, and what it says."""
+"""Takes the server's XML as received, and its parsed form."""
 
 logger = logging.getLogger(__name__)
 
 
 class StreamControl:
-    """Controls the stream of one connected session; used once, as the session is.
+    """Controls the stream of one connected session. Use once, like the session.
 
-    What the server refuses or does not answer becomes a limitation in the status, and the gateway does
-    without it (field note 2). Every method raises LinkError if the connection ends.
+    If the server refuses or does not answer a command, the status shows a limitation, and the gateway
+    continues without it (field note 2). Every method raises LinkError if the connection ends.
     """
 
     def __init__(
@@ -47,16 +47,16 @@ class StreamControl:
         self._status = status
         self._session = session
         self._on_parameters = on_parameters
-        self._request = StreamFrames()  # the one that the server accepted
+        self._request = StreamFrames()  # as the server accepted it, at the full rate
 
     async def start(self) -> None:
         """Do the handshake (§5.3.1 to §5.3.3) and request frames (§5.3.5).
 
-        Raises LinkError also if the server refuses to stream in every form.
+        Also raises LinkError if the server refuses all forms of StreamFrames (see ``stream_requests``).
         """
-        await self._try(Version())
+        await self._ask_optional(Version())
         if self._source.byte_order == "little":
-            await self._try(SetByteOrder("little"))
+            await self._ask_optional(SetByteOrder("little"))
         parameters = await self._fetch_parameters()
         frequency_hz = None
         if parameters is not None and parameters.markers is not None:
@@ -72,12 +72,12 @@ class StreamControl:
         )
 
     async def change_rate(self, halvings: int) -> None:
-        """Request the agreed rate halved so many times; if the server refuses, the rate stays."""
+        """Request the agreed rate, halved ``halvings`` times. If the server refuses, the rate stays."""
         await self._request_frames(replace(self._request, rate=halved(self._request.rate, halvings)))
 
     async def pause(self) -> None:
-        """Stop the frames (§5.3.5); the connection stays."""
-        await self._try(StopStreaming())
+        """Stop the frames (§5.3.5); keep the connection."""
+        await self._ask_optional(StopStreaming())
         self._status.rate_agreed("")
 
     async def resume(self) -> None:
@@ -85,7 +85,7 @@ class StreamControl:
         await self._request_frames(self._request)
 
     async def _request_frames(self, request: StreamFrames) -> bool:
-        """Return whether the server accepted; one that does not answer counts as accepting."""
+        """Request frames; return whether the server accepted. No answer counts as acceptance."""
         try:
             await self._session.ask(request)
         except ServerError as error:
@@ -97,7 +97,8 @@ class StreamControl:
         return True
 
     async def _fetch_parameters(self) -> Parameters | None:
-        packet = await self._try(SendParameters())
+        """Return the server's parameters and pass them on; None if there are none."""
+        packet = await self._ask_optional(SendParameters())
         if packet is None:
             return None
         try:
@@ -110,8 +111,8 @@ class StreamControl:
         self._on_parameters(packet.body, parsed)
         return parsed.parameters
 
-    async def _try(self, command: Command) -> Packet | None:
-        """Return the answer; None if the server refused the command or did not answer it."""
+    async def _ask_optional(self, command: Command) -> Packet | None:
+        """Send ``command``; return the answer, or None if the server refused or did not answer."""
         try:
             return await self._session.ask(command)
         except ServerError as error:

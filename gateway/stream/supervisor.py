@@ -1,4 +1,4 @@
-"""Keeps one stream of one source running: connects, streams, and connects again after every failure."""
+"""Keeps one stream of one source running: connects, streams, and reconnects after every failure."""
 
 import asyncio
 import logging
@@ -22,26 +22,26 @@ logger = logging.getLogger(__name__)
 
 
 class Callbacks(NamedTuple):
-    """What a stream calls when something happens. Called from the event loop; none may wait."""
+    """The functions that a stream calls, in the event loop. They must not block."""
 
     publish: Publish
     """Takes a frame to publish."""
     on_parameters: OnParameters
-    """Takes the parameters with which each connection begins."""
+    """Takes the parameters that the server sends in each handshake."""
     on_connected: Callable[[], None]
-    """Called when the handshake is done and the session can be asked questions."""
+    """Called when the handshake is done and ``Supervisor.session`` can be asked."""
     on_restart: Callable[[], None]
-    """Called when the server's frame numbers or time stamps begin again within a connection."""
+    """Called when the server's frame numbers or time stamps start again within a connection."""
     on_file: OnFile
     """Takes a complete C3D file."""
     has_subscribers: Callable[[], bool]
-    """Says whether the stream's components may have subscribers."""
+    """Returns whether the stream's components may have subscribers."""
 
 
 def backoff_delays_s(reconnect: ReconnectSettings) -> Iterator[float]:
-    """Yield the delays between tries: doubling up to a maximum, each shortened at random by up to half.
+    """Yield the delays between attempts: doubling up to a maximum, each shortened at random by up to half.
 
-    The jitter prevents many gateways from returning to a restarted server in step.
+    The randomness prevents many gateways from reconnecting to a restarted server at the same moment.
     """
     delay_s = reconnect.first_delay_s
     while True:
@@ -71,20 +71,20 @@ class Supervisor:
         self._connect = connect
         self._monotonic = monotonic
         self._failures = FailureLog(logger, status.name)
-        self._ready_session: Session | None = None  # the newest whose handshake is done
+        self._ready_session: Session | None = None  # the newest session with a completed handshake
 
     @property
     def session(self) -> Session | None:
-        """The session that can be asked questions; None while there is none."""
+        """The open session with a completed handshake, which can be asked; None if there is none."""
         session = self._ready_session
         return session if session is not None and session.is_open else None
 
     async def run(self) -> None:
-        """Keep the stream running until cancelled; then say Bye.
+        """Keep the stream running until cancelled; then send Bye.
 
-        The rule for errors: after any failure of a connection (LinkError), try again, without end, because a
-        motion-capture computer that is off today is on tomorrow. Any other exception is a defect of this
-        program and is raised.
+        The rule for errors: after any failure of a connection (LinkError), reconnect, without a limit,
+        because a motion-capture computer that is off today is on tomorrow. Any other exception is a defect
+        in this program and is raised.
         """
         server = f"{self._source.host}:{self._source.port}"
         with log_fields(source=self._source.name, stream=self._status.components, peer=server):
@@ -105,7 +105,7 @@ class Supervisor:
             self._status.reconnecting()
 
     async def _run_session(self) -> None:
-        """Run one session to its end, which is always a LinkError."""
+        """Run one session until it ends, which always raises LinkError."""
         ingest = Ingest(
             self._source,
             self._stream,

@@ -1,4 +1,4 @@
-"""Opens TCP connections to RT servers, and explains what went wrong if that fails."""
+"""Opens TCP connections to RT servers, and explains failures."""
 
 import asyncio
 import socket
@@ -9,7 +9,7 @@ from gateway.config.settings import SourceSettings
 from gateway.errors import ConnectError
 
 Connect = Callable[[SourceSettings, Any], Awaitable[asyncio.Transport]]
-"""Connects a protocol, an ``asyncio.Protocol`` by its methods, to a source's server."""
+"""Connects a protocol, an object with the methods of ``asyncio.Protocol``, to a source's server."""
 
 
 async def open_connection(source: SourceSettings, protocol: Any) -> asyncio.Transport:
@@ -21,8 +21,8 @@ async def open_connection(source: SourceSettings, protocol: Any) -> asyncio.Tran
     loop = asyncio.get_running_loop()
     try:
         async with asyncio.timeout(source.connect_timeout_s):
-            # create_connection looks the name up again. But uvloop cannot cancel a lookup: its late result
-            # is logged as an error, and the next lookup waits behind it.
+            # uvloop cannot cancel a look-up: it logs a late failure as an error, and the next look-up waits
+            # for it. So a thread looks the name up first; create_connection then does so again.
             await asyncio.to_thread(socket.getaddrinfo, source.host, source.port)
             transport, _ = await loop.create_connection(lambda: protocol, source.host, source.port)
             return transport

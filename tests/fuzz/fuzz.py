@@ -19,7 +19,7 @@ import atheris
 with atheris.instrument_imports(include=["gateway"]):
     from gateway.errors import CommandError, ConfigError, FrameError, ParametersError, ProtocolError
     from gateway.messages.decode import decode, to_json
-    from gateway.messages.encode import splice
+    from gateway.messages.encode import encode_message
     from gateway.messages.stamp import Stamp
     from gateway.messages.summary import summarise
     from gateway.rtc3d.client_protocol import ClientProtocol
@@ -55,7 +55,7 @@ def frames(data: bytes) -> None:
     except FrameError:
         return
     for component in frame.components:
-        message = splice(component, STAMP, 7)
+        message = encode_message(component, STAMP, 7)
         decoded = decode(message)
         summarise(decoded)
         to_json(decoded)

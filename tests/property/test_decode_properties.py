@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode, to_json
-from gateway.messages.encode import splice
+from gateway.messages.encode import encode_message
 from gateway.messages.stamp import Stamp
 from gateway.messages.summary import summarise
 from gateway.messages.tool_pose import tool_poses
@@ -31,7 +31,7 @@ STATUS = status_message(
 CLOCK = clock_message(1, 2, StreamStatus("3d"))
 valid = st.sampled_from(
     [
-        *(splice(each, STAMP, 1) for each in COMPONENTS),
+        *(encode_message(each, STAMP, 1) for each in COMPONENTS),
         *tool_poses(TOOLS, STAMP, [1, 2]),
         STATUS.encode(),
         CLOCK.encode(),

@@ -3,7 +3,7 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.messages.encode import MESSAGE_TYPES, splice
+from gateway.messages.encode import MESSAGE_TYPES, encode_message
 from gateway.messages.stamp import Stamp
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import split_frame
@@ -64,7 +64,7 @@ def test_both_byte_orders_give_the_same_message_bit_for_bit(
 ) -> None:
     values = data.draw(word_lists(kind))
     big, little = (
-        splice(component(kind, frame_number, timestamp_us, values, order), stamp, sequence)
+        encode_message(component(kind, frame_number, timestamp_us, values, order), stamp, sequence)
         for order in ORDERS
     )
     assert big == little
@@ -88,7 +88,7 @@ def test_lcm_gen_decodes_and_encodes_a_message_to_the_same_bytes(
     sequence: int,
 ) -> None:
     values = data.draw(word_lists(kind, words.filter(survives_python)))
-    message = splice(component(kind, frame_number, timestamp_us, values, "big"), stamp, sequence)
+    message = encode_message(component(kind, frame_number, timestamp_us, values, "big"), stamp, sequence)
     decoded = MESSAGE_TYPES[kind].decode(message)
     assert (decoded.utime, decoded.capture_utime, decoded.session) == (
         stamp.utime,

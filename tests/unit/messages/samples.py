@@ -4,7 +4,7 @@ from typing import Any
 
 import rtc3d
 
-from gateway.messages.encode import splice
+from gateway.messages.encode import encode_message
 from gateway.messages.stamp import Stamp
 from gateway.messages.tool_pose import tool_poses
 from gateway.outputs.status import OutputHealth, OutputStatus
@@ -25,7 +25,7 @@ def received(vector: ComponentVector, order: ByteOrder = "big") -> Component:
 
 def component_message(vector: ComponentVector) -> bytes:
     """Return the message of the vector's component, number 41."""
-    return splice(received(vector), STAMP, 41)
+    return encode_message(received(vector), STAMP, 41)
 
 
 def tool_pose_messages() -> list[bytes]:

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import rtc3d
 
-from gateway.messages.encode import CONTENT_OFFSET, ITEMS_OFFSET, MESSAGE_TYPES, lcm_type_name, splice
+from gateway.messages.encode import CONTENT_OFFSET, ITEMS_OFFSET, MESSAGE_TYPES, encode_message, lcm_type_name
 from gateway.messages.stamp import Stamp
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
@@ -54,12 +54,15 @@ def header_of(vector: ComponentVector) -> bytes:
 def test_a_message_is_fingerprint_prefix_and_big_endian_component(
     vector: ComponentVector, order: ByteOrder
 ) -> None:
-    assert splice(received(vector, order), STAMP, SEQUENCE) == header_of(vector) + vector.wire["big"][24:]
+    assert (
+        encode_message(received(vector, order), STAMP, SEQUENCE)
+        == header_of(vector) + vector.wire["big"][24:]
+    )
 
 
 def test_every_byte_of_a_markers_message_is_as_documented() -> None:
     missing = b"\xff\xff\xff\xff"
-    assert splice(received(MARKERS), STAMP, SEQUENCE) == (
+    assert encode_message(received(MARKERS), STAMP, SEQUENCE) == (
         rtc3d.markers_t._get_packed_fingerprint()
         + struct.pack(">q", 1_700_000_000_000_001)
         + struct.pack(">q", 1_700_000_000_000_000)
@@ -73,7 +76,7 @@ def test_every_byte_of_a_markers_message_is_as_documented() -> None:
 
 @both_orders
 def test_events_of_16_bytes_get_the_time_stamp_of_their_component(order: ByteOrder) -> None:
-    assert splice(received(SHORT_EVENTS, order), STAMP, SEQUENCE) == (
+    assert encode_message(received(SHORT_EVENTS, order), STAMP, SEQUENCE) == (
         header_of(SHORT_EVENTS)
         + struct.pack(">iqiii", 0x123456, 10000, 7, 1, -1)
         + struct.pack(">iqiii", 2, 10000, 1065353216, -1, -1)
@@ -83,7 +86,7 @@ def test_events_of_16_bytes_get_the_time_stamp_of_their_component(order: ByteOrd
 @both_orders
 @each_component
 def test_lcm_gen_decodes_every_field(vector: ComponentVector, order: ByteOrder) -> None:
-    message = LCM_TYPES[vector.type].decode(splice(received(vector, order), STAMP, SEQUENCE))
+    message = LCM_TYPES[vector.type].decode(encode_message(received(vector, order), STAMP, SEQUENCE))
     prefix = (message.utime, message.capture_utime, message.sequence, message.session)
     assert prefix == (STAMP.utime, STAMP.capture_utime, SEQUENCE, STAMP.session)
     assert (message.frame_number, message.timestamp) == (vector.frame_number, vector.timestamp_us)
@@ -100,7 +103,7 @@ def test_lcm_gen_decodes_every_field(vector: ComponentVector, order: ByteOrder) 
 @both_orders
 @each_component
 def test_lcm_gen_encodes_what_it_decoded_to_the_same_bytes(vector: ComponentVector, order: ByteOrder) -> None:
-    message = splice(received(vector, order), STAMP, SEQUENCE)
+    message = encode_message(received(vector, order), STAMP, SEQUENCE)
     assert LCM_TYPES[vector.type].decode(message).encode() == message
 
 
@@ -117,11 +120,11 @@ def test_a_component_without_items_gives_a_message_without_items(
     expected = struct.pack(
         ">8sqqqiiqi", fingerprint, STAMP.utime, STAMP.capture_utime, SEQUENCE, STAMP.session, 7, 9, 0
     )
-    assert splice(component, STAMP, SEQUENCE) == expected
+    assert encode_message(component, STAMP, SEQUENCE) == expected
 
 
 def test_content_and_items_begin_at_the_documented_offsets() -> None:
-    message = splice(received(ANALOG), STAMP, SEQUENCE)
+    message = encode_message(received(ANALOG), STAMP, SEQUENCE)
     assert (CONTENT_OFFSET, ITEMS_OFFSET) == (36, HEADER.size) == (36, 52)
     assert message[CONTENT_OFFSET:ITEMS_OFFSET] == ANALOG.wire["big"][8:24]
     assert message[ITEMS_OFFSET:] == ANALOG.wire["big"][24:]

@@ -30,8 +30,8 @@ def tools(*poses: tuple[float, ...]) -> Component:
     return component
 
 
-def pose_of(component: Component, metres: float = 1e-3) -> Any:
-    [message] = tool_poses(component, STAMP, [SEQUENCE], metres)
+def pose_of(component: Component, unit_m: float = 1e-3) -> Any:
+    [message] = tool_poses(component, STAMP, [SEQUENCE], unit_m)
     return rtc3d.tool_pose_t.decode(message)
 
 
@@ -79,7 +79,7 @@ def test_zeros_are_a_valid_pose() -> None:
 
 
 def test_a_component_in_metres_is_not_scaled() -> None:
-    pose = pose_of(tools((1.0, 0.0, 0.0, 0.0, 1.5, -2.0, 0.25, 0.0625)), metres=1.0)
+    pose = pose_of(tools((1.0, 0.0, 0.0, 0.0, 1.5, -2.0, 0.25, 0.0625)), unit_m=1.0)
     assert (pose.position_m, pose.error_m) == ((1.5, -2.0, 0.25), 0.0625)
 
 

@@ -6,7 +6,7 @@ import pytest
 
 from gateway.errors import OutputError
 from gateway.messages.decode import decode
-from gateway.messages.encode import splice
+from gateway.messages.encode import encode_message
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.memory import MemoryOutput
@@ -37,7 +37,10 @@ def test_every_component_goes_to_every_output_under_its_topic() -> None:
     FanOut("lab", outputs).publish(FULL, STAMP, ALL)
     names = {1: "markers_t", 2: "analog_t", 3: "forces_t", 4: "tools_t", 5: "events_t"}
     expected = [
-        (Topic("lab", (component.type.key,), f"rtc3d.{names[component.type]}"), splice(component, STAMP, 0))
+        (
+            Topic("lab", (component.type.key,), f"rtc3d.{names[component.type]}"),
+            encode_message(component, STAMP, 0),
+        )
         for component in FULL.components
     ]
     assert len(expected) == 5

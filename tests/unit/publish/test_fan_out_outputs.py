@@ -27,7 +27,7 @@ def test_replacing_an_output_does_not_disturb_the_others() -> None:
     stays, before, after = ToyOutput("stays"), ToyOutput("side"), ToyOutput("side")
     fan_out = FanOut("lab", [stays, before])
     declared = list(stays.declared)
-    fan_out.use([stays, after])
+    fan_out.set_outputs([stays, after])
     publish(fan_out)
     assert (stays.declared, stays.closed_topics) == (declared, [])
     assert sequences(stays, "3d") == [0]
@@ -37,7 +37,7 @@ def test_a_replacement_continues_numbers_and_counters() -> None:
     before, after = ToyOutput("side"), ToyOutput("side")
     fan_out = FanOut("lab", [before])
     publish(fan_out)
-    fan_out.use([after])
+    fan_out.set_outputs([after])
     publish(fan_out)
     assert (sequences(before, "3d"), sequences(after, "3d")) == ([0], [1])
     [(output, status)] = fan_out.outputs
@@ -53,7 +53,7 @@ def test_a_replacement_continues_the_counts_of_what_was_lost() -> None:
     before.error = after.error = OutputError("no router", cause="no router")
     fan_out = FanOut("lab", [before])
     fan_out.publish_status(b"status")
-    fan_out.use([after])
+    fan_out.set_outputs([after])
     fan_out.publish_status(b"status")
     [(_, status)] = fan_out.outputs
     assert status.drops == {"no router": 2}
@@ -71,7 +71,7 @@ def test_removing_an_output_closes_everything_declared_on_it() -> None:
     output = ToyOutput()
     fan_out = FanOut("lab", [output])
     declared = list(output.declared)
-    fan_out.use([])
+    fan_out.set_outputs([])
     publish(fan_out)
     assert (output.declared, output.announced, output.messages) == ([], [], [])
     assert sorted(output.closed_topics) == sorted(declared)
@@ -80,9 +80,9 @@ def test_removing_an_output_closes_everything_declared_on_it() -> None:
 def test_an_output_that_comes_back_continues_its_numbers() -> None:
     fan_out = FanOut("lab", [ToyOutput("side")])
     publish(fan_out)
-    fan_out.use([])
+    fan_out.set_outputs([])
     again = ToyOutput("side")
-    fan_out.use([again])
+    fan_out.set_outputs([again])
     publish(fan_out)
     assert sequences(again, "3d") == [1]
 
@@ -91,7 +91,7 @@ def test_a_new_output_shows_that_frames_flow() -> None:
     fan_out = FanOut("lab", [ToyOutput("one")])
     fan_out.show_streaming(True)
     new = ToyOutput("two")
-    fan_out.use([new])
+    fan_out.set_outputs([new])
     assert (new.announced, new.streaming) == (["lab"], [True])
 
 
@@ -112,7 +112,7 @@ def test_tool_topics_stay_open_on_an_output_that_stays() -> None:
     fan_out = FanOut("lab", [stays, before])
     fan_out.set_parameters(PROBES)
     publish(fan_out)
-    fan_out.use([stays, after])
+    fan_out.set_outputs([stays, after])
     publish(fan_out)
     assert stays.closed_topics == []
     assert [len(output.poses("Probe")) for output in (stays, before, after)] == [2, 1, 1]
@@ -126,7 +126,7 @@ def test_tool_topics_are_closed_where_they_are_switched_off() -> None:
     fan_out.set_parameters(PROBES)
     publish(fan_out)
     output.has_tool_poses = False
-    fan_out.use([output])
+    fan_out.set_outputs([output])
     publish(fan_out)
     assert output.tool_names() == []
     assert len(output.poses("Probe")) == 1

@@ -93,7 +93,7 @@ def test_a_replacement_continues_the_numbers_and_the_former_one_is_closed() -> N
     before, after = FrameOutput(), FrameOutput()
     fan_out = FanOut("lab", [before])
     fan_out.publish(FULL, STAMP, ALL)
-    fan_out.use([after])
+    fan_out.set_outputs([after])
     fan_out.publish(FULL, STAMP, ALL)
     assert [sequence for _, _, sequence, _ in after.frames] == [1]
     assert (before.closed, after.closed) == (1, 0)
@@ -105,7 +105,7 @@ def test_drops_that_an_output_counts_itself_are_added_and_outlive_it() -> None:
     before.own_drops, after.own_drops = {"malformed request": 3}, {"malformed request": 1}
     fan_out = FanOut("lab", [before])
     assert fan_out.outputs[0][1].drops == {"malformed request": 3}
-    fan_out.use([after])
+    fan_out.set_outputs([after])
     assert fan_out.outputs[0][1].drops == {"malformed request": 4}
 
 
@@ -113,9 +113,9 @@ def test_an_output_of_frames_can_replace_one_of_components() -> None:
     before, after = ToyOutput(), FrameOutput()
     fan_out = FanOut("lab", [before])
     fan_out.publish(FULL, STAMP, ALL)
-    fan_out.use([after])
+    fan_out.set_outputs([after])
     fan_out.publish(FULL, STAMP, ALL)
     assert [sequence for _, _, sequence, _ in after.frames] == [0]
-    fan_out.use([before])
+    fan_out.set_outputs([before])
     fan_out.publish(FULL, STAMP, MARKERS)
     assert len(before.messages) == 6

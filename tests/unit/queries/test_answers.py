@@ -4,7 +4,7 @@ import math
 import pytest
 import rtc3d
 
-from gateway.messages.encode import splice
+from gateway.messages.encode import encode_message
 from gateway.messages.stamp import Stamp
 from gateway.outputs.encodings import JSON, TEXT
 from gateway.queries.answers import message_answer, parameters_json, schema_answer
@@ -18,7 +18,7 @@ from tests.vectors import FULL_FRAME
 def encoded_message(component_type: ComponentType) -> bytes:
     components = split_frame(FULL_FRAME["big"], "big").components
     [component] = [component for component in components if component.type is component_type]
-    return splice(component, Stamp(1, 2, 3), 4)
+    return encode_message(component, Stamp(1, 2, 3), 4)
 
 
 @pytest.mark.parametrize("name", SCHEMA_TYPES)

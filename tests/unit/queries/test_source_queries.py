@@ -4,7 +4,7 @@ import json
 import pytest
 
 from gateway.errors import QueryError
-from gateway.messages.encode import splice
+from gateway.messages.encode import encode_message
 from gateway.messages.stamp import Stamp
 from gateway.outputs.encodings import JSON, XML
 from gateway.rtc3d.components import ComponentType
@@ -97,7 +97,7 @@ async def test_recording_without_a_connection_is_an_error() -> None:
 
 def markers_message(session: int) -> bytes:
     [component] = split_frame(FRAME, "big").components
-    return splice(component, Stamp(1, 1, session), 5)
+    return encode_message(component, Stamp(1, 1, session), 5)
 
 
 async def test_while_streaming_a_component_is_answered_with_its_newest_message() -> None:
