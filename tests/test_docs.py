@@ -1,4 +1,4 @@
-"""The documents tell the truth as far as a machine can see: links, commands, configurations, byte tables.
+"""Checks of the documents: links, commands, configurations, tables of bytes, causes of drops.
 
 The tutorial's commands are run as well, in tests/integration/test_tutorial.py; those of other pages are
 parsed by the program, because they name servers that nobody has.
@@ -154,15 +154,15 @@ def test_the_reference_has_the_fingerprint_and_sizes_of_every_type() -> None:
     assert sizes["tool_pose_t"] == (f"{len(rtc3d.tool_pose_t().encode())} in all", "")
 
 
-def test_every_cause_of_a_drop_is_told_and_no_other() -> None:
-    told = set(re.findall(r"^\| `([a-z ]+)` \| (?:stream|output|LCM) \|", WHAT_IS_LOST, re.MULTILINE))
-    for_others = {"demo.py", "memory_output.py"}
+def test_the_page_about_loss_lists_every_cause_of_a_drop_and_no_other() -> None:
+    documented = set(re.findall(r"^\| `([a-z ]+)` \| (?:stream|output|LCM) \|", WHAT_IS_LOST, re.MULTILINE))
+    for_others = {"demo.py", "memory.py"}
     sources = [path for path in ROOT.glob("gateway/**/*.py") if path.name not in for_others]
     text = "\n".join(path.read_text() for path in sources)
     counted = set(re.findall(r'(?:\bdrops\[|\bcause=|_drop\()"([^"]+)"', text))
     assert len(counted) > 7
-    assert counted <= told
-    assert {cause for cause in told if f'"{cause}"' not in text} == set()
+    assert counted <= documented
+    assert {cause for cause in documented if f'"{cause}"' not in text} == set()
 
 
 def test_the_design_names_every_module() -> None:

@@ -15,7 +15,6 @@ from gateway.outputs.kind import SubscriptionRequest
 from gateway.outputs.registry import OUTPUTS
 
 QUEUE_MESSAGES: Final = 10_000
-
 """How many messages may wait to be printed."""
 
 Messages = queue.Queue[tuple[str, bytes]]

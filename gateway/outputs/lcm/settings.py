@@ -84,7 +84,7 @@ class LcmSettings(OutputSettings):
     """The URL of requests and replies; null means url, with the next port if url begins with udpm."""
 
     max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
-    """The highest rate of some components, in Hz; the gateway leaves out further frames at even intervals."""
+    """The highest rate of each listed component, in Hz; further frames are left out at even intervals."""
 
     tool_poses: Switch = False
     """Whether to publish the pose of each tool on its own channel."""

@@ -87,7 +87,7 @@ class ZenohSettings(OutputSettings):
     """Whether to send each message at once instead of in batches."""
 
     max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
-    """The highest rate of some components, in Hz; the gateway leaves out further frames at even intervals."""
+    """The highest rate of each listed component, in Hz; further frames are left out at even intervals."""
 
     tool_poses: Switch = False
     """Whether to publish the pose of each tool on its own key, while someone subscribes to it."""

@@ -90,13 +90,13 @@ class Fault(Section):
     """The kind's name in scenarios and on the command line."""
 
     at_s: Seconds | None = None
-    """Begin so many seconds after the start."""
+    """Begin this many seconds after the start."""
 
     every_s: Interval | None = None
-    """Begin repeatedly, so many seconds apart, up to half more or less at random."""
+    """Begin repeatedly, at intervals of this many seconds, varied at random by up to half."""
 
     times: Count | None = None
-    """End for good after it happened so many times."""
+    """Do not happen again after this many times."""
 
     @property
     def lasts_s(self) -> float | None:
@@ -140,7 +140,7 @@ class LastingFault(Fault):
     """A fault that has an end."""
 
     for_s: Interval | None = None
-    """Last so many seconds; by default, until the simulator ends."""
+    """Last this many seconds; by default, until the simulator ends."""
 
     @model_validator(mode="after")
     def _ends_before_it_begins_again(self) -> Self:

@@ -79,10 +79,10 @@ class Occlusion(FrameFault):
     kind: ClassVar[str] = "occlusion"
 
     markers: Fraction = 1.0
-    """The fraction of the markers; different ones each time the fault begins."""
+    """The fraction of the markers that is out of view; other markers each time the fault begins."""
 
     tools: Fraction = 1.0
-    """The fraction of the tools."""
+    """The fraction of the tools that is out of view."""
 
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
@@ -117,7 +117,7 @@ class JumpingTimestamps(FrameFault):
     kind: ClassVar[str] = "jumping_timestamps"
 
     jump_ms: Jump = -5000.0
-    """The distance in milliseconds; a negative one is into the past."""
+    """The jump in milliseconds; a negative value jumps into the past."""
 
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
@@ -138,7 +138,7 @@ class ConstantFrameNumbers(FrameFault):
     kind: ClassVar[str] = "constant_frame_numbers"
 
     frame_number: FrameNumber = 0
-    """The number."""
+    """The frame number."""
 
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
@@ -176,7 +176,7 @@ class WrongByteOrder(FrameFault):
     kind: ClassVar[str] = "wrong_byte_order"
 
     byte_order: Annotated[Literal["big", "little", "other"], expects("big, little or other")] = "other"
-    """big or little: always that one; other: not the one that the client requested."""
+    """big or little: always this byte order; other: the one that the client did not request."""
 
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
@@ -212,7 +212,7 @@ class WrongCounts(FrameFault):
     kind: ClassVar[str] = "wrong_counts"
 
     field: Annotated[Literal["components", "size", "items"], expects("components, size or items")] = "items"
-    """The field that is 1000 too large: the number of components, or the first one's size or items."""
+    """The field that is 1000 too large: the number of components, or the first component's size or items."""
 
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""

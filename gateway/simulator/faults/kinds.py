@@ -24,11 +24,11 @@ KINDS: Final[dict[str, type[Fault]]] = {
 """In the order in which they act on the bytes of a connection."""
 
 COMMON_PARAMETERS: Final = {
-    "at_s": "begin so many seconds after the start; without it and every_s, at the start",
-    "every_s": "begin repeatedly, so many seconds apart, up to half more or less at random",
-    "for_s": "last so many seconds; without it, until the simulator ends",
-    "times": "end for good after so many packets, replies or reads changed; for other kinds, beginnings",
-    "connection": "affect only the n-th connection since the server's start; without it, all",
+    "at_s": "begin this many seconds after the start; without at_s and every_s, begin at the start",
+    "every_s": "begin repeatedly, at intervals of this many seconds, varied at random by up to half",
+    "for_s": "last this many seconds; without for_s, last until the simulator ends",
+    "times": "happen at most this many times: packets, replies or reads changed; for other kinds, beginnings",
+    "connection": "affect only the n-th connection since the server's start; without it, affect all",
 }
 """The parameters that many kinds have, and what they do."""
 

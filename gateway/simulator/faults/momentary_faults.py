@@ -64,7 +64,7 @@ class Cut(MomentaryFault):
     kind: ClassVar[str] = "cut"
 
     reset: Switch = False
-    """End them by RST instead of FIN, as when the server's computer has forgotten the connection."""
+    """End connections with RST instead of FIN, as a server's computer does after a restart."""
 
     def act_on(self, connection: FaultyConnection, active: ActiveFault) -> None:  # noqa: ARG002 - see MomentaryFault
         """See MomentaryFault."""

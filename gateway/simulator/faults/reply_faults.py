@@ -57,7 +57,7 @@ class RefusedCommands(LastingConnectionFault):
 
 
 class MinimalServer(LastingConnectionFault):
-    """The server accepts only SendCurrentFrame alone and StreamFrames alone, with Stop or FrequencyDivisor:n.
+    """The server accepts only SendCurrentFrame, and StreamFrames alone, with Stop or FrequencyDivisor:n.
 
     Field note 2.
     """
@@ -140,7 +140,7 @@ class FramesFirst(LastingConnectionFault):
     kind: ClassVar[str] = "frames_first"
 
     frames: Count = 3
-    """The number of frames; a No Data packet ends the wait."""
+    """The number of frames before the acknowledgement; a No Data packet also ends the wait."""
 
     def change_replies(self, command: Packet, replies: list[Reply]) -> list[Reply]:
         """See LastingConnectionFault."""
@@ -153,7 +153,7 @@ class FramesFirst(LastingConnectionFault):
 
 
 class ReplyText(LastingConnectionFault):
-    """Replies are worded as by servers other than NDI's; errors begin with err-.
+    """Replies have the wording of servers other than NDI's; errors begin with err-.
 
     Field note 1.
     """

@@ -52,7 +52,7 @@ class Merge(LastingConnectionFault):
     kind: ClassVar[str] = "merge"
 
     window_ms: Milliseconds = 20.0
-    """Milliseconds for which it collects packets."""
+    """How long the server collects packets, in milliseconds."""
 
     def change_writes(self, writes: list[PendingWrite], active: ActiveFault) -> list[PendingWrite]:
         """See LastingConnectionFault."""
