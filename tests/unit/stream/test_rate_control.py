@@ -160,6 +160,7 @@ def test_halvings_are_bounded() -> None:
     link = Link(carries_halvings=100)
     link.run(1000)
     assert link.control.halvings == MAX_HALVINGS
+    assert len(link.changes) == MAX_HALVINGS
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,10 @@
 
 import asyncio
 import logging
+import socket
+import struct
 from typing import Any
+from unittest.mock import Mock
 
 import pytest
 
@@ -172,6 +175,36 @@ async def test_a_c3d_file_is_passed_on(lab: Lab) -> None:
     await lab.streaming()
     lab.connection.send(packet(5, b"content"))
     assert lab.files == [b"content"]
+
+
+# --- the connection
+
+
+async def test_the_kernel_is_asked_to_detect_a_server_that_has_vanished(lab: Lab) -> None:
+    options: list[tuple[object, ...]] = []
+    transport = Mock()
+    transport.get_extra_info.return_value.setsockopt = lambda *option: options.append(option)
+    lab.session.connection_made(transport)
+    transport.get_extra_info.assert_called_once_with("socket")
+    assert options == [(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)]
+
+
+@pytest.mark.parametrize(("packet_type", "limit"), [(3, 1024), (5, 4096)])
+async def test_packets_above_the_configured_limits_end_the_session(packet_type: int, limit: int) -> None:
+    lab = Lab(max_packet_bytes=1024, max_c3d_bytes=4096)
+    await lab.streaming()
+    lab.connection.send(struct.pack(">II", limit, packet_type) + bytes(limit - 8))
+    assert lab.session.is_open
+    lab.connection.send(struct.pack(">II", limit + 1, packet_type))
+    with pytest.raises(ClosedError, match=rf"packet size {limit + 1} \(limit {limit}\), type {packet_type}"):
+        await lab.session.monitor()
+
+
+async def test_the_byte_order_is_unknown_before_the_first_frame(lab: Lab) -> None:
+    await lab.streaming()
+    assert lab.status.byte_order == ""
+    lab.connection.send_frames(1)
+    assert lab.status.byte_order == "big"
 
 
 # --- silence

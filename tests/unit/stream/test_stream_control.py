@@ -8,12 +8,12 @@ import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import LinkError
-from gateway.rtc3d.parameters_xml import ParsedParameters
+from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from gateway.stream.session import Session
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
-from tests.servers import ok, packet
+from tests.servers import markers_frame, ok, packet
 from tests.unit.stream.scripted_server import XML, Answer, ScriptedServer, obliging, refusing, silent_to
 from tests.unit.stream.virtual_time import settle
 
@@ -27,6 +27,7 @@ class Lab:
         self.server = ScriptedServer(answer)
         self.status = StreamStatus("3d", name="lab (3d)")
         self.parameters: list[bytes] = []
+        self.parsed: list[ParsedParameters] = []
         source = SourceSettings.model_validate(
             {"name": "lab", "host": "192.0.2.20", "byte_order": byte_order}
         )
@@ -42,8 +43,9 @@ class Lab:
         )
         self.control = StreamControl(source, settings, self.status, self.session, self._on_parameters)
 
-    def _on_parameters(self, xml: bytes, _parsed: ParsedParameters) -> None:
+    def _on_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
         self.parameters.append(xml)
+        self.parsed.append(parsed)
 
     @property
     def commands(self) -> list[str]:
@@ -59,6 +61,7 @@ async def test_the_handshake_asks_for_version_parameters_and_frames() -> None:
     await lab.start()
     assert lab.commands == ["Version 1.0", "SendParameters", "StreamFrames AllFrames 3D"]
     assert lab.parameters == [XML[8:]]
+    assert lab.parsed == [parse_parameters(XML[8:])]
     assert lab.status.rate == "AllFrames"
     assert lab.status.state is StreamState.IDLE
     assert lab.status.limitations == []
@@ -69,6 +72,19 @@ async def test_little_endian_is_requested_before_the_parameters() -> None:
     lab = Lab(byte_order="little")
     await lab.start()
     assert lab.commands[:3] == ["Version 1.0", "SetByteOrder LittleEndian", "SendParameters"]
+    lab.server.connection.send(markers_frame(1, (0.0, 0.0, 0.0), order="<"))
+    assert lab.status.byte_order == "little"
+    assert lab.status.limitations == []
+
+
+async def test_a_frame_before_the_acknowledgement_is_streaming_after_the_handshake() -> None:
+    def answer(command: str) -> bytes | None:
+        early = markers_frame(1, (0.0, 0.0, 0.0)) if command.startswith("StreamFrames") else b""
+        return early + obliging(command)
+
+    lab = Lab(answer)
+    await lab.start()
+    assert lab.status.state is StreamState.STREAMING
 
 
 async def test_the_gateway_does_without_what_the_server_refuses_or_ignores(

@@ -68,6 +68,18 @@ async def test_rejected_frames_are_a_warning_once_and_their_end_is_logged(
     assert lab.status.drops == {"frame rejected": 2}
 
 
+async def test_frames_that_are_rejected_now_and_then_are_one_failure(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    lab = await session_with_frames()
+    caplog.clear()
+    for number in range(2, 5):
+        lab.connection.send(TOO_SHORT)
+        lab.connection.send_frames(number)
+    levels = [line.split()[0] for line in logged(caplog, "session")]
+    assert levels == ["WARNING", "DEBUG", "DEBUG"]
+
+
 async def test_frames_in_another_byte_order_are_a_limitation() -> None:
     lab = test_session.Lab()
     await lab.streaming()

@@ -42,7 +42,7 @@ def test_the_protocol_gets_the_connection_and_the_transport_is_returned() -> Non
 
     async def connect(port: int) -> bytes:
         protocol = Greeter()
-        transport = await open_connection(source(host="127.0.0.1", port=port), protocol)
+        transport = await open_connection(source(host="127.0.0.2", port=port), protocol)
         assert protocol.transport is transport
         accepted, _ = await asyncio.to_thread(server.accept)
         transport.write(b"Version 1.0")
@@ -51,7 +51,7 @@ def test_the_protocol_gets_the_connection_and_the_transport_is_returned() -> Non
         transport.close()
         return received
 
-    with socket.create_server(("127.0.0.1", 0)) as server:
+    with socket.create_server(("127.0.0.2", 0)) as server:
         assert uvloop.run(connect(server.getsockname()[1])) == b"Version 1.0"
 
 
