@@ -209,3 +209,43 @@ def test_a_server_that_restarts_at_nearly_every_frame_has_no_clock() -> None:
     frames = simulate(seconds=1, rate_hz=RATE_HZ).with_host_set(60_000_000)
     nonsense = frames.with_timestamps(random_stamps(frames.timestamps_us))
     assert not observe(clock, nonsense).has_clock[10:].any()
+
+
+# --- without jitter, to the frame
+
+
+class ExactFrames:
+    """Frames 5 ms apart, shown to a clock that has seen ten seconds of them; ``late_us`` delays the next."""
+
+    def __init__(self) -> None:
+        self.clock = ServerClock()
+        self.late_us = 0
+        self._number = 0
+        for _ in range(10 * SECOND):
+            self.lag_s()
+
+    def lag_s(self, timestamp_us: int | None = None) -> float:
+        """Return the lag of the next frame, which may have another time stamp than its own."""
+        self._number += 1
+        captured_us = 5_000 * self._number
+        stamp_us = captured_us if timestamp_us is None else timestamp_us
+        _, lag_s, _ = self.clock.observe(stamp_us, self._number, EPOCH_UTIME + captured_us + self.late_us)
+        return lag_s
+
+
+def test_a_shift_that_lasts_is_believed_after_two_seconds() -> None:
+    frames = ExactFrames()
+    frames.late_us = 1_000_000
+    lags_s = [frames.lag_s() for _ in range(2 * SECOND)]
+    assert min(lags_s) == max(lags_s) == pytest.approx(1.0)
+    assert frames.lag_s() == 0.0
+
+
+def test_a_time_stamp_may_be_repeated_for_half_a_second() -> None:
+    frames = ExactFrames()
+    frozen_us = 10_000_000
+    for _ in range(SECOND // 2):
+        frames.lag_s(frozen_us)
+    assert frames.clock.has_clock is True
+    frames.lag_s(frozen_us)
+    assert [frames.clock.has_clock] == [False]
