@@ -1,1 +1,1 @@
-"""The outputs: one contract, one module or package each."""
+"""The outputs: one contract for all, and a module or package for each."""

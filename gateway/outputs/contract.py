@@ -1,8 +1,8 @@
 """The contract between the gateway and its outputs; tests/contract/ holds every output to it.
 
 The core is ``start``, ``publisher``, ``health`` and ``close``. Everything else is an optional ability: a
-method or an attribute with a default that does nothing. An output overrides what it can do, and no caller
-asks for its class.
+method or an attribute with a default that does nothing. An output overrides the abilities that it has. No
+caller checks the class of an output.
 """
 
 from abc import ABC, abstractmethod
@@ -26,17 +26,17 @@ class Publisher(Protocol):
 
     @property
     def wanted(self) -> bool:
-        """Whether anybody may be subscribed; always True where the output cannot know."""
+        """Whether there may be a subscriber; always True if the output cannot know."""
 
     def publish(self, message: bytes) -> None:
-        """Send one message without blocking, whatever the peer does.
+        """Send one message without blocking, whatever the peers do.
 
-        Raises OutputError if the output does not take it. That message is lost; the next may be sent
-        as before.
+        Raises OutputError if the output does not accept it. Then this message is lost, but the next one may
+        be sent as usual.
         """
 
     def close(self) -> None:
-        """Close the publisher. Messages published later raise OutputError."""
+        """Close the publisher. After that, ``publish`` raises OutputError."""
 
 
 class FramePublisher(Protocol):
@@ -44,14 +44,14 @@ class FramePublisher(Protocol):
 
     @property
     def wanted(self) -> bool:
-        """Whether anybody may be subscribed; always True where the output cannot know."""
+        """Whether there may be a subscriber; always True if the output cannot know."""
 
     def publish(
         self, frame: Frame, stamp: Stamp, sequence: int, components: frozenset[ComponentType]
     ) -> None:
         """Send the ``components`` of one frame without blocking.
 
-        ``sequence`` counts the frames of the source from 0. Raises OutputError if the output does not take
+        ``sequence`` counts the frames of the source from 0. Raises OutputError if the output does not accept
         the frame.
         """
 
@@ -60,7 +60,7 @@ class FramePublisher(Protocol):
 
 
 class Answer(NamedTuple):
-    """An answer to a peer: its bytes, their Zenoh encoding, and further facts (ages in s, names, session)."""
+    """An answer to a peer: its bytes, their encoding as named by Zenoh, and facts such as the age in s."""
 
     payload: bytes
     encoding: str
@@ -68,7 +68,7 @@ class Answer(NamedTuple):
 
 
 class ServerParameters(NamedTuple):
-    """A server's parameters (§6): its XML as received, the session it came in, and how old it is in s."""
+    """A server's parameters (§6): the XML as received, the number of its session, and its age in s."""
 
     xml: bytes
     session: int
@@ -76,7 +76,7 @@ class ServerParameters(NamedTuple):
 
 
 Command = Callable[[str, Mapping[str, str]], Awaitable[Answer]]
-"""An output's own command: takes the source's name and the options; raises QueryError."""
+"""A command of one output: takes the source's name and the options; raises QueryError."""
 
 
 class QueryService(Protocol):
@@ -86,54 +86,57 @@ class QueryService(Protocol):
         """Return whether the gateway has this source now."""
 
     def keys(self, source: str) -> list[KeyPath]:
-        """Return every key that a wildcard may select; commands and recording control are not among them."""
+        """Return every key that a wildcard may select; not those of commands and recording control."""
 
     def accepted_keys(self, source: str) -> str:
         """Return the keys that can be queried, as text for an error message."""
 
     async def answer(self, source: str, path: KeyPath, options: Mapping[str, str]) -> Answer:
-        """Return the answer to one key; raises QueryError."""
+        """Return the answer for one key; raises QueryError."""
 
     async def answer_all(
         self, source: str, paths: Sequence[KeyPath], options: Mapping[str, str]
     ) -> dict[KeyPath, Answer]:
-        """Return the answers to several keys, without the keys that have none.
+        """Return the answers for several keys, without the keys that have none.
 
-        Raises QueryError if none has one.
+        Raises QueryError if no key has one.
         """
 
     async def parameters(self, source: str, sections: Sequence[str], *, fresh: bool) -> ServerParameters:
-        """Return the parameters in some sections (§6), () for all; raises QueryError."""
+        """Return the parameters of some sections (§6); () means all. Raises QueryError.
+
+        With ``fresh``, accept no cached parameters older than ``fresh_interval_s``.
+        """
 
 
 class Output(ABC):
-    """A way out of the gateway.
+    """One destination of the gateway's messages, such as a Zenoh session or an LCM URL.
 
-    Only ``close`` may take long. Nothing here raises, except ``publish`` of publishers. An output that cannot
-    send keeps trying by itself, and ``health`` says in words what is wrong.
+    Only ``close`` may block. No method raises, except ``publish`` of the publishers. An output that cannot
+    send retries by itself, and ``health`` says what is wrong.
     """
 
     name: str
-    """The short name in the configuration, counters and logs: zenoh, lcm."""
+    """The name in the configuration, in counters and in logs: zenoh, lcm."""
 
     max_rate_hz: Mapping[ComponentType, float] = NO_LIMITS
-    """The highest rate of each component that is limited, in Hz."""
+    """The highest rate, in Hz, of each component that has a limit."""
 
     has_tool_poses: bool = False
-    """Whether each tool's pose is published on a topic of its own."""
+    """Whether to publish the pose of each tool on its own topic."""
 
     drop_causes: Sequence[str] = ()
-    """The causes of drops that are counted from 0 on in the metrics; others appear with their first drop."""
+    """The causes of drops that the metrics show from the start, as 0. Others appear with their first drop."""
 
     # The core.
 
     @abstractmethod
     def start(self) -> None:
-        """Start to open what the output sends through; return at once."""
+        """Start to open the connection, and return at once."""
 
     @abstractmethod
     def publisher(self, topic: Topic) -> Publisher:
-        """Return a new publisher of ``topic``, before or after the output is open."""
+        """Return a new publisher of ``topic``. The output need not be open yet."""
 
     @abstractmethod
     def health(self) -> OutputHealth:
@@ -141,28 +144,28 @@ class Output(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Close everything. Safe to call more than once, and in any state; called in a thread."""
+        """Close everything. Called in a thread; safe to call more than once and in any state."""
 
-    # Upkeep.
+    # Maintenance.
 
     def maintain(self) -> None:
-        """Do what is due; called once a second in the event loop, does not block."""
+        """Do periodic work without blocking. Called once a second in the event loop."""
 
     def is_configured_like(self, other: "Output") -> bool:
-        """Return whether ``other`` would behave the same, so that a reload can keep this one."""
+        """Return whether a reload can keep this output because ``other`` would behave the same."""
         return self is other
 
     def drops(self, source: str) -> Mapping[str, int]:
-        """Return how many requests about ``source`` the output dropped by itself, by cause."""
+        """Return the number of requests about ``source`` that the output dropped itself, by cause."""
         return {}
 
     # Liveliness.
 
     def announce(self, source: str) -> None:
-        """Serve ``source`` from now on, and show it to peers, until ``withdraw``."""
+        """Start to serve ``source`` and show it to peers, until ``withdraw``."""
 
     def withdraw(self, source: str) -> None:
-        """Serve ``source`` no longer."""
+        """Stop serving ``source``."""
 
     def show_streaming(self, source: str, is_streaming: bool) -> None:
         """Show peers whether frames of ``source`` arrive."""
@@ -173,28 +176,28 @@ class Output(ABC):
         """Return a publisher of whole frames of ``source``; None if the output takes single components."""
         return None
 
-    # What the server sends besides frames.
+    # Parameters and files from the server.
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
-        """Publish the parameters of a source's server; called for every connection and every change."""
+        """Publish the parameters of a source's server. Called for every connection and every change."""
 
     def announce_file(self, source: str, description: Mapping[str, Any]) -> None:
-        """Announce a C3D file that the server sent: its name and bytes."""
+        """Announce a C3D file that the server sent: ``name``, and ``bytes``, its size."""
 
     # Queries of peers.
 
     def serve_queries(self, service: QueryService) -> None:
-        """Answer queries of peers by ``service``; called once, before ``start``."""
+        """Start to answer queries of peers with ``service``. Called once, before ``start``."""
 
     async def stop_queries(self) -> None:
-        """Stop answering queries; called before ``close``."""
+        """Stop answering queries. Called before ``close``."""
 
     @property
     def query_results(self) -> Mapping[str, int] | None:
-        """How many queries were answered with ok, or with which error; None if the output answers none."""
+        """The number of queries by result, ok or the code of the error; None if the output answers none."""
         return None
 
     @property
     def commands(self) -> Mapping[str, Command]:
-        """The output's own commands, which peers call as keys below PREFIX/SOURCE/, by name."""
+        """The output's own commands by name. Peers call them as keys below PREFIX/SOURCE/."""
         return {}

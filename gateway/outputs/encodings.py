@@ -1,4 +1,4 @@
-"""The encodings of answers to peers, as Zenoh names them, and JSON for them."""
+"""The encodings of messages and answers, as Zenoh names them, and a JSON encoder for answers."""
 
 import json
 from typing import Any, Final
@@ -12,5 +12,5 @@ LCM: Final = "application/x-lcm"
 
 
 def json_bytes(value: Any) -> bytes:
-    """Return ``value`` as compact JSON in UTF-8; raises ValueError for numbers that JSON lacks."""
+    """Return ``value`` as compact JSON in UTF-8. Raises ValueError for NaN and infinity."""
     return json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()

@@ -1,7 +1,7 @@
-"""An output as the registry describes it: its name, its settings, how to build it, and its tools.
+"""The description of an output in the registry: its name, its settings, and functions for it.
 
-The tools are for the command line: subscribing (``echo``), diagnosis (``doctor``) and the demo. An output
-without one of them is left out there.
+The optional functions are for the commands ``echo``, ``doctor`` and ``demo``. An output without the function
+is left out of that command.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,22 +13,22 @@ from gateway.findings import Finding, MessageLoad
 from gateway.outputs.contract import Output
 
 Receive = Callable[[str, bytes], None]
-"""Called with the key or channel and the message, from a thread of the subscription's own."""
+"""Takes the key or channel, and the message. Called in a thread of the subscription."""
 
 
 OPENS: Final = "opens"
-"""The check that any output has."""
+"""The check of an output without checks of its own: does it open?"""
 
 
 class Subscription(Protocol):
-    """A subscriber of what a gateway publishes."""
+    """A subscriber of a gateway's messages."""
 
     def close(self) -> None:
         """Unsubscribe and end the thread that receives."""
 
 
 class SubscriptionRequest(NamedTuple):
-    """What to subscribe to, and where; None stands for the default, or for all."""
+    """What to subscribe to, and where. None means all sources or components, or the default."""
 
     source: str | None = None
     component: str | None = None
@@ -37,33 +37,33 @@ class SubscriptionRequest(NamedTuple):
 
 
 class DemoSide(NamedTuple):
-    """One output in the demo: its settings, the output, and a subscriber of it on this machine."""
+    """One output in the demo: its settings, the output, and a function that subscribes to it locally."""
 
     settings: OutputSettings
     output: Output
     subscribe: Callable[[str, Receive], Subscription]
-    """Takes the source's name; called once the output is open; raises OutputError."""
+    """Takes the source's name. Called after the output has opened. Raises OutputError."""
 
 
 @dataclass(frozen=True)
 class OutputKind:
-    """One entry of the registry; ``settings`` is the model of its section, which ``create`` takes."""
+    """One entry of the registry. ``settings`` is the model of its section, ``create`` takes an instance."""
 
     name: str
     settings: type[OutputSettings]
     create: Callable[[Any], Output]
 
     subscribe: Callable[[SubscriptionRequest, Receive], Subscription] | None = None
-    """Subscribes to what a gateway publishes; raises OutputError."""
+    """Subscribes to a gateway's messages. Raises OutputError."""
 
     checks: Sequence[str] = (OPENS,)
-    """The names of the doctor's checks, in their order."""
+    """The names of the doctor's checks, in order."""
 
     run_checks: Callable[[Any, Sequence[str], Sequence[MessageLoad], float], list[Finding]] | None = None
-    """Runs ``checks``, given settings, names of sources, loads and seconds to wait; it may block.
+    """Runs ``checks``. Takes the settings, the sources' names, loads and the seconds to wait. May block.
 
-    Without it, the doctor checks that the output opens.
+    If it is None, the doctor checks that the output opens.
     """
 
     demo: Callable[[bool], DemoSide] | None = None
-    """Takes whether to use the real network; raises OutputError."""
+    """Builds the output for the demo. Takes whether to use the network. Raises OutputError."""

@@ -1,4 +1,4 @@
-"""An output that keeps messages in memory, for tests and benchmarks."""
+"""An output that stores messages in memory, for tests and benchmarks."""
 
 from collections import deque
 
@@ -9,7 +9,7 @@ from gateway.outputs.status import OutputHealth
 
 
 class MemoryPublisher:
-    """Appends the messages of one topic to its output's list."""
+    """Appends the messages of one topic to ``MemoryOutput.messages``."""
 
     def __init__(self, output: "MemoryOutput", topic: Topic) -> None:
         self._output = output
@@ -22,7 +22,7 @@ class MemoryPublisher:
         return self._output.has_subscriber
 
     def publish(self, message: bytes) -> None:
-        """Keep ``message``; raises OutputError while the output is not open."""
+        """Store ``message``. Raises OutputError if the publisher is closed or the output is not open."""
         if self._is_closed:
             raise OutputError(f"{self._topic} is closed; ask for a new publisher", cause="closed")
         if not self._output.is_open:
@@ -35,13 +35,13 @@ class MemoryPublisher:
 
 
 class MemoryOutput(Output):
-    """Keeps the newest ``capacity`` messages, as (topic, message), in ``messages``."""
+    """Stores the newest ``capacity`` messages, as (topic, message), in ``messages``."""
 
     name = "memory"
 
     def __init__(self, capacity: int = 100_000) -> None:
         self.has_subscriber = True
-        """Whether somebody is subscribed, as publishers report it."""
+        """Whether publishers report a subscriber."""
         self.messages: deque[tuple[Topic, bytes]] = deque(maxlen=capacity)
         self.announced: set[str] = set()
         self.streaming: set[str] = set()
@@ -56,15 +56,15 @@ class MemoryOutput(Output):
         return MemoryPublisher(self, topic)
 
     def announce(self, source: str) -> None:
-        """Note that ``source`` is served."""
+        """Add ``source`` to ``announced``."""
         self.announced.add(source)
 
     def withdraw(self, source: str) -> None:
-        """Note that ``source`` is no longer served."""
+        """Remove ``source`` from ``announced``."""
         self.announced.discard(source)
 
     def show_streaming(self, source: str, is_streaming: bool) -> None:
-        """Note whether frames of ``source`` arrive."""
+        """Add ``source`` to ``streaming``, or remove it."""
         if is_streaming:
             self.streaming.add(source)
         else:
@@ -75,5 +75,5 @@ class MemoryOutput(Output):
         return OutputHealth(self.is_open, "" if self.is_open else "memory output is not open; start it")
 
     def close(self) -> None:
-        """Close the output; the messages stay readable."""
+        """Close the output. The messages stay readable."""
         self.is_open = False

@@ -1,4 +1,4 @@
-"""The registry of outputs: everything that lists outputs reads it. To add an output, add its line."""
+"""The registry of outputs. All code that lists outputs reads it. To add an output, add it to OUTPUTS."""
 
 from typing import Final
 
@@ -17,5 +17,5 @@ def settings_type() -> type[Settings]:
 
 
 def build_outputs(settings: Settings) -> list[Output]:
-    """Return the outputs that are enabled; raises ConfigError if one refuses its configuration."""
+    """Return the enabled outputs. Raises ConfigError if an output rejects its settings."""
     return [OUTPUTS[name].create(section) for name, section in settings.outputs.items() if section.enabled]

@@ -1,4 +1,4 @@
-"""How an output is doing: its counters for one source, and whether it can send."""
+"""The status of an output: its counters for one source, and whether it can send."""
 
 from collections import Counter
 from dataclasses import dataclass, field
@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 @dataclass
 class OutputStatus:
-    """What one output did for one source: messages and their bytes by component, and drops by cause."""
+    """The counters of one output for one source: messages and their bytes by component, drops by cause."""
 
     name: str
     messages: Counter[str] = field(default_factory=Counter)

@@ -10,7 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 from gateway.config.settings import ReconnectSettings, Settings, SourceSettings, StreamSettings
 from gateway.errors import ConfigError
 from gateway.messages import topics
-from gateway.outputs.lcm.settings import LCM_PROVIDERS, LcmSettings
+from gateway.outputs.lcm.settings import LCM_SCHEMES, LcmSettings
 from gateway.outputs.zenoh.settings import KeyPrefix, ZenohSettings
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
@@ -115,7 +115,7 @@ SETTINGS = st.builds(
         LcmSettings,
         enabled=st.booleans(),
         prefix=st.from_regex(r"\A[A-Za-z0-9_]{1,16}\Z"),
-        url=st.none() | st.sampled_from([f"{provider}://" for provider in LCM_PROVIDERS]),
+        url=st.none() | st.sampled_from([f"{scheme}://" for scheme in LCM_SCHEMES]),
         tool_poses=st.booleans(),
     ),
 )

@@ -1,4 +1,4 @@
-"""Checks of LCM: the route of multicast, and the size of a subscriber's receive buffer."""
+"""The doctor's checks of LCM: the multicast route, and the size of a subscriber's receive buffer."""
 
 import socket
 from collections.abc import Sequence
@@ -97,7 +97,7 @@ def receive_buffer_bytes(requested: int | None) -> int:
 
 
 def charged_bytes(message_bytes: int) -> int:
-    """Return an upper bound of what a message takes from a receive buffer.
+    """Return an upper bound of the bytes that a message occupies in a receive buffer.
 
     Linux counts the memory allocated for a datagram: the next power of two above its size and headers,
     plus 256. Measured on loopback: 1280 for 200 bytes, 2304 for 1500, 16640 for 8000.

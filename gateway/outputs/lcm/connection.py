@@ -1,4 +1,4 @@
-"""Opening LCM, and why it does not open, in words."""
+"""Opening LCM, and explaining failures to open and to send."""
 
 import ipaddress
 import socket
@@ -11,18 +11,18 @@ from gateway.errors import OutputError
 
 MULTICAST_SCHEMES: Final = ("udpm", "mpudpm")
 BLOCKING_SCHEMES: Final = ("tcpq", "file")
-"""Providers that open and publish synchronously: a peer or disk that stalls blocks the caller."""
+"""Schemes that open and publish synchronously: a peer or disk that stalls blocks the caller."""
 
 
 def scheme_of(url: str) -> str:
-    """Return the provider of an LCM URL: udpm, tcpq, …."""
+    """Return the scheme of an LCM URL, which selects how LCM sends: udpm, tcpq, …"""
     return urlsplit(url).scheme
 
 
 def multicast_problem(url: str) -> str:
-    """Return why datagrams to a multicast URL would not leave this machine; "" if they would.
+    """Return why the system cannot send to a multicast URL, and what to do; "" if it can.
 
-    LCM reports it on C's stderr only and raises a bare RuntimeError, so this checks it first.
+    LCM itself only prints the reason to stderr and raises RuntimeError without it.
     """
     parts = urlsplit(url)
     if parts.scheme not in MULTICAST_SCHEMES:
@@ -30,7 +30,7 @@ def multicast_problem(url: str) -> str:
     try:
         group, port = str(ipaddress.IPv4Address(parts.hostname or "239.255.76.67")), parts.port or 7667
     except ValueError:
-        return ""  # not an address: LCM itself refuses it
+        return ""  # not an address: LCM itself rejects it
     try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
             probe.connect((group, port))
@@ -43,9 +43,9 @@ def multicast_problem(url: str) -> str:
 
 
 def open_lcm(url: str) -> lcm.LCM:
-    """Return an LCM object on ``url``; raises OutputError with the reason and the remedy.
+    """Return an LCM object on ``url``. Raises OutputError with the reason and the remedy.
 
-    Blocks for BLOCKING_SCHEMES.
+    Blocks if the scheme is in BLOCKING_SCHEMES.
     """
     problem = multicast_problem(url)
     if problem:

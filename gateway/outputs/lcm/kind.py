@@ -11,14 +11,14 @@ from gateway.outputs.lcm.subscriber import LcmSubscriber, channel_pattern, subsc
 
 
 def _demo(use_network: bool) -> DemoSide:
-    """Return the LCM side of the demo: in memory, or on multicast with ``use_network``."""
+    """Return LCM for the demo: in memory, or on multicast with ``use_network``."""
     settings = LcmSettings(url=None if use_network else "memq://")
     subscriber_lcm = open_lcm(settings.effective_url)
 
     def subscribe_here(source: str, receive: Receive) -> Subscription:
         return LcmSubscriber(subscriber_lcm, channel_pattern(settings.prefix, source, None), receive)
 
-    # memq:// reaches nobody but the same object, so the output and the subscriber share it.
+    # memq:// connects only users of one LCM object, so the output and the subscriber share it.
     output = LcmOutput(settings, None if use_network else subscriber_lcm)
     return DemoSide(settings, output, subscribe_here)
 

@@ -16,7 +16,10 @@ from gateway.outputs.status import OutputHealth
 
 
 class LcmOutput(Output):
-    """One LCM URL. ``shared`` is an LCM object that exists already, because memq:// reaches no other."""
+    """Publishes on one LCM URL.
+
+    ``shared`` is an existing LCM object to use, because memq:// connects only users of one object.
+    """
 
     name = "lcm"
     drop_causes = ("not open", "send failed")
@@ -39,11 +42,11 @@ class LcmOutput(Output):
             self._queries.start()
 
     def start(self) -> None:
-        """Open LCM; what fails is tried again."""
+        """Open LCM, with retries."""
         self._sender.open()
 
     def publisher(self, topic: Topic) -> LcmPublisher:
-        """Return a new publisher of ``topic`` on a channel that no other publisher of this output has."""
+        """Return a new publisher of ``topic`` on a channel that no other publisher of this output uses."""
         name = lcm_channel(self.settings.prefix, topic.source, *topic.path)
         channel = unique_name(name, self._channels)
         self._channels.add(channel)
@@ -53,11 +56,11 @@ class LcmOutput(Output):
         self._channels.discard(publisher.channel)
 
     def health(self) -> OutputHealth:
-        """Return whether the last message could be sent."""
+        """Return whether LCM is open and the last message was sent."""
         return OutputHealth(not self._sender.problem, self._sender.problem)
 
     def maintain(self) -> None:
-        """Open LCM if it is not open and the last attempt is a while ago; repeat parameters that are due."""
+        """Retry to open LCM if it is time, and publish parameters again that are due."""
         self._sender.maintain()
         if self._queries is not None:
             self._queries.maintain()
@@ -67,21 +70,21 @@ class LcmOutput(Output):
         return isinstance(other, LcmOutput) and self.settings == other.settings
 
     def drops(self, source: str) -> Mapping[str, int]:
-        """Return how many requests about ``source`` were ignored, by cause."""
+        """Return the number of ignored requests about ``source`` by cause."""
         return {} if self._queries is None else self._queries.ignored(source)
 
     def announce(self, source: str) -> None:
-        """Answer requests about ``source``; its status messages show that the gateway serves it."""
+        """Answer requests about ``source``. LCM has no liveliness; status messages show the gateway."""
         if self._queries is not None:
             self._queries.add(source)
 
     def withdraw(self, source: str) -> None:
-        """Answer no more requests about ``source``."""
+        """Stop answering requests about ``source``."""
         if self._queries is not None:
             self._queries.remove(source)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
-        """Publish the XML as ``parameters_t``, now and again every few seconds."""
+        """Publish the XML as ``parameters_t``, now and every few seconds."""
         if self._queries is not None:
             self._queries.publish_parameters(source, parameters)
 
@@ -91,13 +94,13 @@ class LcmOutput(Output):
         self._queries = LcmQueries(self.settings, service, loop, self._sender, self._shared)
 
     async def stop_queries(self) -> None:
-        """Stop listening; requests being answered get no reply."""
+        """Stop receiving requests. Pending requests get no reply."""
         if self._queries is not None:
             await self._queries.close()
 
     @property
     def query_results(self) -> Mapping[str, int] | None:
-        """See Output."""
+        """The number of requests by result; None before ``serve_queries``."""
         return None if self._queries is None else self._queries.results
 
     def close(self) -> None:

@@ -1,6 +1,6 @@
-"""Requests that arrive on LCM, as parameters_request_t; and parameters published unasked, as parameters_t.
+"""Requests from LCM (parameters_request_t) and their replies, and the parameters that the gateway publishes.
 
-LCM is open to everybody on the network and knows no flow control: requests wait in a bounded queue, and
+Anybody on the network can send on LCM, and LCM has no flow control. So requests wait in a bounded queue, and
 malformed ones are counted and ignored.
 """
 
@@ -26,7 +26,7 @@ from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.thread_sender import LcmThreadSender
 
 MAX_PENDING: Final = 64
-"""How many requests are answered at once; further ones are dropped and counted."""
+"""The maximum number of requests in progress. Further ones are dropped and counted."""
 
 MAX_REQUEST_BYTES: Final = 4096
 MAX_REQUESTER_BYTES: Final = 128
@@ -34,7 +34,7 @@ REPEAT_S: Final = 5.0
 """How often the parameters are published again, for late subscribers."""
 
 _MALFORMED: Final = "malformed request"
-_BEYOND: Final = "request beyond the queue"
+_QUEUE_FULL: Final = "request beyond the queue"
 """The causes under which ignored requests are counted."""
 
 _POLL_MS: Final = 100
@@ -52,10 +52,11 @@ class _Publication:
 
 
 class LcmQueries:
-    """Answers requests on the channels of ``settings.prefix`` by ``service``.
+    """Answers requests on the channels of ``settings.prefix`` with ``service``.
 
-    ``sender`` publishes parameters. Requests arrive, and replies leave, on ``queries_url``: a thread of this
-    object receives there. With a ``shared`` LCM object, as with memq://, its owner handles what arrives.
+    ``sender`` publishes parameters. Requests and replies use ``queries_url``, where a thread of this object
+    receives. If ``queries_url`` is the output's own URL and there is a ``shared`` LCM object (memq://), the
+    owner of that object receives instead.
     """
 
     def __init__(
@@ -79,7 +80,7 @@ class LcmQueries:
         self._thread = threading.Thread(target=self._receive, name="lcm-requests", daemon=True)
         self._closing = threading.Event()
         self._opening = FailureLog(logger, "lcm")
-        self._free = threading.BoundedSemaphore(MAX_PENDING)  # acquired in the receiving thread
+        self._free_slots = threading.BoundedSemaphore(MAX_PENDING)  # acquired in the receiving thread
         self._ignored: dict[str, Counter[str]] = defaultdict(
             Counter
         )  # by source; the receiving thread counts
@@ -95,7 +96,7 @@ class LcmQueries:
         return LcmSender(url, None, lambda: None)
 
     def start(self) -> None:
-        """Listen for requests; called in any thread once the output is open."""
+        """Receive requests. Called in any thread, after the output has opened."""
         if self._shared is not None:
             self._subscribe(self._shared)
         else:
@@ -108,17 +109,16 @@ class LcmQueries:
             self._subscribe(self._shared)
 
     def remove(self, source: str) -> None:
-        """Answer no more requests about a source.
+        """Stop publishing a source's parameters; ``service`` no longer serves requests about it.
 
-        Its subscription stays, because LCM's Python module frees one at once though the receiving thread may
-        be using it.
+        Its subscription stays: LCM's Python module would free it while the receiving thread may be using it.
         """
         self._publications.pop(source, None)
 
     def ignored(self, source: str) -> dict[str, int]:
-        """Return how many requests about ``source`` were ignored, by cause."""
+        """Return the number of ignored requests about ``source`` by cause."""
         counts = self._ignored.get(source, Counter())
-        return {cause: counts[cause] for cause in (_MALFORMED, _BEYOND) if counts[cause]}
+        return {cause: counts[cause] for cause in (_MALFORMED, _QUEUE_FULL) if counts[cause]}
 
     # In the receiving thread.
 
@@ -133,7 +133,7 @@ class LcmQueries:
                 self._closing.wait(_POLL_MS / 1000)
 
     def _open(self) -> lcm.LCM | None:
-        """Return the LCM object that receives requests; None if ``close`` was called first."""
+        """Return the LCM object that receives requests, with retries; None if ``close`` is called first."""
         while not self._closing.is_set():
             try:
                 connection = open_lcm(self._url)
@@ -149,7 +149,7 @@ class LcmQueries:
         return None
 
     def _subscribe(self, connection: lcm.LCM) -> None:
-        """Subscribe to the requests about sources that are new."""
+        """Subscribe to requests about the sources that are new."""
         for source in self._sources.copy() - self._subscriptions.keys():
             channel = lcm_channel(self._prefix, source, "PARAMETERS_REQUEST")
             subscription = connection.subscribe(f"^{channel}$", self._handler(source))
@@ -160,12 +160,12 @@ class LcmQueries:
         return lambda _channel, data: self._take(source, data)
 
     def _take(self, source: str, data: bytes) -> None:
-        """Check a request and hand it to the event loop."""
+        """Check a request and pass it to the event loop."""
         request = _decoded(data)
         if request is None:
             self._ignored[source][_MALFORMED] += 1
-        elif not self._free.acquire(blocking=False):
-            self._ignored[source][_BEYOND] += 1
+        elif not self._free_slots.acquire(blocking=False):
+            self._ignored[source][_QUEUE_FULL] += 1
         else:
             with contextlib.suppress(RuntimeError):  # the loop has just ended
                 self._loop.call_soon_threadsafe(self._start_answer, source, request)
@@ -174,7 +174,7 @@ class LcmQueries:
 
     def _start_answer(self, source: str, request: Any) -> None:
         if not self._service.serves(source):
-            self._free.release()
+            self._free_slots.release()
             return
         with log_fields(source=source):
             task = asyncio.create_task(self._answer(source, request))
@@ -194,12 +194,12 @@ class LcmQueries:
         else:
             reply.xml, reply.age_s = _text(parameters.xml), parameters.age_s
         finally:
-            self._free.release()  # before the reply leaves: its receiver may ask again at once
+            self._free_slots.release()  # before the reply is sent: its receiver may ask again at once
         self.results[reply.error_code or "ok"] += 1
         self._publish(self._reply_sender, source, "PARAMETERS_REPLY", reply)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
-        """Publish a source's parameters, now and again every REPEAT_S seconds."""
+        """Publish a source's parameters, now and every REPEAT_S seconds."""
         publication = self._publications.setdefault(source, _Publication())
         publication.message.xml = _text(parameters.xml)
         publication.message.capture_utime = now_utime()
@@ -207,7 +207,7 @@ class LcmQueries:
         self._publish_again(source, publication)
 
     def maintain(self) -> None:
-        """Publish the parameters that are due again; called once a second."""
+        """Publish the parameters again that are due. Called once a second."""
         if self._reply_sender is not self._sender:
             self._reply_sender.maintain()
         for source, publication in self._publications.items():
@@ -227,7 +227,7 @@ class LcmQueries:
             logger.debug("%s: %s not sent on LCM: %s", source, name, error)
 
     async def close(self) -> None:
-        """Stop listening; requests being answered get no reply."""
+        """Stop receiving requests. Pending requests get no reply."""
         self._closing.set()
         for task in self._tasks:
             task.cancel()
@@ -242,7 +242,7 @@ class LcmQueries:
 
 
 def _decoded(data: bytes) -> Any | None:
-    """Return a ``parameters_request_t``; None for bytes that are none, or too many."""
+    """Return ``data`` as a ``parameters_request_t``; None if it is not one, or too long."""
     if len(data) > MAX_REQUEST_BYTES:
         return None
     try:
@@ -253,7 +253,7 @@ def _decoded(data: bytes) -> Any | None:
 
 
 def _text(xml: bytes) -> str:
-    """Return XML as text: UTF-8, else Latin-1, without the NULs at its end (field note 9)."""
+    """Return XML as text (UTF-8, otherwise Latin-1), without the NULs at its end (field note 9)."""
     body = xml.rstrip(b"\0")
     try:
         return body.decode()

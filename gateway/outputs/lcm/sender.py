@@ -1,4 +1,4 @@
-"""Sending on LCM from the event loop: what every message goes through."""
+"""Sending on LCM from the event loop."""
 
 import logging
 import time
@@ -22,10 +22,10 @@ logger = logging.getLogger(__name__)
 
 
 class LcmSender:
-    """One LCM object that publishes without blocking: multicast, or in memory.
+    """One LCM object for the schemes that publish without blocking: multicast, or in memory.
 
-    ``shared`` is an LCM object that exists already, because memq:// reaches no other. ``on_open`` is called
-    once it is open.
+    ``shared`` is an existing LCM object to use, because memq:// connects only users of one object.
+    ``on_open`` is called after LCM has opened.
     """
 
     def __init__(self, url: str, shared: lcm.LCM | None, on_open: Callable[[], None]) -> None:
@@ -40,7 +40,7 @@ class LcmSender:
         self._sending = FailureLog(logger, "lcm", HOLD_S)
 
     def open(self) -> None:
-        """Open LCM; ``maintain`` repeats what fails."""
+        """Open LCM. If this fails, ``maintain`` tries again."""
         try:
             self._lcm = self._shared or open_lcm(self._url)
         except OutputError as error:
@@ -53,7 +53,7 @@ class LcmSender:
             self._on_open()
 
     def send(self, channel: str, message: bytes) -> None:
-        """Publish on ``channel``; raises OutputError if it failed. The next message is tried again."""
+        """Publish on ``channel``. Raises OutputError on failure; the next message may succeed."""
         if self._lcm is None:
             raise OutputError(self.problem, cause="not open")
         try:
@@ -67,12 +67,12 @@ class LcmSender:
             self._sending.recovered(f"sending to {self._url}")
 
     def maintain(self) -> None:
-        """Open LCM again if it is not open and the last attempt was RETRY_S ago."""
+        """Try to open LCM again, RETRY_S after an attempt that failed."""
         if self._lcm is None and time.monotonic() >= self._retry_at_s:
             self.open()
 
     def close(self) -> None:
-        """Release LCM: it has no close, deleting the object frees its sockets and thread."""
+        """Release LCM. It has no close(): deleting the object frees its sockets and its thread."""
         self._lcm = None
         self.problem = CLOSED
         self._retry_at_s = _NEVER
@@ -92,7 +92,7 @@ class LcmPublisher:
         self._is_closed = False
 
     def publish(self, message: bytes) -> None:
-        """Send one message; raises OutputError if LCM did not take it."""
+        """Send one message. Raises OutputError if LCM does not accept it."""
         if self._is_closed:
             raise OutputError(
                 f"LCM channel {self.channel} is closed; ask for a new publisher", cause="closed"

@@ -13,13 +13,13 @@ from gateway.config.values import MaxRates, Switch
 DEFAULT_LCM_URL: Final = "udpm://239.255.76.67:7667?ttl=0"
 """LCM's own default, which stays on this host."""
 
-LCM_PROVIDERS: Final = ("udpm", "mpudpm", "memq", "tcpq", "file")
-"""The URL schemes that the lcm package knows."""
+LCM_SCHEMES: Final = ("udpm", "mpudpm", "memq", "tcpq", "file")
+"""The URL schemes that the lcm package supports."""
 
 
 def _lcm_url(text: str) -> str:
-    provider, separator, rest = text.partition("://")
-    if provider not in LCM_PROVIDERS or not separator or not text.isprintable() or " " in text:
+    scheme, separator, rest = text.partition("://")
+    if scheme not in LCM_SCHEMES or not separator or not text.isprintable() or " " in text:
         raise ValueError
     if "@" in rest.partition("/")[0]:  # LCM has no passwords, and logs the whole URL
         raise ValueError
@@ -35,8 +35,7 @@ LcmUrl = Annotated[
     str,
     AfterValidator(_lcm_url),
     expects(
-        f"a URL that begins with {join_or(f'{provider}://' for provider in LCM_PROVIDERS)}, "
-        "without a user name"
+        f"a URL that begins with {join_or(f'{scheme}://' for scheme in LCM_SCHEMES)}, without a user name"
     ),
 ]
 
@@ -53,7 +52,7 @@ def lcm_queries_url(url: str) -> str:
     """Return the default URL of requests: ``url``, with the next port if it is a multicast URL.
 
     A program that listens on a multicast URL receives everything that is sent there. On ``url`` itself, the
-    gateway would receive its own messages, which more than doubles what LCM costs it. The other providers
+    gateway would receive its own messages, which more than doubles the CPU time for LCM. The other schemes
     deliver only messages on subscribed channels.
     """
     parts = urlsplit(url)

@@ -1,4 +1,4 @@
-"""Subscribing on LCM to what a gateway publishes: for ``echo``, the demo and tests."""
+"""Subscribing to a gateway's messages on LCM, for ``echo``, the demo and tests."""
 
 import re
 import threading
@@ -14,13 +14,13 @@ from gateway.outputs.lcm.settings import effective_lcm_url
 DEFAULT_PREFIX: Final = "MOCAP"
 
 QUEUE_MESSAGES: Final = 10_000
-"""LCM's own default of 30 messages loses some whenever this process pauses for a moment."""
+"""With LCM's own default, 30, messages are lost whenever this process pauses for a moment."""
 
 _POLL_MS: Final = 100
 
 
 def channel_pattern(prefix: str, source: str | None, component: str | None) -> str:
-    """Return the regular expression of the channels; None stands for all sources or components."""
+    """Return the regular expression of the channels. None means all sources, or all components."""
     if source is not None and component is not None:
         return re.escape(lcm_channel(prefix, source, component))
     if source is not None:
@@ -29,7 +29,7 @@ def channel_pattern(prefix: str, source: str | None, component: str | None) -> s
 
 
 class LcmSubscriber:
-    """Subscribes to ``channels``, a regular expression, and receives in a thread of its own."""
+    """Subscribes to ``channels``, a regular expression, and receives messages in its own thread."""
 
     def __init__(self, connection: lcm.LCM, channels: str, receive: Receive) -> None:
         self._lcm = connection
@@ -51,6 +51,6 @@ class LcmSubscriber:
 
 
 def subscribe(request: SubscriptionRequest, receive: Receive) -> LcmSubscriber:
-    """Subscribe on a new LCM object; ``request.address`` is its URL. Raises OutputError."""
+    """Subscribe with a new LCM object; ``request.address`` is its URL. Raises OutputError."""
     channels = channel_pattern(request.prefix or DEFAULT_PREFIX, request.source, request.component)
     return LcmSubscriber(open_lcm(effective_lcm_url(request.address)), channels, receive)

@@ -1,4 +1,4 @@
-"""Sending on LCM from a thread, for the providers that block: tcpq and file."""
+"""Sending on LCM from a thread, for the schemes that block: tcpq and file."""
 
 import logging
 import threading
@@ -15,7 +15,7 @@ from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN, RETRY_S
 
 MAX_QUEUED_BYTES: Final = 8 * 1024 * 1024
 MAX_QUEUED_MESSAGES: Final = 10_000
-"""What may wait for the peer; further messages are refused, and counted as "queue full"."""
+"""The limits of the queue. Further messages are dropped and counted as "queue full"."""
 
 _JOIN_S: Final = 0.5
 
@@ -23,10 +23,10 @@ logger = logging.getLogger(__name__)
 
 
 class LcmThreadSender:
-    """Opens LCM and publishes in a thread, through a bounded queue. Its methods are those of LcmSender.
+    """Opens LCM and publishes in a thread, from a bounded queue. It has the methods of LcmSender.
 
-    A peer that accepts the connection and then never reads blocks that thread only. ``on_open`` is called in
-    it.
+    A peer that accepts the connection but never reads blocks only this thread. ``on_open`` is called in the
+    thread after LCM has opened.
     """
 
     def __init__(self, url: str, on_open: Callable[[], None]) -> None:
@@ -45,11 +45,11 @@ class LcmThreadSender:
         self._queueing = FailureLog(logger, "lcm", HOLD_S)
 
     def open(self) -> None:
-        """Start the thread, which opens LCM, again and again until it opens or ``close`` is called."""
+        """Start the thread, which opens LCM and retries until it succeeds or ``close`` is called."""
         self._thread.start()
 
     def send(self, channel: str, message: bytes) -> None:
-        """Queue a message; raises OutputError if LCM is not open or the queue is full."""
+        """Queue a message. Raises OutputError if LCM is not open or the queue is full."""
         if self._lcm is None:
             raise OutputError(self.problem, cause="not open")
         with self._changed:
@@ -75,8 +75,8 @@ class LcmThreadSender:
         """Do nothing: the thread retries by itself."""
 
     def close(self) -> None:
-        """Send what is queued and end the thread; one that a peer blocks is left alone after a moment."""
-        self._lcm = None  # refuses further messages
+        """Send the queued messages and end the thread. If a peer blocks it, wait only for _JOIN_S."""
+        self._lcm = None  # send() now raises
         self._closing.set()
         with self._changed:
             self._changed.notify()
@@ -99,7 +99,7 @@ class LcmThreadSender:
             self._publish(connection, channel, message)
 
     def _open(self) -> lcm.LCM | None:
-        """Return LCM once it is open; None if ``close`` was called first."""
+        """Return LCM after it has opened, with retries; None if ``close`` is called first."""
         while not self._closing.is_set():
             try:
                 connection = open_lcm(self._url)

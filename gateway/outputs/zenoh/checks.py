@@ -1,7 +1,7 @@
-"""Checks of Zenoh: whether a session opens and reaches other sessions, and whether a gateway is running.
+"""The doctor's checks of Zenoh: does a session open and reach others, and is a gateway running?
 
 The doctor's session uses the gateway's configuration but does not listen, because a running gateway may
-occupy the addresses. It connects to them instead.
+already use the addresses. It connects to them instead.
 """
 
 import json
@@ -34,7 +34,7 @@ _zenoh: Final = Subject("zenoh")
 def check_zenoh(
     settings: ZenohSettings, sources: Sequence[str], _loads: Sequence[MessageLoad], seconds: float
 ) -> list[Finding]:
-    """Check the session and find gateways that serve ``sources``. Blocks for ``seconds`` or a bit longer."""
+    """Check the session and find gateways that serve ``sources``. Blocks for about ``seconds``."""
     try:
         config = zenoh_config(settings.config)
     except ConfigError as error:
@@ -70,7 +70,7 @@ def check_zenoh(
 def _doctor_config(
     settings: ZenohSettings, mode: str, connect: list[str], listen: list[str], seconds: float
 ) -> zenoh.Config:
-    """Return the configuration of a session that connects to ``listen`` too instead of listening there."""
+    """Return the configuration of a session that also connects to ``listen`` instead of listening there."""
     config = zenoh_config(settings.config)
     config.insert_json5("listen/endpoints", "[]")
     timeout_ms = str(round(1000 * seconds))
@@ -111,7 +111,7 @@ def _flat(endpoints: Any) -> Iterator[str]:
 
 
 def _find_gateways(session: zenoh.Session, keys: dict[str, str], seconds: float) -> list[str]:
-    """Return the sources that a gateway serves. Waits for all of them, for ``seconds`` at most."""
+    """Return the sources that a gateway serves. Waits up to ``seconds`` until all are served."""
     deadline_s = time.monotonic() + seconds
     while True:
         served = [

@@ -1,4 +1,4 @@
-"""Zenoh's own configuration, and its error messages made readable."""
+"""Zenoh's own configuration, and readable texts of Zenoh's errors."""
 
 import json
 import re
@@ -14,23 +14,23 @@ from gateway.errors import ConfigError
 _ZENOH_MESSAGE: Final = re.compile(
     r'Message \{ msg: "((?:[^"\\]|\\.)*)", location: Some\(Location \{ line: (\d+), column: (\d+)'
 )
-"""How Zenoh reports a value in a file that it cannot use: a Rust debug text."""
+"""The Rust debug text by which Zenoh reports a value in a file that it cannot use."""
 
 _DEFAULTS: Final = {
     # 16 MB of /dev/shm, and files left behind after a kill, for messages of a few kB.
     "transport": {"shared_memory": {"enabled": False}},
     # Caches for late subscribers need samples with time stamps.
     "timestamping": {"enabled": True},
-    # A lost router is found again within half a second instead of up to 4 s.
+    # Reconnects to a lost router within 0.5 s instead of up to 4 s.
     "connect": {"retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}},
 }
 """The gateway's defaults where they differ from Zenoh's; an inline configuration overrides them."""
 
 
 def zenoh_config(config: Path | Mapping[str, Any]) -> zenoh.Config:
-    """Return Zenoh's configuration from a JSON5 file, as it stands, or from keys given inline.
+    """Return Zenoh's configuration from a JSON5 file, unchanged, or from inline keys over _DEFAULTS.
 
-    Raises ConfigError with Zenoh's own reason.
+    Raises ConfigError with Zenoh's reason.
     """
     try:
         if isinstance(config, Path):
@@ -58,10 +58,10 @@ def zenoh_reason(error: Exception) -> str:
     if message := _ZENOH_MESSAGE.search(text):
         text = f"line {message[2]}, column {message[3]}: " + re.sub(r"\\(.)", r"\1", message[1])
     text = re.sub(r"\s+at \S+\.rs:\d+\.?", "", text)
-    # A drawing shows the line of the file that cannot be read, which may hold a password: its place
-    # and what was expected remain. So does the type of a wrong value, without the value.
+    # Zenoh quotes the line that it cannot parse, which may contain a password. Keep only the position and
+    # what was expected. Of a value with the wrong type, keep the type, not the value.
     text = re.sub(r"^ *--> (\d+):(\d+)", r"line \1, column \2:", text)
     text = re.sub(r"^ *(\d+ )?\|.*\n|^ *= ", "", text, flags=re.MULTILINE)
     text = re.sub(r"(invalid (?:type|value): [a-z ]+) (?:`[^`]*`|\"(?:[^\"\\]|\\.)*\")", r"\1", text)
-    text = re.sub(r"\bSingle\(([^()]*)\)", r"\1", text)  # Rust's word for an endpoint without alternatives
+    text = re.sub(r"\bSingle\(([^()]*)\)", r"\1", text)  # how Rust prints an endpoint without alternatives
     return " ".join(mask_secrets_in_text(text).split())

@@ -11,7 +11,7 @@ from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_pattern, open_
 
 
 def _demo(_use_network: bool) -> DemoSide:
-    """Return the Zenoh side of the demo: loopback TCP without scouting, so nothing leaves the machine."""
+    """Return Zenoh for the demo: TCP on loopback without scouting, so that nothing leaves the machine."""
     with socket.create_server(("127.0.0.1", 0)) as probe:
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
     settings = ZenohSettings(

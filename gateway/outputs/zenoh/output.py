@@ -32,7 +32,7 @@ _JOIN_S: Final = 0.5
 _CLOSE_S: Final = 0.5
 """How long to wait for the session to close.
 
-A peer that does not read delays it by 10 s; then it goes on alone.
+A peer that does not read delays this by 10 s; then the session continues to close in its thread.
 """
 
 logger = logging.getLogger(__name__)
@@ -41,7 +41,7 @@ logger = logging.getLogger(__name__)
 class ZenohOutput(Output):
     """One Zenoh session and everything declared on it.
 
-    Raises ConfigError if Zenoh refuses the configuration.
+    Creating it raises ConfigError if Zenoh does not accept the configuration.
     """
 
     name = "zenoh"
@@ -54,9 +54,8 @@ class ZenohOutput(Output):
         self.config = zenoh_config(settings.config)
         self._is_client = json.loads(self.config.get_json("mode") or "null") == "client"
         self._link = ZenohLink(self._refusal)
-        self._lock = (
-            threading.Lock()
-        )  # of everything that _opener shares: session, publishers, tokens, queries
+        # Protects what the opening thread shares: session, publishers, tokens and queries.
+        self._lock = threading.Lock()
         self._session: zenoh.Session | None = None
         self._publishers: list[ZenohPublisher] = []
         # By the source's name; None while the session is not open.
@@ -77,11 +76,11 @@ class ZenohOutput(Output):
 
     @property
     def lacks_router(self) -> bool:
-        """Whether this is a client, which reaches others through a router only, without its router."""
+        """Whether this is a Zenoh client, which needs a router, and none is connected."""
         return self._is_client and self._num_transports == 0
 
     def start(self) -> None:
-        """Start to open the session, again and again until it opens or ``close`` is called."""
+        """Start the thread that opens the session and retries until it succeeds or ``close`` is called."""
         self._opener.start()
 
     def _open(self) -> None:
@@ -104,7 +103,7 @@ class ZenohOutput(Output):
             return
 
     def _declare_all(self, session: zenoh.Session) -> None:
-        """Declare on a new session everything that was asked for before it opened."""
+        """Declare on a new session everything that was requested before it opened."""
         for publisher in self._publishers:
             publisher.declare(session)
         for tokens, name in ((self._alive, "alive"), (self._streaming, "server")):
@@ -120,14 +119,14 @@ class ZenohOutput(Output):
         self._update_link()
 
     def _update_link(self) -> None:
-        """Note whether messages can leave; ``maintain`` repeats it, in case two threads did it at once."""
+        """Update whether messages can be sent. ``maintain`` repeats it, in case two threads do it at once."""
         self._link.is_cut_off = self._session is None or self.lacks_router
 
     def _token(self, session: zenoh.Session, source: str, name: str) -> zenoh.LivelinessToken:
         return session.liveliness().declare_token(zenoh_key(self.settings.prefix, source, name))
 
     def publisher(self, topic: Topic) -> ZenohPublisher:
-        """Return a new publisher of ``topic``; it sends as soon as the session is open."""
+        """Return a new publisher of ``topic``. It can send when the session is open."""
         key = zenoh_key(self.settings.prefix, topic.source, *topic.path)
         publisher = ZenohPublisher(self._link, key, topic.type_name, self.settings.express, self._forget)
         with self._lock:
@@ -146,7 +145,7 @@ class ZenohOutput(Output):
         return OutputError(self.health().problem, cause=cause)
 
     def health(self) -> OutputHealth:
-        """Return whether messages can leave."""
+        """Return whether messages can be sent."""
         if self._session is None:
             return OutputHealth(False, self._problem)
         if self.lacks_router:
@@ -154,7 +153,7 @@ class ZenohOutput(Output):
         return _HEALTHY
 
     def maintain(self) -> None:
-        """Log a router lost or found, and check again who is subscribed; Zenoh itself reconnects."""
+        """Log whether a client has its router, and check for subscribers. Zenoh itself reconnects."""
         self._update_link()
         if self._session is None:
             return
@@ -167,7 +166,7 @@ class ZenohOutput(Output):
             self._router_failures.recovered("connected to the router")
 
     def is_configured_like(self, other: Output) -> bool:
-        """Return whether the settings are the same, and the content of Zenoh's configuration file too."""
+        """Return whether the settings and the content of Zenoh's configuration file are the same."""
         return (
             isinstance(other, ZenohOutput)
             and self.settings == other.settings
@@ -177,19 +176,19 @@ class ZenohOutput(Output):
     # Sources: liveliness, queries, parameters.
 
     def announce(self, source: str) -> None:
-        """Hold the liveliness token PREFIX/SOURCE/alive and answer queries about ``source``."""
+        """Declare the liveliness token PREFIX/SOURCE/alive, and answer queries about ``source``."""
         self._show(self._alive, source, "alive", True)
         self._serve_source(source)
 
     def withdraw(self, source: str) -> None:
-        """Drop the liveliness token PREFIX/SOURCE/alive and answer no more queries about ``source``."""
+        """Undeclare the liveliness token PREFIX/SOURCE/alive, and stop answering queries about ``source``."""
         self._show(self._alive, source, "alive", False)
         with self._lock:
             if self._queries is not None:
                 self._queries.remove(source)
 
     def show_streaming(self, source: str, is_streaming: bool) -> None:
-        """Hold the liveliness token PREFIX/SOURCE/server while frames arrive, and only then."""
+        """Declare the liveliness token PREFIX/SOURCE/server, or undeclare it: it shows that frames arrive."""
         self._show(self._streaming, source, "server", is_streaming)
 
     def _show(
@@ -209,7 +208,7 @@ class ZenohOutput(Output):
                 self._queries.add(source)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
-        """Publish the XML on PREFIX/SOURCE/parameters, now and for everybody who subscribes later."""
+        """Publish the XML on PREFIX/SOURCE/parameters, now and for each later subscriber."""
         if self._queries is not None:
             self._queries.publish_parameters(source, parameters.xml)
 
@@ -223,20 +222,20 @@ class ZenohOutput(Output):
         self._queries = ZenohQueries(self.settings.prefix, service, asyncio.get_running_loop())
 
     async def stop_queries(self) -> None:
-        """Drop the queries being answered; their askers see no reply at once."""
+        """Drop the pending queries. Their peers see at once that no reply follows."""
         if self._queries is not None:
             await self._queries.close()
 
     @property
     def query_results(self) -> Mapping[str, int] | None:
-        """See Output."""
+        """The number of queries by result; None before ``serve_queries``."""
         return None if self._queries is None else self._queries.results
 
     def close(self) -> None:
-        """Close the session: without this a process with Zenoh callbacks never ends."""
+        """Close the session. Otherwise a process with Zenoh callbacks never ends."""
         self._closing.set()
         if self._opener.is_alive():
-            self._opener.join(_JOIN_S)  # an open() that blocks is left alone; it closes what it opens
+            self._opener.join(_JOIN_S)  # If zenoh.open blocks longer, the thread closes what it opens.
         with self._lock:
             session, self._session = self._session, None
             self._update_link()

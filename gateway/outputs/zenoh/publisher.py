@@ -1,4 +1,4 @@
-"""The publisher of one Zenoh key: what every message goes through."""
+"""The publisher of one Zenoh key."""
 
 import logging
 from collections.abc import Callable
@@ -14,10 +14,10 @@ logger = logging.getLogger(__name__)
 
 
 class ZenohLink:
-    """Whether messages can leave, as all publishers of one output see it.
+    """Whether messages can be sent, shared by all publishers of one output.
 
-    ``refusal`` returns the error for a message that cannot leave. Every message reads ``is_cut_off``, so the
-    output keeps it up to date instead of working it out.
+    ``refusal`` returns the error for a message that cannot be sent. ``is_cut_off`` is read for every message,
+    so the output updates it when something changes.
     """
 
     def __init__(self, refusal: Callable[[], OutputError]) -> None:
@@ -26,7 +26,7 @@ class ZenohLink:
 
 
 class ZenohPublisher:
-    """Sends the messages of one key, with DROP on congestion: a stalled subscriber delays nobody."""
+    """Sends the messages of one key. On congestion it drops them, so a stalled subscriber delays nobody."""
 
     def __init__(
         self, link: ZenohLink, key: str, type_name: str, express: bool, forget: Callable[[Any], None]
@@ -49,12 +49,12 @@ class ZenohPublisher:
             congestion_control=zenoh.CongestionControl.DROP,
             express=self._express,
         )
-        publisher.declare_matching_listener(self._on_matching)  # reports subscribers that exist already, too
+        publisher.declare_matching_listener(self._on_matching)  # also reports existing subscribers
         self._publisher = publisher
 
     def check_subscribers(self) -> None:
-        """Ask again whether anybody is subscribed: a notification may have been missed."""
-        # Zenoh's type stub declares matching_status as a bool; it is the MatchingStatus that listeners get.
+        """Check again for subscribers, because a notification may have been missed."""
+        # Zenoh's type stub says that matching_status is a bool, but it is a MatchingStatus.
         publisher: Any = self._publisher
         if publisher is not None:
             self.wanted = publisher.matching_status.matching
@@ -64,7 +64,7 @@ class ZenohPublisher:
         self.wanted = status.matching and not self._is_closed
 
     def publish(self, message: bytes) -> None:
-        """Hand ``message`` to Zenoh; raises OutputError while it cannot leave."""
+        """Pass ``message`` to Zenoh. Raises OutputError if it cannot be sent."""
         if self._publisher is None or self._link.is_cut_off:
             raise self._refusal()
         try:

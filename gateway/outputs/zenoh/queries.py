@@ -1,7 +1,7 @@
-"""Queries that arrive on Zenoh, one queryable per source; and parameters and files published unasked.
+"""Queries from Zenoh and their replies, and the parameters and files that the gateway publishes.
 
-A handler that fails, or sends nothing, looks to the asker as if nobody were there. So every query gets a
-reply, an error where there is no answer.
+If a handler fails or does not reply, the peer cannot distinguish that from a gateway that is not running. So
+every query gets a reply, which is an error if there is no answer.
 """
 
 import asyncio
@@ -25,12 +25,12 @@ from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.outputs.zenoh.send_thread import SendThread
 
 MAX_PENDING: Final = 4096
-"""How many queries are answered at once; further ones are refused as busy."""
+"""The maximum number of queries in progress. Further ones get the error busy."""
 
 LONG_ANSWER_BYTES: Final = 1024 * 1024
-"""Longer answers (C3D files) are sent by a second thread, so that others need not wait for them."""
+"""A second thread sends longer answers (C3D files), so that other answers need not wait."""
 
-# Parameters must arrive, and may wait for that, behind the streams.
+# Parameters must arrive, even if that takes longer, and messages of streams have priority.
 _RELIABLE: Final = zenoh.CongestionControl.BLOCK
 _LOW_PRIORITY: Final = zenoh.Priority.DATA_LOW
 
@@ -49,7 +49,7 @@ class _Declared(NamedTuple):
 
 
 class ZenohQueries:
-    """Answers queries below PREFIX/SOURCE/ by ``service``.
+    """Answers queries below PREFIX/SOURCE/ with ``service``, through one queryable per source.
 
     ``open`` may be called in any thread; everything else runs in ``loop``.
     """
@@ -64,7 +64,7 @@ class ZenohQueries:
         self._newest_xml: dict[str, bytes] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         # Sending to a peer that has stopped reading blocks for 5 s, until Zenoh closes the link. So a thread
-        # sends, and only one: two that block there stop all of Zenoh meanwhile.
+        # sends. There is only one for short answers: two threads that block stop all of Zenoh meanwhile.
         self._sender = SendThread("zenoh-send")
         self._long_sender = SendThread("zenoh-send-long")
         self._is_closed = False
@@ -85,7 +85,7 @@ class ZenohQueries:
                 self._declared[source] = self._declare(self._session, source)
 
     def remove(self, source: str) -> None:
-        """Answer no more queries about a source."""
+        """Stop answering queries about a source."""
         self._newest_xml.pop(source, None)
         with self._lock:
             declared = self._declared.pop(source, None)
@@ -98,7 +98,7 @@ class ZenohQueries:
         key = zenoh_key(self._prefix, source)
 
         def on_query(query: zenoh.Query) -> None:
-            self._call_in_loop(self._take, source, query)
+            self._call_in_loop(self._start_answer, source, query)
 
         def on_matching(status: zenoh.MatchingStatus) -> None:
             if status.matching:
@@ -106,18 +106,18 @@ class ZenohQueries:
 
         queryable = session.declare_queryable(f"{key}/**", on_query)
         publisher = _parameters_publisher(session, f"{key}/parameters")
-        # An AdvancedPublisher does not report who subscribes. Subscribers without a history that connect
-        # after the parameters were published would wait for the next change.
+        # An AdvancedPublisher does not report its subscribers, so a plain publisher on the same key does.
+        # Otherwise plain subscribers that connect late would have to wait for the next change.
         subscriber_watch = session.declare_publisher(f"{key}/parameters")
         subscriber_watch.declare_matching_listener(on_matching)
         return _Declared(queryable, publisher, subscriber_watch)
 
     def _call_in_loop(self, call: Callable[..., None], *arguments: Any) -> None:
-        """Call from one of Zenoh's threads, where nothing else may be done."""
+        """Call ``call`` in the event loop, from one of Zenoh's threads."""
         with contextlib.suppress(RuntimeError):  # the loop has just ended
             self._loop.call_soon_threadsafe(call, *arguments)
 
-    # Published unasked.
+    # Parameters and files.
 
     def publish_parameters(self, source: str, xml: bytes) -> None:
         """Publish a source's parameters as the server sent them."""
@@ -148,7 +148,7 @@ class ZenohQueries:
 
     # Queries.
 
-    def _take(self, source: str, query: zenoh.Query) -> None:
+    def _start_answer(self, source: str, query: zenoh.Query) -> None:
         if self._is_closed or not self._service.serves(source):
             query.drop()
             return
@@ -181,38 +181,39 @@ class ZenohQueries:
         self.results[error.code] += 1
 
     async def _answers(self, source: str, query: zenoh.Query) -> dict[str, Answer]:
-        """Return the answers by key; raises QueryError if there is none."""
-        own = zenoh_key(self._prefix, source) + "/"
-        asked, options = str(query.key_expr), _options(query)
-        if "*" not in asked and asked.startswith(own):
-            path = tuple(asked.removeprefix(own).split("/"))
-            return {asked: await self._service.answer(source, path, options)}
-        paths = self._matching(query.key_expr, own, source)
+        """Return the answers by key. Raises QueryError if there is none."""
+        base = zenoh_key(self._prefix, source) + "/"
+        selected, options = str(query.key_expr), _options(query)
+        if "*" not in selected and selected.startswith(base):
+            path = tuple(selected.removeprefix(base).split("/"))
+            return {selected: await self._service.answer(source, path, options)}
+        paths = self._matching(query.key_expr, base, source)
         if not paths:
-            raise QueryError(self._nothing_matches(asked, own, source))
+            raise QueryError(self._nothing_matches(selected, base, source))
         answers = await self._service.answer_all(source, paths, options)
-        return {own + "/".join(path): answer for path, answer in answers.items()}
+        return {base + "/".join(path): answer for path, answer in answers.items()}
 
-    def _matching(self, asked: zenoh.KeyExpr, own: str, source: str) -> list[KeyPath]:
+    def _matching(self, selected: zenoh.KeyExpr, base: str, source: str) -> list[KeyPath]:
         """Return the keys of the source that a selector with wildcards matches.
 
-        A C3D file may have hundreds of MB, so it needs to be named, as in mocap/*/c3d.
+        A C3D file may have hundreds of MB, so it is selected only by its name, as in mocap/*/c3d.
         """
-        last = str(asked).rpartition("/")[2]
+        last = str(selected).rpartition("/")[2]
         return [
             path
             for path in self._service.keys(source)
-            if (path != ("c3d",) or last == "c3d") and asked.intersects(zenoh.KeyExpr(own + "/".join(path)))
+            if (path != ("c3d",) or last == "c3d")
+            and selected.intersects(zenoh.KeyExpr(base + "/".join(path)))
         ]
 
-    def _nothing_matches(self, asked: str, own: str, source: str) -> str:
-        if asked.rpartition("/")[2] == "recording":
-            return f"recording is controlled for one source at a time; accepted: {own}recording"
+    def _nothing_matches(self, selected: str, base: str, source: str) -> str:
+        if selected.rpartition("/")[2] == "recording":
+            return f"recording is controlled for one source at a time; accepted: {base}recording"
         accepted = self._service.accepted_keys(source)
-        return f"nothing of source {source!r} matches {asked}; accepted below {own}: {accepted}"
+        return f"nothing of source {source!r} matches {selected}; accepted below {base}: {accepted}"
 
     async def close(self) -> None:
-        """Drop the queries being answered; their askers see no reply at once."""
+        """Drop the pending queries. Their peers see at once that no reply follows."""
         self._is_closed = True
         for task in self._tasks:
             task.cancel()
@@ -227,7 +228,7 @@ def _parameters_publisher(session: zenoh.Session, key: str) -> _AnyPublisher:
             session,
             key,
             encoding=XML,
-            # The cache answers late subscribers; they need not ask.
+            # The cache serves late AdvancedSubscribers, so that they need not query.
             cache=zenoh.ext.CacheConfig(max_samples=1),
             publisher_detection=True,
             congestion_control=_RELIABLE,
@@ -244,7 +245,7 @@ def _parameters_publisher(session: zenoh.Session, key: str) -> _AnyPublisher:
         )
 
 
-# These run in a thread, because they may block.
+# These functions may block, so they run in a SendThread.
 
 
 def _put(put: Callable[..., None], *arguments: Any) -> None:
@@ -265,7 +266,7 @@ def _reply(query: zenoh.Query, answers: Mapping[str, Answer]) -> None:
 
 
 def _reply_error(query: zenoh.Query, error: QueryError) -> None:
-    """Reply with an error, whose code is the schema of the encoding."""
+    """Reply with an error. The schema of the encoding is the error's code."""
     with query:
         try:
             query.reply_err(str(error), encoding=zenoh.Encoding(TEXT).with_schema(error.code))

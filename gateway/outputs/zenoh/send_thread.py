@@ -1,4 +1,4 @@
-"""A thread for what may block in Zenoh, which the end of the program does not wait for."""
+"""A thread for calls that may block in Zenoh. The program does not wait for it when it ends."""
 
 import contextlib
 import queue
@@ -8,10 +8,10 @@ from concurrent.futures import CancelledError, Future
 
 
 class SendThread:
-    """Makes calls one after the other in a thread of its own.
+    """Makes calls one after the other in its own thread.
 
-    Not concurrent.futures' ThreadPoolExecutor, because Python waits for its threads at exit: a peer that
-    has stopped reading would hold up the end of the gateway for 5 s.
+    A concurrent.futures.ThreadPoolExecutor does not fit: Python waits for its threads at exit, so a peer that
+    has stopped reading would delay the end of the gateway by 5 s.
     """
 
     def __init__(self, name: str) -> None:
@@ -20,20 +20,20 @@ class SendThread:
         threading.Thread(target=self._run, name=name, daemon=True).start()
 
     def submit(self, call: Callable[[], None]) -> Future[None]:
-        """Have ``call`` made when its turn comes; the future ends as the call does."""
+        """Queue ``call``; the returned future has its result or exception."""
         done: Future[None] = Future()
         self._work.put((done, call))
         return done
 
     def close(self) -> None:
-        """Make no more calls than the one that is being made."""
+        """Make no further calls; a call in progress continues."""
         self._closed = True
         self._work.put(None)
 
     def _run(self) -> None:
         while (work := self._work.get()) is not None and not self._closed:
             done, call = work
-            del work  # or the call, and what it holds on to, would stay until the next one comes
+            del work  # otherwise this keeps the call, and all it refers to, until the next one
             with contextlib.suppress(CancelledError):
                 if done.set_running_or_notify_cancel():
                     try:

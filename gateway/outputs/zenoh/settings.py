@@ -32,9 +32,9 @@ KeyPrefix = Annotated[
 
 
 def _zenoh_config(value: object, info: ValidationInfo) -> Path | dict[str, Any]:
-    """Return the path of Zenoh's configuration, or its keys, once Zenoh itself has read them.
+    """Return the path of Zenoh's configuration, or its keys, after Zenoh itself has checked them.
 
-    A relative path counts from ``folder`` in the validation's context; without one, no file is read.
+    A relative path is relative to ``folder`` in the validation context; without a folder, no file is read.
     """
     match value:
         case dict():

@@ -1,4 +1,4 @@
-"""Subscribing on Zenoh to what a gateway publishes: for ``echo``, the demo and tests."""
+"""Subscribing to a gateway's messages on Zenoh, for ``echo``, the demo and tests."""
 
 from typing import Any
 
@@ -13,15 +13,15 @@ DEFAULT_PREFIX = "mocap"
 
 
 def key_pattern(prefix: str, source: str | None, component: str | None) -> str:
-    """Return the key expression of one component, or of all (None), of one source or of all."""
+    """Return the key expression of the messages. None means all sources, or all components."""
     return zenoh_key(prefix, source or "*") + "/" + (component or "**")
 
 
 def open_zenoh(connect: str | None) -> zenoh.Session:
-    """Return an open session; raises OutputError if it does not open.
+    """Return an open session. Raises OutputError if it does not open.
 
-    With ``connect``, an endpoint such as tcp/127.0.0.1:7447, it is a client of that endpoint and looks for
-    nobody else. Without, it is a peer that finds others by multicast, as Zenoh does by default.
+    With ``connect``, an endpoint such as tcp/127.0.0.1:7447, the session is a client of that endpoint only.
+    Without it, the session is a peer that finds others by multicast, Zenoh's default.
     """
     config: dict[str, Any] = {}
     if connect is not None:
@@ -41,7 +41,7 @@ def open_zenoh(connect: str | None) -> zenoh.Session:
 
 
 class ZenohSubscriber:
-    """Subscribes to ``keys``, a key expression; closes the session too if it ``owns_session``."""
+    """Subscribes to ``keys``, a key expression. If it ``owns_session``, ``close`` closes the session, too."""
 
     def __init__(
         self, session: zenoh.Session, keys: str, receive: Receive, *, owns_session: bool = False
@@ -61,6 +61,6 @@ class ZenohSubscriber:
 
 
 def subscribe(request: SubscriptionRequest, receive: Receive) -> ZenohSubscriber:
-    """Subscribe in a new session; ``request.address`` is the endpoint to connect to. Raises OutputError."""
+    """Subscribe with a new session; ``request.address`` is the endpoint to connect to. Raises OutputError."""
     keys = key_pattern(request.prefix or DEFAULT_PREFIX, request.source, request.component)
     return ZenohSubscriber(open_zenoh(request.address), keys, receive, owns_session=True)
