@@ -1,4 +1,4 @@
-"""``rtc3d-gateway check``: is this configuration file valid?"""
+"""``rtc3d-gateway check``: check a configuration file."""
 
 from pathlib import Path
 from typing import Annotated

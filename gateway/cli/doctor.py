@@ -29,7 +29,7 @@ def doctor(
 
     Without options, it uses the installed configuration, /etc/rtc3d-gateway/gateway.yaml.
     """
-    set_up_log(LogLevel.ERROR, LogFormat.TEXT)  # the findings contain everything that is a warning
+    set_up_log(LogLevel.ERROR, LogFormat.TEXT)  # warnings would repeat the findings
     report = Report(Console(quiet=as_json))
     uvloop.run(_report_findings(report, config, server, seconds))
     if as_json:

@@ -76,7 +76,7 @@ def subscribed(output: str, request: SubscriptionRequest) -> Iterator[Messages]:
 
 
 def _put(messages: Messages, name: str, message: bytes) -> None:
-    # When the terminal is slower than the stream, messages are lost here; the printed sequence shows it.
+    # If printing is slower than the stream, messages are dropped; the gap in the printed sequence shows it.
     with suppress(queue.Full):
         messages.put_nowait((name, message))
 

@@ -3,6 +3,7 @@
 import json
 from typing import Any
 
+from gateway.cli.terminal_text import printable
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode, to_json
 from gateway.messages.summary import summarise, summarise_xml
@@ -24,7 +25,7 @@ def json_line(name: str, message: bytes) -> str:
 
 
 def text_line(name: str, message: bytes) -> str:
-    """Return a line for people: ``name`` (the key or channel) and a summary of the message."""
+    """Return a line of text: ``name`` (the key or channel) and a summary of the message."""
     try:
         line = f"{name} {summarise(decode(message))}"
     except ProtocolError as error:
@@ -35,14 +36,11 @@ def text_line(name: str, message: bytes) -> str:
                 line = f"{name} " + ", ".join(f"{key} {value}" for key, value in json_object.items())
             case _:
                 line = f"{name}: {error}"
-    # The text comes from servers and unknown publishers: control characters must not reach the terminal.
-    return "".join(
-        character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in line
-    )
+    return printable(line)
 
 
 def _xml_or_json(message: bytes) -> bytes | dict[str, Any] | None:
-    """Return a server's XML as it is, or the object in a JSON text: Zenoh carries both; else None."""
+    """Return XML unchanged, or the object in a JSON text (both exist on Zenoh); None for other bytes."""
     if message.lstrip().startswith(b"<"):
         return message
     try:

@@ -61,9 +61,10 @@ PrefixOption = Annotated[
 
 
 def configuration_from_options(config: Path | None, server: str | None) -> Configuration:
-    """Return the configuration that ``--config``, ``--server`` and the environment give.
+    """Return the configuration from ``--config`` or ``--server``, and the environment.
 
-    Raises ConfigError if it is not valid, BadParameter if none or both of the options are given.
+    Raises ConfigError if it is not valid; BadParameter if both options are given, or neither and no environment
+    variable sets the configuration.
     """
     if server is not None and config is None:
         return read_server(*_host_and_port(server), settings_type())
@@ -75,7 +76,7 @@ def configuration_from_options(config: Path | None, server: str | None) -> Confi
 
 
 def _host_and_port(server: str) -> tuple[str, int]:
-    """Split HOST, HOST:PORT or [IPV6]:PORT."""
+    """Split HOST, HOST:PORT or [IPV6]:PORT; the default port is that of First Principles."""
     if server.startswith("["):
         host, _, rest = server[1:].partition("]")
         port = rest.removeprefix(":")

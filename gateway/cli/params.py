@@ -5,10 +5,10 @@ from typing import Annotated, Final
 
 import typer
 
-from gateway.cli.ask_lcm import ask_lcm
-from gateway.cli.ask_zenoh import ask_zenoh
 from gateway.cli.options import ConnectOption, PrefixOption, SourceOption, UrlOption
-from gateway.cli.params_tables import write_replies
+from gateway.cli.params_lcm import query_lcm
+from gateway.cli.params_output import write_replies
+from gateway.cli.params_zenoh import query_zenoh
 from gateway.outputs.lcm.settings import effective_lcm_url
 from gateway.rtc3d.parameters import SECTIONS
 
@@ -51,9 +51,9 @@ def params(
         raise typer.BadParameter("give either --json or --xml")
     wanted = tuple(dict.fromkeys(sections or ()))
     if unknown := set(wanted) - set(SECTIONS):
-        raise typer.BadParameter(f"unknown section {min(unknown)!r}; known are {', '.join(SECTIONS)}")
+        raise typer.BadParameter(f"unknown section {min(unknown)!r}; known sections: {', '.join(SECTIONS)}")
     if lcm:
-        replies, problems = ask_lcm(
+        replies, problems = query_lcm(
             prefix or "MOCAP",
             source,
             wanted,
@@ -63,7 +63,7 @@ def params(
             timeout_s=timeout,
         )
     else:
-        replies, problems = ask_zenoh(
+        replies, problems = query_zenoh(
             prefix or "mocap", source, wanted, fresh=fresh, connect=connect, timeout_s=timeout
         )
     problems += write_replies(replies, "json" if as_json else "xml" if as_xml else "table", sys.stdout)

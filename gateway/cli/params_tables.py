@@ -1,19 +1,13 @@
-"""Parameters of servers (§6) as tables, as JSON, or as unchanged XML."""
+"""Tables of a server's parameters (§6), one per section."""
 
-import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from typing import Any, BinaryIO, Final, Literal, NamedTuple, TextIO
+from typing import Any, Final
 
-from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from gateway.cli.asking import ParametersReply
-from gateway.errors import ParametersError, QueryError
-from gateway.queries.answers import parameters_json
+from gateway.cli.terminal_text import printable
 from gateway.rtc3d.parameters import (
-    SECTIONS,
     EventParameter,
     General,
     Parameters,
@@ -25,89 +19,11 @@ from gateway.rtc3d.parameters import (
     Plate,
     Point,
 )
-from gateway.rtc3d.parameters_xml import parse_parameters
-
-OutputFormat = Literal["table", "json", "xml"]
 
 _Rows = Sequence[Sequence[object]]
 
 
-class _SourceParameters(NamedTuple):
-    """The parameters of one source, merged from its replies, and the age of the oldest reply in s."""
-
-    parameters: Parameters
-    age_s: float | None
-
-
-def write_replies(
-    replies: Sequence[ParametersReply], output_format: OutputFormat, out: TextIO
-) -> list[QueryError]:
-    """Write the parameters of all sources to ``out``; return what is wrong with the replies.
-
-    Writes a table per section; or one JSON object with the sources as keys; or the XML unchanged, each
-    piece after a comment with the source's name if there are several.
-    """
-    if output_format == "xml":
-        _write_xml(replies, out.buffer)
-        return []
-    problems: list[QueryError] = []
-    by_source: dict[str, _SourceParameters] = {}
-    for reply in replies:
-        merged = by_source.get(reply.source, _SourceParameters(Parameters(), None))
-        ages_s = [age_s for age_s in (merged.age_s, reply.age_s) if age_s is not None]
-        parameters = _merge(merged.parameters, reply, problems)
-        by_source[reply.source] = _SourceParameters(parameters, max(ages_s, default=None))
-    if output_format == "json":
-        _write_json(by_source, out.buffer)
-    else:
-        _write_tables(by_source, out)
-    return problems
-
-
-def _merge(parameters: Parameters, reply: ParametersReply, problems: list[QueryError]) -> Parameters:
-    """Return ``parameters`` with the sections of ``reply``; append problems to ``problems``."""
-    name = f"source {reply.source!r}"
-    try:
-        parsed = parse_parameters(reply.xml).parameters
-    except ParametersError as error:
-        problems.append(QueryError(f"{name}: {error}; use --xml to see it", code="unreadable"))
-        return parameters
-    fields = {SECTIONS[key].field: SECTIONS[key].of(parsed) for key in reply.sections or SECTIONS}
-    missing = [key for key in reply.sections if fields[SECTIONS[key].field] is None]
-    if missing:
-        text = f"{name}: the server's reply has no section {', '.join(missing)}"
-        problems.append(QueryError(text, code="nothing-yet"))
-    return replace(parameters, **fields)
-
-
-def _write_xml(replies: Sequence[ParametersReply], out: BinaryIO) -> None:
-    for reply in replies:
-        if len(replies) > 1:
-            out.write(f"<!-- {reply.source} {' '.join(reply.sections)} -->\n".encode())
-        out.write(reply.xml.rstrip(b"\0\r\n") + b"\n")
-
-
-def _write_json(by_source: dict[str, _SourceParameters], out: BinaryIO) -> None:
-    values = {
-        source: {
-            "age_s": None if merged.age_s is None else round(merged.age_s, 3),
-            "parameters": json.loads(parameters_json(merged.parameters, "") or b"{}"),
-        }
-        for source, merged in by_source.items()
-    }
-    out.write(json.dumps(values, indent=2, ensure_ascii=False).encode() + b"\n")
-
-
-def _write_tables(by_source: dict[str, _SourceParameters], out: TextIO) -> None:
-    console = Console(file=out)
-    for source, merged in by_source.items():
-        for table in _tables(source, merged.parameters):
-            console.print(table)
-        if merged.age_s is not None:
-            console.print(Text(_plain(f"{source}: parameters are {merged.age_s:.1f} s old")))
-
-
-def _tables(source: str, parameters: Parameters) -> Iterator[Table]:
+def tables(source: str, parameters: Parameters) -> Iterator[Table]:
     """Yield one table for each section in ``parameters``, with ``source`` in its title."""
     sections: tuple[tuple[Any, Callable[[Any], tuple[str, Sequence[str], _Rows]]], ...] = (
         (parameters.general, _general),
@@ -123,26 +39,20 @@ def _tables(source: str, parameters: Parameters) -> Iterator[Table]:
             yield _table(f"{source}: {title}", headings, rows)
 
 
-def _plain(value: object) -> str:
-    """Return a value as text for a terminal: "" for None, one line per item of a tuple.
-
-    Labels come from servers: control characters are replaced, so that they cannot control the terminal.
-    """
+def _cell(value: object) -> str:
+    """Return a value as text for a table: "" for None, one line per item of a tuple."""
     if isinstance(value, tuple):
-        return "\n".join(map(_plain, value))
-    text = f"{value:g}" if isinstance(value, float) else "" if value is None else str(value)
-    return "".join(
-        character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in text
-    )
+        return "\n".join(map(_cell, value))
+    return printable(f"{value:g}" if isinstance(value, float) else "" if value is None else str(value))
 
 
 def _table(title: str, headings: Sequence[str], rows: _Rows) -> Table:
-    table = Table(title=Text(_plain(title)), title_justify="left")
+    table = Table(title=Text(_cell(title)), title_justify="left")
     for heading in headings:
         table.add_column(heading, overflow="fold")
     for row in rows:
         # Text objects, because rich would read square brackets in a string as markup.
-        table.add_row(*(Text(_plain(value)) for value in row))
+        table.add_row(*(Text(_cell(value)) for value in row))
     return table
 
 

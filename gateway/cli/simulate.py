@@ -1,4 +1,4 @@
-"""``rtc3d-gateway simulate``: an RTC3D server without a camera."""
+"""``rtc3d-gateway simulate``: simulate an RTC3D server."""
 
 import asyncio
 import contextlib

@@ -148,7 +148,7 @@ async def test_a_source_that_no_gateway_serves_is_status_3(side: str) -> None:
     expected = (
         "no gateway serves source 'hall'; sources found: lab"
         if side == "zenoh"
-        else "no gateway heard on LCM (MOCAP_HALL"
+        else "no gateway found on LCM (MOCAP_HALL"
     )
     assert done.stderr.startswith(expected)
 
@@ -198,7 +198,7 @@ async def test_a_server_that_does_not_know_the_command_is_status_1(side: str) ->
 @pytest.mark.parametrize(
     ("arguments", "text"),
     [
-        (["4d"], "unknown section '4d'; known are general, 3d, 6d, analog, force, events"),
+        (["4d"], "unknown section '4d'; known sections: general, 3d, 6d, analog, force, events"),
         (["--zenoh", "--lcm"], "--zenoh or --lcm"),
         (["--json", "--xml"], "--json or --xml"),
         (["--timeout", "0"], "--timeout"),

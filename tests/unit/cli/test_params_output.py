@@ -5,8 +5,8 @@ import json
 
 import pytest
 
-from gateway.cli.asking import ParametersReply, Sections
-from gateway.cli.params_tables import OutputFormat, write_replies
+from gateway.cli.params_output import OutputFormat, write_replies
+from gateway.cli.params_query import ParametersReply, Sections
 from gateway.messages.decode import to_json
 from gateway.rtc3d.parameters import SECTIONS
 from tests.spec_parameters import ALL, in_root, spec_body, spec_xml

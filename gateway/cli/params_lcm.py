@@ -1,4 +1,4 @@
-"""Asking for parameters on LCM."""
+"""Parameter queries on LCM."""
 
 import re
 import threading
@@ -8,7 +8,7 @@ from typing import Any
 
 import rtc3d
 
-from gateway.cli.asking import DISCOVERY_S, RETRY_S, ParametersReply, Replies, Sections, TimeLimits
+from gateway.cli.params_query import DISCOVERY_S, RETRY_S, ParametersReply, Replies, Sections, TimeLimits
 from gateway.errors import OutputError, ProtocolError, QueryError
 from gateway.messages.decode import decode
 from gateway.messages.topics import lcm_channel
@@ -17,7 +17,7 @@ from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 
 
-def ask_lcm(
+def query_lcm(
     prefix: str,
     source: str | None,
     sections: Sections,
@@ -27,41 +27,41 @@ def ask_lcm(
     queries_url: str | None = None,
     timeout_s: float,
 ) -> Replies:
-    """Ask the gateway of ``source``, or of every source found (None), for all sections at once.
+    """Request ``sections`` of ``source``, or of every source that is found (None).
 
     Sources are found by their status messages on ``url``. Requests and replies use ``queries_url``; None
     means the one derived from ``url``. Raises OutputError if LCM does not open or a request cannot be sent.
     """
-    asker = _LcmAsker(url, queries_url or lcm_queries_url(url), prefix, sections, fresh=fresh)
+    client = _LcmClient(url, queries_url or lcm_queries_url(url), prefix, sections, fresh=fresh)
     try:
-        sources = asker.find_sources() if source is None else [source]
+        sources = client.find_sources() if source is None else [source]
         limits = TimeLimits(timeout_s)
         try:
-            asker.ask(sources, limits)
+            client.request(sources, limits)
         except OSError as error:
             raise OutputError(
                 f"LCM did not send to {url}: {error}; check --url", cause="send failed"
             ) from error
     finally:
-        asker.close()
+        client.close()
     replies = Replies([], [])
     if not sources:
         replies.problems.append(_no_gateway(prefix, url))
     for name in sources:
-        reply = asker.replies.get(name)
-        if reply is None and name in asker.found:
-            replies.problems.append(limits.no_reply(f"source {name!r}"))
-        elif reply is None:
-            replies.problems.append(_no_gateway(lcm_channel(prefix, name), url))
-        elif reply.error:
-            replies.problems.append(QueryError(reply.error, code=reply.error_code))
-        else:
+        reply = client.replies.get(name)
+        if reply is not None and not reply.error:
             replies.received.append(ParametersReply(name, sections, reply.xml.encode(), reply.age_s))
+        elif reply is not None:
+            replies.problems.append(QueryError(reply.error, code=reply.error_code))
+        elif name in client.found_sources:
+            replies.problems.append(limits.no_reply(f"source {name!r}"))
+        else:
+            replies.problems.append(_no_gateway(lcm_channel(prefix, name), url))
     return replies
 
 
-class _LcmAsker:
-    """Sends requests and receives replies and status messages, until ``close``."""
+class _LcmClient:
+    """Sends requests, and receives replies and status messages until ``close``."""
 
     def __init__(self, url: str, queries_url: str, prefix: str, sections: Sections, *, fresh: bool) -> None:
         self._lcm = open_lcm(queries_url)
@@ -71,13 +71,13 @@ class _LcmAsker:
         self._request.sections, self._request.num_sections = list(sections), len(sections)
         self._request.fresh = fresh
         self._sources_by_request_id: dict[int, str] = {}
-        self.found: set[str] = set()
-        """Sources from which a status message came."""
+        self.found_sources: set[str] = set()
+        """Sources that have sent a status message."""
         self.replies: dict[str, Any] = {}
         """``parameters_reply_t`` by source."""
         self._is_complete = threading.Event()
         channels = f"{re.escape(prefix)}_.+_"
-        self._listeners = [
+        self._subscribers = [
             LcmSubscriber(self._lcm, f"{channels}PARAMETERS_REPLY", self._receive),
             LcmSubscriber(open_lcm(url), f"{channels}STATUS", self._receive),
         ]
@@ -89,7 +89,7 @@ class _LcmAsker:
             return
         match message:
             case rtc3d.status_t():
-                self.found.add(message.source)
+                self.found_sources.add(message.source)
             case rtc3d.parameters_reply_t() if message.requester == self._request.requester:
                 source = self._sources_by_request_id.get(message.request_id)
                 if source is not None:
@@ -98,11 +98,11 @@ class _LcmAsker:
                     self._is_complete.set()
 
     def find_sources(self) -> list[str]:
-        """Wait until every running gateway has sent a status, and return the names of their sources."""
+        """Wait for DISCOVERY_S and return the names of all sources that sent a status, sorted."""
         time.sleep(DISCOVERY_S)
-        return sorted(self.found.copy())
+        return sorted(self.found_sources.copy())
 
-    def ask(self, sources: list[str], limits: TimeLimits) -> None:
+    def request(self, sources: list[str], limits: TimeLimits) -> None:
         """Send a request to each source, and repeat it until all have replied or time is up."""
         self._sources_by_request_id = dict(enumerate(sources))
         while sources and not self._is_complete.is_set():
@@ -112,21 +112,21 @@ class _LcmAsker:
                     channel = lcm_channel(self._prefix, source, "PARAMETERS_REQUEST")
                     self._lcm.publish(channel, self._request.encode())
             left_s = limits.left_s
-            # While no source is found, wait for a status even after the time for replies: only a status
-            # shows whether a gateway is missing or does not reply.
-            if left_s == 0 and (self.found or limits.discovery_is_over):
+            # Only a status message distinguishes a gateway that does not reply from a missing one. If none has
+            # come when the time for replies is up, wait for one until discovery is over.
+            if left_s == 0 and (self.found_sources or limits.discovery_is_over):
                 return
             self._is_complete.wait(min(RETRY_S, left_s or RETRY_S))
 
     def close(self) -> None:
         """Stop receiving."""
-        for listener in self._listeners:
-            listener.close()
+        for subscriber in self._subscribers:
+            subscriber.close()
 
 
 def _no_gateway(name: str, url: str) -> QueryError:
     return QueryError(
-        f"no gateway heard on LCM ({name}, {url}); check that it is running with this prefix and URL, and "
+        f"no gateway found on LCM ({name}, {url}); check that it is running with this prefix and URL, and "
         "that its ttl reaches this computer",
         code="no-gateway",
     )

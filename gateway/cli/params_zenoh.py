@@ -1,4 +1,4 @@
-"""Asking for parameters on Zenoh."""
+"""Parameter queries on Zenoh."""
 
 import contextlib
 import json
@@ -6,17 +6,20 @@ import time
 
 import zenoh
 
-from gateway.cli.asking import RETRY_S, ParametersReply, Replies, Sections, TimeLimits
+from gateway.cli.params_query import RETRY_S, ParametersReply, Replies, Sections, TimeLimits
 from gateway.errors import OutputError, QueryError
 from gateway.messages.topics import unique_name, zenoh_key
 from gateway.outputs.encodings import TEXT
 from gateway.outputs.zenoh.subscriber import open_zenoh
 
 
-def ask_zenoh(
+def query_zenoh(
     prefix: str, source: str | None, sections: Sections, *, fresh: bool, connect: str | None, timeout_s: float
 ) -> Replies:
-    """Ask the gateways that serve ``source`` (None: all gateways) for each section separately."""
+    """Query each of ``sections`` from the gateways that serve ``source``, or from all gateways (None).
+
+    A session that does not open is one of the problems, not an exception.
+    """
     replies = Replies([], [])
     try:
         session = open_zenoh(connect)
@@ -26,7 +29,7 @@ def ask_zenoh(
     key = zenoh_key(prefix, source or "*") + "/parameters"
     keys = [f"{key}/{section}" for section in sections] or [key]
     try:
-        _ZenohAsker(session, prefix, TimeLimits(timeout_s), replies).ask(keys, source, fresh=fresh)
+        _ZenohClient(session, prefix, TimeLimits(timeout_s), replies).query(keys, source, fresh=fresh)
     except QueryError as error:
         replies.problems.append(error)
     finally:
@@ -34,19 +37,19 @@ def ask_zenoh(
     return replies
 
 
-class _ZenohAsker:
-    """Sends queries over ``session`` and adds what comes back to ``replies``."""
+class _ZenohClient:
+    """Sends queries over ``session`` and adds the replies and problems to ``replies``."""
 
     def __init__(self, session: zenoh.Session, prefix: str, limits: TimeLimits, replies: Replies) -> None:
         self._session = session
         self._prefix = prefix
         self._limits = limits
         self._replies = replies
-        self._names: dict[tuple[str, str], str] = {}  # by source and gateway
+        self._unique_names: dict[tuple[str, str], str] = {}  # by source and the gateway's Zenoh id
 
-    def ask(self, keys: list[str], source: str | None, *, fresh: bool) -> None:
+    def query(self, keys: list[str], source: str | None, *, fresh: bool) -> None:
         """Query ``keys``, and repeat those without a reply; raises QueryError when time is up."""
-        unanswered = self._query(keys, fresh=fresh)
+        unanswered = self._query_once(keys, fresh=fresh)
         while unanswered:
             left_s = self._limits.left_s
             if left_s == 0 or self._limits.discovery_is_over:
@@ -54,13 +57,13 @@ class _ZenohAsker:
             if left_s == 0:
                 raise self._limits.no_reply(", ".join(unanswered))
             time.sleep(min(RETRY_S, left_s))
-            unanswered = self._query(unanswered, fresh=fresh)
+            unanswered = self._query_once(unanswered, fresh=fresh)
 
-    def _query(self, keys: list[str], *, fresh: bool) -> list[str]:
-        """Query ``keys`` once; return those without any reply, as happens during a reconnection."""
+    def _query_once(self, keys: list[str], *, fresh: bool) -> list[str]:
+        """Query ``keys`` and return those without any reply, as happens while Zenoh reconnects."""
         options = "?fresh=true" if fresh else ""
         handlers = {
-            # Several gateways may serve sources of the same name: keep the replies of all of them.
+            # NONE keeps the replies of all gateways: several may serve sources of the same name.
             key: self._session.get(
                 key + options,
                 consolidation=zenoh.ConsolidationMode.NONE,
@@ -83,10 +86,10 @@ class _ZenohAsker:
 
     def _parameters_reply(self, sample: zenoh.Sample, gateway: str) -> ParametersReply:
         source, _, *sections = str(sample.key_expr).removeprefix(f"{self._prefix}/").split("/")
-        if (source, gateway) not in self._names:
-            self._names[source, gateway] = unique_name(source, set(self._names.values()))
+        if (source, gateway) not in self._unique_names:
+            self._unique_names[source, gateway] = unique_name(source, set(self._unique_names.values()))
         attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
-        name = self._names[source, gateway]
+        name = self._unique_names[source, gateway]
         return ParametersReply(name, tuple(sections), sample.payload.to_bytes(), _age_s(attachment))
 
     def _problem(self, reply: zenoh.ReplyError) -> QueryError:

@@ -1,4 +1,4 @@
-"""What asking for parameters on Zenoh and on LCM has in common."""
+"""What parameter queries on Zenoh and on LCM have in common: replies, problems and time limits."""
 
 import time
 from typing import Final, NamedTuple
@@ -6,13 +6,13 @@ from typing import Final, NamedTuple
 from gateway.errors import QueryError
 
 RETRY_S: Final = 0.5
-"""How long to wait before a question without a reply is repeated."""
+"""How long to wait before repeating a query that got no reply."""
 
 DISCOVERY_S: Final = 2.5
-"""How long a gateway may take to be found: links take time, and on LCM a status comes once a second."""
+"""How long it may take to find a gateway: Zenoh needs time to connect; LCM carries one status a second."""
 
 Sections = tuple[str, ...]
-"""Members of SECTIONS; () means all."""
+"""Keys of SECTIONS (gateway.rtc3d.parameters), such as "3d"; () means all sections."""
 
 
 class ParametersReply(NamedTuple):
@@ -28,14 +28,14 @@ class ParametersReply(NamedTuple):
 
 
 class Replies(NamedTuple):
-    """All replies to a question, and what went wrong: codes as in QueryError, and no-gateway."""
+    """All replies to a query, and the problems; QueryError lists their codes."""
 
     received: list[ParametersReply]
     problems: list[QueryError]
 
 
 class TimeLimits:
-    """Two deadlines that start now: for finding a gateway, and for its replies."""
+    """Two time limits, both counted from now: for finding a gateway, and for its replies."""
 
     def __init__(self, timeout_s: float) -> None:
         start_s = time.monotonic()
