@@ -7,7 +7,7 @@
     ├── TakeError                 a C3D file cannot be played
     ├── ProtocolError             bytes that violate RTC3D
     │   ├── PacketError           §4: a size out of bounds; the connection must end
-    │   ├── FrameError            §7: sizes and counts contradict each other; this frame is lost
+    │   ├── FrameError            §7: sizes and counts contradict each other; the frame is rejected
     │   ├── CommandError          §5: a text that is not a command of the protocol
     │   └── ParametersError       §6: no parameters can be read from the XML
     ├── ServerError               the server answered with an error packet (type 0)
@@ -16,7 +16,7 @@
     │   ├── ReplyTimeoutError     a command was not answered in time
     │   ├── SilenceError          nothing arrived although something should have
     │   └── ClosedError           it was closed by the server, by the gateway, or by the network
-    ├── OutputError               Zenoh or LCM did not take a message
+    ├── OutputError               an output did not open or did not accept a message
     ├── SpoolError                a C3D file from a server could not be stored
     └── QueryError                a peer's query cannot be answered; the text goes to the peer
 
@@ -25,7 +25,7 @@ A message says what happened, to which server or file, and what to do.
 
 
 class GatewayError(Exception):
-    """Base of all errors that the gateway raises on purpose."""
+    """Base of all errors that this package raises on purpose."""
 
 
 class ConfigError(GatewayError):
@@ -44,19 +44,21 @@ class PacketError(ProtocolError):
     """A packet's size is out of bounds (§4.1); the next packet cannot be found, so the connection ends.
 
     ``size`` and ``packet_type`` are the header's fields, ``offset`` is the packet's position in the stream
-    in bytes. ``begin`` has up to the first 60 bytes; they may show which other protocol this is.
+    in bytes. ``first_bytes`` are up to 60 bytes of it; they may show which other protocol this is.
     """
 
-    def __init__(self, message: str, *, size: int, packet_type: int, offset: int, begin: bytes = b"") -> None:
+    def __init__(
+        self, message: str, *, size: int, packet_type: int, offset: int, first_bytes: bytes = b""
+    ) -> None:
         super().__init__(message)
         self.size = size
         self.packet_type = packet_type
         self.offset = offset
-        self.begin = begin
+        self.first_bytes = first_bytes
 
 
 class FrameError(ProtocolError):
-    """A data frame contradicts itself (§7); it is rejected whole, and the session continues."""
+    """Sizes and counts in a data frame contradict each other (§7); it is rejected, the session continues."""
 
 
 class CommandError(ProtocolError):
@@ -92,7 +94,7 @@ class ClosedError(LinkError):
 
 
 class OutputError(GatewayError):
-    """Zenoh or LCM did not take a message; the drop is counted under ``cause``, a short name."""
+    """An output did not open or did not accept a message; such a drop is counted under ``cause``."""
 
     def __init__(self, message: str, *, cause: str) -> None:
         super().__init__(message)

@@ -63,8 +63,8 @@ PrefixOption = Annotated[
 def configuration_from_options(config: Path | None, server: str | None) -> Configuration:
     """Return the configuration from ``--config`` or ``--server``, and the environment.
 
-    Raises ConfigError if it is not valid; BadParameter if both options are given, or neither and no environment
-    variable sets the configuration.
+    Raises ConfigError if it is not valid; BadParameter if both options are given, or if neither is given and
+    no environment variable is set.
     """
     if server is not None and config is None:
         return read_server(*_host_and_port(server), settings_type())

@@ -112,8 +112,8 @@ class _LcmClient:
                     channel = lcm_channel(self._prefix, source, "PARAMETERS_REQUEST")
                     self._lcm.publish(channel, self._request.encode())
             left_s = limits.left_s
-            # Only a status message distinguishes a gateway that does not reply from a missing one. If none has
-            # come when the time for replies is up, wait for one until discovery is over.
+            # Only a status message shows whether a gateway is missing or does not reply. If none has come
+            # when the time for replies is up, wait for one until discovery is over.
             if left_s == 0 and (self.found_sources or limits.discovery_is_over):
                 return
             self._is_complete.wait(min(RETRY_S, left_s or RETRY_S))

@@ -1,4 +1,4 @@
-"""What every part of the configuration shares: it is frozen, and tells mistakes in words of ours."""
+"""The base class of all parts of the configuration: frozen, and with error texts of its own."""
 
 import difflib
 from collections.abc import Iterable, Mapping
@@ -18,31 +18,31 @@ from pydantic_core import InitErrorDetails, PydanticCustomError
 from gateway.config.secrets import mask_secrets_in_text
 
 UNKNOWN_KEY: Final = "unknown_key"
-"""The type of the error that is in a key itself; all others are in a value, or in its absence."""
+"""The error type of a key that does not exist; all other errors are about a value or its absence."""
 
 _MISTAKE: Final = "mistake"
 
 
 class Effective(NamedTuple):
-    """The value in effect for a key without one, and the environment variables that it may come from."""
+    """The value used for a key that is not set, and the environment variables that it may come from."""
 
     value: Any
     variables: tuple[str, ...] = ()
 
 
 class Section(BaseModel):
-    """A mapping of the configuration: no other keys than its own, and nothing changes later."""
+    """A mapping in the configuration: frozen, and without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True)
 
     @property
     def effective(self) -> dict[str, Effective]:
-        """What the program uses for keys without a value, by key; for showing the configuration."""
+        """The values used for keys that are not set, by key; ``config show`` prints them."""
         return {}
 
     @model_validator(mode="wrap")
     @classmethod
-    def _tell_mistakes_in_our_words(cls, value: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
+    def _reword_errors(cls, value: Any, validate: ModelWrapValidatorHandler[Self]) -> Self:
         known = ", ".join(cls.model_fields)
         if not isinstance(value, Mapping | cls):
             raise validation_error(
@@ -64,12 +64,12 @@ class Section(BaseModel):
 
 
 def validation_error(text: str, *location: str | int) -> ValidationError:
-    """Return the error for a validator to raise; ``location`` counts from the value it was given."""
+    """Return the error for a validator to raise; ``location`` is relative to the value that it validates."""
     return ValidationError.from_exception_data("configuration", [_line_error(text, location, _MISTAKE)])
 
 
 def expects(what: str) -> WrapValidator:
-    """Return an annotation: a value refused by the type beside it was found, and ``what`` is accepted."""
+    """Return an annotation that rewords the errors of the type beside it: "found VALUE; expected ``what``"."""
 
     def check(value: object, validate: ValidatorFunctionWrapHandler) -> object:
         try:
@@ -77,7 +77,7 @@ def expects(what: str) -> WrapValidator:
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             if first["loc"]:
-                raise  # of an item inside the value, told in words of its own
+                raise  # the error is in an item of the value, which has a text of its own
             unquoted = first["type"] == "string_type" and isinstance(value, bool | int | float)
             hint = " (use quotes to make it text)" if unquoted else ""
             raise validation_error(f"found {describe(value)}{hint}; expected {what}") from None
@@ -86,7 +86,7 @@ def expects(what: str) -> WrapValidator:
 
 
 def describe(value: object) -> str:
-    """Return what was found, fit for a sentence: printable, on one line, bounded, without passwords."""
+    """Return a value as part of a sentence: printable, on one line, of limited length, without passwords."""
     match value:
         case None:
             return "nothing"
@@ -109,13 +109,13 @@ def join_or(words: Iterable[str]) -> str:
 
 
 def spelling_hint(word: object, known: Iterable[str]) -> str:
-    """Return " (did you mean 'x'?)" if ``word`` is nearly ``x``, one of ``known``; else nothing."""
+    """Return " (did you mean 'x'?)" with the member of ``known`` that is most like ``word``; "" if none is."""
     near = difflib.get_close_matches(str(word).lower()[:60], known, n=1)
     return f" (did you mean {near[0]!r}?)" if near else ""
 
 
 def _line_error(text: str, location: tuple[str | int, ...], kind: str) -> InitErrorDetails:
-    # The text is an argument, not the template: braces in it are to stay.
+    # The text is an argument of the template, because pydantic replaces braces in the template itself.
     return InitErrorDetails(
         type=PydanticCustomError(kind, "{text}", {"text": text}), loc=location, input=None
     )

@@ -1,1 +1,1 @@
-"""The doctor: checks every layer between a server and the subscribers, and says how to repair faults."""
+"""The doctor: checks every layer between servers and subscribers, and suggests remedies."""

@@ -4,9 +4,9 @@ import asyncio
 from collections.abc import AsyncIterator, Iterator
 
 from gateway.config.settings import Settings
-from gateway.doctor import source_checks
 from gateway.doctor.clock_check import check_clock
 from gateway.doctor.output_checks import check_output
+from gateway.doctor.source_checks import CHECKS, SourceChecks
 from gateway.errors import ConfigError
 from gateway.findings import Finding, MessageLoad, Subject
 from gateway.outputs.registry import OUTPUTS
@@ -15,7 +15,7 @@ _configuration = Subject("configuration")
 
 
 async def run_checks(settings: Settings, origin: str, seconds: float) -> AsyncIterator[Finding]:
-    """Yield each finding as soon as it is made. Watches one source after the other, for ``seconds`` each.
+    """Run all checks and yield each finding at once. Sources are watched one after the other for ``seconds``.
 
     ``origin`` says where the settings come from, for example a file name.
     """
@@ -24,7 +24,7 @@ async def run_checks(settings: Settings, origin: str, seconds: float) -> AsyncIt
     yield _configuration.passing("file", f"{origin}: {', '.join(names)} to {' and '.join(enabled)}")
     loads: list[MessageLoad] = []
     for source in settings.sources:
-        checks = source_checks.SourceChecks(source, seconds)
+        checks = SourceChecks(source, seconds)
         async for finding in checks.run():
             yield finding
         loads += checks.message_loads
@@ -35,11 +35,11 @@ async def run_checks(settings: Settings, origin: str, seconds: float) -> AsyncIt
 
 
 def run_checks_without_settings(error: ConfigError) -> Iterator[Finding]:
-    """Yield the findings that are possible although ``error`` prevents loading the settings."""
+    """Yield ``error`` as a finding, and run the checks that need no settings."""
     yield _configuration.failing(
         "file", str(error), "Correct these lines; config/gateway.yaml explains every key."
     )
-    subjects = {"source": source_checks.CHECKS, **{name: kind.checks for name, kind in OUTPUTS.items()}}
+    subjects = {"source": CHECKS, **{name: kind.checks for name, kind in OUTPUTS.items()}}
     for subject, checks in subjects.items():
         for check in checks:
             yield Subject(subject).not_tested(check, "it needs the configuration, which failed")

@@ -1,4 +1,4 @@
-"""Check of this computer's clock, which utime and capture_utime depend on."""
+"""Check of this computer's clock, on which utime and capture_utime depend."""
 
 import ctypes
 from typing import Final
@@ -39,7 +39,7 @@ def read_clock() -> tuple[bool, int]:
 
 
 def check_clock() -> Finding:
-    """Check that the clock is synchronised."""
+    """Check that this computer's clock is synchronised."""
     try:
         is_synchronised, max_error_us = read_clock()
     except OSError as error:

@@ -1,21 +1,19 @@
-"""Checks of the frames that one stream received: whether they are complete, and markers and tools in view."""
+"""Checks of the frames that one stream received: completeness, and visibility of markers and tools."""
 
 from typing import Final
 
-from gateway.doctor.observation import ObservedComponent, ObservedStream
-from gateway.doctor.server_description import described_items, described_labels
+from gateway.doctor.observation import COMPONENTS_WITH_VISIBILITY, ObservedComponent, ObservedStream
+from gateway.doctor.server_description import described_labels, num_described_items
 from gateway.findings import Finding, Subject
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.stream.state import StreamState
 
 _MIN_VISIBLE: Final = 0.5
-"""If a smaller share of the markers or of the tools is in view, the check fails."""
+"""The check fails if a smaller share of the markers, or of the tools, is in view."""
 
 _MAX_NAMES: Final = 5
-
-COMPONENTS_WITH_VISIBILITY: Final = (ComponentType.MARKERS, ComponentType.TOOLS)
-"""The components whose items can be out of view."""
+"""How many markers or tools a finding names."""
 
 
 def check_frames(subject: Subject, stream: ObservedStream, parameters: Parameters | None) -> Finding:
@@ -38,11 +36,7 @@ def check_frames(subject: Subject, stream: ObservedStream, parameters: Parameter
         )
     if not stream.observed:
         return _no_frames(subject, stream, of_stream)
-    missing = [
-        component.key
-        for component in stream.settings.components
-        if parameters and component not in stream.observed and described_items(parameters, component)
-    ]
+    missing = _missing_components(stream, parameters)
     if missing:
         names = ", ".join(missing)
         return subject.failing(
@@ -58,6 +52,15 @@ def check_frames(subject: Subject, stream: ObservedStream, parameters: Parameter
     return subject.passing(
         "frames", f"{stream.status.frames_in} frames with {names}; the largest message has {largest} bytes"
     )
+
+
+def _missing_components(stream: ObservedStream, parameters: Parameters | None) -> list[str]:
+    """Return the keys of the components that the parameters describe but no frame contains."""
+    return [
+        component.key
+        for component in stream.settings.components
+        if parameters and component not in stream.observed and num_described_items(parameters, component)
+    ]
 
 
 def _no_frames(subject: Subject, stream: ObservedStream, of_stream: str) -> Finding:
@@ -105,7 +108,7 @@ def check_visibility(subject: Subject, stream: ObservedStream, parameters: Param
 def _never_visible(
     observed: ObservedComponent, component: ComponentType, parameters: Parameters | None
 ) -> str:
-    """Return " (never NAMES)" for items that were in view in no frame; "" if this is true for all or none."""
+    """Return " (never NAMES)" for the items that were never in view; "" if these are all items or none."""
     indices = observed.never_visible_indices
     if not indices or not observed.visible_share:
         return ""

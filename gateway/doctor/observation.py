@@ -1,4 +1,6 @@
-"""What the doctor observes of one stream: rates, message sizes, which markers and tools are in view."""
+"""Observation of one stream: rates, message sizes, and which markers and tools are in view."""
+
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -13,15 +15,18 @@ from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
 
+COMPONENTS_WITH_VISIBILITY: Final = (ComponentType.MARKERS, ComponentType.TOOLS)
+"""The components whose items can be out of view."""
+
 
 class ObservedComponent:
-    """The frames of one component: how many, when, how large, and which of their items are in view."""
+    """Statistics of the frames of one component: number, times, size, and which items are in view."""
 
     def __init__(self) -> None:
-        self._frames = 0
+        self._num_frames = 0
         self._largest_message_bytes = 0
-        self._items = 0
-        self._visible_items = 0
+        self._num_items = 0
+        self._num_visible_items = 0
         self._was_visible: npt.NDArray[np.bool_] = np.zeros(0, np.bool_)
         self._timestamps_us: list[int] = []
         self._first_utime = self._last_utime = 0
@@ -30,38 +35,39 @@ class ObservedComponent:
         """Count one frame with this component, which arrived at ``utime`` (µs since the Unix epoch)."""
         self._first_utime = self._first_utime or utime
         self._last_utime = utime
-        self._frames += 1
+        self._num_frames += 1
         self._timestamps_us.append(component.timestamp_us)
         message_bytes = ITEMS_OFFSET + component.num_items * component.item_bytes
         self._largest_message_bytes = max(self._largest_message_bytes, message_bytes)
-        if component.type in {ComponentType.MARKERS, ComponentType.TOOLS}:
+        if component.type in COMPONENTS_WITH_VISIBILITY:
             self._count_visible(component)
 
     def _count_visible(self, component: Component) -> None:
         items = component.items()
         # A NaN in any coordinate means missing (field note 7).
         visible = ~(np.isnan(items["x"]) | np.isnan(items["y"]) | np.isnan(items["z"]))
-        self._items += len(visible)
-        self._visible_items += int(np.count_nonzero(visible))
+        self._num_items += len(visible)
+        self._num_visible_items += int(np.count_nonzero(visible))
         if len(visible) != len(self._was_visible):  # the layout has changed: start again
             self._was_visible = np.zeros(len(visible), np.bool_)
         self._was_visible |= visible
 
     @property
     def rate_hz(self) -> float:
-        """Frames per second, by the server's time stamps if they are plausible, else by arrival times.
+        """Frames per second; 0 if fewer than two frames arrived.
 
-        Time stamps are better because delays of the network or of this program do not affect them. But
-        the time stamps of some servers stand still, jump, or are not in microseconds (field note 11).
-        0 with fewer than two frames.
+        By the server's time stamps if they increase and agree with the arrival times within a factor of 2,
+        else by arrival times. Time stamps are better because delays of the network or of this program do
+        not affect them. But some servers' time stamps are constant, jump, or are not in microseconds (field
+        note 11).
         """
-        gaps = self._frames - 1
+        intervals = self._num_frames - 1
         span_s = (self._last_utime - self._first_utime) / 1e6
-        arrival_hz = gaps / span_s if gaps > 0 and span_s > 0 else 0.0
+        arrival_hz = intervals / span_s if intervals > 0 and span_s > 0 else 0.0
         steps_us = np.diff(np.array(self._timestamps_us, np.int64))
-        if gaps < 1 or bool(np.any(steps_us <= 0)):
+        if intervals < 1 or bool(np.any(steps_us <= 0)):
             return arrival_hz
-        timestamp_hz = gaps * 1e6 / float(steps_us.sum())
+        timestamp_hz = intervals * 1e6 / float(steps_us.sum())
         is_plausible = not arrival_hz or 0.5 < timestamp_hz / arrival_hz < 2
         return timestamp_hz if is_plausible else arrival_hz
 
@@ -73,7 +79,7 @@ class ObservedComponent:
     @property
     def visible_share(self) -> float | None:
         """The share of markers or tools in view, over all frames; None if there were no items."""
-        return self._visible_items / self._items if self._items else None
+        return self._num_visible_items / self._num_items if self._num_items else None
 
     @property
     def never_visible_indices(self) -> list[int]:

@@ -1,4 +1,4 @@
-"""Checks of the outputs, as the registry lists them."""
+"""Checks of one output: its own, or whether it opens."""
 
 import time
 from collections.abc import Sequence
@@ -19,7 +19,10 @@ def check_output(
     loads: Sequence[MessageLoad],
     seconds: float,
 ) -> list[Finding]:
-    """Run the checks of one output; blocks for ``seconds`` or a bit longer."""
+    """Run the checks of one output; blocks for about ``seconds``.
+
+    ``sources`` are the names of all sources, ``loads`` the messages that they make.
+    """
     if not settings.enabled:
         subject = Subject(kind.name)
         return [subject.not_tested(check, f"{kind.name}.enabled is false") for check in kind.checks]
@@ -29,7 +32,7 @@ def check_output(
 
 
 def _check_opens(kind: OutputKind, settings: OutputSettings, seconds: float) -> Finding:
-    """Open the output as the gateway does, and close it."""
+    """Check that the output opens, as in the gateway, within ``seconds``; then close it."""
     subject = Subject(kind.name)
     default_remedy = f"Correct {kind.name} in the configuration."
     try:

@@ -11,14 +11,14 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 
 _MIN_SHARE: Final = 0.9
-"""A component that arrives at a smaller share of its expected rate is too slow."""
+"""The check fails if a component arrives at a smaller share of its expected rate."""
 
 _Rates = Mapping[ComponentType, float]
 """Rates in Hz."""
 
 
 def check_rate(subject: Subject, stream: ObservedStream, parameters: Parameters | None) -> Finding:
-    """Check that each component arrives at the server's rate, or at the lower rate that is configured."""
+    """Check that each component arrives at the rate that the server describes, or at a lower configured one."""
     rates_hz: _Rates = {
         component: observed.rate_hz
         for component, observed in stream.observed.items()
@@ -27,7 +27,7 @@ def check_rate(subject: Subject, stream: ObservedStream, parameters: Parameters 
     if not rates_hz:
         return subject.not_tested("rate", "too few frames to measure the rate")
     expected_hz = {} if parameters is None else _expected_rates_hz(stream, parameters)
-    found = f"{', '.join(_text(component, rates_hz, expected_hz) for component in rates_hz)} Hz"
+    found = f"{', '.join(_rate_text(component, rates_hz, expected_hz) for component in rates_hz)} Hz"
     compared = [component for component in rates_hz if component in expected_hz]
     if not compared:
         return subject.not_tested("rate", f"{found}; the server's parameters have no rate to compare with")
@@ -50,8 +50,8 @@ def check_rate(subject: Subject, stream: ObservedStream, parameters: Parameters 
     )
 
 
-def _text(component: ComponentType, rates_hz: _Rates, expected_hz: _Rates) -> str:
-    """Return for example "3d 100 of 200"."""
+def _rate_text(component: ComponentType, rates_hz: _Rates, expected_hz: _Rates) -> str:
+    """Return a component's measured and expected rate, such as "3d 100 of 200"."""
     expected = f" of {_number(expected_hz[component])}" if component in expected_hz else ""
     return f"{component.key} {_number(rates_hz[component])}{expected}"
 
@@ -61,7 +61,7 @@ def _number(rate_hz: float) -> str:
 
 
 def _is_limited_by_others(slow: Sequence[ComponentType], rates_hz: _Rates, expected_hz: _Rates) -> bool:
-    """Return whether the slow components arrive exactly as fast as a slower component of the stream."""
+    """Return whether the slow components arrive at the rate of the stream's slowest component (§5.3.5)."""
     others_hz = [expected_hz[other] for other in rates_hz if other in expected_hz and other not in slow]
     return bool(others_hz) and all(
         _MIN_SHARE * min(others_hz) <= rates_hz[component] <= min(others_hz) / _MIN_SHARE
@@ -70,9 +70,9 @@ def _is_limited_by_others(slow: Sequence[ComponentType], rates_hz: _Rates, expec
 
 
 def _expected_rates_hz(stream: ObservedStream, parameters: Parameters) -> dict[ComponentType, float]:
-    """Return the rate at which each component should arrive, where the parameters say a rate.
+    """Return the rate at which each component should arrive, for those with a rate in the parameters.
 
-    A divisor divides the rate of the stream, which is that of its slowest component (§5.3.5).
+    A divisor applies to the rate of the stream, which is that of its slowest component (§5.3.5).
     """
     rates_hz = {
         component: rate

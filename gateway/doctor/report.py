@@ -15,7 +15,7 @@ _MARKS: Final = {
     Result.NOT_TESTED: ("skip", "yellow"),
 }
 _INDENT: Final = " " * 20
-"""The indentation of texts, which follow the mark (column 3) and the name of the check (column 9)."""
+"""The indentation of texts: the mark begins in column 3, the name of the check in column 9."""
 
 _MAX_WIDTH: Final = 100
 
@@ -35,10 +35,10 @@ class Report:
             self._subject = finding.subject
             self._print(Text(finding.subject, "bold"))
         mark, style = _MARKS[finding.result]
-        begin = Text.assemble("  ", (f"{mark:<4}", style), f"  {finding.check:<12}")
+        columns = Text.assemble("  ", (f"{mark:<4}", style), f"  {finding.check:<12}")
         text = "not tested: " if finding.result is Result.NOT_TESTED else ""
         first, *others = self._wrapped(text + finding.found)
-        self._print(begin + Text(first))
+        self._print(columns + Text(first))
         for line in others:
             self._print(Text(_INDENT + line))
         for number, line in enumerate(self._wrapped(finding.remedy)):
@@ -68,8 +68,8 @@ class Report:
         width = max(20, min(self._console.width, _MAX_WIDTH) - len(_INDENT) - 2)
         return [
             line
-            for part in text.splitlines()
-            for line in textwrap.wrap(part, width, break_long_words=False, break_on_hyphens=False)
+            for paragraph in text.splitlines()
+            for line in textwrap.wrap(paragraph, width, break_long_words=False, break_on_hyphens=False)
         ]
 
     def _print(self, text: Text) -> None:

@@ -1,11 +1,14 @@
-"""What a server's parameters (§6) say about one component."""
+"""What a server's parameters (§6) say about one component: its rate, its items and their labels."""
 
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 
 
 def described_rate_hz(parameters: Parameters, component: ComponentType) -> float | None:
-    """Return the rate at which the server samples ``component``; None if the parameters do not say."""
+    """Return the rate at which the server samples ``component``, in Hz; None if the parameters lack it.
+
+    For analog and force, this is the highest rate of a channel or plate.
+    """
     match component:
         case ComponentType.MARKERS:
             return parameters.markers.frequency_hz if parameters.markers else None
@@ -13,16 +16,16 @@ def described_rate_hz(parameters: Parameters, component: ComponentType) -> float
             return parameters.tools.frequency_hz if parameters.tools else None
         case ComponentType.ANALOG:
             channels = parameters.analog.channels if parameters.analog else ()
-            return max((channel.frequency_hz or 0 for channel in channels), default=None)
+            return max((channel.frequency_hz or 0 for channel in channels), default=0) or None
         case ComponentType.FORCE:
             plates = parameters.force.plates if parameters.force else ()
-            return max((plate.frequency_hz or 0 for plate in plates), default=None)
+            return max((plate.frequency_hz or 0 for plate in plates), default=0) or None
         case _:
             return None
 
 
-def described_items(parameters: Parameters, component: ComponentType) -> int:
-    """Return how many markers, tools, channels or plates the parameters list; 0 for events."""
+def num_described_items(parameters: Parameters, component: ComponentType) -> int:
+    """Return the number of markers, tools, channels or plates in the parameters; 0 for events."""
     match component:
         case ComponentType.MARKERS:
             return len(parameters.markers.markers) if parameters.markers else 0
@@ -37,7 +40,7 @@ def described_items(parameters: Parameters, component: ComponentType) -> int:
 
 
 def described_labels(parameters: Parameters, component: ComponentType) -> list[str]:
-    """Return the labels of the markers or tools, in the order of the frames; [] for other components."""
+    """Return the labels of the markers or tools, in their order in a frame; [] for other components."""
     if component is ComponentType.MARKERS and parameters.markers:
         return [marker.label for marker in parameters.markers.markers]
     if component is ComponentType.TOOLS and parameters.tools:

@@ -7,8 +7,8 @@ from collections.abc import AsyncIterator
 from typing import Final
 
 from gateway.config.settings import SourceSettings
-from gateway.doctor.frame_checks import COMPONENTS_WITH_VISIBILITY, check_frames, check_visibility
-from gateway.doctor.observation import ObservedStream
+from gateway.doctor.frame_checks import check_frames, check_visibility
+from gateway.doctor.observation import COMPONENTS_WITH_VISIBILITY, ObservedStream
 from gateway.doctor.rate_check import check_rate
 from gateway.errors import ConnectError, LinkError, PacketError
 from gateway.findings import Finding, MessageLoad, Result, Subject
@@ -16,13 +16,13 @@ from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 from gateway.rtc3d.parameters import Parameters
 
 CHECKS: Final = ("name", "TCP", "protocol", "parameters", "frames", "rate", "visibility")
-"""The checks in order. Each of the first three is a condition for all that follow."""
+"""The checks in order. If one of the first three fails, those after it are not made."""
 
 _PORTS: Final = f"{FIRST_PRINCIPLES_PORT} is First Principles, {WAVEFRONT_PORT} WaveFront"
 
 
 class SourceChecks:
-    """The checks of one source. Use once; create it in a running event loop."""
+    """Runs the checks of one source, once. Create it in a running event loop."""
 
     def __init__(self, source: SourceSettings, seconds: float) -> None:
         self._source = source
@@ -33,11 +33,11 @@ class SourceChecks:
 
     @property
     def message_loads(self) -> list[MessageLoad]:
-        """The messages that the observed frames make, one entry per component."""
+        """The messages that the gateway would publish, one entry per observed component."""
         return [component.message_load for stream in self._streams for component in stream.observed.values()]
 
     async def run(self) -> AsyncIterator[Finding]:
-        """Yield the findings, layer by layer. After a failing layer, the others are not tested."""
+        """Run the checks in order, yield their findings, and close the connections."""
         remaining = list(CHECKS)
         for check in (self._check_name, self._check_tcp, self._check_protocol):
             finding = await check()
@@ -59,7 +59,7 @@ class SourceChecks:
 
     @property
     def _parameters(self) -> Parameters | None:
-        """The server's parameters as received on the first stream that got any."""
+        """The parameters that the first stream with any received."""
         parsed = next((stream.parsed for stream in self._streams if stream.parsed is not None), None)
         return None if parsed is None else parsed.parameters
 
@@ -120,14 +120,14 @@ class SourceChecks:
 
     def _protocol_failure(self, stream: ObservedStream, error: LinkError) -> Finding:
         if isinstance(error.__cause__, PacketError):
-            begin = error.__cause__.begin.decode("latin-1")
-            text = "".join(letter if letter.isprintable() else "·" for letter in begin)
+            first_bytes = error.__cause__.first_bytes.decode("latin-1")
+            text = "".join(letter if letter.isprintable() else "·" for letter in first_bytes)
             return self._subject.failing(
                 "protocol",
                 f"the program at {self._server} is not an RT server; its first bytes are {text!r}",
                 f"Correct the source's host and port: {_PORTS}.",
             )
-        if stream.session.is_open:  # the only error that leaves the connection open
+        if stream.session.is_open:  # only the refusal of StreamFrames leaves it open
             return self._subject.failing(
                 "protocol",
                 f"{self._server} refuses every form of the StreamFrames command",
@@ -141,7 +141,7 @@ class SourceChecks:
         )
 
     def _check_parameters(self) -> Finding:
-        [first, *_] = self._streams
+        first = self._streams[0]
         if first.parsed is not None:
             repaired = f" (repaired: {first.parsed.recovered[0]})" if first.parsed.recovered else ""
             return self._subject.passing("parameters", _summary(first.parsed.parameters) + repaired)

@@ -150,7 +150,7 @@ class PacketReader:
         return packets, start
 
 
-def _size_error(size: int, packet_type: int, offset: int, limit: int, begin: bytes) -> PacketError:
+def _size_error(size: int, packet_type: int, offset: int, limit: int, first_bytes: bytes) -> PacketError:
     is_small = size < PACKET_HEADER_BYTES
     bound = f"less than the header's {PACKET_HEADER_BYTES}" if is_small else f"limit {limit}"
     return PacketError(
@@ -159,5 +159,5 @@ def _size_error(size: int, packet_type: int, offset: int, limit: int, begin: byt
         size=size,
         packet_type=packet_type,
         offset=offset,
-        begin=begin,
+        first_bytes=first_bytes,
     )

@@ -184,7 +184,7 @@ def test_the_error_has_the_first_60_bytes(piece: int) -> None:
     reader = limited_reader()
     greeting = b"SSH-2.0-" + bytes(range(92))
     reader.feed(PACKETS[1].packet + greeting[:piece])
-    assert error_of(reader).begin == greeting[: min(piece, 60)]
+    assert error_of(reader).first_bytes == greeting[: min(piece, 60)]
 
 
 # Of 20, 8 and 15 bytes: the next packet starts at byte 43 of the stream.
