@@ -69,7 +69,7 @@ def validation_error(text: str, *location: str | int) -> ValidationError:
 
 
 def expects(what: str) -> WrapValidator:
-    """Return an annotation that rewords the errors of the type beside it: "found VALUE; expected ``what``"."""
+    """Return an annotation that rewords errors of the type beside it: "found VALUE; expected ``what``"."""
 
     def check(value: object, validate: ValidatorFunctionWrapHandler) -> object:
         try:
@@ -109,7 +109,7 @@ def join_or(words: Iterable[str]) -> str:
 
 
 def spelling_hint(word: object, known: Iterable[str]) -> str:
-    """Return " (did you mean 'x'?)" with the member of ``known`` that is most like ``word``; "" if none is."""
+    """Return " (did you mean 'x'?)" if ``word`` is similar to ``x``, a member of ``known``; else ""."""
     near = difflib.get_close_matches(str(word).lower()[:60], known, n=1)
     return f" (did you mean {near[0]!r}?)" if near else ""
 

@@ -18,7 +18,7 @@ _Rates = Mapping[ComponentType, float]
 
 
 def check_rate(subject: Subject, stream: ObservedStream, parameters: Parameters | None) -> Finding:
-    """Check that each component arrives at the rate that the server describes, or at a lower configured one."""
+    """Check that each component arrives at the rate that the server describes, or the one configured."""
     rates_hz: _Rates = {
         component: observed.rate_hz
         for component, observed in stream.observed.items()

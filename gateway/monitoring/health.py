@@ -18,7 +18,7 @@ _ONLY_EVENTS: Final = {ComponentType.EVENT}
 
 
 def health_page(gateway: Gateway) -> Page:
-    """Return the page /healthz: status 200, or 503 if something has a problem, and the details as JSON."""
+    """Return the page /healthz: JSON with status 200, or 503 if a stream or an output has a problem."""
     utime = now_utime()
     streams = [
         _stream_health(source, stream, status, utime)
@@ -51,7 +51,7 @@ def _output_health(output: Output) -> dict[str, str]:
 
 
 def _stream_problem(source: Source, stream: StreamSettings, status: StreamStatus, age_s: float | None) -> str:
-    """Return what is wrong with a stream and what to check; "" if it has frames or needs none."""
+    """Return what is wrong with a stream and what to check; "" if frames arrive or none are needed."""
     max_age_s = source.settings.stall_timeout_s
     if age_s is not None and age_s < max_age_s:
         return ""

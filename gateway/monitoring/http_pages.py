@@ -1,6 +1,6 @@
 """A minimal HTTP/1.1 server for monitoring: GET only, small requests, one per connection.
 
-It runs in the event loop, so the counters on a page are consistent with each other. Clients are
+Pages are built in the event loop, so their counters are consistent with each other. Clients are
 untrusted: size, duration and number of requests are bounded.
 """
 
@@ -29,7 +29,7 @@ class Page(NamedTuple):
 
 
 class HttpPages:
-    """Serves ``pages``, functions by their paths; each request calls its function."""
+    """Serves ``pages``: a function for each path, called for each request."""
 
     def __init__(self, pages: Mapping[str, Callable[[], Page]]) -> None:
         self._pages = pages
@@ -44,7 +44,7 @@ class HttpPages:
         """Stop listening and close all connections."""
         if self._server is not None:
             self._server.close()
-        # Not cancelled: before Python 3.12, asyncio's streams log a cancellation as an error.
+        # Abort instead of cancelling: before Python 3.12, asyncio's streams log a cancellation as an error.
         for transport in self._connections.values():
             transport.abort()
         await asyncio.gather(*self._connections, return_exceptions=True)
@@ -56,7 +56,7 @@ class HttpPages:
             return
         self._connections[task] = writer.transport
         try:
-            # These errors are the client's; nobody here could act on them.
+            # The client caused these errors; an operator of the gateway can do nothing about them.
             with contextlib.suppress(
                 TimeoutError, OSError, asyncio.IncompleteReadError, asyncio.LimitOverrunError
             ):

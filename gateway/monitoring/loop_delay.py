@@ -1,4 +1,4 @@
-"""How late the event loop runs callbacks; frames wait as long."""
+"""How late the event loop runs callbacks. Received frames wait just as long."""
 
 import asyncio
 import time
@@ -9,18 +9,18 @@ _WINDOW_S: Final = 60.0
 
 
 class LoopDelay:
-    """Measures the delay of a timer every 0.1 s; call ``start`` in the running event loop."""
+    """Measures every 0.1 s how late a timer fires. Call ``start`` in the running event loop."""
 
     def __init__(self) -> None:
         self.last_s = 0.0
         """The delay of the newest measurement."""
-        self._max_s = self._previous_max_s = 0.0  # of this window and of the one before
+        self._max_s = self._previous_max_s = 0.0  # of this minute and of the one before
         self._window_end_s = self._due_s = 0.0
         self._timer: asyncio.TimerHandle | None = None
 
     @property
     def max_s(self) -> float:
-        """The largest delay of the last one to two minutes: a scrape every minute misses none."""
+        """The largest delay of the last one to two minutes, so a scrape each minute misses none."""
         return max(self._max_s, self._previous_max_s)
 
     def start(self) -> None:
@@ -42,7 +42,7 @@ class LoopDelay:
         self._max_s = max(self._max_s, delay_s)
 
     def _schedule(self) -> None:
-        # Not the loop's own time, which uvloop keeps in whole milliseconds.
+        # time.monotonic, because uvloop's own clock counts whole milliseconds
         self._due_s = time.monotonic() + _PERIOD_S
         self._timer = asyncio.get_running_loop().call_later(_PERIOD_S, self._measure)
 

@@ -1,6 +1,6 @@
-"""Prometheus metrics, made from the gateway's counters at each scrape.
+"""Prometheus metrics, read from the gateway's counters at each scrape.
 
-The data path does not depend on them. Label values come from the configuration and from this program
+The data path does not know about them. Label values come from the configuration and from this program
 (sources, streams, components, outputs, causes, states), never from a network, so the number of series is
 bounded.
 """
@@ -23,18 +23,19 @@ from gateway import __version__
 from gateway.gateway import Gateway
 from gateway.monitoring.http_pages import Page
 from gateway.monitoring.loop_delay import LoopDelay
+from gateway.outputs.status import OutputStatus
 from gateway.stream.clock import ServerClock
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 
 METRIC_PREFIX: Final = "rtc3d_gateway_"
 
-# These causes start at 0, so that queries see the first drop as an increase. Others appear when they occur.
+# Counters of these causes exist from the start, so that PromQL sees the first drop as an increase.
 _STREAM_DROP_CAUSES: Final = ("frame rejected", "unknown component", "skipped while behind")
 
 Labels = tuple[str, ...]
 Sample = tuple[Labels, float]
-"""The values of the labels, and the value of the sample."""
+"""The label values of a sample, and its value."""
 
 
 class _StreamMetric(NamedTuple):
@@ -46,7 +47,7 @@ class _StreamMetric(NamedTuple):
 
 
 def _if_valid(value: Callable[[ServerClock], float]) -> Callable[[StreamStatus], float | None]:
-    """Return a function for the value of a stream's clock, or None while the clock is not valid."""
+    """Return a function that returns a value of a stream's clock, or None while the clock is not valid."""
     return lambda status: value(status.clock) if status.clock.has_clock else None
 
 
@@ -92,6 +93,20 @@ _STREAM_GAUGES: Final = (
     ),
 )
 
+_ROUTE_COUNTERS: Final[tuple[tuple[str, str, Callable[[OutputStatus], Mapping[str, int]]], ...]] = (
+    (
+        "messages",
+        "Messages passed to the output; 6d/tool, status and clock count as separate components.",
+        lambda status: status.messages,
+    ),
+    (
+        "message_bytes",
+        "Bytes of these messages, without the overhead of Zenoh, LCM and the network.",
+        lambda status: status.message_bytes,
+    ),
+)
+"""Name, help text and value of the counters of a source's messages to one output."""
+
 
 def metrics_registry(gateway: Gateway, loop_delay: LoopDelay) -> CollectorRegistry:
     """Return the registry of all metrics of ``gateway``."""
@@ -106,7 +121,7 @@ def metrics_page(registry: CollectorRegistry) -> Page:
 
 
 class GatewayCollector(Collector):
-    """Reads a gateway's counters; ``collect`` runs in the thread of the event loop."""
+    """Reads a gateway's counters. ``collect`` must run in the thread of the event loop."""
 
     def __init__(self, gateway: Gateway, loop_delay: LoopDelay) -> None:
         self._gateway = gateway
@@ -174,44 +189,35 @@ class GatewayCollector(Collector):
         )
 
     def _routes(self) -> Iterator[Metric]:
+        """Yield the metrics of what each source passes to each output."""
         routes = [
-            (
-                (source.settings.name, output.name),
-                status,
-                [component.key for component in source.queries.components],
-            )
+            (source, output, status)
             for source in self._gateway.sources
             for output, status in source.fan_out.outputs
         ]
         labels = ("source", "output")
-        yield _counter(
-            "messages",
-            "Messages passed to the output; 6d/tool, status and clock count as separate components.",
-            (*labels, "component"),
-            [
-                sample
-                for route, status, components in routes
-                for sample in _samples(route, status.messages, components)
-            ],
-        )
-        yield _counter(
-            "message_bytes",
-            "Bytes of these messages, without the overhead of Zenoh, LCM and the network.",
-            (*labels, "component"),
-            [
-                sample
-                for route, status, components in routes
-                for sample in _samples(route, status.message_bytes, components)
-            ],
-        )
+        for name, help_text, counts in _ROUTE_COUNTERS:
+            yield _counter(
+                name,
+                help_text,
+                (*labels, "component"),
+                [
+                    sample
+                    for source, output, status in routes
+                    for sample in _samples(
+                        (source.name, output.name),
+                        counts(status),
+                        [component.key for component in source.queries.components],
+                    )
+                ],
+            )
         yield _counter(
             "output_drops",
             "Messages that the output did not accept, and LCM requests without an answer, by cause.",
             (*labels, "cause"),
             [
                 sample
-                for source in self._gateway.sources
-                for output, status in source.fan_out.outputs
+                for source, output, status in routes
                 for sample in _samples((source.name, output.name), status.drops, output.drop_causes)
             ],
         )
@@ -238,18 +244,18 @@ class GatewayCollector(Collector):
     def _process(self) -> Iterator[Metric]:
         yield _gauge(
             "loop_delay_seconds",
-            "How late the event loop ran its last measured callback; frames wait as long.",
+            "How late the event loop ran the last measured callback; frames wait just as long.",
             (),
             [((), self._loop_delay.last_s)],
         )
         yield _gauge(
             "loop_delay_max_seconds",
-            "Largest such delay of the last one to two minutes.",
+            "Largest of these delays in the last one to two minutes.",
             (),
             [((), self._loop_delay.max_s)],
         )
         yield InfoMetricFamily(f"{METRIC_PREFIX}build", "Versions; always 1.", self._build)
-        # Not prometheus_client's own collector, which needs /proc/stat: the service's sandbox hides that.
+        # prometheus_client's own collector reads /proc/stat, which the service's sandbox hides.
         cpu_s = time.process_time()
         pages = int(Path("/proc/self/statm").read_text().split()[1])
         memory_bytes = pages * resource.getpagesize()
@@ -260,7 +266,7 @@ class GatewayCollector(Collector):
 
 
 def _samples(labels: Labels, counts: Mapping[str, int], known: Iterable[str]) -> Iterator[Sample]:
-    """Yield one sample per count, and 0 for each of ``known`` without a count."""
+    """Yield one sample per count, and a 0 for each of the ``known`` names without a count."""
     for name, count in (dict.fromkeys(known, 0) | dict(counts)).items():
         yield (*labels, name), count
 

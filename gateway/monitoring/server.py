@@ -24,7 +24,7 @@ class MonitoringServer:
         )
 
     async def start(self) -> None:
-        """Listen if it is enabled. If the port cannot be bound, log a warning and continue without it."""
+        """Listen if the settings enable it. If the port cannot be bound, log a warning and continue."""
         if not self._settings.enabled:
             return
         address, port = self._settings.address, self._settings.port

@@ -1,4 +1,4 @@
-"""The gateway's status in one line for people, shown by ``systemctl status``."""
+"""The texts of the status line that ``systemctl status`` shows."""
 
 from collections.abc import Iterable, Sequence
 
@@ -10,7 +10,7 @@ from gateway.stream.status import StreamStatus
 
 
 def status_lines(gateway: Gateway) -> list[str]:
-    """Return a line per source, and one for each output that cannot send."""
+    """Return a text for each source, and for each output that cannot send."""
     outputs = ((output.name, output.health()) for output in gateway.outputs)
     return [
         *(source_line(source.settings, source.streams) for source in gateway.sources),
@@ -21,8 +21,8 @@ def status_lines(gateway: Gateway) -> list[str]:
 def source_line(source: SourceSettings, streams: Sequence[tuple[StreamStatus, float]]) -> str:
     """Return the status of a source, such as "lab: streaming 200.0 Hz".
 
-    ``streams`` are pairs of a status and a frame rate in Hz. If they have different texts, each text
-    follows the components of its stream.
+    ``streams`` are pairs of a status and a frame rate in Hz. If their texts differ, the components of each
+    stream precede its text.
     """
     server = f"{source.host}:{source.port}"
     texts = [_stream_text(server, status, rate_hz) for status, rate_hz in streams]

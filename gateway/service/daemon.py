@@ -1,4 +1,4 @@
-"""The gateway as a daemon: it handles signals, reloads the configuration and notifies systemd."""
+"""The gateway as a daemon: handles signals, reloads the configuration and notifies systemd."""
 
 import asyncio
 import logging
@@ -19,8 +19,8 @@ logger = logging.getLogger(__name__)
 async def serve(load: Callable[[], Settings]) -> None:
     """Run a gateway with the settings that ``load`` returns, until SIGTERM or SIGINT.
 
-    SIGHUP calls ``load`` again and applies what has changed; a configuration with an error is refused
-    as a whole. Raises ConfigError if the settings cannot be used at the start.
+    SIGHUP calls ``load`` again and applies the changes; a configuration with an error is refused as a
+    whole. Raises ConfigError if the settings cannot be used at the start.
     """
     await Daemon(load, Gateway(load())).run()
 
@@ -37,7 +37,7 @@ class Daemon:
         self._reload_requested = asyncio.Event()
         self._started_on_terminal = os.isatty(0)
         self._reload_problem = ""
-        """Why the last reload was refused; empty if it was not."""
+        """Why the last reload was refused; "" if it succeeded."""
 
     async def run(self) -> None:
         """Run until SIGTERM, SIGINT or the end of the controlling terminal."""
@@ -70,9 +70,9 @@ class Daemon:
             self._reload_requested.set()
 
     async def _notify_systemd(self) -> None:
-        """Report the start, then the status periodically.
+        """Notify systemd of the start, then periodically of the status.
 
-        This runs in the event loop so that the watchdog restarts the service when the loop hangs.
+        This runs in the event loop so that the watchdog restarts the service if the loop hangs.
         """
         await self._gateway.opened.wait()
         self._systemd.notify_alive(self._status_line())
@@ -101,7 +101,7 @@ class Daemon:
 
     async def _reload(self) -> None:
         try:
-            # In a thread, so that reading a large file does not delay frames.
+            # in a thread, because reading a file could delay frames
             settings = await asyncio.to_thread(self._load)
             metrics_before = self._gateway.settings.metrics
             changes = await self._gateway.reload(settings)

@@ -44,7 +44,10 @@ _SYSLOG_IDENTIFIER: Final = "rtc3d-gateway"
 
 
 class ContextFilter(logging.Filter):
-    """Adds the fields that are set by ``log_fields`` to each record, as its attributes; for handlers."""
+    """Adds the fields set by ``log_fields`` to each record, as attributes.
+
+    Attach it to handlers: a logger's own filters do not see the records of other loggers.
+    """
 
     def filter(self, record: logging.LogRecord) -> bool:
         """Add the fields; every record passes."""
@@ -72,7 +75,7 @@ def _handler_for(log_format: LogFormat) -> logging.Handler:
                     f"cannot log to the journal: {error}; pip install 'rtc3d-gateway[systemd]', "
                     "or choose another --log-format"
                 ) from error
-            # systemd also forwards stderr to the journal, but as text without fields.
+            # Otherwise use stderr: systemd forwards it to the journal, as text without fields.
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(
         JsonFormatter()
@@ -121,9 +124,9 @@ class JournalHandler(logging.Handler):
     Raises ImportError if cysystemd is not installed.
     """
 
-    # cysystemd's own JournaldLogHandler does not fit: it calls the field LOGGER_NAME, gives each record
-    # another MESSAGE_ID (which should identify the kind of message), adds about twenty more fields, and
-    # raises its errors, such as a KeyError for an unusual level, into the code that logs.
+    # Not cysystemd's own JournaldLogHandler: it calls the field LOGGER_NAME, gives each record a new
+    # MESSAGE_ID (which should identify the kind of message), adds about twenty more fields, and lets its
+    # errors, such as a KeyError for an unusual level, reach the code that logs.
 
     def __init__(self) -> None:
         super().__init__()

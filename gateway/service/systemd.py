@@ -1,7 +1,7 @@
-"""Notifications for systemd (sd_notify); without $NOTIFY_SOCKET nothing is sent.
+"""Notifications for systemd (sd_notify), sent only if $NOTIFY_SOCKET is set.
 
-They need cysystemd, which contains libsystemd. It is the optional extra ``systemd`` because it has no
-wheels for platforms without systemd, such as Alpine containers.
+They need cysystemd, which contains libsystemd. It is installed with the optional extra ``systemd``, because
+it has no wheels for platforms without systemd, such as Alpine containers.
 """
 
 import logging
@@ -16,7 +16,7 @@ logger = logging.getLogger(__name__)
 
 
 class SystemdNotifier:
-    """The connection to the systemd that started this process, if one did."""
+    """Notifies the systemd that started this process, if one did."""
 
     def __init__(self) -> None:
         self._enabled = bool(os.environ.get("NOTIFY_SOCKET"))
