@@ -75,7 +75,7 @@ async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool
         await _show(received, seconds, console)
         simulator.stop_measurement()
         lost = await _count_missing(simulator, received)
-    console.print(_report(simulator.sent, received))
+    console.print(_report(simulator.components_sent, received))
     console.print("[green]Nothing was lost.[/]" if not lost else f"[red]{lost} messages were lost.[/]")
     return not lost
 
@@ -139,7 +139,7 @@ async def _count_missing(simulator: Simulator, received: dict[str, _Received]) -
     def missing() -> int:
         return sum(
             max(0, sent - each.count[component])
-            for component, sent in simulator.sent.items()
+            for component, sent in simulator.components_sent.items()
             for each in received.values()
         )
 

@@ -127,7 +127,7 @@ class Soak:
                 )
             simulator.stop_measurement()
             await asyncio.sleep(2)
-            self.sent = simulator.sent
+            self.sent = simulator.components_sent
         finally:
             await faults.clear()
             session.close()

@@ -19,8 +19,10 @@ from gateway.rtc3d_server.scene import Scene
 from gateway.rtc3d_server.sent_counts import SentCounts
 
 MAX_COMMAND_BYTES: Final = 64 * 1024
+"""The largest packet that a client may send."""
+
 MAX_UNREAD_BYTES: Final = 4 * 1024 * 1024
-"""How much is kept for a client that does not read; beyond it, frames for that client are dropped."""
+"""How many bytes are kept for a client that does not read; beyond this, its frames are dropped."""
 
 _log = logging.getLogger(__name__)
 
@@ -40,7 +42,7 @@ class ConnectionOwner(Protocol):
         ...
 
     def frame_builder(self, components: Sequence[ComponentType]) -> FrameBuilder:
-        """Return the frame builder of these components; none means all."""
+        """Return the frame builder of these components; an empty sequence means all."""
         ...
 
     def elapsed_us(self) -> int | None:
@@ -48,15 +50,15 @@ class ConnectionOwner(Protocol):
         ...
 
     def frames_requested(self) -> int | None:
-        """Start a measurement that waits for the first request for frames; return ``elapsed_us``."""
+        """Start the measurement if it waits for the first request for frames; return ``elapsed_us``."""
         ...
 
     def connection_opened(self, connection: "ClientConnection") -> int:
-        """Keep a new connection; return its number."""
+        """Add a new connection; return its number."""
         ...
 
     def connection_closed(self, connection: "ClientConnection") -> None:
-        """Forget a connection that has ended."""
+        """Remove a connection that has ended."""
         ...
 
     def new_filter(self, connection: FilteredConnection) -> ConnectionFilter:
@@ -64,35 +66,35 @@ class ConnectionOwner(Protocol):
         ...
 
     def schedule(self) -> None:
-        """Set the timer again: the connection's ``due_us`` may have changed."""
+        """Reset the timer, because the connection's ``due_us`` may have changed."""
         ...
 
 
 class ClientConnection(asyncio.Protocol):
-    """One client's TCP connection: packets in to its session, replies and due frames out.
+    """One client's TCP connection: passes packets to its session, and sends replies and due frames.
 
     Nagle's algorithm is off (§2.1): asyncio and uvloop switch it off for every TCP connection. Each
     packet is written at once and by itself, because common clients read a packet with one recv
-    (field note 15). While a client does not read, the server does not read from it either, and
-    drops its frames.
+    (field note 15). While a client does not read, the server drops its frames and does not read from
+    it either.
     """
 
     transport: asyncio.Transport
     filter: ConnectionFilter
-    """What bytes pass through in both directions."""
+    """Passes all bytes in both directions, and may change them."""
 
     number: int
-    """Counts the connections since the server's start, from 1."""
+    """The connection's number since the server's start, from 1."""
 
     def __init__(self, owner: ConnectionOwner) -> None:
         self._owner = owner
         self._loop = asyncio.get_running_loop()
         self._reader = PacketReader(max_packet_bytes=MAX_COMMAND_BYTES, max_c3d_bytes=MAX_COMMAND_BYTES)
         self._inbox: deque[Packet] = deque()
-        self._is_full = False  # MAX_UNREAD_BYTES wait for the client to read
-        self._was_full = False
-        self._first_sent_s: float | None = None  # monotonic times of the first and the newest frame sent
-        self._last_sent_s = 0.0
+        self._is_full = False  # whether MAX_UNREAD_BYTES wait for the client to read
+        self._was_full = False  # whether it has been full before
+        self._first_sent_s: float | None = None  # when the first frame was sent, on the monotonic clock
+        self._last_sent_s = 0.0  # when the newest frame was sent
         self.closed: asyncio.Future[None] = self._loop.create_future()
         """Done once the connection has ended."""
         self.sent_counts = SentCounts()
@@ -162,7 +164,7 @@ class ClientConnection(asyncio.Protocol):
         self.filter.receive(data)
 
     def handle(self, data: bytes) -> None:
-        """Act on the next bytes from the client."""
+        """Read packets from the next bytes of the client, and answer them."""
         is_idle = not self._inbox
         self._inbox.extend(self._reader.feed(data))
         if is_idle:
@@ -192,7 +194,7 @@ class ClientConnection(asyncio.Protocol):
         self.filter.send(packet)
 
     def write(self, data: bytes) -> None:
-        """Write bytes to the socket with one send; nothing reaches the client in another way."""
+        """Write bytes to the socket with one send. All bytes to the client go through here."""
         if not self.transport.is_closing():
             self.transport.write(data)
 
@@ -206,7 +208,7 @@ class ClientConnection(asyncio.Protocol):
         return not (self._is_full or self.transport.is_closing())
 
     def _process_inbox(self) -> None:
-        """Answer one packet, and schedule the next for the loop's next turn: no client delays the others."""
+        """Answer one packet. The next one waits for the loop's next turn, so no client delays the others."""
         if not self._can_send():
             return
         if self._inbox:

@@ -29,7 +29,7 @@ from gateway.rtc3d_server.frame_schedule import FrameRequest, FrameSchedule
 VERSION: Final = "1.0"
 NO_DATA: Final = encode_packet(PacketType.NO_DATA)
 MAX_LATE_US: Final = 1_000_000
-"""Frames of a stream that are later than this are dropped; the others are still sent."""
+"""Stream frames that are later than this are dropped; less late ones are still sent."""
 
 _log = logging.getLogger(__name__)
 
@@ -39,66 +39,68 @@ class SessionCallbacks:
     """What a session needs from its server."""
 
     frame_builder: Callable[[Sequence[ComponentType]], FrameBuilder]
-    """Returns the frame builder of these components; none means all."""
+    """Returns the frame builder of these components; an empty sequence means all."""
 
     parameters: Callable[[], Parameters]
     """Returns all sections of §6."""
 
     frames_requested: Callable[[], int | None]
-    """Called when the client requests frames; returns the measurement's time in µs, None if none runs."""
+    """Called when the client requests frames; returns the measurement's time in µs, None without one."""
 
 
 class ClientSession:
     """The protocol with one client, independent of the transport.
 
-    The caller keeps the measurement's time; all times are in µs since the measurement's start. The
-    caller reports ``measurement_started``, ``measurement_stopped`` and ``scene_changed``, sends the
-    packets that ``answer`` returns, and at ``due_us`` those that ``due_frames`` yields.
+    All times are in µs since the measurement's start; the caller has the clock. It calls
+    ``measurement_started``, ``measurement_stopped`` and ``scene_changed``, sends the packets that ``answer``
+    returns, and at ``due_us`` those that ``due_frames`` yields.
     """
 
     def __init__(self, callbacks: SessionCallbacks) -> None:
         self._callbacks = callbacks
         self.name = "client"
         """The client's name in log messages."""
-        self._subscription: StreamFrames | None = None
-        self._stream: FrameSchedule | None = None  # of the subscription, while a measurement runs
-        self._requests: deque[FrameRequest] = deque()  # answered first in, first out
-        self._newest_us = -1  # time stamp of the newest frame that was built for this client
-        self._events_from_us: int | None = None  # time of the first event to send; None: no frames requested
+        self._stream_command: StreamFrames | None = None  # the newest one, until StreamFrames Stop
+        self._schedule: FrameSchedule | None = None  # of that command, while a measurement is running
+        self._frame_requests: deque[FrameRequest] = deque()  # SendCurrentFrame; answered in order
+        self._newest_us = -1  # time stamp of the newest frame built for this client
+        self._events_from_us: int | None = (
+            None  # time of the first event to send; None if no frames are requested
+        )
         self.byte_order: ByteOrder = "big"
         """The byte order of the client's data frames (§4.3)."""
         self.frames_dropped = 0
-        """The number of frames of its streams that were dropped because the client or the server was late."""
+        """The number of stream frames that were dropped because the client or the server was late."""
         self.is_recording = False
         """Whether the client started a recording, as WaveFront's clients do (field note 16)."""
         self.said_bye = False
-        """Whether the client said Bye: close the connection once the replies are sent."""
+        """Whether the client sent Bye: close the connection once the replies are sent."""
 
     @property
     def due_us(self) -> int | None:
-        """When the next frame is due; None if none is requested or no measurement runs."""
-        waiting = (self._stream, self._requests[0] if self._requests else None)
+        """When the next frame is due; None if none is requested or no measurement is running."""
+        waiting = (self._schedule, self._frame_requests[0] if self._frame_requests else None)
         return min((frames.due_us for frames in waiting if frames is not None), default=None)
 
     def measurement_started(self) -> None:
-        """Begin the stream, if the client subscribed to one, with the measurement's first frame."""
+        """Start the client's stream, if it requested one, with the measurement's first frame."""
         self._newest_us = -1
         self._events_from_us = None
-        if self._subscription is not None:
+        if self._stream_command is not None:
             self._events_from_us = 0
-            self._begin_stream(self._subscription, 0)
+            self._start_stream(self._stream_command, 0)
 
     def measurement_stopped(self) -> list[bytes]:
         """Return a No Data packet for the stream and for each waiting request (§5.3.4, §5.3.5)."""
-        num_waiting = len(self._requests) + (self._stream is not None)
-        self._requests.clear()
-        self._stream = None
+        num_waiting = len(self._frame_requests) + (self._schedule is not None)
+        self._frame_requests.clear()
+        self._schedule = None
         return [NO_DATA] * num_waiting
 
     def scene_changed(self) -> None:
-        """Continue the stream, from its next frame on, with frames of the new scene."""
-        if self._stream is not None and self._subscription is not None:
-            self._begin_stream(self._subscription, self._stream.due_us)
+        """Continue the stream with frames of the new scene, from the next frame on."""
+        if self._schedule is not None and self._stream_command is not None:
+            self._start_stream(self._stream_command, self._schedule.due_us)
 
     def answer(self, packet: Packet) -> list[bytes]:
         """Execute a client's packet; return the replies, each one packet."""
@@ -118,27 +120,27 @@ class ClientSession:
                 ]
 
     def due_frames(self, elapsed_us: int) -> Iterator[DataPacket]:
-        """Yield the frames that are due, oldest first; a frame that the caller does not take stays due."""
+        """Yield the frames that are due, oldest first. Frames that the caller does not take stay due."""
         self.drop_due_frames(elapsed_us - MAX_LATE_US)
-        while self._stream is not None and self._stream.due_us <= elapsed_us:
-            stream = self._stream
-            tick = stream.tick
-            stream.advance()
-            frame = self._build(stream.builder, tick)
+        while self._schedule is not None and self._schedule.due_us <= elapsed_us:
+            schedule = self._schedule
+            tick = schedule.tick
+            schedule.advance()
+            frame = self._build(schedule.builder, tick)
             if frame.components:
                 yield frame
-        while self._requests and self._requests[0].due_us <= elapsed_us:
-            builder = self._requests.popleft().builder
+        while self._frame_requests and self._frame_requests[0].due_us <= elapsed_us:
+            builder = self._frame_requests.popleft().builder
             yield self._build(builder, builder.tick_after(elapsed_us) - 1)
 
     def drop_due_frames(self, elapsed_us: int) -> None:
         """Drop the stream's frames that are due; their events go into the next frame."""
-        stream = self._stream
-        if stream is None or stream.due_us > elapsed_us:
+        schedule = self._schedule
+        if schedule is None or schedule.due_us > elapsed_us:
             return
-        count = stream.num_due(elapsed_us)
-        stream.advance(count)
-        if stream.builder.measured:
+        count = schedule.num_due(elapsed_us)
+        schedule.advance(count)
+        if schedule.builder.measured:  # a stream that has only events loses nothing
             self.frames_dropped += count
 
     def _execute(self, command: Command, body: bytes) -> list[bytes]:
@@ -155,8 +157,8 @@ class ClientSession:
             case SendCurrentFrame() | StreamFrames():
                 return [acknowledgement, *self._request_frames(command)]
             case StopStreaming():
-                self._subscription = self._stream = None
-                if not self._requests:
+                self._stream_command = self._schedule = None
+                if not self._frame_requests:
                     self._events_from_us = None
             case Bye():
                 self.said_bye = True
@@ -171,27 +173,27 @@ class ClientSession:
         return replace(parameters, **omitted)
 
     def _request_frames(self, command: SendCurrentFrame | StreamFrames) -> list[bytes]:
-        """Keep a request for frames; return a No Data packet if no measurement runs."""
+        """Store a request for frames; return a No Data packet if no measurement is running."""
         elapsed_us = self._callbacks.frames_requested()
         if isinstance(command, StreamFrames):
-            self._subscription = command
+            self._stream_command = command
         if elapsed_us is None:
             return [NO_DATA]
         if isinstance(command, StreamFrames):
-            self._begin_stream(command, elapsed_us)
+            self._start_stream(command, elapsed_us)
         else:
-            self._requests.append(
+            self._frame_requests.append(
                 FrameRequest(self._callbacks.frame_builder(command.components), self._newest_us)
             )
         if self._events_from_us is None:
             self._events_from_us = elapsed_us
         return []
 
-    def _begin_stream(self, command: StreamFrames, elapsed_us: int) -> None:
+    def _start_stream(self, command: StreamFrames, elapsed_us: int) -> None:
         builder = self._callbacks.frame_builder(command.components)
         # a frame that is due right now is sent, unless the client already has it
         first_tick = builder.tick_after(max(elapsed_us - 1, self._newest_us))
-        self._stream = FrameSchedule(builder, command.rate, first_tick)
+        self._schedule = FrameSchedule(builder, command.rate, first_tick)
 
     def _build(self, builder: FrameBuilder, tick: int) -> DataPacket:
         time_us = builder.time_us(tick)

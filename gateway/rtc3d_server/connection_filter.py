@@ -1,4 +1,4 @@
-"""The hook between a client's connection and its socket, by which a program can change what passes."""
+"""The hook between a client's connection and its socket, where a program can change the bytes."""
 
 import asyncio
 from typing import Protocol
@@ -11,7 +11,7 @@ class FilteredConnection(Protocol):
 
     transport: asyncio.Transport
     number: int
-    """Counts the connections since the server's start, from 1."""
+    """The connection's number since the server's start, from 1."""
 
     @property
     def name(self) -> str:
@@ -19,11 +19,11 @@ class FilteredConnection(Protocol):
         ...
 
     def write(self, data: bytes) -> None:
-        """Write bytes to the socket with one send, past the filter."""
+        """Write bytes to the socket with one send, bypassing the filter."""
         ...
 
     def handle(self, data: bytes) -> None:
-        """Act on bytes from the client, past the filter; the replies go through it."""
+        """Process bytes from the client, bypassing the filter; the replies go through it."""
         ...
 
     def answer(self, packet: Packet) -> list[bytes]:
@@ -38,7 +38,7 @@ class FilteredConnection(Protocol):
 class ConnectionFilter:
     """Passes one connection's bytes through unchanged.
 
-    Subclasses override what they change, delay or drop. They reach the socket and the server only
+    Subclasses override methods to change, delay or drop them. They reach the socket and the server only
     through ``connection``.
     """
 
@@ -50,7 +50,7 @@ class ConnectionFilter:
         self.connection.write(packet)
 
     def receive(self, data: bytes) -> None:
-        """Take bytes that were read from the client's socket."""
+        """Process bytes that were read from the client's socket."""
         self.connection.handle(data)
 
     def answer(self, packet: Packet) -> list[bytes]:
@@ -58,7 +58,7 @@ class ConnectionFilter:
         return self.connection.answer(packet)
 
     def flush(self) -> None:
-        """Write at once whatever the filter has kept back: the server is about to close the connection."""
+        """Write at once all bytes that the filter holds back: the server is about to close the connection."""
 
     def connection_lost(self) -> None:
-        """Discard whatever the filter has kept back, and cancel its timers: the connection has ended."""
+        """Discard all bytes that the filter holds back, and cancel its timers: the connection has ended."""

@@ -1,4 +1,4 @@
-"""Builds a scene's data frames: the sample of each component that a frame has, and the packet's bytes."""
+"""Builds a scene's data frames: which sample of each component they have, and the bytes of the packets."""
 
 from collections.abc import Sequence
 from fractions import Fraction
@@ -19,10 +19,10 @@ from gateway.rtc3d.frames import encode_frame
 from gateway.rtc3d.packets import PacketType, encode_packet
 from gateway.rtc3d_server.scene import NO_EVENTS, Scene
 
-_BLOCK_FRAMES: Final = (
-    64  # computed by the scene in one call, because a call of numpy costs much more than a value
-)
-_KEPT_PACKETS: Final = 64  # so that clients with equal streams share them
+_BLOCK_FRAMES: Final = 64
+"""The scene computes this many frames in one call, because a call of numpy costs much more than a value."""
+
+_CACHED_PACKETS: Final = 64  # clients with equal streams share them
 _SECOND_US: Final = 1_000_000
 _FRAME_NUMBERS: Final = 2**31  # the field is a signed 32-bit integer
 
@@ -35,7 +35,7 @@ class DataPacket(NamedTuple):
 
 
 def exact_rate(rate_hz: float) -> Fraction:
-    """Return the fraction that a rounded rate stands for, such as 60000/1001 for 59.94006."""
+    """Return the exact value of a rounded rate, such as 60000/1001 for 59.94006."""
     return Fraction(rate_hz).limit_denominator(1001)
 
 
@@ -47,8 +47,8 @@ class FrameBuilder:
     of each component at its tick, and all components have the tick's time stamp. A FrameNumber is
     the number of the component's own sample, from 1.
 
-    ``requested`` names the components as in a command: none means all. Components that the scene
-    lacks are left out. ``event_bytes`` is the size of an event: 24 as NDI's code writes events, or 16
+    ``requested`` are the components of a command; an empty sequence means all. Components that the
+    scene lacks are left out. ``event_bytes`` is the size of an event: 24 as NDI's code writes events, or 16
     as in §7.7 (field note 6).
     """
 
@@ -60,13 +60,13 @@ class FrameBuilder:
         self._scene = scene
         self._event_bytes = event_bytes
         self.measured = tuple(rates)
-        """The components of each frame, events aside, in their order in it."""
+        """The components of each frame except events, in wire order."""
         self.has_events = ComponentType.EVENT in chosen and events is not None and bool(events.events)
         self.rate = min(rates.values(), default=measurement_rate)
         """Ticks per second."""
         self._samples_per_tick = [rates[component] / self.rate for component in self.measured]
         self._events_per_tick = measurement_rate / self.rate
-        self._packet = lru_cache(_KEPT_PACKETS)(self._build_packet)
+        self._packet = lru_cache(_CACHED_PACKETS)(self._build_packet)
         self._block = lru_cache(4)(self._build_block)
 
     def time_us(self, tick: int) -> int:
@@ -115,7 +115,7 @@ class FrameBuilder:
         return block
 
     def _resized(self, events: Items) -> Items:
-        """Return the events in the size that was configured."""
+        """Return the events in the configured size."""
         if self._event_bytes == SHORT_EVENT.itemsize:
             return events[["id", "param1", "param2", "param3"]].astype(SHORT_EVENT)
         return events

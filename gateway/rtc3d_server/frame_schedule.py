@@ -23,7 +23,7 @@ class FrameRequest:
 class FrameSchedule:
     """The frames of a client's StreamFrames during one measurement (§5.3.5).
 
-    Frame j of the stream is that of tick ``first_tick`` + ⌈j · stride⌉.
+    Frame j of the stream (from 0) is the frame of tick ``first_tick`` + ⌈j · stride⌉.
     """
 
     def __init__(self, builder: FrameBuilder, rate: Rate | None, first_tick: int) -> None:
@@ -38,13 +38,13 @@ class FrameSchedule:
         """When the next frame is due."""
 
     def advance(self, count: int = 1) -> None:
-        """Pass over the next ``count`` frames, which were sent or dropped."""
+        """Go on to the frame after the next ``count`` frames, which were sent or dropped."""
         self._num_passed += count
         self.tick = self._first_tick - (-self._num_passed * self._numerator // self._denominator)
         self.due_us = self.builder.time_us(self.tick)
 
     def num_due(self, elapsed_us: int) -> int:
-        """Return how many frames are due."""
+        """Return how many frames are due at ``elapsed_us``."""
         ticks = self.builder.tick_after(elapsed_us) - 1 - self._first_tick
         return max(0, ticks * self._denominator // self._numerator + 1 - self._num_passed)
 

@@ -13,13 +13,14 @@ SampleNumbers = npt.NDArray[np.int64]
 """Numbers of samples of one component, shape (count,), counted from 0 at the start of the measurement."""
 
 NO_EVENTS: Final = np.zeros(0, LONG_EVENT)
+"""An empty array of events."""
 
 
 class Scene(Protocol):
     """The content of a measurement: a function of time alone.
 
-    Its methods never block, and return the same values whenever they are called with the same
-    arguments, so that all clients see one scene however much their streams differ.
+    Its methods never block, and always return the same values for the same arguments, so that all clients
+    see the same scene even if their streams differ.
     """
 
     @property
@@ -29,12 +30,12 @@ class Scene(Protocol):
 
     @property
     def rates_hz(self) -> Mapping[ComponentType, float]:
-        """The rate of each measured component of the scene; components without items are missing."""
+        """The rate in Hz of each measured component of the scene; components without items are missing."""
         ...
 
     @property
     def measurement_rate_hz(self) -> float:
-        """The rate of real-time frames, and of streams that have nothing but events."""
+        """The rate of frames in a measurement, and of streams that have only events."""
         ...
 
     @property
@@ -45,7 +46,7 @@ class Scene(Protocol):
     def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
         """Return a measured component's items, shape (len(samples), number of items).
 
-        The dtype is that of ITEM_DTYPES. After the last sample of a pass the first one follows again.
+        The dtype is that of ITEM_DTYPES. The first sample of a pass follows the last one.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""Counts of the data frames that were sent."""
+"""Counts of the data frames and components that were sent."""
 
 from collections import Counter
 
@@ -12,7 +12,7 @@ class SentCounts:
         self._frames: Counter[tuple[ComponentType, ...]] = Counter()
 
     def add(self, components: tuple[ComponentType, ...]) -> None:
-        """Count one frame that has these components."""
+        """Count one frame with these components."""
         self._frames[components] += 1
 
     @property
@@ -22,7 +22,7 @@ class SentCounts:
 
     @property
     def components(self) -> Counter[str]:
-        """The number of each component, by the components' keys."""
+        """How often each component was in a frame, by its key."""
         counts: Counter[str] = Counter()
         for components, frames in self._frames.items():
             counts.update({component.key: frames for component in components})

@@ -1,4 +1,4 @@
-"""The RT server: accepts clients, and sends each of them its frames of one measurement."""
+"""The RT server: accepts clients, and sends each of them the frames that it requested."""
 
 import asyncio
 import logging
@@ -24,11 +24,11 @@ _log = logging.getLogger(__name__)
 class RtServer:
     """Serves a scene on a TCP port.
 
-    With ``port`` 0 the system chooses a free port; the attribute ``port`` has it after ``start``.
+    With ``port`` 0 the system chooses a free port, which ``port`` contains after ``start``.
     ``event_bytes`` is the size of an event: 24 as NDI's code writes events, or 16 as in §7.7 (field
-    note 6). The measurement begins with ``start``; with ``once``, it begins with the first request
+    note 6). The measurement starts with ``start``; with ``once``, it starts with the first request
     for frames and ends after one pass of the scene. ``name`` is the server's name in the General
-    parameters. ``new_filter`` makes the filter of each connection; the default changes nothing.
+    parameters. ``new_filter`` returns the filter of a new connection; the default changes nothing.
 
     Use it as an asynchronous context manager, or call ``start`` and ``close``.
     """
@@ -53,9 +53,9 @@ class RtServer:
         self._new_filter = new_filter
         self._measurement = Measurement(scene, event_bytes=event_bytes, once=once)
         self._once = once
-        self._starts_on_request = once  # the measurement, with the first request for frames
+        self._starts_on_request = once  # whether the next request for frames starts the measurement
         self._num_accepted = 0  # connections since the server's start
-        self._dropped_before = 0  # frames that clients missed whose connections have ended
+        self._dropped_for_closed = 0  # frames dropped on connections that have ended
         self._server: asyncio.Server | None = None
         self._timer: asyncio.TimerHandle | None = None
 
@@ -70,24 +70,26 @@ class RtServer:
         return self._server is not None and self._server.is_serving()
 
     @property
-    def sent(self) -> Counter[str]:
-        """The number of each component that was sent to all clients, by the components' keys."""
+    def components_sent(self) -> Counter[str]:
+        """How often each component was sent, to all clients together, by its key."""
         return self.sent_counts.components
 
     @property
     def frames_sent(self) -> int:
-        """The number of frames that were sent to all clients."""
+        """The number of frames sent to all clients together."""
         return self.sent_counts.frames
 
     @property
     def frames_dropped(self) -> int:
-        """The number of frames that clients missed because they did not read or the server was late."""
-        return self._dropped_before + sum(c.session.frames_dropped for c in self.connections)
+        """The number of frames dropped because clients did not read or the server was late."""
+        return self._dropped_for_closed + sum(
+            connection.session.frames_dropped for connection in self.connections
+        )
 
     # Life cycle -----------------------------------------------------------------------------
 
     async def start(self) -> None:
-        """Listen, and start the measurement unless it waits for the first request.
+        """Listen, and start the measurement unless it waits for the first request for frames.
 
         Raises GatewayError if the server cannot listen on the address.
         """
@@ -122,9 +124,9 @@ class RtServer:
         self._server = None
 
     def crash(self) -> None:
-        """End as if the process died, without a word to the clients.
+        """End as if the process died: abort all connections without a packet, and stop listening.
 
-        ``start`` brings the server back, on the same port.
+        ``start`` lets the server return on the same port.
         """
         for connection in list(self.connections):
             connection.transport.abort()
@@ -148,9 +150,9 @@ class RtServer:
     # The measurement ------------------------------------------------------------------------
 
     def start_measurement(self) -> None:
-        """Start a measurement, unless one runs.
+        """Start a measurement, unless one is running.
 
-        Frame numbers and time stamps start again; clients' streams go on with the first frame.
+        Frame numbers and time stamps start over; clients' streams continue with the first frame.
         """
         if self._measurement.is_running:
             return
@@ -162,7 +164,7 @@ class RtServer:
         self.schedule()
 
     def stop_measurement(self) -> None:
-        """Stop the measurement, if one runs: clients that wait for frames get a No Data packet."""
+        """Stop the measurement, if one is running; clients that wait for frames get a No Data packet."""
         if not self._measurement.is_running:
             return
         self._measurement.stop()
@@ -173,14 +175,14 @@ class RtServer:
         self.schedule()
 
     def change_scene(self, scene: Scene) -> None:
-        """Serve another scene from now on; a running measurement and its time stamps go on."""
+        """Serve another scene from now on; a running measurement and its time stamps continue."""
         self._measurement.change_scene(scene)
         for connection in self.connections:
             connection.session.scene_changed()
         self.schedule()
 
     def elapsed_us(self) -> int | None:
-        """Return the time since the measurement's start in µs, None if none runs."""
+        """Return the time since the measurement's start in µs, None if none is running."""
         return self._measurement.elapsed_us()
 
     # For connections ------------------------------------------------------------------------
@@ -211,11 +213,11 @@ class RtServer:
     def connection_closed(self, connection: ClientConnection) -> None:
         """See ConnectionOwner."""
         self.connections.discard(connection)
-        self._dropped_before += connection.session.frames_dropped
+        self._dropped_for_closed += connection.session.frames_dropped
         self.schedule()
 
     def schedule(self) -> None:
-        """Set the timer to the time at which the next frame is due to any client, or the measurement ends."""
+        """Set the timer to when the next frame is due for any client, or when the measurement ends."""
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None

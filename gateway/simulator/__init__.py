@@ -1,1 +1,1 @@
-"""The simulator: scenes for an RT server that stands in for the hardware, and faults."""
+"""The simulator: an RT server with synthetic or recorded scenes, and with faults on request."""

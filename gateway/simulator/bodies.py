@@ -13,19 +13,19 @@ _MARKERS_PER_BODY: Final = 4
 _BODY_RADIUS_MM: Final = 80.0
 _NOISE_MM: Final = 0.1
 _MIN_VISIBLE_MARKERS: Final = 3
-_MARKER_HIDDEN: Final = 0.02  # share of the time for each single marker
-_BODY_HIDDEN: Final = 0.03  # share of the time for all markers of a body together
+_MARKER_HIDDEN: Final = 0.02  # the share of time that a single marker is out of view
+_BODY_HIDDEN: Final = 0.03  # the share of time that all markers of a body are out of view together
 _MARKER_ITEM: Final = ITEM_DTYPES[ComponentType.MARKERS]
 _TOOL_ITEM: Final = ITEM_DTYPES[ComponentType.TOOLS]
 _Booleans = npt.NDArray[np.bool_]
 
 
 class RigidBodies:
-    """Bodies that swing about their own axis while they travel on smooth closed curves.
+    """Bodies that swing about their own axis while their centres move on smooth curves.
 
-    Each body has four markers, and the last one also the remaining markers; with fewer than four
-    markers there is one body. The tools are distributed over the bodies in turn, each with its own
-    origin and orientation on the body, so there can be any number of either.
+    Each body has four markers, and the last body also has the remaining ones; with fewer than four
+    markers there is one body. Tools are assigned to the bodies in turn, each with its own origin and
+    orientation on the body. So any numbers of markers and tools are possible.
     """
 
     def __init__(self, num_markers: int, num_tools: int, rate_hz: float, rng: np.random.Generator) -> None:
@@ -35,7 +35,7 @@ class RigidBodies:
         self._body_of_tool = np.arange(num_tools) % bodies
         self._first_markers = np.arange(bodies) * _MARKERS_PER_BODY
         self.tool_markers: _Booleans = self._body_of_marker[:, None] == self._body_of_tool
-        """Whether a marker belongs to a tool, shape (markers, tools)."""
+        """Whether each marker belongs to each tool, shape (markers, tools)."""
 
         self._travel = _Waves(rng, (bodies, 3), amplitude=(50.0, 300.0), period_s=(2.0, 9.0))
         self._swing = _Waves(rng, (bodies,), amplitude=(0.3, 1.5), period_s=(1.5, 6.0))
@@ -44,14 +44,14 @@ class RigidBodies:
         self._noise = Noise(rng, num_markers * 3)
 
         self._centre_mm = rng.uniform((-1000.0, -1000.0, 500.0), (1000.0, 1000.0, 1500.0), (bodies, 3))
-        self._axis = _unit(rng.standard_normal((bodies, 3)))
+        self._axis = _normalised(rng.standard_normal((bodies, 3)))
         self._markers = self._rotation_terms(
             _BODY_RADIUS_MM * _spread(num_markers, rng), self._body_of_marker
         )
         origin_mm = rng.uniform(-20.0, 20.0, (num_tools, 3))
         self._origins = self._rotation_terms(origin_mm, self._body_of_tool)
-        # A tool's quaternion is the body's, (cos a/2, axis · sin a/2), times that of the tool on the body.
-        own = _unit(rng.standard_normal((num_tools, 4)))
+        # A tool's quaternion is the body's, (cos a/2, axis · sin a/2), times its own on the body.
+        own = _normalised(rng.standard_normal((num_tools, 4)))
         axis = self._axis[self._body_of_tool]
         self._quaternion_cos = own
         self._quaternion_sin = np.concatenate(
@@ -76,15 +76,14 @@ class RigidBodies:
     def tools(self, samples: SampleNumbers) -> Items:
         """Return the 6D items, shape (len(samples), tools), in mm.
 
-        The pose is that of the body without noise; its error is the RMS distance of the visible
-        markers from their positions by the pose. With fewer than three visible markers there is no
-        pose, and the tool is missing.
+        The pose is that of the body without noise. Its error is the RMS distance of the visible markers
+        from where the pose puts them. With fewer than three visible markers, the tool is missing.
         """
         time_s = samples / self._rate_hz
         half = self._swing(time_s).take(self._body_of_tool, axis=1)[..., None] / 2
         visible = ~self._hidden(time_s)
-        num_visible = self._sum_on_tools(visible.astype(np.float32))
-        square_mm = self._sum_on_tools(_square_sum(self._noise_mm(samples)) * visible)
+        num_visible = self._sum_per_tool(visible.astype(np.float32))
+        square_mm = self._sum_per_tool(_square_sum(self._noise_mm(samples)) * visible)
         values = np.empty((*num_visible.shape, 8), np.float32)
         values[..., :4] = self._quaternion_cos * np.cos(half) + self._quaternion_sin * np.sin(half)
         values[..., 4:7] = self._positions_mm(time_s, self._origins, self._body_of_tool)
@@ -95,7 +94,7 @@ class RigidBodies:
     def _rotation_terms(self, local_mm: Floats, body: npt.NDArray[np.int64]) -> tuple[Floats, Floats, Floats]:
         """Return (along, across, beside) of points on bodies, each of shape (points, 3).
 
-        By Rodrigues' formula, along + across · cos a + beside · sin a is a point turned about the
+        By Rodrigues' formula, along + across · cos a + beside · sin a is the point rotated about the
         body's axis by the angle a.
         """
         axis = self._axis[body]
@@ -107,7 +106,7 @@ class RigidBodies:
     ) -> Floats:
         along, across, beside = terms
         angle = self._swing(time_s)
-        # take() and sums in place are several times faster than indexing with arrays and temporaries
+        # take() and in-place sums are several times faster than array indexing and temporary arrays.
         position_mm: Floats = (self._centre_mm + self._travel(time_s)).take(body, axis=1)
         position_mm += along
         position_mm += across * np.cos(angle).take(body, axis=1)[..., None]
@@ -120,11 +119,14 @@ class RigidBodies:
         body: _Booleans = self._body_hiding(time_s) > np.cos(np.pi * _BODY_HIDDEN)
         return marker | body.take(self._body_of_marker, axis=1)
 
-    def _sum_on_tools(self, per_marker: Floats) -> Floats:
-        """Return the sums over each tool's markers, shape (samples, tools), of values per marker."""
+    def _sum_per_tool(self, per_marker: Floats) -> Floats:
+        """Return the sum of ``per_marker`` over the markers of each tool, shape (samples, tools).
+
+        ``per_marker`` has the shape (samples, markers).
+        """
         if per_marker.shape[1] == 0:
             return np.zeros((len(per_marker), len(self._body_of_tool)))
-        # not a matrix product, whose rounding depends on the number of samples in one call
+        # Not a matrix product: its rounding would depend on the number of samples in one call.
         sums: Floats = np.add.reduceat(per_marker, self._first_markers, axis=1)
         return sums.take(self._body_of_tool, axis=1)
 
@@ -133,7 +135,10 @@ class RigidBodies:
 
 
 class _Waves:
-    """Sine waves of random amplitude, period and phase, one for each element of ``shape``."""
+    """Sine waves, one for each element of ``shape``, with random amplitude, period and phase.
+
+    ``amplitude`` and ``period_s`` are ranges.
+    """
 
     def __init__(
         self,
@@ -154,7 +159,7 @@ class _Waves:
 
 
 def _spread(count: int, rng: np.random.Generator) -> Floats:
-    """Return directions, shape (count, 3), of which any four in a row are far from one line or plane."""
+    """Return directions, shape (count, 3); any four consecutive ones span all three dimensions well."""
     corners = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3)
     jitter = rng.uniform(-0.3, 0.3, (count, 3))
     directions: npt.NDArray[Any] = corners[np.arange(count) % 4] + jitter
@@ -162,11 +167,11 @@ def _spread(count: int, rng: np.random.Generator) -> Floats:
 
 
 def _square_sum(vectors: Floats) -> Floats:
-    """Return the squares of the lengths of vectors, shape (…, 3)."""
+    """Return the squared lengths of ``vectors``, which have the shape (…, 3)."""
     squares: npt.NDArray[Any] = np.einsum("...i,...i->...", vectors, vectors)
     return squares
 
 
-def _unit(vectors: Floats) -> Floats:
+def _normalised(vectors: Floats) -> Floats:
     unit: npt.NDArray[Any] = vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
     return unit

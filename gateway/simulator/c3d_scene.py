@@ -30,11 +30,11 @@ _log = logging.getLogger(__name__)
 
 
 class C3dScene:
-    """The scene in a C3D file, repeated from its first frame after its last.
+    """The scene in a C3D file, which starts again after its last frame.
 
-    Every value is the one that ezc3d reads, as float32. A marker with any NaN or with a residual of -1
-    is missing, in the bytes of §7.3 and field note 7. Markers and channels have the order of
-    POINT:LABELS and ANALOG:LABELS.
+    Every value is what ezc3d reads, as float32. A marker with any NaN or with a residual of -1 is
+    missing, with the bytes of §7.3 and field note 7. Markers and channels have the order of POINT:LABELS
+    and ANALOG:LABELS.
     """
 
     def __init__(self, path: Path) -> None:
@@ -116,7 +116,7 @@ def _read(path: Path) -> Any:
 
 
 def _markers(points: npt.NDArray[np.float64], residuals: npt.NDArray[np.float64]) -> Items:
-    """Return the 3D items, shape (frames, markers), of ezc3d's points (4, markers, frames)."""
+    """Return the 3D items, shape (frames, markers), from ezc3d's points, shape (4, markers, frames)."""
     values = np.empty((points.shape[2], points.shape[1], 4), ">f4")
     values[..., :3] = points[:3].T
     values[..., 3] = residuals[0].T
@@ -126,7 +126,7 @@ def _markers(points: npt.NDArray[np.float64], residuals: npt.NDArray[np.float64]
 
 
 def _forces(plates: list[Any]) -> Items:
-    """Return the Force items, shape (samples, plates); ezc3d's plates have force and moment, (3, samples)."""
+    """Return the Force items, shape (samples, plates); ezc3d's force and moment have shape (3, samples)."""
     dtype = ITEM_DTYPES[ComponentType.FORCE]
     if not plates:
         return np.empty((0, 0), dtype)
@@ -166,7 +166,7 @@ def _describe_analog(analog: Any, count: int, rate_hz: float) -> ParametersAnalo
 
 
 def _describe_plate(plate: Any, index: int, force_platform: Any, rate_hz: float) -> Plate:
-    """Return a plate's parameters; C3D has no labels, excitation or gain of plates."""
+    """Return a plate's parameters; C3D has no label, excitation or gain for plates."""
     units = [plate["unit_force"]] * 3 + [plate["unit_moment"]] * 3
     channels = np.reshape(force_platform["CHANNEL"]["value"], (-1, len(force_platform["TYPE"]["value"])))
     calibration = plate["cal_matrix"]
@@ -181,7 +181,7 @@ def _describe_plate(plate: Any, index: int, force_platform: Any, rate_hz: float)
             for number, (label, unit) in enumerate(zip(_FORCE_LABELS, units, strict=True), start=1)
         ),
         analog_channel_ids=tuple(str(channel) for channel in channels[:, index] if channel > 0),
-        # plate types without a calibration matrix have one of zeros
+        # for plate types without a calibration matrix, ezc3d returns zeros
         calibration_matrix=tuple(tuple(map(float, row)) for row in calibration) if calibration.any() else (),
     )
 

@@ -14,9 +14,9 @@ _STRIDE: Final = 7919  # odd, so that a column reads the whole table before it r
 
 
 class Noise:
-    """Normally distributed noise of standard deviation 1, always the same for the same sample.
+    """Normally distributed noise of standard deviation 1, always the same for the same sample number.
 
-    Each of ``width`` columns reads one table of random numbers from another position. That is much
+    All ``width`` columns read the same table of random numbers, each from its own position. This is much
     cheaper than a generator per sample, and repeats only after 65536 samples.
     """
 

@@ -25,13 +25,13 @@ class Scenario(Section):
         tuple[Annotated[SerializeAsAny[Fault], PlainValidator(validate_fault)], ...],
         expects("a list of faults"),
     ]
-    """The faults; see ``gateway.simulator.faults``."""
+    """The faults; ``gateway.simulator.faults`` has their kinds."""
 
     seed: Seed = 1
-    """The seed of everything that is random in the faults."""
+    """The seed of all random choices of the faults."""
 
     def with_overrides(self, scene: Mapping[str, float], faults: Iterable[Fault], seed: int | None) -> Self:
-        """Return this scenario with changes to its scene, more faults, and another seed unless it is None."""
+        """Return this scenario with changes to its scene, more faults, and ``seed`` unless it is None."""
         return self.model_copy(
             update={
                 "scene": self.scene.model_copy(update=dict(scene)),

@@ -1,4 +1,4 @@
-"""The simulator: an RT server with faults."""
+"""The simulator: an RT server that can have faults."""
 
 from gateway.rtc3d_server.scene import Scene
 from gateway.rtc3d_server.server import RtServer
@@ -6,9 +6,9 @@ from gateway.simulator.faults.control import Faults
 
 
 class Simulator(RtServer):
-    """An RT server that stands in for the hardware, and misbehaves on request.
+    """An RT server that replaces the hardware in tests, and has faults on request.
 
-    For the arguments see RtServer.
+    RtServer describes the arguments.
     """
 
     def __init__(
@@ -21,7 +21,7 @@ class Simulator(RtServer):
         once: bool = False,
     ) -> None:
         self.faults = Faults(self)
-        """What goes wrong on purpose; nothing by default."""
+        """Begins and ends faults; by default there are none."""
         super().__init__(
             scene,
             host,

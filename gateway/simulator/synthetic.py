@@ -21,24 +21,25 @@ from gateway.rtc3d.parameters import (
 )
 from gateway.rtc3d_server.scene import NO_EVENTS, SampleNumbers
 from gateway.simulator.bodies import RigidBodies
-from gateway.simulator.gait import ForcePlates
+from gateway.simulator.force_plates import ForcePlates
 from gateway.simulator.noise import Noise
 
 BUTTON_EVENT: Final = 0x123456
-"""The id of the only event, as in §6.6: param1 is the button's number, param2 1 (pressed) or 0 (released)."""
+"""The id of the only event, as in §6.6. param1 is the button's number, param2 1 (pressed) or 0 (released)."""
 
 _UNUSED: Final = -1  # 0xFFFFFFFF (§7.7)
 _BUTTONS: Final = 2  # pressed in turn
 _PERIOD_US: Final = 1_000_000
-_PRESSED_US: Final = 500_000  # into each period
-_RELEASED_US: Final = 800_000
+_PRESSED_US: Final = 500_000  # after the start of each period
+_RELEASED_US: Final = 800_000  # likewise
 
 
 class SyntheticScene:
     """A scene of any size that never ends, always the same for the same arguments.
 
-    Any of the numbers can be 0. ``rate_hz`` is the rate of markers and tools, ``analog_rate_hz`` that of
-    analog channels and force plates. Another ``seed`` gives another scene of the same size.
+    ``markers``, ``tools``, ``analog`` (channels) and ``plates`` are numbers of items and can be 0.
+    ``rate_hz`` is the rate of markers and tools, ``analog_rate_hz`` that of analog channels and force
+    plates. Another ``seed`` gives another scene of the same size.
     """
 
     num_frames: int | None = None
@@ -58,14 +59,14 @@ class SyntheticScene:
         bodies = RigidBodies(markers, tools, rate_hz, rng)
         channels = _AnalogSines(analog, analog_rate_hz, rng)
         force_plates = ForcePlates(plates, analog_rate_hz, rng)
-        sources: list[tuple[ComponentType, int, float, Callable[[SampleNumbers], Items]]] = [
+        components: list[tuple[ComponentType, int, float, Callable[[SampleNumbers], Items]]] = [
             (ComponentType.MARKERS, markers, rate_hz, bodies.markers),
             (ComponentType.TOOLS, tools, rate_hz, bodies.tools),
             (ComponentType.ANALOG, analog, analog_rate_hz, channels.voltages),
             (ComponentType.FORCE, plates, analog_rate_hz, force_plates.forces),
         ]
-        self._items = {component: items for component, count, _, items in sources if count}
-        self.rates_hz = {component: rate for component, count, rate, _ in sources if count}
+        self._items = {component: items for component, count, _, items in components if count}
+        self.rates_hz = {component: rate for component, count, rate, _ in components if count}
         self.measurement_rate_hz = rate_hz
         self.parameters = Parameters(
             markers=Parameters3D(
@@ -93,7 +94,7 @@ class SyntheticScene:
         return self._items[component](samples)
 
     def events(self, start_us: int, stop_us: int) -> Items:
-        """See Scene. A button is pressed and released once a second."""
+        """See Scene. Once a second, a button is pressed and released."""
         first, stop = _events_before(start_us), _events_before(stop_us)
         if first >= stop:
             return NO_EVENTS
@@ -108,7 +109,7 @@ class SyntheticScene:
 
 
 class _AnalogSines:
-    """Channels that each have a sine wave of another frequency, in mV, and noise."""
+    """Analog channels: in each a sine wave of its own frequency, in mV, and noise."""
 
     def __init__(self, num_channels: int, rate_hz: float, rng: np.random.Generator) -> None:
         self._rate_hz = rate_hz

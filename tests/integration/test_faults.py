@@ -61,7 +61,7 @@ async def test_after_each_fault_data_flows_again(kind: str) -> None:
         # Wait until the fault has an effect: it changed something, or the gateway noticed it.
         frames = simulator.frames_sent
         await wait_until_async(
-            lambda: fault.times or lab.status.last_error or simulator.frames_sent > frames + 100, 10
+            lambda: fault.num_happened or lab.status.last_error or simulator.frames_sent > frames + 100, 10
         )
         await simulator.faults.clear()
         await flows_again(lab)

@@ -237,8 +237,8 @@ async def test_no_frame_is_lost_while_two_hundred_queries_are_answered(router: s
                     await asyncio.gather(*(expect_replies(peer, selector) for selector in selectors))
                 await wait_until_async(lambda: len(sequences) > 50)
                 simulator.stop_measurement()
-                await wait_until_async(lambda: len(sequences) >= simulator.sent["3d"])
-    assert sequences == list(range(simulator.sent["3d"]))
+                await wait_until_async(lambda: len(sequences) >= simulator.components_sent["3d"])
+    assert sequences == list(range(simulator.components_sent["3d"]))
 
 
 async def expect_replies(peer: zenoh.Session, selector: str) -> None:

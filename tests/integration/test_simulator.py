@@ -249,7 +249,7 @@ async def test_sent_frames_are_counted_for_each_client_and_in_total() -> None:
                 received.update(KEYS[part.type] for parts in frames for part in parts)
                 num_frames += len(frames)
 
-        assert simulator.sent == received
+        assert simulator.components_sent == received
         assert simulator.frames_sent == num_frames
 
 

@@ -17,21 +17,21 @@ from gateway.simulator.faults.parameters import Count, Interval, Seconds, parame
 
 
 class ActiveFault:
-    """A fault on one server: when it begins and ends, how often, and its random numbers.
+    """A fault on one server: begins and ends it, counts what it changed, and has its random numbers.
 
-    It begins once, or repeatedly if the fault has ``every_s``.
+    A fault with ``every_s`` begins repeatedly, others once.
     """
 
     def __init__(self, fault: "Fault", server: FaultyServer, rng: np.random.Generator) -> None:
         self.fault = fault
         self.server = server
-        # two generators, so that the times do not depend on how many packets the fault changed
+        # Two generators, so that the timing does not depend on how many packets the fault changed.
         self.rng, self._timing_rng = rng.spawn(2)
         self.ended = asyncio.Event()
-        self.times = 0
+        self.num_happened = 0
         """How often it happened: packets, replies or reads that it changed; for other faults, beginnings."""
         self.variant = 0
-        """A different random number each time the fault begins."""
+        """A random number, different each time the fault begins."""
         self.began_us = 0
         """The measurement's time when the fault last began."""
         self._undo: Callable[[], None] | None = None
@@ -39,17 +39,17 @@ class ActiveFault:
 
     @property
     def is_exhausted(self) -> bool:
-        """Whether the fault happened as often as its ``times`` allows."""
-        return self.fault.times is not None and self.times >= self.fault.times
+        """Whether the fault has happened as often as its ``times`` allows."""
+        return self.fault.times is not None and self.num_happened >= self.fault.times
 
     def first_delay_s(self) -> float:
-        """Return the time from the start to the first beginning."""
+        """Return the time from the start of the simulator until the fault first begins."""
         if self.fault.at_s is not None or self.fault.every_s is None:
             return self.fault.at_s or 0.0
         return self.random_interval_s(self.fault.every_s)
 
     def random_interval_s(self, every_s: float) -> float:
-        """Return the time from one beginning to the next: ``every_s``, up to half more or less."""
+        """Return a random time from one beginning to the next: 50 to 150 % of ``every_s``."""
         return every_s * float(self._timing_rng.uniform(0.5, 1.5))
 
     def begin(self) -> None:
@@ -60,7 +60,7 @@ class ActiveFault:
         self._undo = self.fault.begin(self)
 
     def end_after(self, seconds: float, end: Callable[["ActiveFault"], None]) -> None:
-        """Call ``end`` with this fault after so many seconds, at once after 0."""
+        """Call ``end`` with this fault after ``seconds``; at once if they are 0."""
         if seconds:
             self._end_timer = asyncio.get_running_loop().call_later(seconds, end, self)
         else:
@@ -100,7 +100,7 @@ class Fault(Section):
 
     @property
     def lasts_s(self) -> float | None:
-        """How long the fault lasts once it begins: 0 for a momentary one, None until it is ended."""
+        """How long the fault lasts: 0 means a moment, None means until ``end`` is called."""
         return 0.0
 
     def begin(self, active: ActiveFault) -> Callable[[], None] | None:
@@ -112,7 +112,7 @@ class Fault(Section):
 
 
 class ConnectionFault(Fault):
-    """A fault of connections."""
+    """A fault that affects connections."""
 
     connection: Count | None = None
     """Affect only the n-th connection since the server's start; by default, all."""
@@ -137,7 +137,7 @@ class MomentaryFault(ConnectionFault):
 
 
 class LastingFault(Fault):
-    """A fault that has an end."""
+    """A fault that lasts until it ends."""
 
     for_s: Interval | None = None
     """Last this many seconds; by default, until the simulator ends."""
@@ -155,17 +155,17 @@ class LastingFault(Fault):
 
 
 class LastingConnectionFault(ConnectionFault, LastingFault):
-    """A fault that changes what passes through connections, later ones included, until it ends.
+    """A fault that changes the bytes of connections, including later ones, until it ends.
 
-    ``times`` counts what it changed: packets, replies or reads.
+    ``times`` counts the packets, replies or reads that it changed.
     """
 
     def change_writes(self, writes: list[PendingWrite], active: ActiveFault) -> list[PendingWrite]:
-        """Return what to write instead of ``writes``: one packet, as the faults before have changed it."""
+        """Return the writes instead of ``writes``, which are one packet as changed by the previous faults."""
         return writes
 
     def refusal(self, command: Packet) -> str | None:
-        """Return why the server refuses a client's packet, None if it does not."""
+        """Return why the server refuses a client's packet; None if it does not refuse it."""
         return None
 
     def change_replies(self, command: Packet, replies: list[Reply]) -> list[Reply]:
@@ -173,7 +173,7 @@ class LastingConnectionFault(ConnectionFault, LastingFault):
         return replies
 
     def read_delay_s(self, num_bytes: int) -> float:
-        """Return how long the server takes to read so many bytes; infinity for until the fault ends."""
+        """Return how long the server takes to read ``num_bytes``; math.inf means until the fault ends."""
         return 0.0
 
 

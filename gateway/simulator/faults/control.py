@@ -1,4 +1,4 @@
-"""Begins and ends the simulator's faults: at once, or when a scenario says so."""
+"""Begins and ends the simulator's faults: at once, or at the times in a scenario."""
 
 import asyncio
 import logging
@@ -17,21 +17,21 @@ from gateway.simulator.faults.server_faults import NoMeasurement, Restart
 from gateway.simulator.scene_settings import SceneSettings
 
 _RETRY_S: Final = 1.0  # between attempts to listen on a port that another program has taken
-_ORDER: Final = {kind: place for place, kind in enumerate(KINDS.values())}
+_ORDER: Final = {kind: position for position, kind in enumerate(KINDS.values())}
 _log = logging.getLogger(__name__)
 
 
 class Faults:
     """The faults of a running server.
 
-    Each beginning and end is logged in the form of the command line. Everything random depends on the
-    seed of the last ``play`` (1 before any) and on the number of faults since then, not on time.
+    Each beginning and end is logged in the form of the command line. All random choices depend on the
+    seed of the last ``play`` (1 before the first) and on the number of faults since then, not on time.
     """
 
     def __init__(self, server: RtServer) -> None:
         self._server = server
         self.scene = SceneSettings()
-        """The scenario's scene, which faults that change the scene start from."""
+        """The scenario's scene; faults that change the scene change its settings."""
         self._seed = 1
         self._num_added = 0  # faults since the last ``play``
         self._active: list[ActiveFault] = []  # in the order of KINDS
@@ -59,7 +59,7 @@ class Faults:
             task.add_done_callback(self._playing.discard)
 
     def begin(self, fault: Fault) -> ActiveFault:
-        """Begin a fault now and once, whatever its ``at_s`` and ``every_s``."""
+        """Begin a fault now, once; its ``at_s`` and ``every_s`` have no effect."""
         active = self._new_active_fault(fault)
         self._begin(active)
         return active
@@ -73,10 +73,10 @@ class Faults:
         for pipeline in self.connections:
             pipeline.fault_ended()
         if not isinstance(active.fault, MomentaryFault):
-            _log.info("Fault ends: %s (happened %d times so far)", active.fault, active.times)
+            _log.info("Fault ends: %s (happened %d times so far)", active.fault, active.num_happened)
 
     async def clear(self) -> None:
-        """End and forget all faults: when this returns, none is active or planned, and nothing waits."""
+        """End all faults and cancel planned ones. Send and read at once all bytes that faults hold back."""
         await self._stop_playing()
         for active in list(self._active):
             self.end(active)
@@ -87,7 +87,7 @@ class Faults:
             await self._restarting
 
     async def close(self) -> None:
-        """Forget all faults without ending them; a server that has crashed does not come back."""
+        """Cancel all faults without undoing them: a server that has crashed does not come back."""
         await self._stop_playing()
         for active in self._active:
             active.cancel_end()
@@ -103,7 +103,7 @@ class Faults:
         return FaultPipeline(connection, self.active_on, self._count)
 
     def active_on(self, number: int) -> ActiveConnectionFaults:
-        """Return the faults that are active on the connection with this number, in their order."""
+        """Return the faults that are active on the connection with this number, in the order of KINDS."""
         return [
             (active, active.fault)
             for active in self._active
@@ -140,7 +140,7 @@ class Faults:
         if self._restarting is None or self._restarting.done():
             self._restarting = asyncio.get_running_loop().create_task(self._restart())
 
-    # ----------------------------------------------------------------------------------------
+    # Internals ------------------------------------------------------------------------------
 
     def _new_active_fault(self, fault: Fault) -> ActiveFault:
         self._num_added += 1
@@ -166,14 +166,14 @@ class Faults:
         self._active.sort(key=lambda active: _ORDER[type(active.fault)])
         active.begin()
         if not isinstance(fault, LastingConnectionFault):
-            active.times += 1
+            active.num_happened += 1
         if fault.lasts_s is not None:
             active.end_after(fault.lasts_s, self.end)
 
     def _count(self, changed_by: Iterable[ActiveFault]) -> None:
-        """Count that faults changed something, and end those that may not happen again."""
+        """Count that these faults changed something, and end those that are exhausted."""
         for active in changed_by:
-            active.times += 1
+            active.num_happened += 1
             if active.is_exhausted:
                 self.end(active)
 
@@ -188,7 +188,7 @@ class Faults:
                 _log.error("%s", error)
                 await asyncio.sleep(_RETRY_S)
         if self._is_active(Restart):
-            self._server.crash()  # another restart began meanwhile
+            self._server.crash()  # another restart has begun in the meantime
         elif self._is_active(NoMeasurement):
             self._server.stop_measurement()
 

@@ -11,15 +11,15 @@ class FaultyConnection(Protocol):
 
     @property
     def number(self) -> int:
-        """Counts the connections since the server's start, from 1."""
+        """The connection's number since the server's start, from 1."""
         ...
 
     def send_unchanged(self, data: bytes) -> None:
-        """Send bytes that no fault changes, after everything that waits."""
+        """Send bytes that no fault changes, after all bytes that are waiting."""
         ...
 
     def disconnect(self, last_data: bytes, *, reset: bool) -> None:
-        """Write ``last_data`` before everything that waits, and end the connection by FIN or by RST."""
+        """Write ``last_data`` before all bytes that are waiting, and end the connection with FIN or RST."""
         ...
 
 
@@ -32,11 +32,11 @@ class FaultyServer(Protocol):
         ...
 
     def elapsed_us(self) -> int | None:
-        """Return the measurement's time in µs; None while no measurement runs."""
+        """Return the measurement's time in µs; None while none is running."""
         ...
 
     def stop_measurement(self) -> None:
-        """Stop the measurement, if one runs."""
+        """Stop the measurement, if one is running."""
         ...
 
     def start_measurement(self) -> None:
@@ -44,7 +44,7 @@ class FaultyServer(Protocol):
         ...
 
     def change_scene(self, changes: SceneSettings) -> Callable[[], None]:
-        """Serve the scenario's scene with changes; return a function that restores the scene before."""
+        """Serve the scenario's scene with changes; return a function that restores the previous scene."""
         ...
 
     def crash(self) -> None:

@@ -48,11 +48,12 @@ _HEADER: Final[dict[ByteOrder, struct.Struct]] = {
     "little": struct.Struct("<IIiq"),
 }
 _WRONG_BY: Final = 1000
-_OFFSETS: Final = {"components": 0, "size": 4, "items": 24}  # in a frame's body; the first component's fields
+_OFFSETS: Final = {"components": 0, "size": 4, "items": 24}
+"""Offsets in a frame's body: of the number of components, and of the first one's size and number of items."""
 
 
 class FrameFault(LastingConnectionFault):
-    """A fault of data frames; other packets, and frames that another fault has damaged, do not change."""
+    """A fault of data frames. It leaves other packets, and frames damaged by another fault, unchanged."""
 
     def change_writes(self, writes: list[PendingWrite], active: ActiveFault) -> list[PendingWrite]:
         """See LastingConnectionFault."""
@@ -69,7 +70,7 @@ class FrameFault(LastingConnectionFault):
         return encode_packet(PacketType.DATA, self.change_frame(body, byte_order, active))
 
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
-        """Return the body of the frame to send instead of one with this body."""
+        """Return the body to send instead of ``body``."""
         raise NotImplementedError
 
 
@@ -96,7 +97,7 @@ class Occlusion(FrameFault):
                 items[_choose(self.tools, len(items), active.variant)] = (MISSING,) * 8
             return _rebuild(component, items=items)
 
-        return _change_each(body, byte_order, hide)
+        return _change_components(body, byte_order, hide)
 
 
 class FrozenTimestamps(FrameFault):
@@ -106,7 +107,7 @@ class FrozenTimestamps(FrameFault):
 
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
-        return _change_each(
+        return _change_components(
             body, byte_order, lambda component: _rebuild(component, timestamp_us=active.began_us)
         )
 
@@ -122,7 +123,7 @@ class JumpingTimestamps(FrameFault):
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
         jump_us = round(self.jump_ms * 1000)
-        return _change_each(
+        return _change_components(
             body,
             byte_order,
             lambda component: _rebuild(component, timestamp_us=component.timestamp_us + jump_us),
@@ -142,7 +143,7 @@ class ConstantFrameNumbers(FrameFault):
 
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
-        return _change_each(
+        return _change_components(
             body, byte_order, lambda component: _rebuild(component, frame_number=self.frame_number)
         )
 
@@ -164,7 +165,7 @@ class ShortEvents(FrameFault):
                 items = items[list(SHORT_EVENT.names or ())].astype(SHORT_EVENT)
             return _rebuild(component, items=items)
 
-        return _change_each(body, byte_order, shorten)
+        return _change_components(body, byte_order, shorten)
 
 
 class WrongByteOrder(FrameFault):
@@ -184,7 +185,9 @@ class WrongByteOrder(FrameFault):
             order: ByteOrder = self.byte_order
         else:
             order = "little" if byte_order == "big" else "big"
-        return _change_each(body, byte_order, lambda component: _rebuild(component, byte_order=order), order)
+        return _change_components(
+            body, byte_order, lambda component: _rebuild(component, byte_order=order), order
+        )
 
 
 class UnknownComponent(FrameFault):
@@ -234,7 +237,7 @@ FRAME_FAULTS: Final[tuple[type[FrameFault], ...]] = (
 )
 
 
-def _change_each(
+def _change_components(
     body: bytes,
     byte_order: ByteOrder,
     change: Callable[[Component], bytes],
@@ -253,7 +256,7 @@ def _rebuild(
     items: Items | None = None,
     byte_order: ByteOrder | None = None,
 ) -> bytes:
-    """Return a component's bytes with the values that are given instead of its own."""
+    """Return a component's bytes, with the given values instead of its own."""
     return encode_component(
         component.type,
         component.frame_number if frame_number is None else frame_number,

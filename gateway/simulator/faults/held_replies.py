@@ -1,4 +1,4 @@
-"""Replies to one client that other packets overtake."""
+"""Replies to one client that are sent late, after other packets."""
 
 import asyncio
 from collections.abc import Callable
@@ -11,12 +11,12 @@ from gateway.simulator.faults.outgoing import Reply, packet_type_of
 @dataclass(slots=True, eq=False)
 class _HeldReply:
     packet: bytes
-    num_frames: int  # data frames that leave before it; 0 if it waits for its timer
+    num_frames: int  # data frames to send before it; 0 if it waits for its timer
     timer: asyncio.TimerHandle | None = None
 
 
 class HeldReplies:
-    """Holds replies until their time has come or enough frames have passed, then sends them."""
+    """Holds replies until their delay is over or enough frames have been sent, then sends them."""
 
     def __init__(self, send: Callable[[bytes], None]) -> None:
         self._send = send
@@ -35,7 +35,7 @@ class HeldReplies:
         self._held.append(held)
 
     def packet_sent(self, packet: bytes) -> None:
-        """Release the replies that have waited for this packet, if it is a data frame or No Data."""
+        """Send the replies that waited for this packet, if it is a data frame or No Data."""
         packet_type = packet_type_of(packet)
         if not self._held or packet_type not in {PacketType.DATA, PacketType.NO_DATA}:
             return
@@ -59,7 +59,7 @@ class HeldReplies:
 
     def _release(self, held: _HeldReply) -> None:
         if held not in self._held:
-            return  # a packet that was sent meanwhile has released it
+            return  # sending another reply has already released it
         self._held.remove(held)
         if held.timer is not None:
             held.timer.cancel()

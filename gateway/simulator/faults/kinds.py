@@ -21,7 +21,7 @@ KINDS: Final[dict[str, type[Fault]]] = {
     fault.kind: fault
     for fault in (*SERVER_FAULTS, *REPLY_FAULTS, *FRAME_FAULTS, *STREAM_FAULTS, *MOMENTARY_FAULTS)
 }
-"""In the order in which they act on the bytes of a connection."""
+"""All kinds by name, in the order in which they act on the bytes of a connection."""
 
 COMMON_PARAMETERS: Final = {
     "at_s": "begin this many seconds after the start; without at_s and every_s, begin at the start",
@@ -33,7 +33,7 @@ COMMON_PARAMETERS: Final = {
 """The parameters that many kinds have, and what they do."""
 
 _NAMES: Final = ", ".join(KINDS)
-_COMMAS: Final = re.compile(r",(?![^\[]*\])")  # not those in a list
+_COMMAS: Final = re.compile(r",(?![^\[]*\])")  # except commas in a list
 
 
 def parse_fault(text: str) -> Fault:
@@ -51,7 +51,7 @@ def parse_fault(text: str) -> Fault:
             target = target.setdefault(mapping, {})
             if not isinstance(target, dict):
                 raise ConfigError(
-                    f"fault {text!r}: {mapping} has both a value and parts; expected only one of them"
+                    f"fault {text!r}: {mapping} has both a value and keys; expected only one of them"
                 )
         if not equals or name in target:
             raise ConfigError(f"fault {text!r}: found {assignment!r}; expected NAME=VALUE, each name once")
@@ -69,7 +69,7 @@ def parse_fault(text: str) -> Fault:
 def validate_fault(value: object) -> Fault:
     """Return the fault that a mapping describes: its kind under the key ``fault``, and its parameters.
 
-    Raises ValidationError.
+    Raises pydantic's ValidationError.
     """
     match value:
         case Fault():
@@ -84,7 +84,7 @@ def validate_fault(value: object) -> Fault:
 
 
 def summary_of(kind: type[Fault]) -> str:
-    """Return one sentence about what happens."""
+    """Return one sentence that describes what happens."""
     return (kind.__doc__ or "").partition("\n")[0]
 
 
@@ -98,7 +98,7 @@ def parameters_of(kind: type[Fault]) -> Iterator[tuple[str, str, str]]:
 
 
 def describe_kinds() -> str:
-    """Return a text for the terminal about every kind: what happens, and its parameters."""
+    """Return a text for the terminal that describes every kind and its parameters."""
     lines = []
     for name, kind in KINDS.items():
         common = [key for key in ("for_s", "connection") if key in kind.model_fields]

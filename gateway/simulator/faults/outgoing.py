@@ -1,4 +1,4 @@
-"""What the server is about to send, in the form in which faults change it."""
+"""Writes and replies that the server is about to send, as faults receive and change them."""
 
 from typing import NamedTuple
 
@@ -6,31 +6,31 @@ from gateway.rtc3d.packets import PacketType
 
 
 class PendingWrite(NamedTuple):
-    """Bytes to write to a client's socket; before any fault changes it, one packet."""
+    """Bytes to write to a client's socket: one packet, until a fault changes it."""
 
     due_s: float
-    """When to write them, in s on the monotonic clock; later if earlier writes are due later."""
+    """When to write them, in s on the monotonic clock; never before earlier writes."""
 
     data: bytes
 
     joins_previous: bool = False
-    """Whether one send covers these bytes and those before them, if both are due."""
+    """Whether to write these bytes and the previous ones with one send, if both are due."""
 
 
 class Reply(NamedTuple):
-    """A reply to a command, one packet; it leaves at once unless a delay is given."""
+    """A reply to a command, one packet; it is sent at once unless it is delayed."""
 
     packet: bytes
 
     delay_s: float = 0.0
-    """How much later it leaves; everything else overtakes it."""
+    """How much later it is sent; other packets do not wait for it."""
 
     after_frames: int = 0
-    """The number of data frames that leave before it; a No Data packet ends the wait."""
+    """The number of data frames to send before it; a No Data packet ends the wait."""
 
     @property
     def is_held(self) -> bool:
-        """Whether the reply leaves later than its turn."""
+        """Whether the reply is delayed."""
         return bool(self.delay_s or self.after_frames)
 
 

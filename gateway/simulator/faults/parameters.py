@@ -1,4 +1,4 @@
-"""Types of parameters that several kinds of faults have, and the text form of a parameter's value."""
+"""Parameter types that several kinds of faults use, and the text form of a parameter's value."""
 
 from typing import Annotated, Final
 

@@ -16,14 +16,14 @@ from gateway.simulator.faults.outgoing import PendingWrite, Reply
 from gateway.simulator.faults.write_queue import WriteQueue
 
 ActiveConnectionFaults = list[tuple[ActiveFault, LastingConnectionFault]]
-"""Each active fault with its ``fault``, in the order in which they act."""
+"""Pairs of an active fault and its ``fault``, in the order in which they act."""
 
 
 class FaultPipeline(ConnectionFilter):
     """The filter of one connection: its bytes pass through the active faults in both directions.
 
-    Packets keep their order, however late faults send them. ``active_faults`` returns the faults that
-    are active on the connection with a number; ``count`` is called with those that changed something.
+    Packets keep their order, even if faults delay them. ``active_faults`` returns the faults that are
+    active on the connection with a given number; ``count`` is called with those that changed something.
     """
 
     def __init__(
@@ -42,18 +42,18 @@ class FaultPipeline(ConnectionFilter):
 
     @property
     def number(self) -> int:
-        """Counts the connections since the server's start, from 1."""
+        """The connection's number since the server's start, from 1."""
         return self.connection.number
 
     @property
     def waiting_bytes(self) -> int:
-        """The number of bytes that wait to be sent or to be read."""
+        """The number of bytes that faults hold back, in both directions."""
         return self._writes.waiting_bytes + self._held_replies.waiting_bytes + len(self._unread)
 
     # For the connection ---------------------------------------------------------------------
 
     def send(self, packet: bytes) -> None:
-        """Send one packet as the faults change it."""
+        """Send one packet with the changes of the active faults."""
         active_faults = self._active_faults(self.number)
         changed_by = []
         if not active_faults and not self._writes.waiting_bytes:
@@ -70,7 +70,7 @@ class FaultPipeline(ConnectionFilter):
         self._count(changed_by)
 
     def answer(self, packet: Packet) -> list[bytes]:
-        """Return the replies to a client's packet as the faults change them."""
+        """Return the replies to a client's packet with the changes of the active faults."""
         active_faults = self._active_faults(self.number)
         for active, fault in active_faults:
             refusal = fault.refusal(packet)
@@ -91,7 +91,7 @@ class FaultPipeline(ConnectionFilter):
         return [reply.packet for reply in replies]
 
     def receive(self, data: bytes) -> None:
-        """Handle bytes from the client, or keep them and stop reading if a fault delays them."""
+        """Process bytes from the client, or keep them and stop reading if a fault delays them."""
         delays_s = [
             (active, fault.read_delay_s(len(data))) for active, fault in self._active_faults(self.number)
         ]
@@ -106,12 +106,12 @@ class FaultPipeline(ConnectionFilter):
         self._count([active for active, its_delay_s in delays_s if its_delay_s])
 
     def flush(self) -> None:
-        """Send at once everything that waits, in its order."""
+        """Send at once all bytes that faults hold back, in order."""
         self._held_replies.flush()
         self._writes.flush()
 
     def connection_lost(self) -> None:
-        """Discard everything that waits."""
+        """Discard all bytes that faults hold back, in both directions."""
         if self._read_timer is not None:
             self._read_timer.cancel()
         self._writes.clear()
@@ -135,7 +135,7 @@ class FaultPipeline(ConnectionFilter):
             self.connection.transport.close()
 
     def handle_unread(self) -> None:
-        """Handle at once the bytes that a fault delayed."""
+        """Process at once the bytes whose reading a fault delayed."""
         if self._read_timer is not None:
             self._read_timer.cancel()
             self._read_timer = None
@@ -146,9 +146,9 @@ class FaultPipeline(ConnectionFilter):
             self.connection.handle(data)
 
     def fault_ended(self) -> None:
-        """Handle the bytes that only the fault that ended has kept from being read."""
-        is_half_open = any(
+        """Process the bytes that are unread only because of the fault that has just ended."""
+        is_reading_stopped = any(
             math.isinf(fault.read_delay_s(len(self._unread))) for _, fault in self._active_faults(self.number)
         )
-        if self._unread and self._read_timer is None and not is_half_open:
+        if self._unread and self._read_timer is None and not is_reading_stopped:
             self.handle_unread()

@@ -1,4 +1,4 @@
-"""Faults of the replies to commands: refused, doubled, missing, late, or with another text."""
+"""Faults of the replies to commands: refusals, and missing, doubled, late or differently worded replies."""
 
 # ruff: noqa: ARG002 - hooks: not every kind needs every argument
 
@@ -73,7 +73,7 @@ class MinimalServer(LastingConnectionFault):
 
 
 class _AcknowledgementFault(LastingConnectionFault):
-    """A fault of the replies that report success."""
+    """A fault of acknowledgements, the replies that report success."""
 
     commands: CommandNames = COMMAND_NAMES
     """The commands whose acknowledgements change."""

@@ -25,7 +25,7 @@ class ChangeScene(LastingFault):
     kind: ClassVar[str] = "change_scene"
 
     scene: SceneSettings = SceneSettings(markers=12)
-    """What changes in the scenario's scene; by default, it has 12 markers."""
+    """The changes to the scenario's scene; by default, it gets 12 markers."""
 
     def begin(self, active: ActiveFault) -> Callable[[], None]:
         """See Fault."""
@@ -41,7 +41,7 @@ class Restart(Fault):
     """Seconds until the server comes back."""
 
     scene: SceneSettings = SceneSettings()
-    """What changes in the scenario's scene; by default, nothing."""
+    """The changes to the scenario's scene; by default, none."""
 
     @property
     def lasts_s(self) -> float | None:

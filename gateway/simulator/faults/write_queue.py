@@ -1,4 +1,4 @@
-"""Writes to one client that wait until they are due."""
+"""A queue of writes to one client that are not due yet."""
 
 import asyncio
 import logging
@@ -12,13 +12,13 @@ from gateway.rtc3d_server.timers import call_after_us
 from gateway.simulator.faults.outgoing import PendingWrite
 
 MAX_WAITING_BYTES: Final = 4 * 1024 * 1024
-"""How much may wait to be sent on one connection; beyond it, packets are dropped."""
+"""How many bytes may wait to be sent on one connection; beyond this, packets are dropped."""
 
 _log = logging.getLogger(__name__)
 
 
 class WriteQueue:
-    """Writes to a connection in order, none before it is due."""
+    """Writes to a connection in order, each write when it is due."""
 
     def __init__(self, connection: FilteredConnection) -> None:
         self._connection = connection
@@ -26,10 +26,10 @@ class WriteQueue:
         self._timer: asyncio.TimerHandle | None = None
         self._was_full = False
         self.waiting_bytes = 0
-        """The size of all writes that wait."""
+        """The total size of the waiting writes."""
 
     def put(self, writes: list[PendingWrite]) -> None:
-        """Write what is due and keep the rest. If that would be too much, drop ``writes``."""
+        """Write what is due and keep the rest. If that exceeds MAX_WAITING_BYTES, drop ``writes``."""
         size = sum(len(write.data) for write in writes)
         if self._waiting and self.waiting_bytes + size > MAX_WAITING_BYTES:
             if not self._was_full:

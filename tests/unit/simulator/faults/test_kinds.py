@@ -71,7 +71,7 @@ def test_a_fault_is_parsed_from_the_form_in_which_it_is_printed(text: str, fault
         ("delay,delay_ms=.nan", "delay_ms: found nan; expected a number"),
         ("delay,every_s=2", "every_s: found every_s without for_s; expected both"),
         ("restart,scene=3", "scene: found 3; expected a mapping with any of the keys markers, tools"),
-        ("restart,scene=3,scene.markers=1", "scene has both a value and parts; expected only one of them"),
+        ("restart,scene=3,scene.markers=1", "scene has both a value and keys; expected only one of them"),
         ("restart,scene.markers=1.5", "scene.markers: found 1.5; expected a whole number from 0 to 10000"),
         (
             "refused_commands,commands=[]",

@@ -11,8 +11,8 @@ from gateway.simulator.noise import Noise
 
 _WIDTH_MM: Final = 400.0
 _LENGTH_MM: Final = 600.0
-_PITCH_MM: Final = 610.0  # from plate to plate in the direction of walking, +Y
-_STRIDE_S: Final = 1.2  # from one step to the next of the same foot
+_PITCH_MM: Final = 610.0  # distance of two plates in the direction of walking, +Y
+_STRIDE_S: Final = 1.2  # time between two steps of the same foot
 _STANCE_S: Final = 0.72  # how long the foot is on the plate in each stride
 _WEIGHT_N: Final = 800.0
 _NOISE_N: Final = 0.5
@@ -33,10 +33,10 @@ _CHANNELS: Final = tuple(
 
 
 class ForcePlates:
-    """Plates in a row; a foot is on each of them once per stride, half a stride later than on the one before.
+    """Plates in a row. A foot is on each plate once per stride, half a stride later than on the previous one.
 
     Forces (N) are those of the plate on the foot, +Z up. Moments (N·m) are about the centre of the
-    plate's surface, so that the centre of pressure is x = -My / Fz, y = Mx / Fz, in metres from there.
+    plate's surface, so the centre of pressure is x = -My / Fz, y = Mx / Fz, in metres from that centre.
     """
 
     def __init__(self, num_plates: int, rate_hz: float, rng: np.random.Generator) -> None:
