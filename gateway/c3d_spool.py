@@ -1,4 +1,4 @@
-"""The folder of C3D files that servers sent: written whole, limited in number and size."""
+"""The folder of C3D files that servers have sent, limited in number and size."""
 
 import contextlib
 import logging
@@ -14,41 +14,41 @@ from typing import Final, NamedTuple
 
 from gateway.errors import SpoolError
 
-# Whatever else is in the folder is somebody else's, and not touched.
+# Files with other names do not belong to the gateway: it leaves them alone.
 _NAME: Final = re.compile(r"(?P<source>.+)-(?P<time>\d{8}T\d{6}\.\d{6}Z)\.c3d")
 _UNFINISHED: Final = ".c3d.part"
 _ABANDONED_S: Final = 3600.0
-"""An unfinished file that is older was left behind by a gateway that was killed."""
+"""Older unfinished files were left behind by a gateway that was killed."""
 
 logger = logging.getLogger(__name__)
 
 
 class _File(NamedTuple):
-    time: str  # sorts as the times do
+    time: str  # as in its name; sorts in the order of time
     source: str
     path: Path
 
 
 class Spool:
-    """Keeps files as DIRECTORY/SOURCE-YYYYMMDDThhmmss.ffffffZ.c3d; the oldest go first.
+    """Stores files as DIRECTORY/SOURCE-YYYYMMDDThhmmss.ffffffZ.c3d, and deletes the oldest ones.
 
-    Its methods read and write files and wait for the disk: call them in a thread.
+    Its methods block while they read and write files: call them in a thread.
     """
 
     def __init__(self, directory: Path, max_files: int, max_bytes: int) -> None:
         self.directory = directory
         self._max_files = max_files
         self._max_bytes = max_bytes
-        self._making_room = threading.Lock()
+        self._deleting = threading.Lock()
 
     def store(self, source: str, content: bytes) -> Path:
-        """Write one file, under a temporary name until it is whole; return its path.
+        """Write one file and return its path. Until it is complete, it has a temporary name.
 
-        Raises SpoolError if it cannot be written, or is larger than all files together may be.
+        Raises SpoolError if it cannot be written, or is larger than the limit for all files together.
         """
         if len(content) > self._max_bytes:
             raise SpoolError(
-                f"a C3D file of {len(content)} bytes from {source} is not kept: "
+                f"a C3D file of {len(content)} bytes from {source} is not stored: "
                 f"spool.max_bytes is {self._max_bytes}"
             )
         path = self.directory / f"{source}-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}.c3d"
@@ -65,11 +65,11 @@ class Spool:
             if temporary is not None:
                 temporary.unlink(missing_ok=True)
             raise SpoolError(
-                f"a C3D file of {len(content)} bytes from {source} cannot be kept in {self.directory}: "
+                f"a C3D file of {len(content)} bytes from {source} cannot be stored in {self.directory}: "
                 f"{error.strerror}; check spool.directory and the space on it"
             ) from error
-        with self._making_room:
-            self._make_room()
+        with self._deleting:
+            self._delete_old_files()
         return path
 
     def newest(self, source: str) -> Path | None:
@@ -82,8 +82,8 @@ class Spool:
             if name := _NAME.fullmatch(path.name):
                 yield _File(name["time"], name["source"], path)
 
-    def _make_room(self) -> None:
-        """Delete the oldest files beyond the limits, and what was never finished."""
+    def _delete_old_files(self) -> None:
+        """Delete the oldest files beyond the limits, and abandoned unfinished ones."""
         for path in self.directory.glob(f"*{_UNFINISHED}"):
             with contextlib.suppress(FileNotFoundError):  # another thread has just finished it
                 if time.time() - path.stat().st_mtime > _ABANDONED_S:
@@ -94,6 +94,8 @@ class Spool:
                 kept_bytes += file.path.stat().st_size
                 if number > self._max_files or kept_bytes > self._max_bytes:
                     file.path.unlink()
-                    logger.info("%s is deleted: spool.max_files or spool.max_bytes is reached", file.path)
+                    logger.info(
+                        "deleted %s, because spool.max_files or spool.max_bytes was reached", file.path
+                    )
             except OSError as error:
-                logger.warning("%s is old and cannot be deleted: %s", file.path, error.strerror)
+                logger.warning("cannot delete the old file %s: %s", file.path, error.strerror)

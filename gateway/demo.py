@@ -1,8 +1,8 @@
 """The demo: simulator, gateway, and a subscriber of each output, in one process.
 
-Nothing leaves the machine: Zenoh uses loopback TCP without scouting, LCM stays in memory (or uses
-multicast with ``udpm``). The measurement starts after all subscribers receive the gateway's status and
-stops before they do, so every component that was sent must arrive.
+No data leaves the machine: Zenoh uses loopback TCP without scouting, LCM stays in memory (or uses
+multicast with ``udpm``). The measurement starts after all subscribers have received the gateway's status,
+and stops before they close, so every component that was sent must arrive.
 """
 
 import asyncio
@@ -37,7 +37,7 @@ _MESSAGE_WIDTH: Final = 60
 
 @dataclass
 class _Received:
-    """Messages of one subscriber, by component. Its thread writes them, the event loop reads them."""
+    """What one subscriber received, by component. Its thread writes, the event loop reads."""
 
     count: Counter[str] = field(default_factory=Counter)
     newest: dict[str, bytes] = field(default_factory=dict)
@@ -50,7 +50,7 @@ class _Received:
 
 
 async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool) -> bool:
-    """Show rates and values for ``seconds``; return whether every message sent was received.
+    """Show rates and values for ``seconds``; return whether every message was received.
 
     Raises OutputError if Zenoh or LCM does not open on this machine.
     """
@@ -63,8 +63,7 @@ async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool
         outputs = [side.output for side in sides.values()]
         await stack.enter_async_context(_running(Gateway(settings, outputs)))
         for name, side in sides.items():
-            health = side.output.health
-            await _until(lambda: health().connected, _START_TIMEOUT_S, f"{name} did not open")  # noqa: B023
+            await _until_open(name, side)
             stack.callback(side.subscribe(SOURCE, received[name].add).close)
         await _until(
             lambda: all(each.count["status"] for each in received.values()),
@@ -113,6 +112,10 @@ async def _until(condition: Callable[[], bool], timeout_s: float, failure: str) 
         raise OutputError(f"{failure} within {timeout_s:g} s", cause="demo") from None
 
 
+async def _until_open(name: str, side: DemoSide) -> None:
+    await _until(lambda: side.output.health().connected, _START_TIMEOUT_S, f"{name} did not open")
+
+
 async def _show(received: dict[str, _Received], seconds: float, console: Console) -> None:
     """Wait for ``seconds``, and show the live table if the output is a terminal."""
     start_s = time.monotonic()
@@ -134,7 +137,7 @@ async def _show(received: dict[str, _Received], seconds: float, console: Console
 
 
 async def _count_missing(simulator: Simulator, received: dict[str, _Received]) -> int:
-    """Wait for messages that are still on their way; return how many are missing."""
+    """Wait for messages that are in transit; return how many are missing after that."""
 
     def missing() -> int:
         return sum(

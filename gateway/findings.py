@@ -1,4 +1,4 @@
-"""Results of checks, as the doctor reports them."""
+"""Results of checks; the doctor reports them."""
 
 from enum import StrEnum
 from typing import NamedTuple
@@ -15,7 +15,7 @@ class Result(StrEnum):
 class Finding(NamedTuple):
     """The result of one check.
 
-    ``subject`` is what was checked: a source's name, or for example "zenoh". ``check`` names the check.
+    ``subject`` is what was checked: the name of a source, or for example "zenoh". ``check`` names the check.
     ``found`` says what was found, or why the check was not made. ``remedy`` says what to do if it fails.
     """
 
@@ -27,7 +27,7 @@ class Finding(NamedTuple):
 
 
 class Subject(NamedTuple):
-    """Something that is checked; creates its findings."""
+    """Something that is checked: a source, an output or this computer. Creates its findings."""
 
     name: str
 
@@ -45,7 +45,7 @@ class Subject(NamedTuple):
 
 
 class MessageLoad(NamedTuple):
-    """The messages of one component on their way to subscribers: how many per second, how large at most."""
+    """The rate of one component's messages, and the size of the largest."""
 
     rate_hz: float
     largest_bytes: int

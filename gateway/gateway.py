@@ -1,4 +1,4 @@
-"""The gateway as a whole: builds sources and outputs, connects, runs, reloads and stops them."""
+"""The gateway as a whole: builds, connects, runs, reloads and stops sources and outputs."""
 
 import asyncio
 import logging
@@ -15,36 +15,35 @@ from gateway.queries.source_queries import SourceQueries
 from gateway.source import Source
 
 _STATUS_PERIOD_S: Final = 1.0
-_OPENING_S: Final = 2.0
+_OPENING_TIMEOUT_S: Final = 2.0
 _OPENING_POLL_S: Final = 0.02
 
 logger = logging.getLogger(__name__)
 
 
 class Gateway:
-    """All sources and all outputs of one configuration; create it in a running event loop.
+    """All sources and all outputs of one configuration. Create it in a running event loop.
 
-    ``outputs`` are built from the settings unless given, as the demo and tests do; given ones stay at a
-    reload.
+    If ``outputs`` are given (by the demo or a test), a reload keeps them; otherwise they are built from the
+    settings.
     """
 
     def __init__(self, settings: Settings, outputs: Sequence[Output] | None = None) -> None:
         self.settings = settings
         self._given_outputs = outputs
         self._outputs = self._build_outputs(settings)
-        self._spool = _spool(settings.spool)
+        self._spool = _new_spool(settings.spool)
         self._sources: dict[str, Source] = {}
-        self._source_queries: dict[str, SourceQueries] = {}
-        self._running: dict[str, asyncio.Task[None]] = {}
-        self._query_service = SourceQueryService(self._source_queries, self._commands)
+        self._source_tasks: dict[str, asyncio.Task[None]] = {}
+        self._query_service = SourceQueryService(self._queries, self._commands)
         self._tasks = asyncio.TaskGroup()
         self._reload_lock = asyncio.Lock()
         self.opened = asyncio.Event()
-        """Set once the outputs are open, or 2 s after the start: one may be unavailable for long."""
+        """Set once the outputs are open, but at most 2 s after the start: one may be unavailable for long."""
         for output in self._outputs:
             output.serve_queries(self._query_service)
         for source in settings.sources:
-            self._add(source)
+            self._add_source(source)
 
     @property
     def sources(self) -> Sequence[Source]:
@@ -56,39 +55,42 @@ class Gateway:
         """The outputs."""
         return self._outputs
 
+    def _queries(self) -> Mapping[str, SourceQueries]:
+        return {name: source.queries for name, source in self._sources.items()}
+
     def _commands(self) -> Mapping[str, Command]:
         return {name: command for output in self._outputs for name, command in output.commands.items()}
 
     # Running.
 
     async def run(self, stop: asyncio.Event) -> None:
-        """Run until ``stop`` is set; then say Bye to every server and close the outputs."""
+        """Run until ``stop`` is set; then send Bye to every server and close the outputs."""
         for output in self._outputs:
             output.start()
         try:
             await self._wait_for_outputs(stop)
             async with self._tasks:
                 for name in self._sources:
-                    self._start(name)
+                    self._start_source(name)
                 upkeep = self._tasks.create_task(self._upkeep())
                 self.opened.set()
                 await stop.wait()
-                await self._reload_lock.acquire()  # and keep it: a reload that has started is completed first
+                await self._reload_lock.acquire()  # wait for a running reload, and prevent another one
                 logger.info("stopping")
-                for task in (upkeep, *self._running.values()):
+                for task in (upkeep, *self._source_tasks.values()):
                     task.cancel()
         finally:
             await asyncio.gather(*map(_close, self._outputs))
 
     async def _wait_for_outputs(self, stop: asyncio.Event) -> None:
-        deadline_s = asyncio.get_running_loop().time() + _OPENING_S
+        deadline_s = asyncio.get_running_loop().time() + _OPENING_TIMEOUT_S
         while asyncio.get_running_loop().time() < deadline_s and not stop.is_set():
             if all(output.health().connected for output in self._outputs):
                 return
             await asyncio.sleep(_OPENING_POLL_S)
 
-    def _start(self, name: str) -> None:
-        self._running[name] = self._tasks.create_task(self._sources[name].run())
+    def _start_source(self, name: str) -> None:
+        self._source_tasks[name] = self._tasks.create_task(self._sources[name].run())
 
     async def _upkeep(self) -> None:
         while True:
@@ -101,11 +103,10 @@ class Gateway:
     # Reloading.
 
     async def reload(self, settings: Settings) -> list[str]:
-        """Apply ``settings`` and return what changed, in words; call it once ``opened``.
+        """Apply ``settings`` and return a text for each change. Call it after ``opened`` is set.
 
-        Sources and outputs with the same settings as before are left alone. A source that differs says Bye
-        and connects again; an output that differs is closed and opened again. The numbers of messages
-        continue. Raises ConfigError, and changes nothing, if an output refuses its configuration.
+        Sources and outputs with unchanged settings keep running. A source that differs sends Bye and connects
+        again; an output that differs is closed and opened again. Session and sequence numbers continue. Raises ConfigError, and changes nothing, if an output refuses its configuration.
         """
         outputs = [
             next((running for running in self._outputs if running.is_configured_like(output)), output)
@@ -115,7 +116,7 @@ class Gateway:
             before, self.settings = self.settings, settings
             changes = [*await self._change_outputs(outputs), *await self._change_sources(settings.sources)]
             if settings.spool != before.spool:
-                self._spool = _spool(settings.spool)
+                self._spool = _new_spool(settings.spool)
                 for source in self._sources.values():
                     source.spool = self._spool
                 changes.append("spool changed")
@@ -134,17 +135,17 @@ class Gateway:
             output.serve_queries(self._query_service)
         for source in self._sources.values():
             source.fan_out.set_outputs(outputs)
-        await asyncio.gather(*map(_close, removed))  # first, because a new one may listen at the same address
+        await asyncio.gather(*map(_close, removed))  # first, because a new output may use the same address
         for output in new:
             output.start()
             self._publish_known_parameters(output)
         return _changes("output", [output.name for output in removed], [output.name for output in new])
 
     def _publish_known_parameters(self, output: Output) -> None:
-        for name, queries in self._source_queries.items():
-            xml = queries.parameters.xml
+        for name, source in self._sources.items():
+            xml = source.queries.parameters.xml
             if xml is not None:
-                output.publish_parameters(name, ServerParameters(xml, queries.session))
+                output.publish_parameters(name, ServerParameters(xml, source.queries.session))
 
     async def _change_sources(self, wanted_sources: Sequence[SourceSettings]) -> list[str]:
         wanted = {settings.name: settings for settings in wanted_sources}
@@ -152,26 +153,25 @@ class Gateway:
             name: source for name, source in self._sources.items() if source.settings != wanted.get(name)
         }
         new = [settings for name, settings in wanted.items() if name in stopped or name not in self._sources]
-        await asyncio.gather(*map(self._stop, stopped))
+        await asyncio.gather(*map(self._stop_source, stopped))
         for name in stopped.keys() - wanted.keys():
-            del self._source_queries[name]
             self._sources.pop(name).fan_out.close()
         for settings in new:
-            self._add(settings, stopped.get(settings.name))
-            self._start(settings.name)
+            self._add_source(settings, stopped.get(settings.name))
+            self._start_source(settings.name)
         self._sources = {name: self._sources[name] for name in wanted}
         return _changes("source", stopped, [settings.name for settings in new])
 
-    async def _stop(self, name: str) -> None:
-        task = self._running.pop(name)
+    async def _stop_source(self, name: str) -> None:
+        task = self._source_tasks.pop(name)
         task.cancel()
         await asyncio.wait([task])
 
-    def _add(self, settings: SourceSettings, before: Source | None = None) -> None:
+    def _add_source(self, settings: SourceSettings, before: Source | None = None) -> None:
         fan_out = before.fan_out if before else FanOut(settings.name, self._outputs)
-        source = Source(settings, fan_out, self._spool, self._publish_parameters, self._announce_file, before)
-        self._sources[settings.name] = source
-        self._source_queries[settings.name] = source.queries
+        self._sources[settings.name] = Source(
+            settings, fan_out, self._spool, self._publish_parameters, self._announce_file, before
+        )
 
     def _publish_parameters(self, source: str, parameters: ServerParameters) -> None:
         for output in self._outputs:
@@ -188,12 +188,12 @@ async def _close(output: Output) -> None:
 
 
 def _changes(what: str, removed: Collection[str], new: Collection[str]) -> list[str]:
-    """Return what happened to each name: it is in ``removed``, in ``new``, or in both."""
+    """Return "WHAT NAME removed", "added" or, for names in both collections, "changed"."""
     return [
         f"{what} {name} {'added' if name not in removed else 'changed' if name in new else 'removed'}"
         for name in dict.fromkeys((*removed, *new))
     ]
 
 
-def _spool(settings: SpoolSettings) -> Spool:
+def _new_spool(settings: SpoolSettings) -> Spool:
     return Spool(settings.effective_directory, settings.max_files, settings.max_bytes)

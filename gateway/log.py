@@ -1,4 +1,4 @@
-"""Logging for long-running work: persistent failures are logged once, and records carry their context."""
+"""Logging of persistent failures, once each, and of the context of log records."""
 
 import logging
 from collections.abc import Iterator, Mapping
@@ -8,20 +8,20 @@ from time import monotonic
 from typing import Final
 
 FIELDS: Final = ("source", "stream", "peer")
-"""The context that a record can carry besides its text: fields in the journal and in JSON."""
+"""The context that a record can have besides its text: fields in the journal and in JSON."""
 
 HOLD_S: Final = 5.0
-"""For FailureLog: how long all messages must succeed before intermittent failures count as over."""
+"""A ``hold_s`` for FailureLog: intermittent failures are over after this time without a failure."""
 
 _fields: ContextVar[Mapping[str, str]] = ContextVar("log fields")
 
 
 @contextmanager
 def log_fields(**fields: str) -> Iterator[None]:
-    """Add these of FIELDS to every record of the block, and of the tasks and callbacks that it starts.
+    """Add ``fields`` (names from FIELDS) to the records of the block and of tasks and callbacks it starts.
 
     The event loop runs a callback in the context in which it was registered. So all records of a
-    connection carry the fields, and no call has to name them.
+    connection have the fields, without naming them in each call.
     """
     token = _fields.set({**current_log_fields(), **fields})
     try:
@@ -31,15 +31,15 @@ def log_fields(**fields: str) -> Iterator[None]:
 
 
 def current_log_fields() -> Mapping[str, str]:
-    """Return the fields that records get here."""
+    """Return the fields of records that are logged here."""
     return _fields.get({})
 
 
 class FailureLog:
-    """Logs whether one thing works: the first failure as WARNING, repeats as DEBUG, recovery as INFO.
+    """Logs the first of several failures in a row as WARNING, repeats as DEBUG, and recovery as INFO.
 
-    ``subject`` begins every line: "lab", "lcm". With ``hold_s``, an intermittent failure is over only after
-    ``hold_s`` without a failure: until then each failure counts as a repeat.
+    ``subject`` begins every message, for example "lab" or "lcm". Successes within ``hold_s`` after a failure
+    do not count as recovery, so intermittent failures are logged as one.
     """
 
     def __init__(self, logger: logging.Logger, subject: str, hold_s: float = 0.0) -> None:
@@ -51,7 +51,7 @@ class FailureLog:
 
     @property
     def failing(self) -> bool:
-        """Whether a failure was logged and its recovery was not."""
+        """Whether a failure has been logged, and its recovery has not."""
         return self._failures > 0
 
     def failed(self, text: str) -> None:
@@ -65,9 +65,9 @@ class FailureLog:
             self._logger.debug("%s: %s (failure %d in a row)", self._subject, text, self._failures)
 
     def recovered(self, text: str) -> None:
-        """If it was failing, log that it works again, with the duration; within ``hold_s`` do nothing.
+        """After a failure, log the recovery with its duration, unless ``hold_s`` is not over yet.
 
-        Cheap while nothing fails, so it can be called after each success.
+        Cheap if nothing has failed, so it can be called after each success.
         """
         if not self._failures:
             return
@@ -80,7 +80,7 @@ class FailureLog:
             self._failures = 0
 
     def succeeded(self, text: str) -> None:
-        """Log that it works, in any case; if it was failing, do as ``recovered`` does."""
+        """Log a success even if nothing has failed; after a failure, do the same as ``recovered``."""
         if self._failures:
             self.recovered(text)
         else:

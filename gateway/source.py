@@ -1,4 +1,4 @@
-"""One source: its streams' supervisors, the fan-out they share, and the queries about it."""
+"""One source: the supervisors of its streams, its fan-out, and the queries about it."""
 
 import asyncio
 import logging
@@ -21,18 +21,19 @@ from gateway.stream.state import StreamState
 from gateway.stream.status import FrameRate, StreamStatus
 from gateway.stream.supervisor import Callbacks, Supervisor
 
-_MAX_WRITING: Final = 4
-"""How many C3D files may wait in memory for the disk; further ones are dropped and logged."""
+_MAX_UNSTORED_FILES: Final = 4
+"""How many C3D files may wait in memory to be stored; further ones are dropped and logged."""
 
 logger = logging.getLogger(__name__)
 
 
 class Source:
-    """Everything about one source, which publishes through ``fan_out``.
+    """Runs the streams of one source, publishes their data through ``fan_out``, and answers queries.
 
-    ``publish_parameters`` is called with the parameters of every connection and whenever they change,
-    ``announce_file`` with the description of every C3D file that was kept. ``before`` is the source that this
-    one replaces after a change of the configuration: it passes on its fan-out, and the numbers continue.
+    ``publish_parameters`` is called with the source's name and its parameters, for every connection and when
+    they change; ``announce_file`` with the name and the description of every C3D file that was stored.
+    ``before`` is the source that this one replaces after a reload; its session and sequence numbers
+    continue.
     """
 
     def __init__(
@@ -54,30 +55,32 @@ class Source:
             Supervisor(settings, stream, status, self._callbacks(stream))
             for stream, status in zip(settings.streams, self.statuses, strict=True)
         ]
-        self.queries = SourceQueries(
-            settings,
-            [
-                StreamAccess(stream.components, status, _sender(supervisor))
-                for stream, status, supervisor in zip(
-                    settings.streams, self.statuses, self.supervisors, strict=True
-                )
-            ],
-            lambda: self.fan_out.newest,
-            lambda: self._newest_status,
-            self._last_c3d,
-            self._record,
-            self._on_new_parameters,
-        )
+        self.queries = self._new_queries()
         self._publish_parameters = publish_parameters
         self._announce_file = announce_file
-        self._rates = [FrameRate() for _ in settings.streams]
+        self._frame_rates = [FrameRate() for _ in settings.streams]
         self._rates_hz = [0.0 for _ in settings.streams]
         self._tasks: set[asyncio.Task[None]] = set()
-        self._num_writing = 0
+        self._num_unstored_files = 0
         self._is_refresh_planned = False
         self.sequence: int = 0 if before is None else before.sequence
         """The number of the newest status and clock message."""
         self._newest_status: bytes = self._encoded_status()
+
+    def _new_queries(self) -> SourceQueries:
+        streams = zip(self.settings.streams, self.statuses, self.supervisors, strict=True)
+        return SourceQueries(
+            self.settings,
+            [
+                StreamAccess(stream.components, status, _session_ask(supervisor))
+                for stream, status, supervisor in streams
+            ],
+            newest_messages=lambda: self.fan_out.newest,
+            status_message=lambda: self._newest_status,
+            last_c3d=self._last_c3d,
+            record=self._record,
+            on_change=self._on_changed_parameters,
+        )
 
     @property
     def name(self) -> str:
@@ -90,7 +93,7 @@ class Source:
         return list(zip(self.statuses, self._rates_hz, strict=True))
 
     async def run(self) -> None:
-        """Run every stream until cancelled; then say Bye to the server."""
+        """Run every stream until cancelled; then send Bye to the server."""
         try:
             async with asyncio.TaskGroup() as tasks:
                 for supervisor in self.supervisors:
@@ -102,10 +105,11 @@ class Source:
     # Status.
 
     def publish_status(self) -> None:
-        """Publish the status and the clock of this source; called once a second."""
+        """Publish the status and the clock of this source. Called once a second."""
         self.sequence += 1
         self._rates_hz = [
-            rate.update(status.frames_in) for rate, status in zip(self._rates, self.statuses, strict=True)
+            rate.update(status.frames_in)
+            for rate, status in zip(self._frame_rates, self.statuses, strict=True)
         ]
         self._newest_status = self._encoded_status()
         # One server has one clock: publish the best estimate of all streams.
@@ -142,31 +146,31 @@ class Source:
 
         def on_parameters(xml: bytes, parsed: ParsedParameters) -> None:
             self.queries.parameters.store(xml, parsed)
-            self._share_parameters(xml, parsed)
+            self._publish_new_parameters(xml, parsed)
 
         return Callbacks(
             publish=self.fan_out.publish,
             on_parameters=on_parameters,
-            on_connected=lambda: self._start(self.queries.parameters.fill()),
+            on_connected=lambda: self._start_task(self.queries.parameters.fill()),
             on_restart=self._refresh_parameters_soon,
             on_file=self._on_file,
             has_subscribers=lambda: self.fan_out.has_subscribers(components),
         )
 
-    def _on_new_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
-        """Publish parameters that changed while connected, and refresh every section."""
-        self._share_parameters(xml, parsed)
-        self._start(self.queries.parameters.fill())
+    def _on_changed_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
+        """Publish parameters that have changed, and request every section again."""
+        self._publish_new_parameters(xml, parsed)
+        self._start_task(self.queries.parameters.fill())
 
-    def _share_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
+    def _publish_new_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
         self.fan_out.set_parameters(parsed.parameters)
         self._publish_parameters(self.name, ServerParameters(xml, self.queries.session))
 
     def _refresh_parameters_soon(self) -> None:
-        """Ask for the parameters again, because the scene may have changed, once the server may be asked."""
+        """Request the parameters again after ``fresh_interval_s``: the scene may have changed."""
         if not self._is_refresh_planned:
             self._is_refresh_planned = True
-            self._start(self._refresh_parameters())
+            self._start_task(self._refresh_parameters())
 
     async def _refresh_parameters(self) -> None:
         try:
@@ -177,32 +181,32 @@ class Source:
         finally:
             self._is_refresh_planned = False
 
-    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+    def _start_task(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    # C3D files and recording.
+    # C3D files and recordings.
 
     def _on_file(self, content: bytes) -> None:
-        if self._num_writing >= _MAX_WRITING:
+        if self._num_unstored_files >= _MAX_UNSTORED_FILES:
             logger.error(
                 "%s: a C3D file of %d bytes is dropped: %d earlier files are still being written; "
                 "is the disk slow, or the server faulty?",
-                *(self.name, len(content), self._num_writing),
+                *(self.name, len(content), self._num_unstored_files),
             )
             return
-        self._num_writing += 1
-        self._start(self._keep(content))
+        self._num_unstored_files += 1
+        self._start_task(self._store_file(content))
 
-    async def _keep(self, content: bytes) -> None:
+    async def _store_file(self, content: bytes) -> None:
         try:
             path = await asyncio.to_thread(self.spool.store, self.name, content)
         except SpoolError as error:
-            logger.error("%s: %s", self.name, error)  # noqa: TRY400 - the sentence says everything
+            logger.error("%s: %s", self.name, error)  # noqa: TRY400 - no traceback needed
             return
         finally:
-            self._num_writing -= 1
+            self._num_unstored_files -= 1
         logger.info("%s: the server sent a C3D file of %d bytes, kept as %s", self.name, len(content), path)
         self._announce_file(self.name, {"name": path.name, "bytes": len(content)})
 
@@ -227,11 +231,13 @@ class Source:
         return False
 
 
-def _sender(supervisor: Supervisor) -> Callable[[], SendCommand | None]:
-    def sender() -> SendCommand | None:
+def _session_ask(supervisor: Supervisor) -> Callable[[], SendCommand | None]:
+    """Return a function that returns ``ask`` of the current session; None while there is none."""
+
+    def ask() -> SendCommand | None:
         return None if supervisor.session is None else supervisor.session.ask
 
-    return sender
+    return ask
 
 
 def _uncertainty_us(status: StreamStatus) -> float:

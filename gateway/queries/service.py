@@ -20,40 +20,42 @@ from gateway.rtc3d.parameters import SECTIONS
 class SourceQueryService:
     """Implements QueryService (outputs/contract.py) for the sources of one gateway.
 
-    ``sources`` changes at a reload. ``commands`` returns the outputs' own commands, by name.
+    ``sources`` returns the queries of each source, ``commands`` the outputs' own commands, both by name.
     """
 
     def __init__(
-        self, sources: Mapping[str, SourceQueries], commands: Callable[[], Mapping[str, Command]]
+        self,
+        sources: Callable[[], Mapping[str, SourceQueries]],
+        commands: Callable[[], Mapping[str, Command]],
     ) -> None:
         self._sources = sources
         self._commands = commands
 
     def serves(self, source: str) -> bool:
         """See QueryService."""
-        return source in self._sources
+        return source in self._sources()
 
     def keys(self, source: str) -> list[KeyPath]:
         """See QueryService. Recording is left out, so that no wildcard starts one by accident."""
-        return [path for path in known_keys(self._sources[source].components) if path != RECORDING]
+        return [path for path in known_keys(self._sources()[source].components) if path != RECORDING]
 
     def accepted_keys(self, source: str) -> str:
         """See QueryService."""
-        return accepted_keys(self._sources[source].components, self._commands())
+        return accepted_keys(self._sources()[source].components, self._commands())
 
     async def answer(self, source: str, path: KeyPath, options: Mapping[str, str]) -> Answer:
         """See QueryService."""
         command = self._commands().get("/".join(path))
         if command is not None:
             return await command(source, options)
-        queries = self._sources[source]
+        queries = self._sources()[source]
         return await queries.answer(parse_question(path, options, queries.components))
 
     async def answer_all(
         self, source: str, paths: Sequence[KeyPath], options: Mapping[str, str]
     ) -> dict[KeyPath, Answer]:
         """See QueryService. Exceptions other than QueryError are raised in any case."""
-        queries = self._sources[source]
+        queries = self._sources()[source]
         questions = parse_questions(paths, options, queries.components)
         results = await asyncio.gather(*map(queries.answer, questions.values()), return_exceptions=True)
         answers: dict[KeyPath, Answer] = {}
@@ -74,7 +76,7 @@ class SourceQueryService:
         """See QueryService."""
         check_sections(sections)
         ordered = tuple(section for section in SECTIONS if section in sections)
-        cached = await self._sources[source].parameters.get(
+        cached = await self._sources()[source].parameters.get(
             () if ordered == tuple(SECTIONS) else ordered, fresh=fresh, stale_ok=False
         )
         return ServerParameters(cached.xml, cached.session, cached.age_s)

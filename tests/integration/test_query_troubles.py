@@ -132,7 +132,7 @@ async def test_a_file_that_cannot_be_stored_is_logged_and_the_stream_continues(
     (tmp_path / "spool").write_text("a file in place of the folder")
     async with gateway_with_server(spool=tmp_path / "spool") as (server, _, _, peer):
         server.send(packet(5, b"content"))
-        await wait_until_async(lambda: "cannot be kept in" in caplog.text)
+        await wait_until_async(lambda: "cannot be stored in" in caplog.text)
         assert (await query(peer, "mocap/lab/c3d")).code == "nothing-yet"
         assert (await query(peer, "mocap/lab/parameters?fresh=true")).payload == server.xml
     assert any(record.levelno == logging.ERROR for record in caplog.records)

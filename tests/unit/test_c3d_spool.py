@@ -57,15 +57,15 @@ def test_the_oldest_file_goes_first_when_they_are_too_large(tmp_path: Path) -> N
     assert list(spool.directory.iterdir()) == [last]
 
 
-def test_a_file_larger_than_all_may_be_is_refused(tmp_path: Path) -> None:
+def test_a_file_larger_than_the_limit_for_all_files_is_refused(tmp_path: Path) -> None:
     spool = spool_in(tmp_path, max_bytes=10)
     before = spool.store("lab", bytes(10))
-    with pytest.raises(SpoolError, match=r"of 11 bytes from lab is not kept: spool\.max_bytes is 10"):
+    with pytest.raises(SpoolError, match=r"of 11 bytes from lab is not stored: spool\.max_bytes is 10"):
         spool.store("lab", bytes(11))
     assert list(spool.directory.iterdir()) == [before]
 
 
-def test_what_is_not_of_the_gateway_is_not_touched(tmp_path: Path) -> None:
+def test_files_of_other_programs_are_left_alone(tmp_path: Path) -> None:
     spool = spool_in(tmp_path, max_files=1, max_bytes=10)
     spool.directory.mkdir()
     others = [
@@ -79,7 +79,7 @@ def test_what_is_not_of_the_gateway_is_not_touched(tmp_path: Path) -> None:
     assert spool.newest("lab") == kept
 
 
-def test_what_a_killed_gateway_left_unfinished_is_cleared_away(tmp_path: Path) -> None:
+def test_unfinished_files_of_a_killed_gateway_are_deleted(tmp_path: Path) -> None:
     spool = spool_in(tmp_path)
     spool.directory.mkdir()
     old, new = spool.directory / "tmpold.c3d.part", spool.directory / "tmpnew.c3d.part"
@@ -91,13 +91,13 @@ def test_what_a_killed_gateway_left_unfinished_is_cleared_away(tmp_path: Path) -
     assert sorted(spool.directory.iterdir()) == sorted([kept, new])
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_created_is_an_error(tmp_path: Path) -> None:
     (tmp_path / "c3d").write_text("a file where the folder should be")
-    with pytest.raises(SpoolError, match=r"of 1 bytes from lab cannot be kept in .*/c3d: .*spool\.directory"):
+    with pytest.raises(SpoolError, match=r"from lab cannot be stored in .*/c3d: .*spool\.directory"):
         spool_in(tmp_path).store("lab", b"x")
 
 
-def test_a_disk_that_fails_leaves_no_half_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_error_leaves_no_incomplete_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
@@ -108,7 +108,7 @@ def test_a_disk_that_fails_leaves_no_half_file(tmp_path: Path, monkeypatch: pyte
     assert list(spool.directory.iterdir()) == []
 
 
-def test_a_file_that_cannot_be_deleted_is_told_and_the_new_one_kept(
+def test_a_file_that_cannot_be_deleted_is_logged_and_the_new_file_is_stored(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     spool = spool_in(tmp_path, max_files=1)
@@ -120,10 +120,10 @@ def test_a_file_that_cannot_be_deleted_is_told_and_the_new_one_kept(
     monkeypatch.setattr(Path, "unlink", refuse)
     new = spool.store("lab", b"new")
     assert sorted(spool.directory.iterdir()) == [old, new]
-    assert f"{old} is old and cannot be deleted: Operation not permitted" in caplog.text
+    assert f"cannot delete the old file {old}: Operation not permitted" in caplog.text
 
 
-def test_threads_that_store_at_once_leave_as_many_files_as_may_be(tmp_path: Path) -> None:
+def test_threads_that_store_files_at_the_same_time_keep_to_the_limit(tmp_path: Path) -> None:
     spool = spool_in(tmp_path, max_files=3)
     threads = [
         threading.Thread(target=lambda name=name: [spool.store(name, b"x") for _ in range(20)])
