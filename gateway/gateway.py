@@ -106,7 +106,8 @@ class Gateway:
         """Apply ``settings`` and return a text for each change. Call it after ``opened`` is set.
 
         Sources and outputs with unchanged settings keep running. A source that differs sends Bye and connects
-        again; an output that differs is closed and opened again. Session and sequence numbers continue. Raises ConfigError, and changes nothing, if an output refuses its configuration.
+        again; an output that differs is closed and opened again. Session and sequence numbers continue.
+        Raises ConfigError, and changes nothing, if an output refuses its configuration.
         """
         outputs = [
             next((running for running in self._outputs if running.is_configured_like(output)), output)

@@ -1,4 +1,4 @@
-"""Running the doctor in tests: servers, Zenoh and LCM stay on this machine."""
+"""Runs the doctor in tests, with servers, Zenoh and LCM on this machine only."""
 
 from typing import Any
 
@@ -38,6 +38,7 @@ async def run_doctor(
     lcm: LcmSettings | None = None,
     seconds: float = SECONDS,
 ) -> Findings:
+    """Return the findings for ``sources``; by default, Zenoh is disabled and LCM stays in memory."""
     settings = make_settings(
         sources=sources,
         zenoh=zenoh_settings or ZenohSettings(enabled=False),
@@ -47,5 +48,6 @@ async def run_doctor(
 
 
 def lab(port: int, *streams: StreamSettings, **keys: Any) -> SourceSettings:
+    """Return the settings of the source "lab" on this machine; ``keys`` are further settings."""
     source: dict[str, Any] = {"host": "127.0.0.1", "reply_timeout_s": 0.1, "connect_timeout_s": 5.0}
     return SourceSettings(name="lab", port=port, streams=streams or (StreamSettings(),), **(source | keys))

@@ -1,4 +1,4 @@
-"""Finds the messages that the gateway can log at WARNING and above, by reading its source text."""
+"""Finds the messages that the gateway can log at WARNING and above, in its source code."""
 
 import ast
 import re
@@ -9,7 +9,7 @@ from typing import Final
 
 _LOGGERS: Final = {"logger", "_log"}
 _LOUD_METHODS: Final = {"warning", "error", "exception", "critical"}
-"""Methods of loggers that log at WARNING and above; ``log`` may, too."""
+"""Methods of loggers that log at WARNING and above; ``log`` can do so, too."""
 
 _WARNING_METHODS: Final = {"failed", "add_limitation"}
 """Methods that log their argument as WARNING, at least the first time."""
@@ -72,7 +72,7 @@ def _logging_calls(scope: ast.AST) -> Iterator[ast.Call]:
 def _texts(
     node: ast.expr, scope: ast.AST, module: ast.Module, modules: Sequence[ast.Module]
 ) -> Iterator[str]:
-    """Yield a pattern for each text that ``node`` can be, following names and calls to their literals."""
+    """Yield a pattern for each text that ``node`` can have, following names and calls to literals."""
     pending, seen = [(node, scope)], set()
     while pending:
         node, scope = pending.pop()
@@ -115,7 +115,7 @@ def _constants(name: str, modules: Sequence[ast.Module]) -> Iterator[ast.expr]:
 
 
 def _returned(name: str, modules: Sequence[ast.Module]) -> Iterator[tuple[ast.expr, ast.AST]]:
-    """Yield the values that a function returns, whatever module it is in."""
+    """Yield the values that a function returns, in any module."""
     for function in chain.from_iterable(module.body for module in modules):
         if isinstance(function, ast.FunctionDef) and function.name == name:
             for node in ast.walk(function):

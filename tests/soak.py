@@ -1,4 +1,4 @@
-"""Run random faults for a long time, and report what was sent, received and lost, and the memory.
+"""Run random faults for a long time, and report the messages sent, received and lost, and the memory used.
 
     make soak SOAK_MINUTES=30
 
@@ -75,7 +75,7 @@ class ReceivedMessages:
 
 
 class Soak:
-    """One run; ``rounds`` holds each fault's kind with its recovery time in s, None if it did not recover."""
+    """One run. ``rounds`` has the kind of each fault and its recovery time in s, None without recovery."""
 
     def __init__(self, minutes: float, seed: int) -> None:
         self.minutes = minutes
@@ -171,9 +171,9 @@ class Soak:
             f"| memory at the end, MiB | {end_kib / 1024:.1f} |",
             f"| memory at most, MiB | {max(self.memory_kib) / 1024:.1f} |",
             "",
-            "Frames of the simulator and messages at the subscriber, by component. What is lost was under "
-            "way in connections that a fault ended, or is counted in the drops below; a gap is a sequence "
-            "number that did not arrive between gateway and subscriber.",
+            "Frames of the simulator and messages at the subscriber, by component. Lost ones were in transit "
+            "on connections that a fault ended, or are counted as drops below. A gap is a sequence number that "
+            "was lost between gateway and subscriber.",
             "",
             "| component | sent | received | lost | gaps |",
             "|---|--:|--:|--:|--:|",
@@ -192,8 +192,8 @@ class Soak:
                 for count in output.drops
             ),
             "",
-            "How long after a fault's end data flowed again, the gateway's own time to notice and to wait "
-            "included:",
+            "How long after the end of a fault data flowed again, including the time that the gateway needed "
+            "to notice the fault and waited before it reconnected:",
             "",
             "| fault | rounds | median s | longest s |",
             "|---|--:|--:|--:|",

@@ -1,4 +1,4 @@
-"""Coverage-guided fuzzing of everything that takes bytes from outside: only documented errors may be raised.
+"""Coverage-guided fuzzing of all code that reads bytes from outside: it may raise only documented errors.
 
     make fuzz FUZZ_SECONDS=600                                          all targets, this long each
     python tests/fuzz/fuzz.py TARGET CORPUS_FOLDER [libFuzzer options]  one of them

@@ -1,4 +1,4 @@
-"""A simulator with faults, a client of it, and the check that both have recovered."""
+"""A simulator with a client, and the check that both recover from faults."""
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -31,7 +31,7 @@ def waiting_bytes(simulator: Simulator) -> int:
 
 
 async def clear_and_check(simulator: Simulator, client: RawClient) -> None:
-    """Clear all faults; then the connection behaves as if there had never been any."""
+    """Clear all faults, and check that the connection then works as without faults."""
     await simulator.faults.clear()
     assert simulator.faults.active_on(only_connection(simulator).number) == []
     assert waiting_bytes(simulator) == 0
@@ -41,5 +41,5 @@ async def clear_and_check(simulator: Simulator, client: RawClient) -> None:
     assert await client.ask("StreamFrames 3D") == (COMMAND, b"OK-StreamFrames 3D")
     frames = await client.frames(20)
     assert consecutive(frames)
-    assert all(part.timestamp_us == (part.frame_number - 1) * 1000 for [part] in frames)
-    assert all(part.items[1][1:] == (1.5, -2.0, 0.25) for [part] in frames)
+    assert all(component.timestamp_us == (component.frame_number - 1) * 1000 for [component] in frames)
+    assert all(component.items[1][1:] == (1.5, -2.0, 0.25) for [component] in frames)

@@ -1,4 +1,4 @@
-"""An RTC3D client that is nothing but a socket, and helpers for its frames."""
+"""An RTC3D client that sends and receives bytes on a socket, and helpers for its frames."""
 
 import asyncio
 import socket
@@ -8,13 +8,13 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Protocol
 
-from tests.unit.rtc3d_server.wire import DATA, ByteOrder, Part, command, frame_of
+from tests.unit.rtc3d_server.wire import DATA, ByteOrder, WireComponent, command, components_in
 
 TIMEOUT_S = 20.0
 
 
 class RawClient:
-    """A client that is nothing but a socket."""
+    """A client without protocol logic."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.reader = reader
@@ -33,16 +33,16 @@ class RawClient:
         self.send(command(text))
         return await self.read()
 
-    async def frames(self, count: int, byte_order: ByteOrder = "big") -> list[list[Part]]:
+    async def frames(self, count: int, byte_order: ByteOrder = "big") -> list[list[WireComponent]]:
         frames = []
         for _ in range(count):
             packet_type, body = await self.read()
             assert packet_type == DATA
-            frames.append(frame_of(body, byte_order))
+            frames.append(components_in(body, byte_order))
         return frames
 
     async def reply(self) -> tuple[int, bytes]:
-        """Return the next packet that is no data frame; discard the frames before it."""
+        """Return the next packet that is not a data frame; discard the frames before it."""
         async with asyncio.timeout(TIMEOUT_S):
             while (packet := await self.read())[0] == DATA:
                 pass
@@ -83,10 +83,10 @@ async def until(condition: Callable[[], bool]) -> None:
             await asyncio.sleep(0.005)
 
 
-def numbers(frames: list[list[Part]]) -> list[int]:
+def numbers(frames: list[list[WireComponent]]) -> list[int]:
     return [frame[0].frame_number for frame in frames]
 
 
-def consecutive(frames: list[list[Part]]) -> bool:
+def consecutive(frames: list[list[WireComponent]]) -> bool:
     first = frames[0][0].frame_number
     return numbers(frames) == list(range(first, first + len(frames)))

@@ -1,4 +1,4 @@
-"""The doctor against healthy, odd, wrong and absent servers: what it finds, and the remedy."""
+"""The doctor's findings and remedies for healthy, unusual, wrong and missing servers."""
 
 import asyncio
 import re
@@ -140,7 +140,7 @@ async def test_a_refused_connection_fails() -> None:
 async def test_a_computer_that_does_not_respond_fails() -> None:
     with socket.create_server(("127.0.0.1", 0), backlog=0) as full:
         address = full.getsockname()
-        with contextmanager(_filled)(address):
+        with _full_queue(address):
             findings = await run_doctor(lab(address[1], connect_timeout_s=0.2))
     assert findings.of("TCP").found == f"no answer from 127.0.0.1:{address[1]} within 0.2 s"
     assert findings.of("TCP").remedy == (
@@ -148,8 +148,9 @@ async def test_a_computer_that_does_not_respond_fails() -> None:
     )
 
 
-def _filled(address: tuple[str, int]) -> Iterator[None]:
-    """Fill a listener's queue: further connections get no answer."""
+@contextmanager
+def _full_queue(address: tuple[str, int]) -> Iterator[None]:
+    """Fill the queue of a listener, so that further connections get no answer."""
     waiting = [socket.socket() for _ in range(4)]
     for each in waiting:
         each.setblocking(False)
@@ -337,12 +338,11 @@ async def test_a_configured_lower_rate_passes(rate: Rate, text: str) -> None:
     assert (findings.of("rate").result, findings.of("rate").found) == (Result.PASSING, text)
 
 
-async def test_time_stamps_that_stand_still_are_ignored() -> None:
+async def test_constant_time_stamps_are_ignored() -> None:
     frame = markers_frame(7, (1.0, 2.0, 3.0))
     findings = await diagnose(streaming(parameters(MARKERS_XML.format(1)), lambda _number: frame))
-    assert (
-        findings.of("rate").result is Result.PASSING
-    )  # about 100 Hz by arrival times; the server describes 1 Hz
+    # The server describes 1 Hz; by arrival times, the rate is about 100 Hz.
+    assert findings.of("rate").result is Result.PASSING
 
 
 async def test_time_stamps_that_are_not_in_microseconds_are_ignored() -> None:
@@ -351,9 +351,8 @@ async def test_time_stamps_that_are_not_in_microseconds_are_ignored() -> None:
         parameters(MARKERS_XML.format(900)), lambda number: markers_frame(number, (1, 2, 3)), step=1
     )
     findings = await diagnose(script)
-    assert (
-        findings.of("rate").result is Result.FAILING
-    )  # about 100 Hz by arrival times; the server describes 900 Hz
+    # The server describes 900 Hz; by arrival times, the rate is about 100 Hz.
+    assert findings.of("rate").result is Result.FAILING
 
 
 async def test_markers_out_of_view_fail() -> None:

@@ -1,4 +1,4 @@
-"""The doctor on Zenoh, LCM and this computer, and the command: what it finds, and the remedy."""
+"""The doctor's findings and remedies for Zenoh, LCM and this computer, and the command ``doctor``."""
 
 import asyncio
 import json
@@ -183,7 +183,7 @@ def test_large_enough_buffers_pass() -> None:
 
 @pytest.mark.netns
 def test_too_small_buffers_fail() -> None:
-    """First as many messages as fit into the largest buffer that a URL can request, then twice as many."""
+    """The messages just fit into the largest buffer that a URL can request. Then there are twice as many."""
     maximum = lcm_checks.receive_buffer_bytes(2**30)
     url = networks.lcm_url()
     largest = 65_000  # charged twice that

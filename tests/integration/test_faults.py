@@ -1,4 +1,4 @@
-"""Faults of the server and of the network, one by one and several at once: after each, data flows again."""
+"""Faults of the server and of the network, alone and several at once; after them, data flows again."""
 
 import asyncio
 import threading
@@ -24,7 +24,7 @@ from tests.waiting import wait_until_async
 
 _Result = TypeVar("_Result")
 
-LINGERING = 20  # frames sent during a fault that may still be in transit when it ends
+MAX_FRAMES_IN_TRANSIT = 20  # when a fault ends
 
 
 def scene() -> SyntheticScene:
@@ -32,25 +32,25 @@ def scene() -> SyntheticScene:
 
 
 def assert_well_formed(lab: MemoryGateway) -> None:
-    """Check that every message decodes and none came twice: sequences grow by one without a gap."""
+    """Check that every message decodes, and that there are no duplicates and no gaps in the sequences."""
     for component in COMPONENTS_BY_KEY:
         messages = lab.messages(component)  # decodes each
         if messages:
             first = messages[0].sequence
             assert [message.sequence for message in messages] == list(range(first, first + len(messages)))
-        marks = [(message.session, message.frame_number, message.timestamp) for message in messages]
+        identities = [(message.session, message.frame_number, message.timestamp) for message in messages]
         if not lab.status.restarts:
-            assert len(set(marks)) == len(marks)
+            assert len(set(identities)) == len(identities)
 
 
 def _more_reconnects(lab: MemoryGateway, than: int) -> bool:
     return lab.status.reconnects > than
 
 
-async def flows_again(lab: MemoryGateway) -> None:
-    """Wait for more frames than may have been in transit; the limit is generous because CI is slow."""
+async def wait_for_data(lab: MemoryGateway) -> None:
+    """Wait for more frames than may have been in transit. The time limit allows for slow CI."""
     before = lab.status.frames_in
-    await wait_until_async(lambda: lab.status.frames_in > before + LINGERING, 20)
+    await wait_until_async(lambda: lab.status.frames_in > before + MAX_FRAMES_IN_TRANSIT, 20)
 
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
@@ -64,7 +64,7 @@ async def test_after_each_fault_data_flows_again(kind: str) -> None:
             lambda: fault.num_happened or lab.status.last_error or simulator.frames_sent > frames + 100, 10
         )
         await simulator.faults.clear()
-        await flows_again(lab)
+        await wait_for_data(lab)
         assert_well_formed(lab)
 
 
@@ -85,7 +85,7 @@ async def test_the_last_error_names_the_fault(kind: str, message: str) -> None:
         simulator.faults.begin(KINDS[kind].model_validate({}))
         await wait_until_async(lambda: message in lab.status.last_error, 15)
         await simulator.faults.clear()
-        await flows_again(lab)
+        await wait_for_data(lab)
 
 
 async def test_connections_cut_within_packets_lose_only_the_frames_in_transit() -> None:
@@ -95,11 +95,11 @@ async def test_connections_cut_within_packets_lose_only_the_frames_in_transit() 
         run_gateway(proxy.port) as lab,
     ):
         for _ in range(5):
-            await flows_again(lab)
+            await wait_for_data(lab)
             reconnects = lab.status.reconnects
             proxy.cut_after(num_bytes=100)
             await wait_until_async(partial(_more_reconnects, lab, reconnects), 10)
-        await flows_again(lab)
+        await wait_for_data(lab)
         assert_well_formed(lab)
         assert lab.status.reconnects >= 5
 
@@ -172,7 +172,7 @@ class ManyFaults(RuleBasedStateMachine):
         async def clear() -> None:
             self.proxy.clear()
             await self.simulator.faults.clear()
-            await flows_again(self.lab)
+            await wait_for_data(self.lab)
 
         self._in_loop(clear())
 

@@ -30,7 +30,7 @@ class Completed(NamedTuple):
 
 
 async def run(*arguments: str) -> Completed:
-    """Run the program in its own process; the event loop of this one keeps running."""
+    """Run the program in another process, without blocking the event loop of this one."""
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "gateway", *arguments),
         stdout=subprocess.PIPE,
@@ -275,7 +275,7 @@ async def test_several_sources_are_found_on_lcm() -> None:
 
 
 async def test_a_query_without_a_reply_is_repeated() -> None:
-    """The first queries get no reply, as during a reconnection; the third one does."""
+    """The first two queries get no reply, as while Zenoh reconnects; the third one does."""
     endpoint = free_endpoint()
     session = open_zenoh("peer", listen=endpoint)
     queries: list[zenoh.Query] = []

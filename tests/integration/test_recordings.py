@@ -1,4 +1,4 @@
-"""Real recordings, from the file through simulator, TCP and gateway to subscribers on both sides."""
+"""Real recordings, from the file through simulator, TCP and gateway to subscribers on Zenoh and LCM."""
 
 import asyncio
 import os
@@ -45,7 +45,7 @@ Received = dict[str, list[bytes]]
 
 
 class Lab:
-    """A simulator, a gateway, and the messages that a subscriber on each side received, by component."""
+    """A simulator, and the messages that one subscriber each on Zenoh and LCM received, by component."""
 
     def __init__(self, simulator: Simulator) -> None:
         self.simulator = simulator

@@ -50,7 +50,7 @@ async def test_a_server_without_a_filter_serves_a_scene_under_its_name() -> None
         assert consecutive(await client.frames(20))
 
 
-async def test_a_filter_can_change_all_that_passes_through_a_connection() -> None:
+async def test_a_filter_can_change_all_bytes_of_a_connection() -> None:
     filters: list[RefusingFilter] = []
 
     def new_filter(connection: FilteredConnection) -> ConnectionFilter:

@@ -1,4 +1,4 @@
-"""The simulator from a client's side: packets made by hand, over TCP."""
+"""The simulator from a client's side: hand-made packets over TCP."""
 
 import asyncio
 import logging
@@ -26,11 +26,11 @@ from tests.unit.rtc3d_server.wire import (
     TOOLS,
     XML,
     ByteOrder,
-    Part,
+    WireComponent,
     command,
-    cut,
-    frame_of,
+    components_in,
     packet,
+    packets_in,
 )
 
 KEYS = {MARKERS: "3d", TOOLS: "6d", ANALOG: "analog", FORCE: "force", EVENT: "event"}
@@ -56,11 +56,21 @@ async def test_a_client_can_follow_the_order_of_the_specification() -> None:
         assert parameters.force == simulator.scene.parameters.force
         assert parameters.events == simulator.scene.parameters.events
         assert await client.ask("StreamFrames") == (COMMAND, b"OK-StreamFrames")
-        for parts in await client.frames(20):
-            assert [part.type for part in parts if part.type != EVENT] == [MARKERS, TOOLS, ANALOG, FORCE]
-            assert [len(part.items) for part in parts if part.type != EVENT] == [20, 2, 8, 2]
+        for components in await client.frames(20):
+            assert [component.type for component in components if component.type != EVENT] == [
+                MARKERS,
+                TOOLS,
+                ANALOG,
+                FORCE,
+            ]
+            assert [len(component.items) for component in components if component.type != EVENT] == [
+                20,
+                2,
+                8,
+                2,
+            ]
         client.send(command("Bye"))
-        assert cut(await client.rest())[-1] == (COMMAND, b"bye")
+        assert packets_in(await client.rest())[-1] == (COMMAND, b"bye")
 
 
 async def test_ndis_client_can_request_little_endian_first_and_events_in_the_current_frame() -> None:
@@ -70,9 +80,9 @@ async def test_ndis_client_can_request_little_endian_first_and_events_in_the_cur
         sent = "SendCurrentFrame 3D 6D Analog Force Events "
         for _ in range(10):
             assert await client.ask(sent) == (COMMAND, b"OK-SendCurrentFrame 3D 6D Analog Force Events")
-            [parts] = await client.frames(1, "little")
-            assert [part.type for part in parts][:3] == [MARKERS, TOOLS, ANALOG]
-            assert parts[0].items[0][0] == parts[0].frame_number - 1
+            [components] = await client.frames(1, "little")
+            assert [component.type for component in components][:3] == [MARKERS, TOOLS, ANALOG]
+            assert components[0].items[0][0] == components[0].frame_number - 1
         client.send(command("Bye"))
         assert await client.rest() == packet(COMMAND, b"bye")
 
@@ -84,7 +94,7 @@ async def test_nothing_follows_bye() -> None:
                 await client.ask("StreamFrames Analog")
                 await client.frames(5)
                 client.send(command("Bye"), command("Version 1.0"))
-                assert cut(await client.rest())[-1] == (COMMAND, b"bye")
+                assert packets_in(await client.rest())[-1] == (COMMAND, b"bye")
 
 
 @pytest.mark.parametrize("ending", ["", "\0", "\n", "\r\n", " \n\0"])
@@ -93,7 +103,7 @@ async def test_commands_can_have_any_ending_and_any_case(words: str, ending: str
     async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
         assert await client.ask(words + ending) == (COMMAND, f"OK-{words.strip()}".encode())
         frames = await client.frames(30)
-        assert {part.type for frame in frames for part in frame} == {ANALOG}
+        assert {component.type for frame in frames for component in frame} == {ANALOG}
         assert consecutive(frames)
 
 
@@ -141,7 +151,7 @@ async def test_a_size_out_of_bounds_gets_an_error_packet_and_ends_the_connection
     async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
         client.send(command("Version 1.0"), struct.pack(">II", size, COMMAND))
 
-        [reply, (packet_type, text)] = cut(await client.rest())
+        [reply, (packet_type, text)] = packets_in(await client.rest())
 
         assert reply == (COMMAND, b"OK-Version 1.0")
         assert packet_type == ERROR
@@ -169,7 +179,7 @@ async def test_each_packet_is_sent_with_one_send() -> None:
 
 
 async def test_64_clients_get_every_frame() -> None:
-    async def play(simulator: Simulator, number: int) -> list[list[Part]]:
+    async def play(simulator: Simulator, number: int) -> list[list[WireComponent]]:
         async with connected(simulator) as client:
             byte_order: ByteOrder = "little" if number % 2 else "big"
             await client.ask(f"SetByteOrder {byte_order}Endian")
@@ -205,7 +215,11 @@ async def test_a_client_that_does_not_read_delays_no_other_and_continues_when_it
         frames = await silent.frames(full.sent_counts.frames + 50)
         assert not consecutive(frames)
         events = [
-            event[0] for parts in frames for part in parts if part.type == EVENT for event in part.items
+            event[0]
+            for components in frames
+            for component in components
+            if component.type == EVENT
+            for event in component.items
         ]
         assert events == list(range(1, len(events) + 1))
         assert len(events) >= 4
@@ -239,14 +253,14 @@ async def test_sent_frames_are_counted_for_each_client_and_in_total() -> None:
                 frames = await client.frames(150)
                 client.send(command("StreamFrames Stop"), command("SendParameters General"))
                 while (reply := await client.read())[0] != COMMAND:
-                    frames.append(frame_of(reply[1]))
+                    frames.append(components_in(reply[1]))
                 _, xml = await client.read()
                 general = parse_parameters(xml).parameters.general
                 assert general is not None
                 assert general.frames_sent == len(frames)
                 assert general.frames_per_s is not None
                 assert general.frames_per_s > 0
-                received.update(KEYS[part.type] for parts in frames for part in parts)
+                received.update(KEYS[component.type] for components in frames for component in components)
                 num_frames += len(frames)
 
         assert simulator.components_sent == received
@@ -268,7 +282,7 @@ async def test_closing_sends_no_data_and_frees_the_port() -> None:
         await client.ask("StreamFrames 3D")
         await client.frames(1)
         await simulator.close()
-        assert cut(await client.rest())[-1] == (NO_DATA, b"")
+        assert packets_in(await client.rest())[-1] == (NO_DATA, b"")
     async with Simulator(CountingScene(), port=simulator.port) as again, connected(again) as client:
         assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
 

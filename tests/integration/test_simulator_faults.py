@@ -20,7 +20,7 @@ from gateway.simulator.simulator import Simulator
 from tests.integration.faulty import FAST_HZ, NEVER_MS, VERSION, clear_and_check, only_connection, playing
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import COMMAND, DATA, MARKERS, NO_DATA, Part, command
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, MARKERS, NO_DATA, WireComponent, command
 
 # The server ---------------------------------------------------------------------------------
 
@@ -61,9 +61,9 @@ async def test_a_restarted_server_has_the_same_port_a_new_measurement_and_the_ne
         async with connected(simulator) as again:
             assert await num_markers(again) == 12
             await again.ask("StreamFrames 3D")
-            [[part]] = await again.frames(1)
-            assert len(part.items) == 12
-            assert part.timestamp_us == (part.frame_number - 1) * 2000
+            [[component]] = await again.frames(1)
+            assert len(component.items) == 12
+            assert component.timestamp_us == (component.frame_number - 1) * 2000
             assert only_connection(simulator).number == 1
 
 
@@ -155,8 +155,8 @@ async def test_a_server_whose_port_was_taken_comes_back_when_it_is_free(
             assert await again.ask("Version 1.0") == VERSION
 
 
-async def frames_up_to(client: RawClient, num_markers: int) -> list[list[Part]]:
-    frames: list[list[Part]] = []
+async def frames_up_to(client: RawClient, num_markers: int) -> list[list[WireComponent]]:
+    frames: list[list[WireComponent]] = []
     async with asyncio.timeout(TIMEOUT_S):
         while not frames or len(frames[-1][0].items) != num_markers:
             frames += await client.frames(1)

@@ -39,9 +39,9 @@ from tests.unit.rtc3d_server.wire import (
     MARKERS,
     NO_DATA,
     XML,
-    Part,
+    WireComponent,
     command,
-    frame_of,
+    components_in,
 )
 
 # Replies ------------------------------------------------------------------------------------
@@ -75,8 +75,8 @@ async def test_acknowledgements_can_be_missing() -> None:
     async with playing() as (simulator, client):
         simulator.faults.begin(MissingAcknowledgements(commands=("version", "sendcurrentframe")))
         client.send(command("Version 1.0"), command("SendCurrentFrame 3D"))
-        [[part]] = await client.frames(1)
-        assert part.type == MARKERS
+        [[component]] = await client.frames(1)
+        assert component.type == MARKERS
         assert await client.ask("SetByteOrder BigEndian") == (COMMAND, b"OK-SetByteOrder BigEndian")
         assert (await client.ask("Fly"))[0] == ERROR
         await clear_and_check(simulator, client)
@@ -155,7 +155,9 @@ async def test_replies_can_have_another_text(fault: Fault, text: bytes) -> None:
 # Frames -------------------------------------------------------------------------------------
 
 
-async def frames_with(simulator: Simulator, client: RawClient, fault: Fault, asked: str) -> list[list[Part]]:
+async def frames_with(
+    simulator: Simulator, client: RawClient, fault: Fault, asked: str
+) -> list[list[WireComponent]]:
     await client.ask(f"StreamFrames {asked}")
     await client.frames(5)
     simulator.faults.begin(fault)
@@ -177,7 +179,7 @@ async def test_time_stamps_can_freeze() -> None:
     async with playing() as (simulator, client):
         frames = await frames_with(simulator, client, FrozenTimestamps(), "3D")
         [(frozen, _)] = simulator.faults.active_on(only_connection(simulator).number)
-        assert {part.timestamp_us for [part] in frames} == {frozen.began_us}
+        assert {component.timestamp_us for [component] in frames} == {frozen.began_us}
         assert frozen.began_us > 0
         assert consecutive(frames)
         await clear_and_check(simulator, client)
@@ -186,15 +188,18 @@ async def test_time_stamps_can_freeze() -> None:
 async def test_time_stamps_can_jump() -> None:
     async with playing() as (simulator, client):
         frames = await frames_with(simulator, client, JumpingTimestamps(jump_ms=-7000), "3D")
-        assert all(part.timestamp_us == (part.frame_number - 1) * 1000 - 7_000_000 for [part] in frames)
+        assert all(
+            component.timestamp_us == (component.frame_number - 1) * 1000 - 7_000_000
+            for [component] in frames
+        )
         await clear_and_check(simulator, client)
 
 
 async def test_frame_numbers_can_be_constant() -> None:
     async with playing() as (simulator, client):
         frames = await frames_with(simulator, client, ConstantFrameNumbers(frame_number=5), "3D")
-        assert {part.frame_number for [part] in frames} == {5}
-        assert np.diff([part.timestamp_us for [part] in frames]).tolist() == [1000] * 19
+        assert {component.frame_number for [component] in frames} == {5}
+        assert np.diff([component.timestamp_us for [component] in frames]).tolist() == [1000] * 19
         await clear_and_check(simulator, client)
 
 
@@ -205,8 +210,8 @@ async def test_events_can_be_short() -> None:
         for event_bytes in (16, 16, 24):
             packet_type, body = await client.read()
             assert packet_type == DATA
-            [part] = frame_of(body, event_bytes=event_bytes)
-            assert part.type == EVENT
+            [component] = components_in(body, event_bytes=event_bytes)
+            assert component.type == EVENT
         await clear_and_check(simulator, client)
 
 

@@ -23,7 +23,7 @@ from tests.integration.faulty import (
 )
 from tests.integration.raw_client import connected, consecutive, numbers, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, XML, command, cut, frame_of
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, XML, command, components_in, packets_in
 
 
 async def test_delayed_packets_keep_their_order() -> None:
@@ -121,7 +121,7 @@ async def test_a_half_open_server_accepts_clients_but_neither_reads_nor_writes()
 
             assert await other.read() == VERSION
         while (reply := await client.read())[0] == DATA:
-            frames.append(frame_of(reply[1]))
+            frames.append(components_in(reply[1]))
         assert reply[0] == XML
         frames += await client.frames(5)
         assert np.diff(numbers(frames)).max() > 40
@@ -212,4 +212,4 @@ async def test_bye_is_answered_before_the_connection_ends_despite_any_delay() ->
         simulator.faults.begin(Delay(delay_ms=NEVER_MS))
         simulator.faults.begin(LateAcknowledgements(delay_ms=NEVER_MS))
         client.send(command("Version 1.0"), command("Bye"))
-        assert cut(await client.rest()) == [VERSION, (COMMAND, b"bye")]
+        assert packets_in(await client.rest()) == [VERSION, (COMMAND, b"bye")]

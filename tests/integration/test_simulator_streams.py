@@ -1,4 +1,4 @@
-"""The simulator's streams, checked by frame numbers and values, never by the clock."""
+"""The simulator's streams, checked by frame numbers and values, without timing."""
 
 import asyncio
 import os
@@ -24,9 +24,9 @@ from tests.unit.rtc3d_server.wire import (
     NO_DATA,
     TOOLS,
     XML,
-    Part,
+    WireComponent,
     command,
-    frame_of,
+    components_in,
 )
 
 FAST_HZ = 1000.0
@@ -58,13 +58,17 @@ async def test_frames_are_sent_at_the_requested_rate(sent: str, gaps: list[int])
 async def test_time_stamps_are_those_of_the_measurement_and_equal_within_a_frame() -> None:
     async with Simulator(CountingScene(FAST_HZ)) as simulator, connected(simulator) as client:
         await client.ask("StreamFrames FrequencyDivisor:3 All")
-        for parts in await client.frames(100):
-            measured = [part for part in parts if part.type != EVENT]
-            assert {part.timestamp_us for part in parts} == {(parts[0].frame_number - 1) * 1000}
+        for components in await client.frames(100):
+            measured = [component for component in components if component.type != EVENT]
+            assert {component.timestamp_us for component in components} == {
+                (components[0].frame_number - 1) * 1000
+            }
             per_frame = {MARKERS: 1, TOOLS: 1, ANALOG: 10}
-            for part in measured:
-                assert part.frame_number - 1 == (parts[0].frame_number - 1) * per_frame[part.type]
-                assert part.items[0][0] == part.frame_number - 1
+            for component in measured:
+                assert (
+                    component.frame_number - 1 == (components[0].frame_number - 1) * per_frame[component.type]
+                )
+                assert component.items[0][0] == component.frame_number - 1
 
 
 async def test_each_client_has_its_own_rate_and_byte_order() -> None:
@@ -79,8 +83,8 @@ async def test_each_client_has_its_own_rate_and_byte_order() -> None:
 
         big_frames, little_frames = await asyncio.gather(big.frames(50), little.frames(50, "little"))
 
-    assert {part.type for frame in big_frames for part in frame} == {MARKERS}
-    assert {part.type for frame in little_frames for part in frame} == {TOOLS}
+    assert {component.type for frame in big_frames for component in frame} == {MARKERS}
+    assert {component.type for frame in little_frames for component in frame} == {TOOLS}
     assert np.diff(numbers(big_frames)).tolist() == [1] * 49
     assert np.diff(numbers(little_frames)).tolist() == [2] * 49
 
@@ -90,7 +94,13 @@ async def test_no_event_is_lost_at_a_low_rate() -> None:
         await client.ask("StreamFrames FrequencyDivisor:50 3D Events")
         frames = await client.frames(10)
 
-    events = [event[0] for parts in frames for part in parts if part.type == EVENT for event in part.items]
+    events = [
+        event[0]
+        for components in frames
+        for component in components
+        if component.type == EVENT
+        for event in component.items
+    ]
     assert len(events) >= 5
     assert np.diff(events).tolist() == [1.0] * (len(events) - 1)
 
@@ -100,8 +110,8 @@ async def test_events_can_be_sent_in_16_bytes() -> None:
         await client.ask("StreamFrames Events")
         _, body = await client.read()
 
-    [part] = frame_of(body, event_bytes=16)
-    assert part.items == [(part.timestamp_us // 70_000, -1, -1, -1)]
+    [component] = components_in(body, event_bytes=16)
+    assert component.items == [(component.timestamp_us // 70_000, -1, -1, -1)]
 
 
 # Measurements -------------------------------------------------------------------------------
@@ -171,15 +181,15 @@ async def test_once_plays_the_scene_from_the_first_request_to_its_end() -> None:
 # Real recordings ----------------------------------------------------------------------------
 
 
-async def played_once(scene: Scene, components: str) -> dict[int, list[Part]]:
+async def played_once(scene: Scene, components: str) -> dict[int, list[WireComponent]]:
     """Return all components that one pass of the scene sends, by component type."""
-    parts: dict[int, list[Part]] = {}
+    by_type: dict[int, list[WireComponent]] = {}
     async with Simulator(scene, once=True) as simulator, connected(simulator) as client:
         await client.ask(f"StreamFrames {components}")
         while (reply := await client.read())[0] == DATA:
-            for part in frame_of(reply[1]):
-                parts.setdefault(part.type, []).append(part)
-    return parts
+            for component in components_in(reply[1]):
+                by_type.setdefault(component.type, []).append(component)
+    return by_type
 
 
 @pytest.mark.takes
@@ -190,20 +200,20 @@ async def test_a_real_recording_arrives_as_ezc3d_reads_it(name: str) -> None:
         pytest.skip("RTC3D_TAKES names no folder with recordings")
     path = Path(folder) / name
     read = ezc3d.c3d(str(path), extract_forceplat_data=True)["data"]
-    takes: list[Awaitable[dict[int, list[Part]]]] = [
+    takes: list[Awaitable[dict[int, list[WireComponent]]]] = [
         played_once(C3dScene(path), components) for components in ("3D", "Analog Force")
     ]
     points, fast = await asyncio.gather(*takes)
 
-    markers = np.array([part.items for part in points[MARKERS]], np.float32)
+    markers = np.array([component.items for component in points[MARKERS]], np.float32)
     missing = np.isnan(read["points"][:3]).any(axis=0).T
     assert markers.shape == (read["points"].shape[2], read["points"].shape[1], 4)
     assert np.array_equal(markers[..., :3][~missing], read["points"][:3].T[~missing].astype(np.float32))
     assert np.isnan(markers[missing, :3]).all()
     assert (markers[missing, 3] == 999.0).all()
     if read["analogs"].size:
-        analog = np.array([part.items for part in fast[ANALOG]], np.float32)[..., 0]
+        analog = np.array([component.items for component in fast[ANALOG]], np.float32)[..., 0]
         assert np.array_equal(analog, read["analogs"][0].T.astype(np.float32))
     for number, plate in enumerate(read["platform"]):
-        force = np.array([part.items[number] for part in fast[FORCE]], np.float32)
+        force = np.array([component.items[number] for component in fast[FORCE]], np.float32)
         assert np.array_equal(force, np.concatenate([plate["force"], plate["moment"]]).T.astype(np.float32))

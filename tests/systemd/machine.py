@@ -1,4 +1,4 @@
-"""A machine for tests of installing: systemd in namespaces of its own, with the network of the test run."""
+"""A machine for installation tests: a systemd in its own namespaces, with the network of the test run."""
 
 import asyncio
 import json
@@ -28,17 +28,17 @@ class Outcome(NamedTuple):
 
 
 class Machine:
-    """A machine that ``with-systemd`` has booted; ``process_1`` is the outer number of its process 1."""
+    """A machine that ``with-systemd`` has booted; ``init_pid`` is its process 1, as numbered outside."""
 
-    def __init__(self, process_1: int) -> None:
-        self._process_1 = process_1
-        self._files = Path(f"/proc/{process_1}/root")
+    def __init__(self, init_pid: int) -> None:
+        self._init_pid = init_pid
+        self._files = Path(f"/proc/{init_pid}/root")
         self.left_in_clone: set[str] = set()
         """The files that installing created in the clone."""
         self.install_output = ""
 
     def path(self, path: str) -> Path:
-        """Return the outer path of a file of the machine."""
+        """Return the path outside the machine of a file in it."""
         return self._files / path.removeprefix("/")
 
     async def run(
@@ -47,7 +47,7 @@ class Machine:
         """Run a command in the machine as root."""
         namespaces = ("--pid", "--mount", "--uts", "--ipc", "--cgroup")
         process = await asyncio.create_subprocess_exec(
-            *("nsenter", f"--target={self._process_1}", *namespaces, "--", *command),
+            *("nsenter", f"--target={self._init_pid}", *namespaces, "--", *command),
             env={"PATH": _PATH, **(environment or {})},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -79,7 +79,7 @@ class Machine:
             CLONE,
         )
         skipped = [part for path in of_systemd for part in ("-path", path, "-prune", "-o")]
-        # Not for folders: their time changes with their contents, which are listed themselves.
+        # Not of folders: their time changes with their files, which are listed.
         each = ("-type", "d", "-printf", r"%p\t\n", "-o", "-printf", r"%p\t%s %T@\n")
         listed = await self.run("find", *writable, *skipped, *each)
         return dict(line.rsplit("\t", 1) for line in listed.text.splitlines())

@@ -119,7 +119,7 @@ async def test_the_watchdog_restarts_a_hung_service(service: Service) -> None:
         assert await service.main_pid() != before
     log = (await service.machine.run("journalctl", "--output=cat", "--unit", UNIT)).text
     assert "Watchdog timeout" in log
-    assert "Fatal Python error: Aborted" in log  # with the traceback of the hang
+    assert "Fatal Python error: Aborted" in log  # and the traceback shows where it hung
 
 
 class Received:
@@ -226,9 +226,7 @@ async def test_stopping_says_bye_to_a_server_that_never_closes(service: Service)
 
     async with ScriptedServer(script) as server, simulator() as simulated:
         service.configure({"lab": server.port, "sim": simulated.port})
-        await service.drop_in(
-            "TimeoutStopSec=2s"
-        )  # systemd would kill it after that, and the result would be a failure
+        await service.drop_in("TimeoutStopSec=2s")  # then systemd kills it, and the result is a failure
         await service.start()
         await service.wait_for_status("sim: streaming")
         [connection] = simulated.connections

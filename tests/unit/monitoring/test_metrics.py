@@ -1,4 +1,4 @@
-"""Metrics of known counters, parsed as Prometheus does."""
+"""Metrics of counters with known values, parsed by Prometheus' own parser."""
 
 import math
 from collections.abc import Iterator

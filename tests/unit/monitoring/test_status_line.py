@@ -1,4 +1,4 @@
-"""The status line of a source and its streams, and of outputs with a problem."""
+"""The texts of the status line for sources, streams and outputs with a problem."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""A scene whose values are the numbers of their samples."""
+"""A scene whose values are sample numbers."""
 
 import numpy as np
 
@@ -10,9 +10,9 @@ EVENT_EVERY_US = 70_000
 
 
 class CountingScene:
-    """Markers, a tool and no plate; two analog channels at ten times their rate; event k at k · 70 ms.
+    """Markers and one tool at ``rate_hz``, two analog channels at ten times that rate, event k at k · 70 ms.
 
-    The first number of each item is the number of its sample, from 0.
+    The first value of each item is its sample number, from 0.
     """
 
     def __init__(self, rate_hz: float = 100.0, num_frames: int | None = None, num_markers: int = 2) -> None:

@@ -1,4 +1,4 @@
-"""A session of the RT server with one client, at any time of the measurement."""
+"""A session of the RT server with one client; the test sets the measurement's time."""
 
 from collections.abc import Sequence
 
@@ -8,7 +8,7 @@ from gateway.rtc3d.parameters import General
 from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks
 from gateway.rtc3d_server.frame_builder import FrameBuilder
 from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import COMMAND, DATA, ByteOrder, Part, cut, frame_of
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, ByteOrder, WireComponent, components_in, packets_in
 
 
 class ScriptedClient:
@@ -32,13 +32,13 @@ class ScriptedClient:
 
     def send(self, text: bytes | str, packet_type: int = COMMAND) -> list[tuple[int, bytes]]:
         body = text.encode() if isinstance(text, str) else text
-        return cut(b"".join(self.session.answer(Packet(packet_type, body))))
+        return packets_in(b"".join(self.session.answer(Packet(packet_type, body))))
 
-    def frames_until(self, elapsed_us: int, byte_order: ByteOrder = "big") -> list[list[Part]]:
+    def frames_until(self, elapsed_us: int, byte_order: ByteOrder = "big") -> list[list[WireComponent]]:
         self.elapsed_us = elapsed_us
-        packets = cut(b"".join(frame.packet for frame in self.session.due_frames(elapsed_us)))
+        packets = packets_in(b"".join(frame.packet for frame in self.session.due_frames(elapsed_us)))
         assert all(packet_type == DATA for packet_type, _ in packets)
-        return [frame_of(body, byte_order) for _, body in packets]
+        return [components_in(body, byte_order) for _, body in packets]
 
     def numbers_until(self, elapsed_us: int) -> list[int]:
         """Return the frame number of each frame's first component."""

@@ -6,7 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.unit.rtc3d_server.scripted_client import ScriptedClient
-from tests.unit.rtc3d_server.wire import ANALOG, COMMAND, EVENT, MARKERS, NO_DATA, TOOLS, Part, cut
+from tests.unit.rtc3d_server.wire import (
+    ANALOG,
+    COMMAND,
+    EVENT,
+    MARKERS,
+    NO_DATA,
+    TOOLS,
+    WireComponent,
+    packets_in,
+)
 
 SECOND_US = 1_000_000
 
@@ -25,7 +34,7 @@ def test_a_stream_has_all_components_in_every_frame_by_default(client: ScriptedC
 
     frames = client.frames_until(60_000)
 
-    assert [[part.type for part in frame] for frame in frames] == [[MARKERS, TOOLS, ANALOG]] * 7
+    assert [[component.type for component in frame] for frame in frames] == [[MARKERS, TOOLS, ANALOG]] * 7
     assert [frame[0].frame_number for frame in frames] == [1, 2, 3, 4, 5, 6, 7]
     assert [frame[2].frame_number for frame in frames] == [1, 11, 21, 31, 41, 51, 61]
     assert [frame[2].timestamp_us for frame in frames] == list(range(0, 70_000, 10_000))
@@ -89,7 +98,10 @@ def test_a_new_stream_replaces_the_old_one(client: ScriptedClient) -> None:
 
     frames = client.frames_until(60_000)
 
-    assert [(part.type, part.frame_number) for frame in frames for part in frame] == [(TOOLS, 4), (TOOLS, 6)]
+    assert [(component.type, component.frame_number) for frame in frames for component in frame] == [
+        (TOOLS, 4),
+        (TOOLS, 6),
+    ]
 
 
 def test_stop_ends_the_stream_for_later_measurements_too(client: ScriptedClient) -> None:
@@ -146,16 +158,19 @@ def test_every_event_is_sent_once_with_the_next_frame(
     client: ScriptedClient, rate: str, components: str
 ) -> None:
     client.send(f"StreamFrames {rate} {components}")
-    parts = [
-        part for t in range(0, 10 * SECOND_US, 500_000) for frame in client.frames_until(t) for part in frame
+    frame_components = [
+        component
+        for t in range(0, 10 * SECOND_US, 500_000)
+        for frame in client.frames_until(t)
+        for component in frame
     ]
-    events = [part for part in parts if part.type == EVENT]
+    events = [component for component in frame_components if component.type == EVENT]
 
-    sent = [event[0] for part in events for event in part.items]
+    sent = [event[0] for component in events for event in component.items]
     assert sent == list(range(1, len(sent) + 1))
     assert len(sent) >= 130
-    assert all(event[1] <= part.timestamp_us for part in events for event in part.items)
-    assert all(part.items for part in events)
+    assert all(event[1] <= component.timestamp_us for component in events for event in component.items)
+    assert all(component.items for component in events)
 
 
 def test_events_before_the_request_are_not_sent(client: ScriptedClient) -> None:
@@ -217,8 +232,8 @@ def test_polling_gets_each_event_once(client: ScriptedClient) -> None:
     for elapsed_us in range(0, SECOND_US, 50_000):
         client.elapsed_us = elapsed_us
         client.send("SendCurrentFrame Events")
-        [parts] = client.frames_until(elapsed_us)
-        events += [event[0] for part in parts for event in part.items]
+        [components] = client.frames_until(elapsed_us)
+        events += [event[0] for component in components for event in component.items]
 
     assert events == list(range(1, 14))
 
@@ -239,7 +254,7 @@ def test_clients_that_wait_for_frames_get_no_data_when_the_measurement_ends(clie
     client.frames_until(0)
     client.send("SendCurrentFrame")
 
-    assert cut(b"".join(client.session.measurement_stopped())) == [(NO_DATA, b""), (NO_DATA, b"")]
+    assert packets_in(b"".join(client.session.measurement_stopped())) == [(NO_DATA, b""), (NO_DATA, b"")]
     assert client.frames_until(50_000) == []
 
 
@@ -251,7 +266,7 @@ def test_a_stream_continues_with_the_first_frame_of_the_next_measurement(client:
     frames = client.frames_until(70_000)
 
     assert [frame[0].frame_number for frame in frames] == [1, 2, 3, 4, 5, 6, 7, 8]
-    assert frames[-1][1] == Part(EVENT, 8, 70_000, [(1, 70_000, -1, -1, -1)])
+    assert frames[-1][1] == WireComponent(EVENT, 8, 70_000, [(1, 70_000, -1, -1, -1)])
     client.session.measurement_stopped()
     client.session.measurement_started()
     assert client.numbers_until(0) == [1]
@@ -277,4 +292,8 @@ def test_analog_frame_numbers_start_again_with_each_measurement(client: Scripted
 
     frames = client.frames_until(2_000)
 
-    assert [(part.type, part.frame_number) for [part] in frames] == [(ANALOG, 1), (ANALOG, 2), (ANALOG, 3)]
+    assert [(component.type, component.frame_number) for [component] in frames] == [
+        (ANALOG, 1),
+        (ANALOG, 2),
+        (ANALOG, 3),
+    ]

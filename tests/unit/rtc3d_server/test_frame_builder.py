@@ -7,14 +7,23 @@ from hypothesis import strategies as st
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d_server.frame_builder import FrameBuilder, exact_rate
 from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import ANALOG, DATA, EVENT, MARKERS, TOOLS, Part, cut, frame_of
+from tests.unit.rtc3d_server.wire import (
+    ANALOG,
+    DATA,
+    EVENT,
+    MARKERS,
+    TOOLS,
+    WireComponent,
+    components_in,
+    packets_in,
+)
 
 
-def parts_of(builder: FrameBuilder, tick: int, *, with_events: bool = False) -> list[Part]:
+def built_components(builder: FrameBuilder, tick: int, *, with_events: bool = False) -> list[WireComponent]:
     events = builder.events(0, builder.time_us(tick) + 1) if with_events else builder.events(0, 0)
-    [(packet_type, body)] = cut(builder.packet("big", tick, events).packet)
+    [(packet_type, body)] = packets_in(builder.packet("big", tick, events).packet)
     assert packet_type == DATA
-    return frame_of(body)
+    return components_in(body)
 
 
 def test_a_frame_has_the_bytes_of_the_specification() -> None:
@@ -41,19 +50,24 @@ def test_a_frame_has_the_bytes_of_the_specification() -> None:
 def test_by_default_a_frame_has_all_components_of_the_scene_in_wire_order() -> None:
     builder = FrameBuilder(CountingScene(), ())
 
-    assert [part.type for part in parts_of(builder, 7, with_events=True)] == [MARKERS, TOOLS, ANALOG, EVENT]
+    assert [component.type for component in built_components(builder, 7, with_events=True)] == [
+        MARKERS,
+        TOOLS,
+        ANALOG,
+        EVENT,
+    ]
 
 
 def test_components_the_scene_lacks_are_left_out() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.FORCE, ComponentType.ANALOG))
 
-    assert [part.type for part in parts_of(builder, 0)] == [ANALOG]
+    assert [component.type for component in built_components(builder, 0)] == [ANALOG]
 
 
 def test_the_rate_is_that_of_the_slowest_component_and_each_has_its_own_sample() -> None:
     builder = FrameBuilder(CountingScene(rate_hz=200), (ComponentType.MARKERS, ComponentType.ANALOG))
 
-    markers, analog = parts_of(builder, 20)
+    markers, analog = built_components(builder, 20)
 
     assert builder.rate == 200
     assert (markers.frame_number, analog.frame_number) == (21, 201)
@@ -64,7 +78,7 @@ def test_the_rate_is_that_of_the_slowest_component_and_each_has_its_own_sample()
 def test_samples_are_consecutive_across_blocks_of_frames() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.ANALOG,))
 
-    samples = [parts_of(builder, tick)[0].items[0][0] for tick in range(300)]
+    samples = [built_components(builder, tick)[0].items[0][0] for tick in range(300)]
 
     assert samples == list(range(300))
 
@@ -72,17 +86,19 @@ def test_samples_are_consecutive_across_blocks_of_frames() -> None:
 def test_frames_of_events_alone_are_numbered_at_the_measurement_rate() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.EVENT,))
 
-    assert parts_of(builder, 14, with_events=True) == [
-        Part(EVENT, 15, 140_000, [(1, 70_000, -1, -1, -1), (2, 140_000, -1, -1, -1)])
+    assert built_components(builder, 14, with_events=True) == [
+        WireComponent(EVENT, 15, 140_000, [(1, 70_000, -1, -1, -1), (2, 140_000, -1, -1, -1)])
     ]
-    assert parts_of(builder, 14) == []
+    assert built_components(builder, 14) == []
 
 
 def test_events_can_have_the_16_bytes_of_the_specification() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.EVENT,), event_bytes=16)
     data = builder.packet("little", 7, builder.events(0, 70_001))
 
-    assert frame_of(data.packet[8:], "little", event_bytes=16) == [Part(EVENT, 8, 70_000, [(1, -1, -1, -1)])]
+    assert components_in(data.packet[8:], "little", event_bytes=16) == [
+        WireComponent(EVENT, 8, 70_000, [(1, -1, -1, -1)])
+    ]
 
 
 def test_events_that_were_not_requested_are_left_out() -> None:
@@ -94,8 +110,8 @@ def test_events_that_were_not_requested_are_left_out() -> None:
 def test_frame_numbers_stay_within_a_signed_32_bit_field() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.MARKERS,))
 
-    assert parts_of(builder, 2**31 - 2)[0].frame_number == 2**31 - 1
-    assert parts_of(builder, 2**31 - 1)[0].frame_number == 0
+    assert built_components(builder, 2**31 - 2)[0].frame_number == 2**31 - 1
+    assert built_components(builder, 2**31 - 1)[0].frame_number == 0
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""RTC3D packets and frames, packed and read with struct by the tables of the specification alone."""
+"""RTC3D packets and frames, encoded and decoded with struct, following only the specification's tables."""
 
 import struct
 from typing import Literal, NamedTuple
@@ -11,7 +11,7 @@ _ITEMS = {MARKERS: "4f", ANALOG: "f", FORCE: "6f", TOOLS: "8f", EVENT: "iqiii"}
 _SHORT_EVENT = "iiii"
 
 
-class Part(NamedTuple):
+class WireComponent(NamedTuple):
     """One component of a frame."""
 
     type: int
@@ -30,8 +30,8 @@ def command(text: str) -> bytes:
     return packet(COMMAND, text.encode("ascii"))
 
 
-def cut(stream: bytes) -> list[tuple[int, bytes]]:
-    """Return the packets (type, body) in a byte stream; it must end with a whole packet."""
+def packets_in(stream: bytes) -> list[tuple[int, bytes]]:
+    """Return the packets (type, body) in a byte stream, which must end with a complete packet."""
     packets = []
     while stream:
         size, packet_type = struct.unpack_from(">II", stream)
@@ -41,17 +41,19 @@ def cut(stream: bytes) -> list[tuple[int, bytes]]:
     return packets
 
 
-def frame_of(body: bytes, byte_order: ByteOrder = "big", *, event_bytes: int = 24) -> list[Part]:
+def components_in(
+    body: bytes, byte_order: ByteOrder = "big", *, event_bytes: int = 24
+) -> list[WireComponent]:
     """Return the components of a data frame's body (§7.1); all sizes and counts must agree."""
     sign = ">" if byte_order == "big" else "<"
     (component_count,) = struct.unpack_from(sign + "I", body)
-    start, parts = 4, []
+    start, components = 4, []
     for _ in range(component_count):
         size, kind, number, timestamp_us, count = struct.unpack_from(sign + "IIiqI", body, start)
         item = sign + (_SHORT_EVENT if kind == EVENT and event_bytes == 16 else _ITEMS[kind])
         data = body[start + 24 : start + size]
         assert len(data) == count * struct.calcsize(item), "size and count disagree"
-        parts.append(Part(kind, number, timestamp_us, list(struct.iter_unpack(item, data))))
+        components.append(WireComponent(kind, number, timestamp_us, list(struct.iter_unpack(item, data))))
         start += size
     assert start == len(body), "bytes after the last component"
-    return parts
+    return components

@@ -21,7 +21,7 @@ NOISE_MM = 0.1
 def scene() -> SyntheticScene:
     return SyntheticScene(
         markers=23, tools=7, analog=5, plates=2, rate_hz=RATE_HZ, analog_rate_hz=500.0
-    )  # 5 bodies, two of them two tools, one of 7 markers
+    )  # 5 bodies: two have two tools, the last one has 7 markers
 
 
 def table(items: Items) -> Floats:

@@ -1,4 +1,4 @@
-"""Packets for faults to change, and what the faults make of them."""
+"""Packets for faults to change, and helpers that return the changed ones."""
 
 import struct
 
@@ -8,7 +8,15 @@ from gateway.simulator.faults.base import ActiveFault, Fault, LastingConnectionF
 from gateway.simulator.faults.outgoing import PendingWrite
 from gateway.simulator.simulator import Simulator
 from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import DATA, MARKERS, ByteOrder, Part, cut, frame_of, packet
+from tests.unit.rtc3d_server.wire import (
+    DATA,
+    MARKERS,
+    ByteOrder,
+    WireComponent,
+    components_in,
+    packet,
+    packets_in,
+)
 
 
 def active(fault: Fault, seed: int = 1) -> ActiveFault:
@@ -42,7 +50,9 @@ def changed(fault: LastingConnectionFault, packet: bytes, active_fault: ActiveFa
     return write.data
 
 
-def parts_of(data: bytes, byte_order: ByteOrder = "big", event_bytes: int = 24) -> list[Part]:
-    [(packet_type, body)] = cut(data)
+def components_in_packet(
+    data: bytes, byte_order: ByteOrder = "big", event_bytes: int = 24
+) -> list[WireComponent]:
+    [(packet_type, body)] = packets_in(data)
     assert packet_type == DATA
-    return frame_of(body, byte_order, event_bytes=event_bytes)
+    return components_in(body, byte_order, event_bytes=event_bytes)

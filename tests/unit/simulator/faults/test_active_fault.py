@@ -1,4 +1,4 @@
-"""When faults begin."""
+"""The times at which faults begin."""
 
 import numpy as np
 import pytest
@@ -23,7 +23,7 @@ def test_a_repeated_fault_begins_at_random_intervals_that_are_the_same_for_the_s
     assert first != delays_s(fault, 2)
 
 
-def test_the_times_of_a_fault_do_not_depend_on_how_many_packets_it_changed() -> None:
+def test_when_a_fault_begins_does_not_depend_on_how_many_packets_it_changed() -> None:
     fault = Jitter(every_s=4, for_s=1)
     idle, busy = active(fault), active(fault)
     for _ in range(10):

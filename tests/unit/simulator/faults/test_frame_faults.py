@@ -19,17 +19,17 @@ from gateway.simulator.faults.frame_faults import (
     WrongCounts,
 )
 from gateway.simulator.faults.kinds import KINDS
-from tests.unit.rtc3d_server.wire import COMMAND, DATA, MARKERS, TOOLS, ByteOrder, cut, packet
-from tests.unit.simulator.faults.faulty_packets import active, changed, frame, markers, parts_of
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, MARKERS, TOOLS, ByteOrder, packet, packets_in
+from tests.unit.simulator.faults.faulty_packets import active, changed, components_in_packet, frame, markers
 
 MISSING = b"\xff" * 4
 
 
 @pytest.mark.parametrize(("fraction", "hidden"), [(0.0, 0), (0.01, 1), (0.5, 4), (0.51, 5), (1.0, 8)])
 def test_occlusion_hides_a_fraction_of_the_markers(fraction: float, hidden: int) -> None:
-    [part] = parts_of(changed(Occlusion(markers=fraction), frame(markers(count=8))))
+    [component] = components_in_packet(changed(Occlusion(markers=fraction), frame(markers(count=8))))
 
-    seen = [item for item in part.items if not math.isnan(item[0])]
+    seen = [item for item in component.items if not math.isnan(item[0])]
     assert len(seen) == 8 - hidden
     assert all(item == (item[0], 1.5, -2.0, 0.25) for item in seen)
 
@@ -41,7 +41,10 @@ def test_hidden_markers_and_tools_have_the_bytes_of_field_note_7() -> None:
 
     assert data[8 + 4 + 24 : 8 + 4 + 40] == MISSING * 3 + struct.pack(">f", 999.0)
     assert data[-32:] == MISSING * 8
-    assert [(part.type, part.frame_number, part.timestamp_us) for part in parts_of(data)] == [
+    assert [
+        (component.type, component.frame_number, component.timestamp_us)
+        for component in components_in_packet(data)
+    ] == [
         (MARKERS, 7, 9000),
         (TOOLS, 7, 9000),
     ]
@@ -117,7 +120,7 @@ def test_an_unknown_component_comes_last_with_a_header_like_any_other(byte_order
 @pytest.mark.parametrize("byte_order", ["big", "little"])
 def test_wrong_counts_are_invalid_in_either_byte_order(field: str, byte_order: ByteOrder) -> None:
     good = frame(markers(byte_order), markers(byte_order), byte_order=byte_order)
-    [(_, body)] = cut(changed(WrongCounts.model_validate({"field": field}), good))
+    [(_, body)] = packets_in(changed(WrongCounts.model_validate({"field": field}), good))
 
     assert len(body) == len(good) - 8
     for order in ("big", "little"):

@@ -8,7 +8,7 @@ FIRST, SECOND = packet(COMMAND, b"first"), packet(COMMAND, b"second")
 NEVER_S = 600.0
 
 
-def test_a_reply_waits_for_as_many_frames_as_it_should() -> None:
+def test_a_reply_waits_for_its_number_of_frames() -> None:
     sent: list[bytes] = []
     held = HeldReplies(sent.append)
     held.hold(Reply(FIRST, after_frames=2))

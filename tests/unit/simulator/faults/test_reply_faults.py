@@ -47,6 +47,6 @@ def test_refused_commands_are_recognised_by_their_first_word() -> None:
     }
 
 
-def test_packets_that_are_no_commands_are_not_refused() -> None:
+def test_packets_that_are_not_commands_are_not_refused() -> None:
     for fault in (MinimalServer(), RefusedCommands(commands=("version",))):
         assert fault.refusal(Packet(DATA, b"Version 1.0")) is None
