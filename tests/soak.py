@@ -172,8 +172,8 @@ class Soak:
             f"| memory at most, MiB | {max(self.memory_kib) / 1024:.1f} |",
             "",
             "Frames of the simulator and messages at the subscriber, by component. Lost ones were in transit "
-            "on connections that a fault ended, or are counted as drops below. A gap is a sequence number that "
-            "was lost between gateway and subscriber.",
+            "on connections that a fault ended, or are counted as drops below. A gap is a sequence number "
+            "that was lost between gateway and subscriber.",
             "",
             "| component | sent | received | lost | gaps |",
             "|---|--:|--:|--:|--:|",
