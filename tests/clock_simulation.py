@@ -1,4 +1,4 @@
-"""Simulated frames of a server whose clock is known exactly, as a network delivers them. Nothing sleeps."""
+"""Simulated frames of a server whose clock is known exactly, with network delays. No test waits for them."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -23,7 +23,7 @@ def whole_us(times_us: npt.NDArray[np.floating[Any]]) -> Times:
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames in the order of arrival; the arrays are of shape (frames,) and in µs.
+    """Frames in the order of arrival; the arrays have the shape (frames,) and are in µs.
 
     ``captured_utime`` includes the network's least delay, which a receiver cannot measure.
     """
@@ -43,21 +43,21 @@ class Frames:
         )
 
     def part(self, first: int, end: int | None = None) -> "Frames":
-        """Return some of the frames."""
-        part = slice(first, end)
-        return Frames(self.timestamps_us[part], self.arrivals_utime[part], self.captured_utime[part])
+        """Return the frames from index ``first`` to before ``end``."""
+        indices = slice(first, end)
+        return Frames(self.timestamps_us[indices], self.arrivals_utime[indices], self.captured_utime[indices])
 
     def with_timestamps(self, timestamps_us: Times) -> "Frames":
         """Return the same frames with other time stamps."""
         return replace(self, timestamps_us=timestamps_us)
 
     def with_delays(self, delays_us: npt.NDArray[np.floating[Any]]) -> "Frames":
-        """Return the same frames, each delayed by so much; later frames do not overtake it."""
+        """Return the same frames with these additional delays; no frame overtakes an earlier one."""
         arrivals = self.arrivals_utime + whole_us(delays_us)
         return replace(self, arrivals_utime=np.maximum.accumulate(arrivals))
 
     def with_host_set(self, by_us: int) -> "Frames":
-        """Return the same frames as seen by a host whose clock was set forward by so much."""
+        """Return the same frames as seen by a host whose clock was set forward by ``by_us``."""
         return Frames(self.timestamps_us, self.arrivals_utime + by_us, self.captured_utime + by_us)
 
 
@@ -73,9 +73,9 @@ def simulate(
 ) -> Frames:
     """Return the frames of a server that captures at ``rate_hz`` for ``seconds`` of host time.
 
-    The host's clock is faster than the server's by ``drift_ppm``, or by that as a function of the seconds.
-    Delays are exponential with the mean ``jitter_us``; a share of ``outliers`` has 200 ms more. TCP keeps the
-    order: frames that follow a late frame are late, too. The server's clock starts at ``start_us``.
+    The host's clock is faster than the server's by ``drift_ppm``, which may be a function of the host time in
+    s. Delays are exponential with the mean ``jitter_us``; a share of ``outliers`` has 200 ms more. TCP keeps
+    the order, so frames that follow a late frame are late, too. The server's clock starts at ``start_us``.
     """
     random = np.random.default_rng(seed)
     host_s = np.arange(round(seconds * rate_hz)) / rate_hz
@@ -89,13 +89,13 @@ def simulate(
 
 
 def delayed(frames: Frames, rate_hz: float, seconds: Sequence[float], delays_s: Sequence[float]) -> Frames:
-    """Return the frames with delays interpolated between these points."""
+    """Return the frames with delays interpolated between the points (``seconds``, ``delays_s``)."""
     return frames.with_delays(np.interp(np.arange(len(frames)) / rate_hz, seconds, delays_s) * 1e6)
 
 
 @dataclass(frozen=True)
 class Observed:
-    """The readings of a clock at each frame; arrays of shape (frames,)."""
+    """The readings of a clock at each frame; the arrays have the shape (frames,)."""
 
     captures_utime: Times
     lags_s: Numbers
@@ -106,7 +106,7 @@ class Observed:
 
 
 def observe(clock: ServerClock, frames: Frames, first_frame_number: int = 0) -> Observed:
-    """Show the frames to ``clock``; their numbers count from ``first_frame_number``."""
+    """Return the readings of ``clock`` for the frames, which are numbered from ``first_frame_number``."""
     readings = []
     pairs = zip(frames.timestamps_us.tolist(), frames.arrivals_utime.tolist(), strict=True)
     for number, (timestamp_us, arrival_utime) in enumerate(pairs, first_frame_number):

@@ -1,4 +1,4 @@
-"""The specification's examples of §6: the XML, word for word, and the parameters that a human reads in it."""
+"""The specification's examples in §6: the XML, word for word, and the parameters as a human reads them."""
 
 from pathlib import Path
 
@@ -101,12 +101,12 @@ def spec_body(section: str) -> bytes:
 
 
 def in_root(*sections: str) -> bytes:
-    """Return the lines of XML in a root element RT_Parameters."""
+    """Return XML with these sections in a root element RT_Parameters."""
     return "\n".join(("<RT_Parameters Ver='1.00'>", *sections, "</RT_Parameters>")).encode()
 
 
 def markers_of(xml: bytes) -> Parameters3D:
-    """Return the 3D section of XML that must have no faults."""
+    """Return the 3D section of XML; assert that it has no faults."""
     parameters, recovered = parse_parameters(xml)
     assert recovered == ()
     assert parameters.markers is not None

@@ -15,14 +15,14 @@ _ODD_WORDS = [
 
 @st.composite
 def pieces_of(draw: DrawFn, stream: bytes) -> list[bytes]:
-    """Return the stream split anywhere; pieces may be empty."""
+    """Return ``stream`` in pieces, split at random places. Pieces may be empty."""
     cuts = draw(st.lists(st.integers(0, len(stream)), max_size=12))
     return [stream[start:end] for start, end in pairwise([0, *sorted(cuts), len(stream)])]
 
 
 @st.composite
 def damaged(draw: DrawFn, valid: SearchStrategy[bytes]) -> bytes:
-    """Return valid bytes with up to four faults: flipped bits, removed or inserted bytes, replaced words."""
+    """Return valid bytes with one to four faults: flipped bits, removed or inserted bytes, replaced words."""
     data = bytearray(draw(valid))
     for _ in range(draw(st.integers(1, 4))):
         at = draw(st.integers(0, len(data)))

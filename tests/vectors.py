@@ -1,4 +1,4 @@
-"""Bytes of RTC3D, encoded by hand from the tables of the specification and not by the code under test.
+"""Packets, components and frames, encoded by hand from the tables of the specification.
 
 Floats are IEEE 754 single precision: sign, exponent + 127, 23 bits of fraction. So 1.0 is 3F800000,
 and 1000.25 = 1.11110100001b × 2^9 is 0 10001000 11110100001… = 447A1000.
@@ -13,12 +13,12 @@ ALL_ONES: Final = struct.unpack(">f", b"\xff\xff\xff\xff")[0]
 
 
 def _hex(rows: str) -> bytes:
-    """Return the bytes of rows; a row has hex digits and their meaning."""
+    """Return the bytes of ``rows``. A row has hex digits and their meaning."""
     return b"".join(bytes.fromhex(row.split(maxsplit=1)[0]) for row in rows.strip().splitlines())
 
 
 def _both_orders(rows: str) -> dict[ByteOrder, bytes]:
-    """Return the bytes of rows; a row has a field's hex, big-endian and little-endian, and its meaning."""
+    """Return the bytes of ``rows``. A row has a field in hex, in both byte orders, and its meaning."""
     columns = [row.split(maxsplit=2) for row in rows.strip().splitlines()]
     return {
         "big": b"".join(bytes.fromhex(big) for big, _, _ in columns),

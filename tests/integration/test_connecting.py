@@ -1,4 +1,4 @@
-"""What can go wrong while a connection is made."""
+"""Failures while a connection is opened."""
 
 import asyncio
 import socket
@@ -37,7 +37,7 @@ def session_to(port: int, connect: Connect = open_connection) -> Session:
 
 
 class CallingProtocol(asyncio.Protocol):
-    """Wraps a session, and makes a call when the connection is made, before ``connect`` returns."""
+    """Wraps a session, and calls ``on_made`` when the connection is made, before ``connect`` returns."""
 
     def __init__(self, session: Any, on_made: Callable[[], object]) -> None:
         self._session = session
@@ -80,25 +80,25 @@ async def test_a_connect_cancelled_at_the_moment_of_connecting_leaves_a_session_
 
 
 class SlowNameServer:
-    """Answers each question only after two more have arrived, and then with SERVFAIL."""
+    """Answers each DNS query only after two more have arrived, and then with SERVFAIL."""
 
     def __init__(self) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.bind(("127.0.0.1", 53))
-        self.questions: list[tuple[bytes, tuple[str, int]]] = []
+        self.queries: list[tuple[bytes, tuple[str, int]]] = []
         threading.Thread(target=self._serve, daemon=True).start()
 
     def _serve(self) -> None:
         while True:
-            question, client = self._socket.recvfrom(4096)
-            self.questions.append((question, client))
-            if len(self.questions) > 2:
-                question, client = self.questions[-3]
-                self._socket.sendto(question[:2] + b"\x81\x82" + question[4:], client)  # SERVFAIL
+            query, client = self._socket.recvfrom(4096)
+            self.queries.append((query, client))
+            if len(self.queries) > 2:
+                query, client = self.queries[-3]
+                self._socket.sendto(query[:2] + b"\x81\x82" + query[4:], client)  # SERVFAIL
 
 
 def with_own_nameserver(tmp_path: Path) -> list[str]:
-    """Return the beginning of a command that uses the name server of this test."""
+    """Return the first words of a command that runs with the name server of this test."""
     resolver, switch = tmp_path / "resolv.conf", tmp_path / "nsswitch.conf"
     resolver.write_text("nameserver 127.0.0.1\noptions timeout:1 attempts:1\n")
     switch.write_text("hosts: files dns\n")
@@ -125,7 +125,7 @@ def test_late_answers_of_a_name_server_log_no_further_errors(tmp_path: Path) -> 
     command = [*with_own_nameserver(tmp_path), sys.executable, "-m", "gateway", "run", "--config", str(file)]
     with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
         try:
-            wait_until(lambda: len(server.questions) > 16)
+            wait_until(lambda: len(server.queries) > 16)
             process.terminate()
             _, log = process.communicate(timeout=20)
         finally:

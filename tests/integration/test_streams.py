@@ -102,7 +102,7 @@ def tasks_of_sources() -> list[asyncio.Task[Any]]:
     return [task for task, name in names.items() if name.startswith("Source.")]
 
 
-async def test_a_planned_question_for_parameters_is_cancelled_with_the_source() -> None:
+async def test_a_planned_request_for_parameters_is_cancelled_with_the_source() -> None:
     server = Recorder()
     async with ScriptedServer(server.script) as listening:
         async with run_gateway(listening.port, fresh_interval_s=1000) as lab:
@@ -151,7 +151,7 @@ async def test_states_follow_the_server_and_the_outputs_show_them(caplog: pytest
 async def test_late_frames_make_the_gateway_request_a_lower_rate_until_they_are_in_time(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """For 3 s the frames arrive in time, and then 0.3 s late: the time stamps stay behind."""
+    """The frames arrive in time for 3 s, and then 0.3 s late: their time stamps are older."""
     monkeypatch.setattr("gateway.stream.rate_control.FIRST_WAIT_S", 0.3)
     caplog.set_level("INFO", "gateway.stream")
     server = Recorder()

@@ -89,9 +89,7 @@ streamed_packets = st.lists(
 
 
 @given(streamed_packets, st.data())
-def test_frames_are_the_same_whatever_frames_were_received_before(
-    packets: list[bytes], data: st.DataObject
-) -> None:
+def test_earlier_frames_do_not_change_the_frames_returned(packets: list[bytes], data: st.DataObject) -> None:
     protocol = ClientProtocol()
     protocol.send(StreamFrames())
     protocol.receive(FRAME + OTHER_FRAME)

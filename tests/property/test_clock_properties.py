@@ -11,7 +11,7 @@ arrivals_utime = st.integers(EPOCH_UTIME, EPOCH_UTIME + 10**8)
 frame_numbers = st.integers(-(2**31), 2**31 - 1)
 
 any_frames = st.lists(st.tuples(timestamps_us | st.integers(0, 10**8), frame_numbers, arrivals_utime))
-"""Time stamps of any size, real sizes included, in any order."""
+"""Time stamps of any size, including realistic ones, in any order."""
 
 one_time_base = st.lists(st.tuples(st.integers(1, 10**6), st.integers(0, 10**6)), min_size=2).map(
     lambda steps: [

@@ -255,7 +255,7 @@ def test_any_bytes_make_sense_in_the_detected_byte_order_or_raise_frame_error(
 
 @settings(max_examples=300)
 @given(any_bodies, st.data(), orders)
-def test_a_frame_is_read_alike_whatever_frames_were_read_before(
+def test_earlier_frames_do_not_change_how_a_frame_is_read(
     body: bytes, data: st.DataObject, order: ByteOrder
 ) -> None:
     reader = FrameReader(order)

@@ -22,7 +22,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def locations(value: Any, location: Location = ()) -> Iterator[tuple[Location, Any]]:
-    """Yield every value in nested mappings and lists, the root aside, with what leads to it."""
+    """Yield every value in nested mappings and lists, except the root, with its path."""
     if location:
         yield location, value
     if isinstance(value, dict):
@@ -38,7 +38,7 @@ def as_text(value: object) -> str:
 
 
 @given(settings=SETTINGS, data=st.data())
-def test_a_variable_does_what_the_same_value_in_the_file_does(
+def test_a_variable_has_the_effect_of_the_same_value_in_a_file(
     file: Path, settings: Settings, data: st.DataObject
 ) -> None:
     values = settings.model_dump(mode="json")
@@ -57,7 +57,7 @@ def test_a_variable_does_what_the_same_value_in_the_file_does(
 
 
 @given(settings=SETTINGS)
-def test_variables_can_say_all_that_a_file_can(settings: Settings) -> None:
+def test_variables_can_set_everything_that_a_file_can(settings: Settings) -> None:
     values = settings.model_dump(mode="json")
     variables = {
         variable_name(location): as_text(value)

@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[2]
 # Without the comments, so that damage hits keys and values.
 GATEWAY_YAML = yaml.safe_dump(yaml.safe_load((ROOT / "config" / "gateway.yaml").read_text("utf-8"))).encode()
 
-# What YAML files are made of, and what trips their readers.
+# The elements of YAML files, and texts that are difficult for parsers.
 PIECES = [
     *("sources", "name", "host", "streams", "components", "rate", "zenoh", "config", "lcm", "url", "enabled"),
     *(
@@ -127,7 +127,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @given(settings=SETTINGS)
-def test_what_is_written_is_read(file: Path, settings: Settings) -> None:
+def test_written_settings_are_read_back(file: Path, settings: Settings) -> None:
     file.write_text(yaml.safe_dump(settings.model_dump(mode="json")), encoding="utf-8")
     assert load(file) == settings
 
@@ -152,7 +152,7 @@ def test_any_file_gives_settings_or_lines_with_its_path(file: Path, content: byt
 
 
 @given(first=st.from_regex(r"\A[ABab_-]{1,4}\Z"), second=st.from_regex(r"\A[ABab_-]{1,4}\Z"))
-def test_names_are_refused_together_exactly_if_they_share_channels(first: str, second: str) -> None:
+def test_two_names_are_rejected_exactly_if_they_share_channels(first: str, second: str) -> None:
     sources = tuple(SourceSettings(name=name, host="lab") for name in (first, second))
     if topics.lcm_channel("MOCAP", first) == topics.lcm_channel("MOCAP", second):
         with pytest.raises(ValidationError, match="has the same LCM channels"):

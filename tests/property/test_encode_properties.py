@@ -31,7 +31,7 @@ kinds = st.sampled_from(ComponentType)
 
 
 def survives_python(word: int) -> bool:
-    """Return whether the bits survive as a Python float; CPython makes signalling NaNs quiet."""
+    """Return whether a Python float keeps the bits. CPython makes signalling NaNs quiet."""
     bits = struct.pack(">I", word)
     return struct.pack(">f", *struct.unpack(">f", bits)) == bits
 

@@ -50,13 +50,13 @@ nonsense = st.lists(st.tuples(st.none() | st.integers(-(2**63), 2**63 - 1), st.i
 
 
 @given(nonsense, server_rates_hz, shares, st.integers(0, 500))
-def test_the_rate_is_right_at_once_after_any_nonsense(
+def test_the_rate_is_right_at_once_after_any_time_stamps(
     before: list[tuple[int | None, int]], rate_hz: float, share: float, frames: int
 ) -> None:
     pacer = Pacer(rate_hz * share)
     for timestamp_us, arrival_utime in before:
         pacer.due(timestamp_us, arrival_utime)
     indices = picked(pacer, stamps(rate_hz, frames, 2**63))
-    # The pacer restarts with the first frame and knows the spacing with the third. Besides, it may leave out
-    # a frame that is early by more than a quarter of the spacing: at the end three quarters are missing.
+    # The pacer restarts with the first frame and knows the spacing from the third on. It may also leave out
+    # a frame that is early by more than a quarter of the spacing, so up to three quarters may be missing.
     assert frames * share - 2.75 <= len(indices) <= frames * share + 2

@@ -41,7 +41,7 @@ def test_a_message_is_decoded_by_its_fingerprint(message: bytes) -> None:
 
 
 @pytest.mark.parametrize("message", [b"", b"abc", 8 * b"\0", 100 * b"x"])
-def test_messages_of_others_are_rejected_with_their_fingerprint(message: bytes) -> None:
+def test_messages_of_unknown_types_are_rejected_with_their_fingerprint(message: bytes) -> None:
     with pytest.raises(ProtocolError, match=f"^{len(message)} bytes with fingerprint {message[:8].hex()} "):
         decode(message)
 

@@ -1,4 +1,4 @@
-"""What the log says, word for word, when an output or a tool cannot be published on."""
+"""The log, word for word, when an output does not accept messages or tool poses cannot be published."""
 
 import logging
 
@@ -31,7 +31,7 @@ def set_unit(fan_out: FanOut, unit: str) -> None:
         (ValueError("a defect"), "ValueError: a defect"),
     ],
 )
-def test_a_message_that_an_output_does_not_accept(
+def test_a_message_that_an_output_does_not_accept_is_logged(
     error: Exception, text: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     output = ToyOutput("zenoh")
@@ -41,7 +41,7 @@ def test_a_message_that_an_output_does_not_accept(
 
 
 @pytest.mark.usefixtures("no_hold")
-def test_too_many_tools_and_their_end(caplog: pytest.LogCaptureFixture) -> None:
+def test_too_many_tools_are_logged_and_so_is_the_recovery(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "gateway.publish.tool_poses")
     fan_out = FanOut("lab", [ToyOutput(has_tool_poses=True)])
     publish_tools(fan_out, 257)
@@ -51,7 +51,7 @@ def test_too_many_tools_and_their_end(caplog: pytest.LogCaptureFixture) -> None:
     assert end.startswith("INFO lab: frames of 3 tools: tool poses are published, after ")
 
 
-def test_an_unknown_unit_and_its_end(caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unknown_unit_is_logged_and_so_is_the_recovery(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "gateway.publish.tool_poses")
     fan_out = FanOut("lab", [ToyOutput(has_tool_poses=True)])
     set_unit(fan_out, "x" * 41)

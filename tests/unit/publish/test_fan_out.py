@@ -214,7 +214,7 @@ def test_a_changed_number_of_markers_is_logged(caplog: pytest.LogCaptureFixture)
     assert caplog.messages == ["lab: number of items in 3d changed from 2 to 3"]
 
 
-def test_streams_that_take_turns_with_their_components_change_nothing() -> None:
+def test_frames_of_alternating_streams_are_not_a_change() -> None:
     changes: list[int] = []
     fan_out = FanOut("lab", [], on_items_changed=lambda: changes.append(1))
     for _ in range(3):
@@ -223,7 +223,7 @@ def test_streams_that_take_turns_with_their_components_change_nothing() -> None:
     assert not changes
 
 
-def test_the_number_of_events_is_not_a_change() -> None:
+def test_a_changed_number_of_events_is_not_reported() -> None:
     changes: list[int] = []
     fan_out = FanOut("lab", [], on_items_changed=lambda: changes.append(1))
     for num_events in range(3):
@@ -239,14 +239,14 @@ def test_the_number_of_remembered_layouts_is_bounded(memory: MemoryOutput) -> No
     assert len(memory.messages) == 300
 
 
-def test_a_component_is_listened_to_if_one_output_has_a_subscriber() -> None:
+def test_a_component_has_subscribers_if_one_output_has_one() -> None:
     without, with_tools = ToyOutput("without"), ToyOutput("with tools", "6d")
     assert not FanOut("lab", [without]).has_subscribers(ALL)
     assert FanOut("lab", [without, with_tools]).has_subscribers({ComponentType.MARKERS, ComponentType.TOOLS})
     assert not FanOut("lab", [without, with_tools]).has_subscribers({ComponentType.MARKERS})
 
 
-def test_every_output_shows_whether_frames_flow() -> None:
+def test_every_output_shows_whether_frames_arrive() -> None:
     outputs = [ToyOutput("a"), ToyOutput("b")]
     fan_out = FanOut("lab", outputs)
     fan_out.show_streaming(True)

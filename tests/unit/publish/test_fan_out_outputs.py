@@ -1,4 +1,4 @@
-"""Changing the outputs of a fan-out while frames flow."""
+"""Changing the outputs of a fan-out while frames arrive."""
 
 from gateway.errors import OutputError
 from gateway.messages.decode import decode
@@ -87,7 +87,7 @@ def test_an_output_that_comes_back_continues_its_numbers() -> None:
     assert sequences(again, "3d") == [1]
 
 
-def test_a_new_output_shows_that_frames_flow() -> None:
+def test_a_new_output_shows_that_frames_arrive() -> None:
     fan_out = FanOut("lab", [ToyOutput("one")])
     fan_out.show_streaming(True)
     new = ToyOutput("two")

@@ -1,4 +1,4 @@
-"""Which frames of a paced component are published: by server time, or by arrival without a clock."""
+"""The frames of a paced component that are published: by server time or, without a clock, by arrival."""
 
 import numpy as np
 

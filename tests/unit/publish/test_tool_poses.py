@@ -170,7 +170,7 @@ def test_an_unknown_unit_is_not_logged_without_tool_poses(caplog: pytest.LogCapt
     assert not caplog.records
 
 
-def test_before_any_parameters_poses_are_taken_for_millimetres() -> None:
+def test_without_parameters_poses_are_converted_from_millimetres() -> None:
     output = ToyOutput("toy", "tool 1", has_tool_poses=True)
     publish_tools(FanOut("lab", [output]), 1)
     [pose] = output.poses("tool 1")

@@ -1,4 +1,4 @@
-"""Outputs that take whole frames: what they get, how it is numbered and counted, and their end."""
+"""Outputs that take whole frames: what they get, how it is numbered and counted, and how they close."""
 
 from collections.abc import Mapping
 
@@ -17,7 +17,7 @@ MARKERS = frozenset({ComponentType.MARKERS})
 
 
 class FrameOutput(ToyOutput):
-    """Takes whole frames; ``frames`` are those that it accepted, and ``closed`` counts closed publishers."""
+    """Takes whole frames. ``frames`` are those that it accepted, ``closed`` counts closed publishers."""
 
     def __init__(self, name: str = "toy") -> None:
         super().__init__(name)

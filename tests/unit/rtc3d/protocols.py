@@ -1,4 +1,4 @@
-"""Client protocols in the state that a test needs, and packets to feed them."""
+"""Client protocols in a given state, and packets for them to receive."""
 
 from gateway.rtc3d.client_protocol import (
     Answered,

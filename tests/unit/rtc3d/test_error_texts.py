@@ -1,4 +1,4 @@
-"""The whole texts of errors, as a person reads them in a log or in a client's window."""
+"""The complete texts of errors, as a person reads them in a log or in a client program."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""Frames that repeat the layout of an earlier frame, and frames that only seem to."""
+"""Frames that repeat the layout of an earlier frame, and frames that only appear to."""
 
 import struct
 

@@ -1,4 +1,4 @@
-"""Frames split into components, and encoded."""
+"""Splitting frames into components, and encoding them."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What each event of the client's protocol carries."""
+"""The content of each event of the client's protocol."""
 
 import numpy as np
 import pytest

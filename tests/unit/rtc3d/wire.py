@@ -1,4 +1,4 @@
-"""Frames put together without the encoder under test."""
+"""Frames built without the encoder under test."""
 
 import pytest
 
@@ -17,7 +17,7 @@ bodies_of_both_orders = pytest.mark.parametrize(
 
 
 def frame(order: ByteOrder, *components: bytes, count: int | None = None) -> bytes:
-    """Return a frame's bytes; ``count`` is its component count if that is to be wrong."""
+    """Return a frame's bytes. ``count`` replaces its component count with a wrong one."""
     return (len(components) if count is None else count).to_bytes(4, order) + b"".join(components)
 
 

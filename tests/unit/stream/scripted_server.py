@@ -14,7 +14,7 @@ from tests.servers import markers_frame, ok, packet
 XML = packet(2, "<RT_Parameters Ver='1.00'><The_3D/></RT_Parameters>")
 
 Answer = Callable[[str], bytes | None]
-"""Returns the packets that answer a command; None to stay silent."""
+"""Returns the packets that answer a command, or None to ignore it."""
 
 
 def obliging(command: str) -> bytes:
@@ -86,14 +86,14 @@ class Connection(asyncio.Transport):
         self.send(b"".join(markers_frame(number, (0.0, 0.0, 0.0)) for number in numbers))
 
     def end(self, error: Exception | None = None) -> None:
-        """Close the connection, or have it break with ``error``."""
+        """Close the connection, or break it with ``error``."""
         if self.is_open:
             self.is_open = False
             asyncio.get_running_loop().call_soon(self._session.connection_lost, error)
 
 
 class ScriptedServer:
-    """A server that answers each command by ``answer``; while ``refuses`` is set, it refuses connections."""
+    """A server that answers each command with ``answer``; if ``refuses`` is set, it refuses connections."""
 
     def __init__(self, answer: Answer = obliging) -> None:
         self.answer = answer
@@ -101,7 +101,7 @@ class ScriptedServer:
         self.closes_at_bye = True
         self.connections: list[Connection] = []
         self.tried_s: list[float] = []
-        """The loop's time at each try to connect."""
+        """The loop's time at each attempt to connect."""
 
     @property
     def connection(self) -> Connection:

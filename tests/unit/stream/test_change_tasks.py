@@ -1,4 +1,4 @@
-"""Streams that follow demand and lateness, with a scripted server."""
+"""Changes to a stream by demand and by lateness, with a scripted server."""
 
 import asyncio
 import logging
@@ -19,7 +19,7 @@ HALF = "StreamFrames FrequencyDivisor:2"
 
 
 class Lab:
-    """The adaptation of one stream that has done its handshake."""
+    """The change tasks of one stream after its handshake."""
 
     def __init__(self, **stream: Any) -> None:
         self.server = ScriptedServer()
@@ -135,7 +135,7 @@ async def test_a_lag_of_exactly_the_maximum_is_in_time(caplog: pytest.LogCapture
     ]
 
 
-async def test_a_server_that_only_knows_its_default_rate_is_named_so(
+async def test_a_request_for_the_default_rate_is_logged_as_such(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     lab = Lab()

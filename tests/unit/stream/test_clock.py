@@ -196,7 +196,7 @@ def test_a_lasting_delay_becomes_the_networks_delay_after_half_a_minute() -> Non
     assert observed.lags_s[75 * SECOND :].max() < 0.1
 
 
-def test_doubled_frames_have_the_same_capture_time() -> None:
+def test_duplicate_frames_have_the_same_capture_time() -> None:
     frames = simulate(seconds=40, rate_hz=RATE_HZ)
     doubled = Frames(
         np.repeat(frames.timestamps_us, 2),

@@ -1,4 +1,4 @@
-"""Clocks that are set, restarts of the server, and time stamps that are no clock."""
+"""Clocks that are set, restarts of the server, and time stamps that are not a clock."""
 
 import math
 from collections.abc import Callable
@@ -148,7 +148,7 @@ def times(factor: float) -> Callable[[Times], Times]:
         *(pytest.param(times(factor), id=f"{factor} times as fast") for factor in (0.5, 0.9, 1.1, 2)),
     ],
 )
-def test_unusable_time_stamps_are_no_clock(stamped: Callable[[Times], Times]) -> None:
+def test_unusable_time_stamps_are_not_a_clock(stamped: Callable[[Times], Times]) -> None:
     frames = simulate(seconds=60, rate_hz=RATE_HZ)
     clock = ServerClock()
     observed = observe(clock, frames.with_timestamps(stamped(frames.timestamps_us)))

@@ -1,4 +1,4 @@
-"""Batches of frames with their times, against a clock that has learned for three seconds."""
+"""Batches of frames that reach an ingest whose clock has learned for three seconds."""
 
 import numpy as np
 import pytest
@@ -18,12 +18,12 @@ MARKERS, EVENT = ComponentType.MARKERS, ComponentType.EVENT
 
 
 def frame(number: int, *, event: bool = False) -> Frame:
-    """Return a frame with one marker, and with an event if asked for, of number ``number``."""
+    """Return frame ``number`` with one marker and, if requested, an event."""
     return frame_of(number, *((MARKERS, number), (EVENT, number)) if event else ((MARKERS, number),))
 
 
 def frame_of(tick: int, *numbered: tuple[ComponentType, int]) -> Frame:
-    """Return the frame of period ``tick`` with these components, each with a frame number of its own."""
+    """Return the frame of period ``tick`` with these components, each with its own frame number."""
     components = [
         encode_component(
             component,
@@ -62,7 +62,7 @@ class Lab:
             self.published.append((frame.components[0].frame_number, keys))
 
     def receive(self, *frames: Frame, late_us: int = 0) -> None:
-        """Receive the frames together, so long after the newest was captured."""
+        """Receive the frames together, ``late_us`` after the newest was captured."""
         self.receive_at(BOOT_UTIME + frames[-1].components[0].timestamp_us + late_us, *frames)
 
     def receive_at(self, utime: int, *frames: Frame) -> None:
@@ -111,7 +111,7 @@ def test_frames_that_stay_late_request_lower_rates(lab: Lab) -> None:
     assert lab.halvings == [1, 2]
 
 
-def test_a_restart_of_the_server_is_reported_and_is_no_lateness(lab: Lab) -> None:
+def test_a_restart_of_the_server_is_reported_and_does_not_count_as_lateness(lab: Lab) -> None:
     lab.receive_at(BOOT_UTIME + 600 * PERIOD_US, frame(3))
     assert (lab.restarts, lab.status.restarts) == (1, 1)
     assert [number for number, _ in lab.published] == [3]
@@ -134,7 +134,7 @@ def test_lateness_before_a_restart_does_not_count_after_it(lab: Lab) -> None:
 def test_frame_numbers_are_followed_for_one_component_type_only(lab: Lab) -> None:
     for tick in range(600, 610):
         lab.receive(frame_of(tick, (MARKERS, tick), (EVENT, 7)))
-        lab.receive(frame_of(tick, (EVENT, 3)))  # counted apart
+        lab.receive(frame_of(tick, (EVENT, 3)))  # numbered separately
     assert lab.restarts == 0
 
 
@@ -158,7 +158,7 @@ def test_frames_without_components_are_counted_and_not_published(lab: Lab) -> No
     assert not lab.published
 
 
-def test_a_frame_without_components_does_not_hold_up_those_behind_it(lab: Lab) -> None:
+def test_frames_after_one_without_components_are_published(lab: Lab) -> None:
     empty = split_frame(encode_frame([]), "big")
     lab.receive(frame(600), empty, frame(601))
     assert [number for number, _ in lab.published] == [600, 601]

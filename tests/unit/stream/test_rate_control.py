@@ -86,7 +86,7 @@ FRAME_S = 0.005
 
 
 class Link:
-    """A link that carries a share of the frames: if more are sent, they are late. Time is simulated."""
+    """A link that carries part of the full rate: at a higher rate, frames are late. Time is simulated."""
 
     def __init__(self, carries_halvings: int) -> None:
         self.control = LagControl(max_lag_s=0.05)

@@ -25,7 +25,7 @@ NO_DATA = packet(4)
 
 
 class Lab:
-    """A session and its server; ``frames`` and ``files`` are what the session passed on."""
+    """A session and its server. ``frames`` and ``files`` are those that the session passed on."""
 
     def __init__(self, components: tuple[str, ...] = ("3d",), **settings: Any) -> None:
         self.server = ScriptedServer()
@@ -65,7 +65,7 @@ def now_s() -> float:
     return asyncio.get_running_loop().time()
 
 
-# --- questions
+# --- commands and replies
 
 
 async def test_an_answer_goes_to_the_command_that_asked(lab: Lab) -> None:
@@ -157,7 +157,7 @@ async def test_a_stopped_stream_is_idle_before_the_server_answers(lab: Lab) -> N
     stopping.cancel()
 
 
-async def test_a_rejected_frame_is_counted_and_the_next_is_taken(
+async def test_a_rejected_frame_is_counted_and_the_next_is_passed_on(
     lab: Lab, caplog: pytest.LogCaptureFixture
 ) -> None:
     await lab.streaming()
@@ -303,7 +303,7 @@ async def test_a_stream_of_events_alone_may_be_silent_during_a_measurement() -> 
 # --- the end
 
 
-async def test_the_end_reaches_everybody_who_waits(lab: Lab) -> None:
+async def test_the_end_is_raised_by_every_waiting_call(lab: Lab) -> None:
     lab.server.answer = silent_to("Version")
     await lab.session.connect()
     asking = asyncio.create_task(lab.session.ask(Version()))
@@ -337,7 +337,7 @@ async def test_a_broken_connection_names_its_reason(lab: Lab) -> None:
         await lab.session.monitor()
 
 
-async def test_closing_says_bye_and_waits_for_the_server_to_close(lab: Lab) -> None:
+async def test_closing_sends_bye_and_waits_for_the_server_to_close(lab: Lab) -> None:
     await lab.streaming()
     began_s = now_s()
     await lab.session.close()
@@ -361,7 +361,7 @@ async def test_closing_waits_half_a_second_for_a_server_that_does_not_close(lab:
     assert lab.status.state is StreamState.STREAMING  # only the supervisor reports the end
 
 
-async def test_closing_ends_everybody_who_waits_at_once(lab: Lab) -> None:
+async def test_closing_ends_every_waiting_call_at_once(lab: Lab) -> None:
     lab.server.closes_at_bye = False
     lab.server.answer = silent_to("Version")
     await lab.session.connect()
@@ -389,7 +389,7 @@ async def test_a_connection_that_is_lost_while_closing_does_not_change_the_reaso
         await lab.session.ask(Version())
 
 
-async def test_closing_after_the_end_says_no_bye(lab: Lab) -> None:
+async def test_closing_after_the_end_sends_no_bye(lab: Lab) -> None:
     await lab.streaming()
     lab.connection.end()
     await settle()

@@ -1,4 +1,4 @@
-"""The whole rule for the state of a stream: phases by protocol states."""
+"""The complete rule for the state of a stream: each phase with each protocol state."""
 
 import pytest
 

@@ -150,7 +150,7 @@ def test_every_frame_that_is_lost_is_counted_by_its_cause() -> None:
     assert status.last_error == "too short"
 
 
-def test_everything_that_happens_again_and_again_is_added_up() -> None:
+def test_repeated_events_are_added_up() -> None:
     status = StreamStatus("3d")
     for count in (3, 4):
         status.connecting(SERVER)

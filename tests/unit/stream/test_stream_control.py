@@ -1,4 +1,4 @@
-"""Handshake, rate and pause with scripted servers, odd ones included."""
+"""Handshake, rate and pause with scripted servers, including unusual ones."""
 
 import asyncio
 import logging
@@ -21,7 +21,7 @@ RATE_XML = packet(2, "<RT_Parameters Ver='1.00'><The_3D><Frequency>200</Frequenc
 
 
 class Lab:
-    """The control of one session; ``parameters`` are the XML texts that it passed on."""
+    """The control of one session. ``parameters`` are the XML texts that it passed on."""
 
     def __init__(self, answer: Answer = obliging, *, byte_order: str = "big", **stream: Any) -> None:
         self.server = ScriptedServer(answer)
@@ -87,7 +87,7 @@ async def test_a_frame_before_the_acknowledgement_is_streaming_after_the_handsha
     assert lab.status.state is StreamState.STREAMING
 
 
-async def test_the_gateway_does_without_what_the_server_refuses_or_ignores(
+async def test_the_handshake_continues_after_refused_and_ignored_commands(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     lab = Lab(refusing("Version", by=silent_to("SendParameters", "StreamFrames")))

@@ -1,4 +1,4 @@
-"""What the log says of a session, from the handshake to frames that contradict themselves, word for word."""
+"""The log of a session, word for word, from the handshake to frames that contradict themselves."""
 
 import logging
 

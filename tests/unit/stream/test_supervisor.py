@@ -1,4 +1,4 @@
-"""A whole stream with a scripted server: connecting again, and ending."""
+"""A whole stream with a scripted server: reconnecting, and ending."""
 
 import asyncio
 import logging
@@ -59,14 +59,14 @@ class Lab:
 
     def _on_connected(self) -> None:
         self.connected += 1
-        assert self.supervisor.session is not None  # questions can be asked
+        assert self.supervisor.session is not None  # commands can be sent
 
     def _on_restart(self) -> None:
         self.restarts += 1
 
     @property
     def delays_s(self) -> list[float]:
-        """The virtual time between each try to connect and the next."""
+        """The virtual time between each attempt to connect and the next, in s."""
         return [after - before for before, after in pairwise(self.server.tried_s)]
 
     async def tried(self, times: int) -> None:
@@ -87,13 +87,13 @@ async def running(lab: Lab) -> AsyncIterator[asyncio.Task[None]]:
 
 
 def assert_delays(delays_s: list[float], nominal_s: list[float]) -> None:
-    """Each delay is shortened by at most half; ``until`` and timers add next to nothing."""
+    """Each delay is shortened by at most half. ``until`` and timers add almost nothing."""
     for delay_s, limit_s in zip(delays_s, nominal_s, strict=True):
         assert limit_s / 2 <= delay_s + 1e-6
         assert delay_s <= limit_s + 1e-6
 
 
-# --- connecting again
+# --- reconnecting
 
 
 def test_delays_double_up_to_the_maximum_and_are_shortened_at_random() -> None:
@@ -149,7 +149,7 @@ async def test_delays_start_again_after_a_connection_without_a_measurement() -> 
     assert_delays([lab.server.tried_s[-1] - ended_s], [0.2])
 
 
-async def test_delays_go_on_growing_if_connections_bring_nothing() -> None:
+async def test_delays_continue_to_grow_if_connections_bring_nothing() -> None:
     lab = Lab()
     lab.server.answer = refusing("StreamFrames")
     async with running(lab):
@@ -171,7 +171,7 @@ async def test_recovery_is_logged_once_with_its_duration(caplog: pytest.LogCaptu
     assert len(caplog.messages) == 2
 
 
-async def test_a_silent_measurement_is_connected_again() -> None:
+async def test_a_silent_measurement_leads_to_a_new_connection() -> None:
     lab = Lab()
     async with running(lab):
         await lab.ready()
@@ -205,7 +205,7 @@ async def test_there_is_a_session_from_the_handshake_to_the_end() -> None:
     lab.server.answer = silent_to("Version")
     async with running(lab):
         await until(lambda: lab.server.connections)
-        assert lab.supervisor.session is None  # still shaking hands
+        assert lab.supervisor.session is None  # the handshake is not done
         await lab.ready()
         lab.server.refuses = True
         lab.server.connection.end()
@@ -213,7 +213,7 @@ async def test_there_is_a_session_from_the_handshake_to_the_end() -> None:
         assert lab.supervisor.session is None
 
 
-async def test_cancelling_says_bye() -> None:
+async def test_cancelling_sends_bye() -> None:
     lab = Lab()
     async with running(lab):
         await lab.ready()
@@ -225,7 +225,7 @@ async def test_cancelling_says_bye() -> None:
 
 
 async def test_the_tasks_of_a_session_end_with_it() -> None:
-    """One task follows the demand of the first session, and another one that of the second."""
+    """Each session has one task, which follows the demand."""
     lab = Lab(on_demand=True)
     tasks_before = len(asyncio.all_tasks())
     async with running(lab):

@@ -28,7 +28,7 @@ def error_of(settings: SourceSettings) -> str:
 
 @pytest.fixture
 def answer_to_lookups(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
-    """Let every look-up of a name wait for this event."""
+    """Make every name look-up wait for this event."""
     answer = threading.Event()
     monkeypatch.setattr(socket, "getaddrinfo", lambda *_: answer.wait(60))
     yield answer
@@ -55,14 +55,14 @@ def test_the_protocol_gets_the_connection_and_the_transport_is_returned() -> Non
         assert uvloop.run(connect(server.getsockname()[1])) == b"Version 1.0"
 
 
-def test_a_port_without_a_server() -> None:
+def test_the_error_of_a_port_without_a_server() -> None:
     port = free_port()
     assert error_of(source(host="127.0.0.1", port=port)) == (
         f"connection refused by 127.0.0.1:{port}; is the RT server running, and is this its port?"
     )
 
 
-def test_an_unknown_host_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_of_an_unknown_host_name(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
@@ -72,7 +72,7 @@ def test_an_unknown_host_name(monkeypatch: pytest.MonkeyPatch) -> None:
     )
 
 
-def test_no_answer_within_the_time_out(answer_to_lookups: threading.Event) -> None:
+def test_the_error_of_a_time_out(answer_to_lookups: threading.Event) -> None:
     async def connect() -> str:
         with pytest.raises(ConnectError) as caught:
             await open_connection(source(host="lab-pc", port=3020, connect_timeout_s=0.1), asyncio.Protocol())
@@ -92,7 +92,9 @@ def test_no_answer_within_the_time_out(answer_to_lookups: threading.Event) -> No
         (OSError("no text of the system"), "no text of the system"),
     ],
 )
-def test_any_other_error_of_the_network(error: OSError, reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_of_any_other_failure_of_the_network(
+    error: OSError, reason: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(*_: object) -> None:
         raise error
 

@@ -9,7 +9,7 @@ _MAX_STEPS = 10_000
 
 
 class _JumpingSelector(selectors.DefaultSelector):
-    """Never waits: where the loop would, time jumps to the next timer."""
+    """Never waits. When the loop would wait, time jumps to the next timer."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -19,7 +19,7 @@ class _JumpingSelector(selectors.DefaultSelector):
         ready = super().select(0)
         if not ready:
             if timeout is None:
-                raise AssertionError("no task is ready and no timer is set: the test would wait for ever")
+                raise AssertionError("no task is ready and no timer is set: the test would never end")
             self.now_s += max(0.0, timeout)
         return ready
 
@@ -36,7 +36,7 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
 
 
 async def settle() -> None:
-    """Let everything run that is ready now."""
+    """Run everything that is ready now."""
     for _ in range(20):
         await asyncio.sleep(0)
 
