@@ -24,7 +24,7 @@ logger = logging.getLogger(__name__)
 
 
 class _File(NamedTuple):
-    time: str  # as in its name; sorts in the order of time
+    time: str  # as in the file name; sorts chronologically
     source: str
     path: Path
 

@@ -72,12 +72,12 @@ class Gateway:
             async with self._tasks:
                 for name in self._sources:
                     self._start_source(name)
-                upkeep = self._tasks.create_task(self._upkeep())
+                periodic = self._tasks.create_task(self._run_every_second())
                 self.opened.set()
                 await stop.wait()
                 await self._reload_lock.acquire()  # wait for a running reload, and prevent another one
                 logger.info("stopping")
-                for task in (upkeep, *self._source_tasks.values()):
+                for task in (periodic, *self._source_tasks.values()):
                     task.cancel()
         finally:
             await asyncio.gather(*map(_close, self._outputs))
@@ -92,7 +92,8 @@ class Gateway:
     def _start_source(self, name: str) -> None:
         self._source_tasks[name] = self._tasks.create_task(self._sources[name].run())
 
-    async def _upkeep(self) -> None:
+    async def _run_every_second(self) -> None:
+        """Maintain the outputs and publish the status of each source."""
         while True:
             await asyncio.sleep(_STATUS_PERIOD_S)
             for output in self._outputs:

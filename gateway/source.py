@@ -59,12 +59,12 @@ class Source:
         self._publish_parameters = publish_parameters
         self._announce_file = announce_file
         self._frame_rates = [FrameRate() for _ in settings.streams]
-        self._rates_hz = [0.0 for _ in settings.streams]
+        self._frame_rates_hz = [0.0 for _ in settings.streams]
         self._tasks: set[asyncio.Task[None]] = set()
         self._num_unstored_files = 0
         self._is_refresh_planned = False
         self.sequence: int = 0 if before is None else before.sequence
-        """The number of the newest status and clock message."""
+        """The sequence number of the newest status and clock messages."""
         self._newest_status: bytes = self._encoded_status()
 
     def _new_queries(self) -> SourceQueries:
@@ -90,7 +90,7 @@ class Source:
     @property
     def streams(self) -> list[tuple[StreamStatus, float]]:
         """The status of each stream, with its frame rate in Hz at the last ``publish_status``."""
-        return list(zip(self.statuses, self._rates_hz, strict=True))
+        return list(zip(self.statuses, self._frame_rates_hz, strict=True))
 
     async def run(self) -> None:
         """Run every stream until cancelled; then send Bye to the server."""
@@ -107,7 +107,7 @@ class Source:
     def publish_status(self) -> None:
         """Publish the status and the clock of this source. Called once a second."""
         self.sequence += 1
-        self._rates_hz = [
+        self._frame_rates_hz = [
             rate.update(status.frames_in)
             for rate, status in zip(self._frame_rates, self.statuses, strict=True)
         ]

@@ -1,4 +1,4 @@
-"""``rtc3d-gateway demo``: everything in one process."""
+"""``rtc3d-gateway demo``: simulator, gateway and subscribers in one process."""
 
 from typing import Annotated
 

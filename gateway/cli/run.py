@@ -1,4 +1,4 @@
-"""``rtc3d-gateway run``: the gateway itself."""
+"""``rtc3d-gateway run``: run the gateway."""
 
 import logging
 import os

@@ -1,4 +1,4 @@
-"""All checks, ordered so that a fault in one layer comes before the faults that it causes in others."""
+"""All checks, layer by layer, so that a fault is found before its consequences."""
 
 import asyncio
 from collections.abc import AsyncIterator, Iterator
@@ -15,7 +15,9 @@ _configuration = Subject("configuration")
 
 
 async def run_checks(settings: Settings, origin: str, seconds: float) -> AsyncIterator[Finding]:
-    """Run all checks and yield each finding at once. Sources are watched one after the other for ``seconds``.
+    """Run all checks, and yield each finding as soon as it is known.
+
+    The sources are watched one after the other, each for ``seconds``.
 
     ``origin`` says where the settings come from, for example a file name.
     """

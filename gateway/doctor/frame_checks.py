@@ -17,7 +17,7 @@ _MAX_NAMES: Final = 5
 
 
 def check_frames(subject: Subject, stream: ObservedStream, parameters: Parameters | None) -> Finding:
-    """Check that well-formed frames arrive, with every component that the stream asked for."""
+    """Check that well-formed frames arrive, with every component that the stream requested."""
     is_partial = len(stream.settings.components) < len(ComponentType)
     of_stream = f" of stream {stream.component_keys}" if is_partial else ""
     if not stream.session.is_open:
@@ -26,14 +26,8 @@ def check_frames(subject: Subject, stream: ObservedStream, parameters: Parameter
             f"the server closed the connection{of_stream} while the doctor waited for frames",
             "Check whether another program takes over the stream, and read the server's own messages.",
         )
-    rejected = stream.status.drops["frame rejected"]
-    if rejected:
-        return subject.failing(
-            "frames",
-            f"{rejected} of {rejected + stream.status.frames_in} frames{of_stream} are malformed: "
-            f"{stream.status.last_error.removeprefix('frame rejected: ')}",
-            "The gateway drops malformed frames. Update the server's software, or report this to its maker.",
-        )
+    if stream.status.drops["frame rejected"]:
+        return _malformed_frames(subject, stream, of_stream)
     if not stream.observed:
         return _no_frames(subject, stream, of_stream)
     missing = _missing_components(stream, parameters)
@@ -51,6 +45,16 @@ def check_frames(subject: Subject, stream: ObservedStream, parameters: Parameter
     largest = max(component.message_load.largest_bytes for component in stream.observed.values())
     return subject.passing(
         "frames", f"{stream.status.frames_in} frames with {names}; the largest message has {largest} bytes"
+    )
+
+
+def _malformed_frames(subject: Subject, stream: ObservedStream, of_stream: str) -> Finding:
+    rejected = stream.status.drops["frame rejected"]
+    return subject.failing(
+        "frames",
+        f"{rejected} of {rejected + stream.status.frames_in} frames{of_stream} are malformed: "
+        f"{stream.status.last_error.removeprefix('frame rejected: ')}",
+        "The gateway drops malformed frames. Update the server's software, or report this to its maker.",
     )
 
 

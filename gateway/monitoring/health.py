@@ -37,7 +37,7 @@ def _stream_health(
 ) -> dict[str, Any]:
     age_s = (utime - status.last_frame_utime) / 1e6 if status.last_frame_utime else None
     return {
-        "source": source.settings.name,
+        "source": source.name,
         "stream": status.components,
         "state": status.state.value,
         "last_frame_age_s": age_s,

@@ -143,7 +143,7 @@ class GatewayCollector(Collector):
 
     def _streams(self) -> Iterator[Metric]:
         streams = [
-            ((source.settings.name, status.components), status)
+            ((source.name, status.components), status)
             for source in self._gateway.sources
             for status in source.statuses
         ]
@@ -181,7 +181,7 @@ class GatewayCollector(Collector):
             "Frames with the component, including those that an output's max_rate_hz leaves out.",
             ("source", "component"),
             [
-                ((source.settings.name, component.key), count)
+                ((source.name, component.key), count)
                 for source in self._gateway.sources
                 for component, count in source.fan_out.frames.items()
                 if component in source.queries.components

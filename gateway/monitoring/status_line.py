@@ -33,7 +33,7 @@ def source_line(source: SourceSettings, streams: Sequence[tuple[StreamStatus, fl
 
 
 def output_lines(outputs: Iterable[tuple[str, OutputHealth]]) -> list[str]:
-    """Return a line for each output that cannot send; ``outputs`` are pairs of a name and its health."""
+    """Return a text for each output that cannot send; ``outputs`` are pairs of a name and its health."""
     return [f"{name}: {health.problem}" for name, health in outputs if not health.connected]
 
 

@@ -64,9 +64,8 @@ class ClientSession:
         self._schedule: FrameSchedule | None = None  # of that command, while a measurement is running
         self._frame_requests: deque[FrameRequest] = deque()  # SendCurrentFrame; answered in order
         self._newest_us = -1  # time stamp of the newest frame built for this client
-        self._events_from_us: int | None = (
-            None  # time of the first event to send; None if no frames are requested
-        )
+        # When the first event to send occurs; None while no frames are requested.
+        self._events_from_us: int | None = None
         self.byte_order: ByteOrder = "big"
         """The byte order of the client's data frames (§4.3)."""
         self.frames_dropped = 0

@@ -38,7 +38,7 @@ class FrameSchedule:
         """When the next frame is due."""
 
     def advance(self, count: int = 1) -> None:
-        """Go on to the frame after the next ``count`` frames, which were sent or dropped."""
+        """Advance by ``count`` frames, which were sent or dropped."""
         self._num_passed += count
         self.tick = self._first_tick - (-self._num_passed * self._numerator // self._denominator)
         self.due_us = self.builder.time_us(self.tick)

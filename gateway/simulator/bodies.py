@@ -159,7 +159,7 @@ class _Waves:
 
 
 def _spread(count: int, rng: np.random.Generator) -> Floats:
-    """Return directions, shape (count, 3); any four consecutive ones span all three dimensions well."""
+    """Return directions, shape (count, 3); no four consecutive ones are close to one line or plane."""
     corners = np.array([(1, 1, 1), (1, -1, -1), (-1, 1, -1), (-1, -1, 1)]) / np.sqrt(3)
     jitter = rng.uniform(-0.3, 0.3, (count, 3))
     directions: npt.NDArray[Any] = corners[np.arange(count) % 4] + jitter

@@ -25,7 +25,7 @@ class Scenario(Section):
         tuple[Annotated[SerializeAsAny[Fault], PlainValidator(validate_fault)], ...],
         expects("a list of faults"),
     ]
-    """The faults; ``gateway.simulator.faults`` has their kinds."""
+    """The faults; ``rtc3d-gateway simulate --list-faults`` describes their kinds."""
 
     seed: Seed = 1
     """The seed of all random choices of the faults."""

@@ -1,4 +1,4 @@
-"""The sizes and rates of a synthetic scene, as a scenario gives them."""
+"""The settings of a synthetic scene: sizes, rates, labels and seed."""
 
 from dataclasses import replace
 from typing import Annotated, Self
@@ -20,7 +20,7 @@ Seed = Annotated[int, Field(strict=True, ge=0, le=2**63 - 1), expects("a whole n
 
 
 class SceneSettings(Section):
-    """A synthetic scene (``gateway.simulator.synthetic``)."""
+    """The arguments of SyntheticScene, and the labels of its markers."""
 
     markers: Size = 24
     """The number of markers."""

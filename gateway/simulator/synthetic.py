@@ -73,17 +73,7 @@ class SyntheticScene:
                 frequency_hz=rate_hz,
                 markers=tuple(Marker(str(number), f"Marker {number}") for number in range(1, markers + 1)),
             ),
-            tools=Parameters6D(
-                frequency_hz=rate_hz,
-                tools=tuple(
-                    Tool(
-                        str(number),
-                        f"Tool {number}",
-                        marker_ids=tuple(str(marker + 1) for marker in np.flatnonzero(on_tool)),
-                    )
-                    for number, on_tool in enumerate(bodies.tool_markers.T, start=1)
-                ),
-            ),
+            tools=Parameters6D(frequency_hz=rate_hz, tools=_describe_tools(bodies)),
             analog=channels.parameters,
             force=force_plates.parameters,
             events=_EVENTS,
@@ -128,6 +118,17 @@ class _AnalogSines:
         angle = np.multiply.outer(samples / self._rate_hz, self._angular_rate)
         voltage_mv: Items = self._amplitude_mv * np.sin(angle) + 2.0 * self._noise(samples)
         return voltage_mv.astype(ITEM_DTYPES[ComponentType.ANALOG])
+
+
+def _describe_tools(bodies: RigidBodies) -> tuple[Tool, ...]:
+    return tuple(
+        Tool(
+            str(number),
+            f"Tool {number}",
+            marker_ids=tuple(str(marker + 1) for marker in np.flatnonzero(on_tool)),
+        )
+        for number, on_tool in enumerate(bodies.tool_markers.T, start=1)
+    )
 
 
 def _events_before(time_us: int) -> int:

@@ -1,1 +1,1 @@
-"""What goes wrong with the simulator on purpose: the kinds of faults, and what begins and ends them."""
+"""The faults of the simulator: their kinds, and the code that begins, applies and ends them."""

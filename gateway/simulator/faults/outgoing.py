@@ -35,7 +35,7 @@ class Reply(NamedTuple):
 
 
 def packet_type_of(packet: bytes) -> int:
-    """Return a packet's type (§4.2); -1 for bytes that are no packet."""
+    """Return a packet's type (§4.2); -1 for bytes that are not a packet."""
     return int.from_bytes(packet[4:8], "big") if len(packet) >= 8 else -1
 
 
