@@ -190,7 +190,7 @@ class ManyFaults(RuleBasedStateMachine):
         assert_well_formed(self.lab)
 
 
-def test_several_faults_at_once() -> None:
+def test_data_flows_again_after_several_faults_at_once() -> None:
     run_state_machine_as_test(
         ManyFaults,
         settings=settings(

@@ -108,7 +108,7 @@ async def test_the_malformed_xml_of_the_specification_is_printed_unchanged(side:
 
 
 @sides
-async def test_fresh_asks_the_server(side: str) -> None:
+async def test_fresh_queries_the_server(side: str) -> None:
     async with lab() as at:
         requests = at.server.count("SendParameters")
         cached = await run("params", "--xml", *at.options(side))

@@ -109,7 +109,7 @@ START_LITTLE = bytes.fromhex(
     ],
     ids=["big", "little"],
 )
-def test_wavefronts_recording_control_gets_no_reply(
+def test_the_recording_control_of_wavefront_gets_no_reply(
     client: ScriptedClient, start: bytes, stop: bytes
 ) -> None:
     assert client.send(start, DATA) == []

@@ -123,7 +123,7 @@ def test_frame_numbers_stay_within_a_signed_32_bit_field() -> None:
         (0.5, Fraction(1, 2)),
     ],
 )
-def test_a_rounded_rate_becomes_the_fraction_that_it_stands_for(rate_hz: float, exact: Fraction) -> None:
+def test_a_rounded_rate_becomes_an_exact_fraction(rate_hz: float, exact: Fraction) -> None:
     assert exact_rate(rate_hz) == exact
 
 
