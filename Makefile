@@ -29,7 +29,7 @@ test: .venv/installed
 COMPILED_TESTS := tests/packaging/test_compiled.py tests/contract tests/property tests/unit/test_log.py \
     $(addprefix tests/unit/,messages outputs publish queries rtc3d stream) \
     tests/integration/test_gateway.py tests/integration/test_streams.py \
-    tests/integration/test_faults.py::test_several_faults_at_once
+    tests/integration/test_faults.py::test_data_flows_again_after_several_faults_at_once
 
 test-compiled: build/compiled/complete
 	$(COMPILED) RTC3D_COMPILED=1 tests/with-netns $(BIN)/pytest -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
