@@ -188,7 +188,7 @@ class SpoolSettings(Section):
 
     @property
     def effective_directory(self) -> Path:
-        """``directory``, or the folder that null stands for."""
+        """``directory``, or the default folder if it is None."""
         if self.directory is not None:
             return Path(self.directory)
         state = os.environ.get("STATE_DIRECTORY", "").split(":")[0]

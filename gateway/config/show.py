@@ -70,7 +70,7 @@ class _Origins:
 
 
 def _variable(*names: str) -> str:
-    """Return the first environment variable that is set."""
+    """Return the first of these environment variables that is set, or _DEFAULT."""
     return next((name for name in names if os.environ.get(name)), _DEFAULT)
 
 

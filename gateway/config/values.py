@@ -84,7 +84,7 @@ class DivisorRate(Section):
     """``rate: {divisor: 4}``."""
 
     divisor: Divisor
-    """Every how many frames the server sends one."""
+    """With N, the server sends every Nth frame."""
 
 
 def _rate(value: object) -> Rate:

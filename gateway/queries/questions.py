@@ -107,7 +107,7 @@ def _check_options(options: Mapping[str, str], kinds: Iterable[str]) -> None:
             accepted.setdefault(name, {}).update(dict.fromkeys(values))
     for name, value in options.items():
         if name not in accepted:
-            known = ", ".join(f"{each}={'|'.join(values)}" for each, values in accepted.items())
+            known = ", ".join(f"{option}={'|'.join(values)}" for option, values in accepted.items())
             raise QueryError(
                 f"unknown option {_quoted(name)} of {', '.join(kinds)}; accepted: {known or 'none'}"
             )

@@ -71,8 +71,8 @@ class ServerRequests:
             async with asyncio.timeout(timeout_s), self._lock:
                 try:
                     return command, await self._send(command, streams)
-                except QueryError as error:
-                    if fallback is None or error.code == "no-connection":
+                except QueryError:
+                    if fallback is None:
                         raise
                 return fallback, await self._send(fallback, streams)
         except LinkError as error:

@@ -133,17 +133,17 @@ async def test_requests_can_use_a_separate_url() -> None:
 async def test_a_queries_url_that_does_not_open_does_not_stop_the_output(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    data_url, nobody = lcm_url(), f"tcpq://127.0.0.1:{free_port()}"
+    data_url, closed_url = lcm_url(), f"tcpq://127.0.0.1:{free_port()}"
     async with (
         ScriptedServer(ParameterServer().script) as listening,
-        run_gateway(listening.port, lcm_url=data_url, queries_url=nobody),
+        run_gateway(listening.port, lcm_url=data_url, queries_url=closed_url),
     ):
         viewer = LcmPeer(data_url)
         try:
             await wait_until_async(lambda: viewer.statuses)
         finally:
             viewer.close()
-    assert f"lcm: no requests can be received: LCM does not open {nobody}" in caplog.text
+    assert f"lcm: no requests can be received: LCM does not open {closed_url}" in caplog.text
 
 
 @pytest.mark.parametrize("section", SECTIONS)

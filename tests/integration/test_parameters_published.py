@@ -1,13 +1,15 @@
 """Parameters published without a query, to present and to late subscribers."""
 
 import asyncio
-from collections.abc import Iterator
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
 
 import pytest
 import rtc3d
 import zenoh
 import zenoh.ext
 
+from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.lcm import queries as lcm_queries
 from gateway.outputs.lcm.connection import open_lcm
@@ -68,6 +70,17 @@ def subscribe_with_history(
     )
 
 
+@asynccontextmanager
+async def gateway_with_cache(server: ParameterServer, router: str, url: str) -> AsyncIterator[Gateway]:
+    """Run ``server`` and a gateway on Zenoh and LCM that has cached its parameters."""
+    async with (
+        ScriptedServer(server.script) as listening,
+        run_gateway(listening.port, router=router, lcm_url=url) as gateway,
+    ):
+        await wait_until_cached(gateway, server)
+        yield gateway
+
+
 @pytest.fixture
 def url() -> str:
     return lcm_url()
@@ -126,11 +139,7 @@ async def test_the_first_subscribers_get_the_parameters_although_they_are_late(
 ) -> None:
     monkeypatch.setattr(lcm_queries, "REPEAT_S", 0.05)
     server = ParameterServer()
-    async with (
-        ScriptedServer(server.script) as listening,
-        run_gateway(listening.port, router=router, lcm_url=url) as gateway,
-    ):
-        await wait_until_cached(gateway, server)
+    async with gateway_with_cache(server, router, url):
         commands = list(server.commands)
         session = open_zenoh("client", connect=router)
         subscribers = Subscribers(session, url)
@@ -148,10 +157,7 @@ async def test_only_the_late_subscriber_with_a_history_gets_the_parameters_again
     router: str, url: str, subscribers: Subscribers
 ) -> None:
     server = ParameterServer()
-    async with (
-        ScriptedServer(server.script) as listening,
-        run_gateway(listening.port, router=router, lcm_url=url),
-    ):
+    async with gateway_with_cache(server, router, url):
         await subscribers.wait_for(server.xml)
         late: list[bytes] = []
         session = open_zenoh("client", connect=router)
@@ -173,11 +179,7 @@ async def test_a_change_found_by_a_fresh_query_is_published(
     router: str, url: str, subscribers: Subscribers
 ) -> None:
     server = ParameterServer()
-    async with (
-        ScriptedServer(server.script) as listening,
-        run_gateway(listening.port, router=router, lcm_url=url) as gateway,
-    ):
-        await wait_until_cached(gateway, server)
+    async with gateway_with_cache(server, router, url) as gateway:
         await subscribers.wait_for(server.xml)
         server.xml = parameters_xml("One more", "Marker 1")
         with zenoh_peer(router) as peer:
@@ -197,11 +199,7 @@ async def test_a_change_of_the_statistics_is_not_published(
     router: str, url: str, subscribers: Subscribers
 ) -> None:
     server = ParameterServer()
-    async with (
-        ScriptedServer(server.script) as listening,
-        run_gateway(listening.port, router=router, lcm_url=url) as gateway,
-    ):
-        await wait_until_cached(gateway, server)
+    async with gateway_with_cache(server, router, url):
         await subscribers.wait_for(server.xml)
         num_lcm, num_plain = len(subscribers.lcm), len(subscribers.plain)
         server.xml = server.xml.replace(b"<FramesSent>1<", b"<FramesSent>22<")
