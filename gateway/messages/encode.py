@@ -1,4 +1,4 @@
-"""From a component to its LCM message: the type's fingerprint, the gateway's prefix, the component's content.
+"""LCM messages of components: the type's fingerprint, the gateway's prefix, the component's content.
 
 LCM writes big-endian without padding, and RTC3D sends big-endian. The message types in lcm_types/ have the
 component's own fields in the same order, so the content is copied and no value is decoded or encoded.
@@ -36,10 +36,10 @@ MESSAGE_TYPES: Final[dict[ComponentType, type[Any]]] = {
 FINGERPRINT_BYTES: Final = 8
 
 CONTENT_OFFSET: Final = FINGERPRINT_BYTES + PREFIX.size
-"""36: the offset of the component's content in a message."""
+"""The offset of the component's content in a message: 36."""
 
 ITEMS_OFFSET: Final = CONTENT_OFFSET + 16
-"""52: the offset of the items in a message, after frame number, time stamp and count."""
+"""The offset of the items in a message, after frame number, time stamp and count: 52."""
 
 _FINGERPRINTS: Final[dict[ComponentType, bytes]] = {
     component: message_type._get_packed_fingerprint()  # noqa: SLF001 - lcm-gen offers no other way

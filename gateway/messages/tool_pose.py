@@ -1,4 +1,4 @@
-"""From a 6D component to one pose message per tool, in SI units."""
+"""Pose messages of single tools, in SI units, from a 6D component."""
 
 import math
 import struct
@@ -37,7 +37,7 @@ def tool_poses(
 
 def _content(component: Component, tool: tuple[float, ...], unit_m: float) -> bytes:
     q0, qx, qy, qz, x, y, z, error = tool
-    # Any NaN means missing (field note 7): a robot must never get half a pose.
+    # Any NaN means missing (field note 7): a robot must never get an incomplete pose.
     visible = not any(map(math.isnan, tool))
     if visible:
         pose = (x * unit_m, y * unit_m, z * unit_m, qx, qy, qz, q0, error * unit_m)

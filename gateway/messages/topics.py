@@ -33,9 +33,9 @@ def zenoh_key(prefix: str, source: str, *path: str) -> str:
 def escape_key_chunk(label: str) -> str:
     """Return ``label`` as one chunk of a key expression (a part between slashes), without loss.
 
-    Letters, digits and ``_ . - ~`` stay; everything else is percent-escaped (UTF-8), including ``/ * $ # ?``
-    of Zenoh's syntax. ``urllib.parse.unquote`` returns the label. An empty label becomes ``%``, which is
-    not an escape sequence.
+    ASCII letters, digits and ``_ . - ~`` stay. Everything else is percent-escaped (UTF-8), including
+    ``/ * $ # ?`` of Zenoh's syntax. ``urllib.parse.unquote`` returns the label. An empty label becomes
+    ``%``, which is not an escape sequence.
     """
     return quote(label, safe="") or "%"
 

@@ -164,7 +164,7 @@ class FanOut:
                 message = route.publish(content, stamp)
                 if message is not None:
                     planned.record.newest = message
-            if not planned.routes:  # every output takes whole frames, but queries need a message
+            if not planned.routes:  # No output takes components, but queries need a message.
                 planned.record.newest = encode_content(planned.type, content, stamp, NOT_PUBLISHED)
         for index in plan.tool_indices:
             self._tool_poses.publish(frame, index, stamp)

@@ -20,7 +20,7 @@ class Pacer:
     def __init__(self, max_rate_hz: float) -> None:
         self._period_us = 1e6 / max_rate_hz
         self._until_next_us = 0.0
-        self._was_late = False
+        self._picked_late = False  # whether the last picked frame followed its multiple of 1/r
         self._timestamp_us: int | None = None
         self._arrival_utime: int | None = None
         # The two previous intervals. With these initial values, any next interval is the median.
@@ -51,9 +51,10 @@ class Pacer:
         # the least jitter would make the gaps alternate between too short and too long. After an early frame
         # the next may be early again; after a late one the next should be late again.
         self._until_next_us -= interval_us
-        if self._until_next_us > spacing_us * (_EARLY_AFTER_LATE if self._was_late else _EARLY_AFTER_EARLY):
+        early_share = _EARLY_AFTER_LATE if self._picked_late else _EARLY_AFTER_EARLY
+        if self._until_next_us > spacing_us * early_share:
             return False
-        self._was_late = self._until_next_us < 0
+        self._picked_late = self._until_next_us < 0
         self._until_next_us += self._period_us
         if self._until_next_us <= 0:
             self._until_next_us = self._period_us

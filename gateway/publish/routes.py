@@ -87,7 +87,7 @@ class OutputRoute:
             route.close()
         if self.frame_route is not None:
             self.frame_route.close()
-        self.drops.update(self.output.drops(self.source))  # which the successor continues
+        self.drops.update(self.output.drops(self.source))  # for the successor, which continues them
         self.output.withdraw(self.source)
 
 

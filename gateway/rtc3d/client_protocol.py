@@ -72,7 +72,7 @@ class ByteOrderMismatch(NamedTuple):
 
 
 class StreamCorrupted(NamedTuple):
-    """The next packet cannot be found in the byte stream; the connection is closed."""
+    """A packet's size is out of bounds, so the next packet cannot be found; the state is CLOSED."""
 
     error: PacketError
 
@@ -146,13 +146,13 @@ class ClientProtocol:
         self._replies.give_up()
 
     def bytes_to_send(self) -> bytes:
-        """Return the bytes to write to the server, each of them once."""
+        """Return the bytes to write to the server since the last call."""
         data = bytes(self._outgoing)
         self._outgoing.clear()
         return data
 
     def end(self) -> None:
-        """Note that the connection has ended, whichever side closed it."""
+        """Enter the state CLOSED, whichever side closed the connection."""
         self._apply(ProtocolInput.CONNECTION_ENDED)
 
     def receive(self, data: bytes) -> tuple[list[Frame], list[ProtocolEvent]]:

@@ -58,7 +58,7 @@ WIRE_ORDER: Final = tuple(_NAMES)
 COMPONENTS_BY_KEY: Final = {component.key: component for component in WIRE_ORDER}
 
 MISSING: Final = np.uint32(0xFFFFFFFF).view(np.float32)
-"""Each coordinate of a missing marker or tool: all 32 bits set, a negative quiet NaN (§7.3, field note 7)."""
+"""All fields of a missing tool, and x, y, z of a missing marker: 32 bits set, a NaN (§7.3, field note 7)."""
 
 MISSING_RELIABILITY: Final = 999.0
 """The Reliability of a missing marker (field note 7)."""

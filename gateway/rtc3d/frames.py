@@ -129,7 +129,7 @@ class Frame:
 
     @property
     def unknown_types(self) -> tuple[int, ...]:
-        """The types of the components whose type is unknown (§7.2)."""
+        """The types of the skipped components, which §7.2 does not define."""
         return self.layout.unknown_types
 
 

@@ -1,4 +1,4 @@
-"""General-purpose packets (§4.1): a header with size and type, 8 bytes, always big-endian; then the body."""
+"""General-purpose packets (§4.1): a size and a type, 4 bytes each and always big-endian, then the body."""
 
 import struct
 from enum import IntEnum
@@ -96,7 +96,7 @@ class PacketReader:
         self._max_c3d_bytes = max_c3d_bytes
         self._offset = 0  # of the next packet in the stream
         self._partial = bytearray()
-        self._partial_goal = 0  # how many bytes _partial needs before it is worth cutting
+        self._partial_goal = 0  # the length that _partial needs before a packet, or its header, is complete
         self.error: PacketError | None = None
         """Set when a size field is below 8 or above its limit; the stream then has no further packets."""
 
@@ -128,7 +128,7 @@ class PacketReader:
         packets: list[Packet] = []
         available = len(data)
         start = 0
-        # Struct's methods return Any. Declared as int, these are compared, and cut with, in C when compiled.
+        # Struct's methods return Any. Annotated as int, compiled code compares and slices with C integers.
         size: int
         packet_type: int
         while available - start >= PACKET_HEADER_BYTES:

@@ -35,7 +35,7 @@ _NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010f
 
 
 class ParsedParameters(NamedTuple):
-    """The content of an XML reply, and one line for each fault that was repaired or skipped."""
+    """The content of an XML reply, and ``recovered``: a line for each fault that was repaired or skipped."""
 
     parameters: Parameters
     recovered: tuple[str, ...]
@@ -133,8 +133,8 @@ def _tag(element: etree._Element) -> str | None:
 def _copy_elements(root: etree._Element, tree: etree._Element, *, repair: bool) -> None:
     """Copy the elements of §6 below ``root`` into ``tree``, in document order, with parents as in §6.
 
-    After a missing or stray end tag, all elements are nested wrongly. An element whose parent cannot contain
-    it by §6 is skipped or, with ``repair``, moved to the last element before it that can contain it.
+    After a missing or stray end tag, all further elements are nested wrongly. An element whose parent cannot
+    contain it by §6 is skipped or, with ``repair``, moved to the last element before it that can contain it.
     """
     copies: dict[etree._Element | None, etree._Element] = {root: tree}
     latest: dict[str, tuple[int, etree._Element]] = {ROOT: (0, tree)}

@@ -1,7 +1,7 @@
 """Finds the command that a reply from the server answers.
 
-A reply carries no number that says which command it answers. The client therefore has at most one
-pending command, and the matcher remembers earlier commands whose replies may still arrive. The rules:
+A reply has no number that identifies its command. The client therefore has at most one pending command,
+and the matcher remembers earlier commands whose replies may still arrive. The rules:
 
 - Only a packet of the right type answers a command: see ``ANSWERING_TYPES``. An acknowledgement that
   precedes XML or a frame (field note 3) is ignored.
@@ -96,7 +96,7 @@ class ReplyMatcher:
             self.pending = None
 
     def _settle(self, command: Command | None) -> Command | None:
-        """Return ``command`` if it is pending; otherwise its reply is no longer outstanding: return None."""
+        """Return ``command`` if it is pending; otherwise note that its late reply arrived, return None."""
         if command is None or command is self.pending:
             return command
         if command in self._outstanding:

@@ -90,7 +90,7 @@ class ServerClock:
         # The previous frame.
         self._timestamp_us = _NO_TIMESTAMP_US
         self._frame_number = self._arrival_utime = self._capture_utime = 0
-        # The sum that 32-bit time stamps have lost by wrapping around. Line and samples include it.
+        # The total, in µs, that 32-bit time stamps have lost by wrapping around. Line and samples include it.
         self._wrapped_us = 0
         # The time stamp that was repeated last, and when it first arrived.
         self._repeated_us = _NO_TIMESTAMP_US
@@ -214,7 +214,7 @@ class ServerClock:
             self._start(timestamp_us, arrival_utime, has_clock=False)
 
     def _close_window(self, arrival_utime: int) -> None:
-        """End the current window: keep its sample, or keep it apart as a late one, and fit the line again."""
+        """End the current window: add its sample to the others or to the late ones, and fit the line."""
         lag_us = self._least_lag_us
         least = Sample(self._least_timestamp_us, self._least_offset_us)
         self._begin_window(arrival_utime)

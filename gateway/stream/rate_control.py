@@ -23,8 +23,8 @@ def stream_requests(
     """Return the StreamFrames commands to try, in order, beginning with the configured rate and components.
 
     Some servers know neither ``Frequency:n`` nor ``AllFrames`` nor component names (field note 2). The
-    alternatives are: the same rate without names; instead of a frequency, the nearest divisor of
-    ``server_rate_hz`` (the rate in the parameters, if any); finally the server's default.
+    alternatives are: the same rate without names; the divisor 1 instead of AllFrames, or the divisor of
+    ``server_rate_hz`` (the rate in the parameters, if any) nearest to a frequency; the server's default.
     """
     names = () if set(components) == set(WIRE_ORDER) else tuple(components)
     rates: list[Rate] = [rate]
@@ -55,8 +55,7 @@ class LagControl:
     After BEHIND_S of late frames it halves the rate once more (a step down). After ``wait_s`` of frames in
     time it undoes one halving (a step up), until the rate is as configured. A step up fails if a step down
     follows within ``wait_s``; then ``wait_s`` doubles, up to MAX_WAIT_S. If a step down follows later,
-    ``wait_s`` returns to FIRST_WAIT_S. Otherwise a link that carries half of the full rate would see it
-    retried again and again.
+    ``wait_s`` returns to FIRST_WAIT_S. This avoids retrying the full rate on a link that carries half of it.
     """
 
     def __init__(self, max_lag_s: float) -> None:

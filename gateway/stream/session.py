@@ -77,8 +77,8 @@ class Session:
         self._error: LinkError | None = None  # why the session ended
         self._ended = asyncio.Event()  # _error is set
         self._lost = asyncio.Event()  # the transport is closed
-        self._asking = asyncio.Lock()
-        self._reply: asyncio.Future[Packet] | None = None  # to the command being asked
+        self._ask_lock = asyncio.Lock()  # held while a command is pending
+        self._reply: asyncio.Future[Packet] | None = None  # to the command that ``ask`` has sent
         self._quiet_since_s = 0.0  # when the stall time-out last started
         self._rejected = FailureLog(logger, source.name, HOLD_S)
 
@@ -105,7 +105,7 @@ class Session:
         Raises ServerError with the server's text if the server refuses, ReplyTimeoutError if it does not
         answer within reply_timeout_s, LinkError if the connection ends.
         """
-        async with self._asking:
+        async with self._ask_lock:
             self._check_open()
             state_before = self._protocol.state
             self._protocol.send(command)
@@ -259,7 +259,7 @@ class Session:
                 self._transport.abort()
 
     def _end(self, error: LinkError) -> None:
-        """End the session: waiting and later calls raise ``error``."""
+        """End the session. Calls that are waiting, and later calls, raise ``error``."""
         self._error = error
         self._ended.set()
         if self._reply is not None and not self._reply.done():

@@ -9,7 +9,7 @@ from gateway.rtc3d.protocol_state import ProtocolState
 class Phase(Enum):
     """The phases in the life of a connection."""
 
-    WAITING = "waiting"  # no connection; the next try follows after a delay
+    WAITING = "waiting"  # no connection; the next attempt follows after a delay
     CONNECTING = "connecting"
     HANDSHAKING = "handshaking"
     READY = "ready"

@@ -29,7 +29,7 @@ class Callbacks(NamedTuple):
     on_parameters: OnParameters
     """Takes the parameters that the server sends in each handshake."""
     on_connected: Callable[[], None]
-    """Called when the handshake is done and ``Supervisor.session`` can be asked."""
+    """Called when the handshake is done and ``Supervisor.session`` takes commands."""
     on_restart: Callable[[], None]
     """Called when the server's frame numbers or time stamps start again within a connection."""
     on_file: OnFile
@@ -75,7 +75,7 @@ class Supervisor:
 
     @property
     def session(self) -> Session | None:
-        """The open session with a completed handshake, which can be asked; None if there is none."""
+        """The open session with a completed handshake, for further commands; None if there is none."""
         session = self._ready_session
         return session if session is not None and session.is_open else None
 

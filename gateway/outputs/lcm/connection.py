@@ -9,6 +9,10 @@ import lcm
 
 from gateway.errors import OutputError
 
+DEFAULT_GROUP: Final = "239.255.76.67"
+DEFAULT_PORT: Final = 7667
+"""LCM's own defaults for multicast."""
+
 MULTICAST_SCHEMES: Final = ("udpm", "mpudpm")
 BLOCKING_SCHEMES: Final = ("tcpq", "file")
 """Schemes that open and publish synchronously: a peer or disk that stalls blocks the caller."""
@@ -28,7 +32,7 @@ def multicast_problem(url: str) -> str:
     if parts.scheme not in MULTICAST_SCHEMES:
         return ""
     try:
-        group, port = str(ipaddress.IPv4Address(parts.hostname or "239.255.76.67")), parts.port or 7667
+        group, port = str(ipaddress.IPv4Address(parts.hostname or DEFAULT_GROUP)), parts.port or DEFAULT_PORT
     except ValueError:
         return ""  # not an address: LCM itself rejects it
     try:

@@ -74,7 +74,7 @@ class LcmOutput(Output):
         return {} if self._queries is None else self._queries.ignored(source)
 
     def announce(self, source: str) -> None:
-        """Answer requests about ``source``. LCM has no liveliness; status messages show the gateway."""
+        """Answer requests about ``source``. Its status messages show that it is served."""
         if self._queries is not None:
             self._queries.add(source)
 

@@ -242,7 +242,7 @@ class LcmQueries:
 
 
 def _decoded(data: bytes) -> Any | None:
-    """Return ``data`` as a ``parameters_request_t``; None if it is not one, or too long."""
+    """Return ``data`` as a ``parameters_request_t``; None if it is malformed or too long."""
     if len(data) > MAX_REQUEST_BYTES:
         return None
     try:

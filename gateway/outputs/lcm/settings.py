@@ -9,8 +9,11 @@ from pydantic import AfterValidator, Field
 from gateway.config.section import Effective, expects, join_or
 from gateway.config.settings import OutputSettings
 from gateway.config.values import MaxRates, Switch
+from gateway.outputs.lcm.connection import DEFAULT_GROUP, DEFAULT_PORT
 
-DEFAULT_LCM_URL: Final = "udpm://239.255.76.67:7667?ttl=0"
+DEFAULT_LCM_PREFIX: Final = "MOCAP"
+
+DEFAULT_LCM_URL: Final = f"udpm://{DEFAULT_GROUP}:{DEFAULT_PORT}?ttl=0"
 """LCM's own default, which stays on this host."""
 
 LCM_SCHEMES: Final = ("udpm", "mpudpm", "memq", "tcpq", "file")
@@ -57,12 +60,12 @@ def lcm_queries_url(url: str) -> str:
     """
     parts = urlsplit(url)
     try:
-        port = parts.port or 7667
+        port = parts.port or DEFAULT_PORT
     except ValueError:  # LCM itself rejects it
         return url
     if parts.scheme != "udpm":
         return url
-    host = parts.hostname or "239.255.76.67"
+    host = parts.hostname or DEFAULT_GROUP
     other = port + 1 if port < 65535 else port - 1
     return urlunsplit(parts._replace(netloc=f"{host}:{other}"))
 
@@ -73,7 +76,7 @@ class LcmSettings(OutputSettings):
     enabled: Switch = True
     """Whether to publish, and to answer requests, on LCM."""
 
-    prefix: ChannelPrefix = "MOCAP"
+    prefix: ChannelPrefix = DEFAULT_LCM_PREFIX
     """The beginning of all channels."""
 
     url: LcmUrl | None = None

@@ -1,6 +1,6 @@
 """The Zenoh output: one session, its publishers, liveliness tokens and queryables.
 
-The session opens in a thread of its own, because ``zenoh.open`` blocks; docs/design.md has the measurements.
+The session opens in its own thread, because ``zenoh.open`` blocks; docs/design.md has the measurements.
 """
 
 import asyncio
@@ -32,7 +32,7 @@ _JOIN_S: Final = 0.5
 _CLOSE_S: Final = 0.5
 """How long to wait for the session to close.
 
-A peer that does not read delays this by 10 s; then the session continues to close in its thread.
+A peer that does not read delays this by 10 s; the thread then continues without the gateway.
 """
 
 logger = logging.getLogger(__name__)
@@ -188,7 +188,7 @@ class ZenohOutput(Output):
                 self._queries.remove(source)
 
     def show_streaming(self, source: str, is_streaming: bool) -> None:
-        """Declare the liveliness token PREFIX/SOURCE/server, or undeclare it: it shows that frames arrive."""
+        """Declare the liveliness token PREFIX/SOURCE/server while frames arrive, undeclare it otherwise."""
         self._show(self._streaming, source, "server", is_streaming)
 
     def _show(

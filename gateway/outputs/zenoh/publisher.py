@@ -14,7 +14,7 @@ logger = logging.getLogger(__name__)
 
 
 class ZenohLink:
-    """Whether messages can be sent, shared by all publishers of one output.
+    """Whether messages can be sent. All publishers of one output share this object.
 
     ``refusal`` returns the error for a message that cannot be sent. ``is_cut_off`` is read for every message,
     so the output updates it when something changes.

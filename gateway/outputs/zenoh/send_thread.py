@@ -33,7 +33,7 @@ class SendThread:
     def _run(self) -> None:
         while (work := self._work.get()) is not None and not self._closed:
             done, call = work
-            del work  # otherwise this keeps the call, and all it refers to, until the next one
+            del work  # or it would keep the call and its data alive until the next one
             with contextlib.suppress(CancelledError):
                 if done.set_running_or_notify_cancel():
                     try:

@@ -4,7 +4,7 @@ import json
 import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any, ClassVar, Final
 
 import zenoh
 from pydantic import AfterValidator, Field, PlainValidator, ValidationInfo
@@ -13,6 +13,8 @@ from gateway.config.section import describe, expects, validation_error
 from gateway.config.settings import OutputSettings
 from gateway.config.values import MaxRates, Switch
 from gateway.outputs.zenoh.config import zenoh_reason
+
+DEFAULT_ZENOH_PREFIX: Final = "mocap"
 
 
 def _key_prefix(text: str) -> str:
@@ -77,7 +79,7 @@ class ZenohSettings(OutputSettings):
     enabled: Switch = True
     """Whether to publish, and to answer queries, on Zenoh."""
 
-    prefix: KeyPrefix = "mocap"
+    prefix: KeyPrefix = DEFAULT_ZENOH_PREFIX
     """The beginning of all keys."""
 
     config: ZenohConfig = Field(default_factory=dict, repr=False)  # it may hold a password

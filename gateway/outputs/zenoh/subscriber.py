@@ -8,8 +8,7 @@ from gateway.errors import OutputError
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.kind import Receive, SubscriptionRequest
 from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason
-
-DEFAULT_PREFIX = "mocap"
+from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
 
 
 def key_pattern(prefix: str, source: str | None, component: str | None) -> str:
@@ -62,5 +61,5 @@ class ZenohSubscriber:
 
 def subscribe(request: SubscriptionRequest, receive: Receive) -> ZenohSubscriber:
     """Subscribe with a new session; ``request.address`` is the endpoint to connect to. Raises OutputError."""
-    keys = key_pattern(request.prefix or DEFAULT_PREFIX, request.source, request.component)
+    keys = key_pattern(request.prefix or DEFAULT_ZENOH_PREFIX, request.source, request.component)
     return ZenohSubscriber(open_zenoh(request.address), keys, receive, owns_session=True)
