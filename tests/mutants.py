@@ -104,9 +104,10 @@ def _results() -> Iterator[tuple[Path, dict[str, str]]]:
 
 
 def _print_table(results: list[tuple[Path, dict[str, str]]]) -> None:
-    table = Table("Module", "Mutants", *COLUMNS, "Killed %")
-    for column in table.columns[1:]:
-        column.justify = "right"
+    table = Table("module", "mutants", *COLUMNS, "%")
+    for column in table.columns:
+        column.no_wrap = True
+        column.justify = "left" if column is table.columns[0] else "right"
     packages: dict[str, Counter[str]] = {}
     for path, outcomes in results:
         package = path.parts[1]
@@ -114,7 +115,7 @@ def _print_table(results: list[tuple[Path, dict[str, str]]]) -> None:
             table.add_section()
         counts = Counter(outcomes.values())
         packages.setdefault(package, Counter()).update(counts)
-        table.add_row(str(path), *_figures(counts))
+        table.add_row(str(path.relative_to("gateway")), *_figures(counts))
     table.add_section()
     for package, counts in packages.items():
         table.add_row(f"[bold]{package}[/bold]", *_figures(counts))

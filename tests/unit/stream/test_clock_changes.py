@@ -249,3 +249,38 @@ def test_a_time_stamp_may_be_repeated_for_half_a_second() -> None:
     assert frames.clock.has_clock is True
     frames.lag_s(frozen_us)
     assert [frames.clock.has_clock] == [False]
+
+
+def wrapped(time_us: int) -> int:
+    """Return a time as a server shows it that counts µs in 32 bits."""
+    return time_us % WRAP_US
+
+
+def test_a_second_wrap_around_continues_the_time_like_the_first() -> None:
+    clock = ServerClock()
+    times_us = range(0, 2 * WRAP_US + 60_000_000, 1_000_000)
+    assert len(times_us) > 8_000
+    observed = [
+        clock.observe(wrapped(time_us), number, EPOCH_UTIME + time_us)
+        for number, time_us in enumerate(times_us)
+    ]
+    assert not any(restarted for _, _, restarted in observed)
+    assert observed[-1] == (EPOCH_UTIME + times_us[-1], 0.0, False)
+    assert clock.offset_us == EPOCH_UTIME + 2 * WRAP_US
+
+
+def test_a_wrap_around_during_a_pause_is_no_restart() -> None:
+    clock = ServerClock()
+    before_us = range(WRAP_US - 70_000_000, WRAP_US - 60_000_000, 5_000)
+    observed = [
+        clock.observe(wrapped(time_us), number, EPOCH_UTIME + time_us)
+        for number, time_us in enumerate([*before_us, WRAP_US + 60_000_000])
+    ]
+    assert observed[-1] == (EPOCH_UTIME + WRAP_US + 60_000_000, 0.0, False)
+    assert clock.has_clock
+
+
+def test_there_is_no_clock_before_the_first_frame() -> None:
+    clock = ServerClock()
+    assert clock.has_clock is False
+    assert (clock.offset_us, clock.drift_ppm, clock.uncertainty_us, clock.samples) == (0, 0.0, math.inf, 0)

@@ -252,6 +252,19 @@ async def test_silence_is_measured_from_the_last_frame_however_soon_it_came(lab:
     assert now_s() - since_s == pytest.approx(3.4)
 
 
+async def test_packets_that_are_no_frames_do_not_end_the_silence(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    since_s = now_s()
+    monitoring = asyncio.create_task(lab.session.monitor())
+    for _ in range(2):
+        await asyncio.sleep(1)
+        lab.connection.send(packet(77))
+    with pytest.raises(SilenceError):
+        await monitoring
+    assert now_s() - since_s == pytest.approx(3)
+
+
 async def test_silence_without_a_measurement_is_checked_by_a_command(lab: Lab) -> None:
     await lab.streaming()
     lab.connection.send(NO_DATA)
