@@ -1,9 +1,12 @@
 """The complete texts of errors, as a person reads them in a log or in a client program."""
 
+import struct
+
 import pytest
 
-from gateway.errors import CommandError
+from gateway.errors import CommandError, FrameError
 from gateway.rtc3d.commands import parse_command
+from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import PacketReader
 
 
@@ -74,4 +77,31 @@ def test_an_unknown_command_is_quoted_with_up_to_40_printable_characters(word: s
     assert str(caught.value) == (
         f"Unknown command '{shown}'; "
         "known are Version, SetByteOrder, SendParameters, SendCurrentFrame, StreamFrames, Bye"
+    )
+
+
+def frame_error(body: str) -> str:
+    with pytest.raises(FrameError) as caught:
+        split_frame(bytes.fromhex(body), "big")
+    return str(caught.value)
+
+
+def test_a_frame_that_ends_before_its_components() -> None:
+    assert frame_error("00000002 0000000c 00000063 00000000 00000000") == (
+        "data frame announces 2 components; its 20 bytes end after 1"
+    )
+
+
+def test_a_component_that_is_longer_than_the_frame() -> None:
+    assert frame_error("00000002 00000008 00000063 0000000c 00000064") == (
+        "component 2 of 2 (type 100) has size 12; 8 bytes are left in the frame"
+    )
+
+
+@pytest.mark.parametrize(("num_items", "size"), [(1, 24), (0, 8), (0, 23)])
+def test_a_component_whose_size_and_count_contradict_each_other(num_items: int, size: int) -> None:
+    component = struct.pack(">IIiqI", size, 1, 7, 7000, num_items)[:size]
+    announced = num_items if size == 24 else 0
+    assert frame_error((b"\0\0\0\1" + component).hex()) == (
+        f"3d component of {size} bytes announces {announced} items"
     )

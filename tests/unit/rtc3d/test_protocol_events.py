@@ -11,6 +11,7 @@ from gateway.rtc3d.client_protocol import (
     FrameRejected,
     ProtocolEvent,
     Refused,
+    StreamCorrupted,
     UnexpectedPacket,
 )
 from gateway.rtc3d.commands import (
@@ -22,9 +23,10 @@ from gateway.rtc3d.commands import (
     StreamFrames,
     Version,
 )
-from gateway.rtc3d.components import ComponentType, encode_component
-from gateway.rtc3d.frames import encode_frame
+from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, encode_component
+from gateway.rtc3d.frames import encode_frame, split_frame
 from gateway.rtc3d.packets import Packet
+from gateway.rtc3d.protocol_state import ProtocolState
 from tests.servers import error, ok, packet
 from tests.vectors import FULL_FRAME
 
@@ -126,3 +128,38 @@ def test_a_current_frame_without_the_requested_component_is_the_answer_while_not
     command = SendCurrentFrame((ComponentType.MARKERS,))
     body = encode_frame([encode_component(ComponentType.ANALOG, 1, 0, np.zeros(1, ">f4"))])
     assert events_after(command, packet(3, body)) == [Answered(command, Packet(3, body))]
+
+
+def test_an_error_that_begins_with_another_commands_name_refuses_the_pending_command() -> None:
+    [refused] = events_after(SetByteOrder("little"), error("Version must be sent first"))
+    assert isinstance(refused, Refused)
+    assert refused.command == SetByteOrder("little")
+
+
+def test_an_acknowledgement_by_name_passes_over_an_earlier_command_without_a_reply() -> None:
+    connection = ClientProtocol()
+    connection.send(Version())
+    connection.give_up()
+    connection.send(SetByteOrder("little"))
+    _, events = connection.receive(packet(1, b"ok-setbyteorder"))
+    assert events == [Answered(SetByteOrder("little"), Packet(1, b"ok-setbyteorder"))]
+
+
+@pytest.mark.parametrize(("packet_type", "limit"), [(2, 100), (5, 200)])
+def test_packets_are_bounded_by_the_limit_of_their_type(packet_type: int, limit: int) -> None:
+    connection = ClientProtocol(max_packet_bytes=100, max_c3d_bytes=200)
+    connection.receive(packet(packet_type, bytes(limit - 8)))
+    assert connection.state is ProtocolState.IDLE
+    _, [corrupted] = connection.receive(packet(packet_type, bytes(limit - 7)))
+    assert isinstance(corrupted, StreamCorrupted)
+    assert corrupted.error.size == limit + 1
+
+
+def test_the_first_known_component_gives_a_layout_its_type() -> None:
+    markers = encode_component(ComponentType.MARKERS, 1, 0, np.zeros(1, ITEM_DTYPES[ComponentType.MARKERS]))
+    unknown = bytes.fromhex("0000000c 00000063 00000000")
+    types = [
+        split_frame(encode_frame(components), "big").layout.first_component_type
+        for components in ([markers], [unknown, markers], [unknown], [])
+    ]
+    assert types == [ComponentType.MARKERS, ComponentType.MARKERS, None, None]
