@@ -21,7 +21,8 @@ from tests.fresh_clones import (
     skip_if_plain,
 )
 
-pytestmark = [pytest.mark.wheelhouse]
+# gcc takes a minute for the compiled modules, and several on a busy machine.
+pytestmark = [pytest.mark.wheelhouse, pytest.mark.timeout(600)]
 
 _PATH = "/usr/local/bin:/usr/bin:/bin"
 

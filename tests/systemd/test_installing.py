@@ -10,7 +10,7 @@ from tests.networks import free_port, zenoh_keys
 from tests.systemd.machine import CONFIG, UNIT, Machine, Service
 from tests.systemd.page import commands, exposure
 
-pytestmark = [pytest.mark.systemd, pytest.mark.wheelhouse, pytest.mark.netns]
+pytestmark = [pytest.mark.systemd, pytest.mark.wheelhouse, pytest.mark.netns, pytest.mark.timeout(600)]
 
 PROGRAM = "/usr/local/bin/rtc3d-gateway"
 PREFIX = "/opt/rtc3d-gateway"
