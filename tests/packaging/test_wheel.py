@@ -125,7 +125,7 @@ def test_the_program_prints_its_version_and_that_it_is_compiled(
 @pytest.mark.parametrize("name", ["gateway.yaml", "demo.yaml", "two-servers.yaml"])
 def test_the_program_checks_a_configuration(program: Path, tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_bytes((ROOT / "config" / name).read_bytes())
-    assert "good" in run(program, tmp_path, "check", name)
+    assert "valid" in run(program, tmp_path, "check", name)
 
 
 def test_the_program_runs_the_demo(program: Path, tmp_path: Path) -> None:
