@@ -71,7 +71,7 @@ async def test_the_page_has_the_current_exposure_level(machine: Machine) -> None
     figure, version = exposure()
     if not (here := (await machine.run("systemctl", "--version")).text).startswith(f"systemd {version} "):
         pytest.skip(f"the page's figure is for systemd {version}; this is {here.splitlines()[0]}")
-    text = (await machine.run_shell(commands("What systemd does for it"))).text
+    text = (await machine.run_shell(commands("What systemd does"))).text
     assert f"exposure level for {UNIT}: {figure} " in text
 
 
