@@ -1,1 +1,1 @@
-"""What the gateway costs beside bare Zenoh and LCM: `make bench`, docs/performance.md."""
+"""Comparisons of the gateway with bare Zenoh, LCM and TCP: `make bench`, docs/performance.md."""

@@ -1,7 +1,7 @@
-"""How exact the server's clock is known: the table and the picture of docs/explanation/clocks.md.
+"""The accuracy of the server clock's model: the table and the plot of docs/explanation/clocks.md.
 
-Run from the project's folder, with matplotlib installed: python -m benchmarks.clock_simulation
-It prints the table and writes the picture. Everything is simulated, with seeds; nothing sleeps.
+Run it in the repository, with matplotlib installed: python -m benchmarks.clock_simulation
+It prints the table and writes the plot. All frames are simulated with fixed seeds; nothing sleeps.
 """
 
 import time
@@ -15,14 +15,14 @@ from matplotlib.figure import Figure
 from gateway.stream.clock import ServerClock
 from tests.clock_simulation import Frames, Numbers, Observed, observe, percentile_95_us, simulate
 
-PICTURE: Final = Path(__file__).parent.parent / "docs" / "explanation" / "clocks.png"
+PLOT: Final = Path(__file__).parent.parent / "docs" / "explanation" / "clocks.png"
 SEEDS: Final = 50
-LEARNED_S: Final = 30
+LEARNING_S: Final = 30
 COLOURS: Final = {100: "#1f6fb4", -100: "#d1702a"}
 
 
 def changing_drift(host_s: Numbers) -> Numbers:
-    """Return a drift in ppm that goes from -100 to 100 and back in ten minutes."""
+    """Return a drift in ppm that varies between -100 and 100 with a period of ten minutes."""
     return np.asarray(100 * np.sin(2 * np.pi * host_s / 600))
 
 
@@ -37,13 +37,16 @@ NETWORKS: Final[list[tuple[str, dict[str, Any]]]] = [
 
 
 def frames_with_drift(drift_ppm: float, seed: int) -> Frames:
-    """Return a minute of frames as the picture has them."""
+    """Return the frames of one minute, as in the plot."""
     return simulate(seconds=60, rate_hz=200, drift_ppm=drift_ppm, seed=seed)
 
 
 def print_table() -> None:
-    """Print, of each network, the errors from 30 s to 60 s: the 95th percentiles of seeds, and the worst."""
-    print("| frames | 95 % are within: median of seeds | worst seed | greatest error |")
+    """Print the errors of each network after 30 s: 95th percentiles over seeds, and the largest error."""
+    print(
+        "| frames | error of 95 % of the frames, median of the runs | the same, worst run "
+        "| greatest error of any frame |"
+    )
     print("|---|---:|---:|---:|")
     for name, network in NETWORKS:
         print_row(name, [simulate(seconds=60, seed=seed, **network) for seed in range(SEEDS)])
@@ -55,25 +58,25 @@ def print_table() -> None:
 
 def print_row(name: str, runs: list[Frames]) -> None:
     """Print one row of the table."""
-    learned = [late_errors_us(frames) for frames in runs]
-    percentiles = [percentile_95_us(errors_us) for errors_us in learned]
-    greatest_us = max(np.abs(errors_us).max() for errors_us in learned)
-    print(f"| {name} | {whole(np.median(percentiles))} | {whole(max(percentiles))} | {whole(greatest_us)} |")
+    errors = [late_errors_us(frames) for frames in runs]
+    percentiles = [percentile_95_us(errors_us) for errors_us in errors]
+    largest_us = max(np.abs(errors_us).max() for errors_us in errors)
+    print(f"| {name} | {whole(np.median(percentiles))} | {whole(max(percentiles))} | {whole(largest_us)} |")
 
 
 def late_errors_us(frames: Frames) -> Any:
-    """Return the errors of a new clock from LEARNED_S on."""
+    """Return the errors of a new clock from LEARNING_S on."""
     since_us = frames.captured_utime - frames.captured_utime[0]
-    return observe(ServerClock(), frames).errors_us[since_us >= LEARNED_S * 1_000_000]
+    return observe(ServerClock(), frames).errors_us[since_us >= LEARNING_S * 1_000_000]
 
 
 def whole(time_us: Any) -> str:
-    """Return a time as the table has it."""
+    """Return a time as text, rounded to µs."""
     return f"{round(time_us)} µs"
 
 
 def print_speed() -> None:
-    """Print what one frame costs."""
+    """Print the time that ServerClock.observe takes per frame."""
     frames = simulate(seconds=60, rate_hz=2000, jitter_us=1_000)
     stamps, arrivals = frames.timestamps_us.tolist(), frames.arrivals_utime.tolist()
     clock = ServerClock()
@@ -84,7 +87,7 @@ def print_speed() -> None:
 
 
 def draw() -> None:
-    """Write the picture: the error of utime and of capture_utime over a minute, for both drifts."""
+    """Plot the errors of utime and of capture_utime over one minute, for both drifts."""
     mpl.rcParams.update({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False})
     figure = Figure(figsize=(9, 6.2), layout="constrained")
     above, below = figure.subplots(2, 1, sharex=True, height_ratios=[1, 1.6])
@@ -96,7 +99,9 @@ def draw() -> None:
     frames, observed = runs[100]
     host_s = (frames.captured_utime - frames.captured_utime[0]) / 1e6
     utime_errors_ms = (frames.arrivals_utime - frames.captured_utime) / 1000
-    above.plot(host_s, utime_errors_ms, ".", markersize=1.5, color="0.6", label="utime: when the frame came")
+    above.plot(
+        host_s, utime_errors_ms, ".", markersize=1.5, color="0.6", label="utime: when the frame arrived"
+    )
     above.plot(host_s, observed.errors_us / 1000, color=COLOURS[100], linewidth=1.2, label="capture_utime")
     above.set(ylabel="error (ms)", title="Error of a frame's time: 200 Hz, exponential jitter of 5 ms mean")
     above.legend(loc="upper right", markerscale=5, framealpha=1)
@@ -107,15 +112,15 @@ def draw() -> None:
         label = f"capture_utime, drift {drift_ppm:+d} ppm".replace("-", "−")
         below.plot(host_s, observed.errors_us / 1000, color=COLOURS[drift_ppm], linewidth=1.2, label=label)
     for since_s, height_ms, text in (
-        (1.5, -0.93, "1.5 s: there is a clock"),
-        (5.6, -0.75, "5.6 s: and its drift"),
+        (1.5, -0.93, "1.5 s: clock known"),
+        (5.6, -0.75, "5.6 s: drift known"),
     ):
         below.axvline(since_s, color="0.5", linestyle=":", linewidth=1)
         below.text(since_s + 0.4, height_ms, text, color="0.35", backgroundcolor="white")
     below.set(xlabel="time since the first frame (s)", ylabel="error (ms)", xlim=(0, 60), ylim=(-1, 1))
     below.legend(loc="upper right", ncols=2, framealpha=1)
-    PICTURE.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(PICTURE, dpi=130)
+    PLOT.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(PLOT, dpi=130)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""A laboratory: the simulator plays the lab workload, and a gateway serves it on two streams."""
+"""A laboratory: the simulator serves the lab workload, and a gateway receives it in two streams."""
 
 import contextlib
 import sys
@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Self
 
 from benchmarks import processes
-from benchmarks.processes import Program, Worker, zenoh_keys
-from benchmarks.stage import GATEWAY, lcm_url
-from benchmarks.subscribers import Heard, Subscription, subscribe
+from benchmarks.processes import Program, Worker, zenoh_session_config
+from benchmarks.subscribers import Received, Subscription, subscribe
+from benchmarks.workbench import GATEWAY, lcm_url
 from benchmarks.workloads import LAB, LAB_STREAMS
 from tests.networks import free_port
 
@@ -19,7 +19,7 @@ _COMPONENTS = 5
 
 @dataclass
 class Lab:
-    """A context in which the lab workload is served to one subscriber on Zenoh and one on LCM."""
+    """A context in which a gateway publishes the lab workload to a Zenoh subscriber and an LCM subscriber."""
 
     reads: bool = False
 
@@ -31,30 +31,34 @@ class Lab:
             stack.enter_context(Program([sys.executable, "-m", "gateway", "simulate", *_options(port)]))
             settings = {
                 "sources": [processes.source(GATEWAY, port, LAB_STREAMS)],
-                "zenoh": {"config": zenoh_keys("peer", listen=[self.endpoint])},
+                "zenoh": {"config": zenoh_session_config("peer", listen=[self.endpoint])},
                 "lcm": {"url": url},
                 "metrics": {"port": free_port()},
             }
             self.gateway = stack.enter_context(processes.gateway(folder / "gateway.yaml", settings))
             wanted = Subscription(
-                zenoh_keys("peer", connect=[self.endpoint]), (url,), zenoh=1, lcm=1, reads=self.reads
+                zenoh_session_config("peer", connect=[self.endpoint]),
+                (url,),
+                zenoh=1,
+                lcm=1,
+                reads=self.reads,
             )
-            self._listener = stack.enter_context(Worker(subscribe, wanted))
+            self._subscribers = stack.enter_context(Worker(subscribe, wanted))
             processes.wait_until(
-                lambda: all(len(counts) >= _COMPONENTS for counts in self._listener.ask("heard")),
-                "both subscribers of the laboratory hear all five components",
+                lambda: all(len(counts) >= _COMPONENTS for counts in self._subscribers.ask("counts")),
+                "both subscribers of the laboratory receive all five components",
             )
-            self.take()
+            self.take_received()
             self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def take(self) -> list[Heard]:
-        """Return what the Zenoh subscriber and the LCM subscriber heard since the last time."""
-        heard: list[Heard] = self._listener.ask("take")
-        return heard
+    def take_received(self) -> list[Received]:
+        """Return what the Zenoh subscriber and the LCM subscriber have received since the last call."""
+        received: list[Received] = self._subscribers.ask("take")
+        return received
 
 
 def _options(port: int) -> list[str]:

@@ -1,46 +1,46 @@
-"""Part 3: from the server's send to the subscriber's callback, beside the bare relay and a TCP client."""
+"""Part 3: the latency from server to subscriber, compared with the bare relay and a plain TCP client."""
 
 from itertools import chain
 from typing import Any, Final
 
-from benchmarks.comparing import Pair, percentile, table_cell
+from benchmarks.comparison import Pair, percentile, table_cell
 from benchmarks.processes import Worker
 from benchmarks.report import Goal, Progress, Table
-from benchmarks.stage import GATEWAY, PLAIN, RELAY, Stage
 from benchmarks.subscribers import subscribe_tcp
+from benchmarks.workbench import GATEWAY, PLAIN_TCP, RELAY, Workbench
 from benchmarks.workloads import DENSE, cuts
 from gateway.messages.encode import CONTENT_OFFSET
 
-TITLE: Final = "Latency: from the server's send to the subscriber's callback"
+TITLE: Final = "Latency from the server's send to the subscriber's callback"
 GOAL_P50: Final = 1.10
 GOAL_P99: Final = 1.20
 
-_SIDES: Final = {"Zenoh": (True, False), "LCM": (False, True)}
+_OUTPUTS: Final = {"Zenoh": (True, False), "LCM": (False, True)}
 _RATES_HZ: Final = (100, 200, 1000)
 _PERCENTILES: Final = (50.0, 99.0, 99.9)
-_NAMES: Final = (GATEWAY, RELAY, PLAIN)
+_NAMES: Final = (GATEWAY, RELAY, PLAIN_TCP)
 
 
 def _plan(quick: bool) -> tuple[int, dict[int, float]]:
-    """Return how many rounds there are, and how long one run lasts at each rate, s."""
+    """Return the number of rounds, and the duration in s of one run at each rate."""
     return (2, {200: 0.5, 1000: 0.5}) if quick else (20, {100: 2.0, 200: 1.5, 1000: 1.0})
 
 
 def expected_s(quick: bool) -> float:
-    """Return about how long it takes."""
+    """Return the approximate duration in s."""
     rounds, lasting_s = _plan(quick)
-    return len(_SIDES) * (4 + rounds * len(_NAMES) * sum(lasting_s.values()) * 1.05)
+    return len(_OUTPUTS) * (4 + rounds * len(_NAMES) * sum(lasting_s.values()) * 1.05)
 
 
 def measure(quick: bool, progress: Progress) -> dict[str, Any]:
-    """Return, of each side and rate, the percentiles of every run, µs."""
+    """Return the percentiles of every run in µs, for each output and rate."""
     rounds, lasting_s = _plan(quick)
     rows = []
-    for number, (side, (zenoh, lcm)) in enumerate(_SIDES.items()):
+    for number, (output, (zenoh, lcm)) in enumerate(_OUTPUTS.items()):
         subscribers = [(int(zenoh), int(lcm))]
-        clients = (GATEWAY, RELAY, PLAIN)
+        clients = (GATEWAY, RELAY, PLAIN_TCP)
         with (
-            Stage(
+            Workbench(
                 DENSE,
                 zenoh=zenoh,
                 lcm=lcm,
@@ -48,15 +48,15 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
                 reads=True,
                 component="3d",
                 clients=clients,
-            ) as stage,
-            Worker(subscribe_tcp, stage.ports[PLAIN], *_shape()) as plain,
+            ) as workbench,
+            Worker(subscribe_tcp, workbench.ports[PLAIN_TCP], *_shape()) as plain,
         ):
             for rate_hz, each_s in lasting_s.items():
-                progress.step(f"{side}, {rate_hz} Hz", (number + list(lasting_s).index(rate_hz) / 3) / 2)
+                progress.step(f"{output}, {rate_hz} Hz", (number + list(lasting_s).index(rate_hz) / 3) / 2)
                 ages_us: dict[str, list[list[float]]] = {name: [] for name in _NAMES}
                 for name in _NAMES * rounds:
-                    ages_us[name].append(_run(stage, plain, name, rate_hz, each_s))
-                rows.append({"side": side, "rate_hz": rate_hz, **_figures(ages_us)})
+                    ages_us[name].append(_run(workbench, plain, name, rate_hz, each_s))
+                rows.append({"output": output, "rate_hz": rate_hz, **_figures(ages_us)})
     return {"rounds": rounds, "rows": rows}
 
 
@@ -65,21 +65,21 @@ def _shape() -> tuple[int, int]:
     return len(packet), cuts(packet)[0].first + CONTENT_OFFSET
 
 
-def _run(stage: Stage, plain: Worker, name: str, rate_hz: float, lasting_s: float) -> list[float]:
-    if name == PLAIN:
-        plain.send("one connection")
+def _run(workbench: Workbench, plain: Worker, name: str, rate_hz: float, lasting_s: float) -> list[float]:
+    if name == PLAIN_TCP:
+        plain.send("measure one connection")
     frames = round(rate_hz * lasting_s)
-    stage.pace(name, frames, rate_hz)
-    if name == PLAIN:
+    workbench.pace(name, frames, rate_hz)
+    if name == PLAIN_TCP:
         ages_us: list[float] = plain.reply()
         return ages_us
-    stage.settle(frames, quiet_s=0.2)
-    [heard] = stage.take()
-    return [age_us for ages_us in heard.ages_us.values() for age_us in ages_us]
+    workbench.settle(frames, quiet_s=0.2)
+    [received] = workbench.take_received()
+    return [age_us for ages_us in received.ages_us.values() for age_us in ages_us]
 
 
 def _figures(ages_us: dict[str, list[list[float]]]) -> dict[str, Any]:
-    """Return percentiles of each run, which make pairs, and of all runs together."""
+    """Return the percentiles of each run, for the ratios, and of all runs together."""
     return {
         "messages": {name: sum(map(len, runs)) for name, runs in ages_us.items()},
         "runs_us": {
@@ -103,27 +103,27 @@ def _pair(row: dict[str, Any], percentile_name: str) -> Pair:
 
 
 def tables(result: dict[str, Any]) -> list[Table]:
-    """Return what is shown of the figures."""
+    """Return the tables of the result."""
     rows = []
     for row in result["rows"]:
         for each in row["all_us"]:
             times_us = (f"{row['all_us'][each][name]:.0f}" for name in _NAMES)
-            rows.append([row["side"], str(row["rate_hz"]), each, *times_us, table_cell(_pair(row, each))])
+            rows.append([row["output"], str(row["rate_hz"]), each, *times_us, table_cell(_pair(row, each))])
     columns = ["output", "Hz", "percentile", "gateway µs", "bare relay µs", "plain TCP client µs"]
-    return [Table(TITLE, [*columns, "gateway to relay, median of runs"], rows)]
+    return [Table(TITLE, [*columns, "gateway/relay, median of runs"], rows)]
 
 
 def goals(result: dict[str, Any]) -> list[Goal]:
-    """Return the worst ratios of gateway to relay."""
-    found = []
+    """Return the worst and the median ratio of the gateway to the relay."""
+    results = []
     for name, goal in (("p50", GOAL_P50), ("p99", GOAL_P99)):
         ratios = sorted(_pair(row, name).ratio for row in result["rows"])
-        found.append(
+        results.append(
             Goal(
-                f"{name} latency against the bare relay",
+                f"{name} latency compared with the bare relay",
                 f"at most {goal:.2f}",
-                f"{ratios[-1]:.2f} in the worst case, {ratios[len(ratios) // 2]:.2f} in the median one",
+                f"{ratios[-1]:.2f} in the worst case, {ratios[len(ratios) // 2]:.2f} in the median case",
                 ratios[-1] <= goal,
             )
         )
-    return found
+    return results

@@ -1,9 +1,9 @@
-"""Part 4: what subscribers on both sides lose of the dense workload, by frame number."""
+"""Part 4: how many messages of the dense workload Zenoh and LCM subscribers lose."""
 
 from typing import Any, Final
 
 from benchmarks.report import Goal, Progress, Table
-from benchmarks.stage import GATEWAY, Stage
+from benchmarks.workbench import GATEWAY, Workbench
 from benchmarks.workloads import DENSE
 
 TITLE: Final = "Loss: the dense workload to 4 Zenoh and 4 LCM subscribers"
@@ -12,7 +12,7 @@ _COMPONENTS: Final = 5
 
 
 def expected_s(quick: bool) -> float:
-    """Return about how long it takes."""
+    """Return the approximate duration in s."""
     return _seconds(quick) + 6
 
 
@@ -21,22 +21,22 @@ def _seconds(quick: bool) -> int:
 
 
 def measure(quick: bool, progress: Progress) -> dict[str, Any]:
-    """Return how many messages were sent to each subscriber, and how many it received."""
+    """Return how many messages were sent to each subscriber, and how many it received and lost."""
     seconds = _seconds(quick)
     progress.step(f"{seconds} s", 0)
-    subscribers = [(1, 1)] * _EACH  # Zenoh and LCM take turns in what follows
-    with Stage(DENSE, subscribers=subscribers, reads=True, clients=(GATEWAY,)) as stage:
+    subscribers = [(1, 1)] * _EACH  # so Zenoh and LCM subscribers alternate below
+    with Workbench(DENSE, subscribers=subscribers, reads=True, clients=(GATEWAY,)) as workbench:
         frames = round(seconds * DENSE.rate_hz)
-        sent, cpu_s = stage.pace(GATEWAY, frames, DENSE.rate_hz)
-        stage.settle(frames * _COMPONENTS)
+        sent, cpu_s = workbench.pace(GATEWAY, frames, DENSE.rate_hz)
+        workbench.settle(frames * _COMPONENTS)
         rows = [
             {
                 "subscriber": f"{('Zenoh', 'LCM')[number % 2]} {number // 2 + 1}",
                 "sent": frames * _COMPONENTS,
-                "received": heard.messages.total(),
-                "lost": heard.missing(sent.first, frames, _COMPONENTS),
+                "received": received.messages.total(),
+                "lost": received.missing(sent.first, frames, _COMPONENTS),
             }
-            for number, heard in enumerate(stage.take())
+            for number, received in enumerate(workbench.take_received())
         ]
     return {
         "seconds": seconds,
@@ -47,7 +47,7 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
 
 
 def tables(result: dict[str, Any]) -> list[Table]:
-    """Return what is shown of the figures."""
+    """Return the tables of the result."""
     columns = ["subscriber", "messages sent", "received", "lost"]
     rows = [
         [row["subscriber"], *(str(row[name]) for name in ("sent", "received", "lost"))]
@@ -58,7 +58,7 @@ def tables(result: dict[str, Any]) -> list[Table]:
 
 
 def goals(result: dict[str, Any]) -> list[Goal]:
-    """Return what all subscribers lost."""
+    """Return how many messages all subscribers lost."""
     lost = sum(row["lost"] for row in result["rows"])
     sent = sum(row["sent"] for row in result["rows"])
     return [Goal(f"loss, dense, {result['seconds']} s", "none", f"{lost} of {sent}", lost == 0)]

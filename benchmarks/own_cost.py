@@ -1,7 +1,7 @@
-"""Part 1: CPU time per five-component frame, from the bytes of the socket to messages ready for the outputs.
+"""Part 1: the gateway's own CPU time per five-component frame, from received bytes to messages.
 
-Beside it what lcm-gen's own decoding and encoding of the same five messages costs. pyperf measures each in
-processes of its own, which take turns; one of them by hand: python -m benchmarks.own_cost frame_per_read
+For comparison, it also measures lcm-gen's decoding and encoding of the same messages. pyperf measures the
+variants alternately, in processes of their own. To measure one: python -m benchmarks.own_cost frame_per_read
 """
 
 import asyncio
@@ -16,7 +16,7 @@ from typing import Any, Final
 
 import uvloop
 
-from benchmarks.comparing import Pair, table_cell
+from benchmarks.comparison import Pair, table_cell
 from benchmarks.processes import PLAIN_PYTHON, run_measured
 from benchmarks.report import Goal, Progress, Table
 from benchmarks.workloads import DENSE, Frames
@@ -31,7 +31,7 @@ from gateway.stream.state import StreamState
 from tests.configurations import make_settings
 from tests.waiting import wait_until_async
 
-TITLE: Final = "Own cost of one frame of five components, from TCP's bytes to messages"
+TITLE: Final = "The gateway's own CPU time per frame of five components, from received bytes to messages"
 GATEWAY: Final = "frame_per_read"
 BATCH: Final = "frames_in_one_read"
 SEGMENTS: Final = "frame_in_two_reads"
@@ -41,7 +41,7 @@ GOAL_US: Final = 5.0
 GOAL_TIMES: Final = 50.0
 _BATCH_FRAMES: Final = 64
 _SEGMENT_BYTES: Final = 1448
-"""What a TCP segment carries on Ethernet; the frames have 2252 bytes."""
+"""The payload of a TCP segment on Ethernet; a frame has 2252 bytes."""
 
 _BLOCK_FRAMES: Final = 64 * 16
 _LOOPS: Final = {
@@ -52,16 +52,16 @@ _LOOPS: Final = {
     LCM_GEN: 1000,
 }
 _TEXTS: Final = {
-    GATEWAY: "gateway, a frame in each read",
-    BATCH: f"gateway, {_BATCH_FRAMES} frames in each read",
-    SEGMENTS: "gateway, each frame in two reads, cut as TCP does on Ethernet",
-    PLAIN: "gateway not compiled, a frame in each read",
+    GATEWAY: "gateway, one frame per read",
+    BATCH: f"gateway, {_BATCH_FRAMES} frames per read",
+    SEGMENTS: "gateway, each frame in two reads, split like TCP segments on Ethernet",
+    PLAIN: "gateway not compiled, one frame per read",
     LCM_GEN: "lcm-gen: decode and encode the same five messages",
 }
 
 
-class _Kept:
-    """A publisher that keeps the newest message, and no more: it costs as little as one can."""
+class _StoringPublisher:
+    """A publisher that only stores the newest message, at the least possible cost."""
 
     wanted = True
 
@@ -73,23 +73,23 @@ class _Kept:
         pass
 
 
-class _KeepingOutput(MemoryOutput):
-    """An output that only keeps; all else is the gateway's own."""
+class _StoringOutput(MemoryOutput):
+    """An output whose publishers only store messages, so that all other cost is the gateway's own."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.kept: dict[tuple[str, ...], _Kept] = {}
+        self.publishers: dict[tuple[str, ...], _StoringPublisher] = {}
 
     def publisher(self, topic: Topic) -> Any:
-        return self.kept.setdefault(topic.path, _Kept())
+        return self.publishers.setdefault(topic.path, _StoringPublisher())
 
 
-class _Fed:
-    """A running gateway, connected to a server that is silent; its session is fed by hand."""
+class _FedGateway:
+    """A running gateway, connected to a silent server. ``run`` passes frames to its session directly."""
 
     def __init__(self) -> None:
         self._loop = uvloop.new_event_loop()
-        self._output = _KeepingOutput()
+        self._output = _StoringOutput()
         self._frames = Frames(DENSE.packet(), _BLOCK_FRAMES)
         self._number = 1
         self._session = self._loop.run_until_complete(self._connect())
@@ -104,14 +104,17 @@ class _Fed:
             make_settings(sources=(source,), metrics=MetricsSettings(enabled=False)), [self._output]
         )
         self._running = self._loop.create_task(gateway.run(self._stop))
-        [serving] = gateway.sources
-        await wait_until_async(lambda: serving.statuses[0].state is StreamState.NO_MEASUREMENT)
-        session = serving.supervisors[0].session
-        assert session is not None  # noqa: S101 - it has just told of its state
+        [source_gateway] = gateway.sources
+        await wait_until_async(lambda: source_gateway.statuses[0].state is StreamState.NO_MEASUREMENT)
+        session = source_gateway.supervisors[0].session
+        assert session is not None  # noqa: S101 - a stream in this state has a session
         return session
 
     def run(self, loops: int, per_read: int, *, segments: bool = False) -> float:
-        """Feed ``loops`` frames, so many in each read or each in ``segments``; return how long it took, s."""
+        """Pass ``loops`` frames to the session and return the CPU time in s.
+
+        Each read has ``per_read`` frames. With ``segments``, each read is split in two.
+        """
         return self._loop.run_until_complete(self._feed(loops, per_read, segments=segments))
 
     async def _feed(self, loops: int, per_read: int, *, segments: bool) -> float:
@@ -136,26 +139,26 @@ class _Fed:
         """Return the newest message of every component."""
         self.run(1, 1)
         return [
-            kept.messages[0]
-            for parts, kept in self._output.kept.items()
-            if parts[0] not in {"status", "clock"}
+            publisher.messages[0]
+            for path, publisher in self._output.publishers.items()
+            if path[0] not in {"status", "clock"}
         ]
 
     def close(self) -> None:
-        """Stop all of it."""
+        """Stop the gateway and the server."""
         self._stop.set()
         self._loop.run_until_complete(self._running)
         self._loop.run_until_complete(self._server.close())
 
 
 def expected_s(quick: bool) -> float:
-    """Return about how long it takes."""
+    """Return the approximate duration in s."""
     return 20 if quick else 230
 
 
 def measure(quick: bool, progress: Progress) -> dict[str, Any]:
-    """Return the CPU time per frame of each, µs."""
-    import pyperf  # noqa: PLC0415 - the tests of the benchmarks do without
+    """Return the CPU time per frame of each variant, in µs."""
+    import pyperf  # noqa: PLC0415 - not needed by the tests
 
     values: dict[str, list[float]] = {name: [] for name in _LOOPS}
     rounds = 2 if quick else 15
@@ -174,20 +177,20 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
 
 
 def tables(result: dict[str, Any]) -> list[Table]:
-    """Return what is shown of the figures."""
+    """Return the tables of the result."""
     values = result["cpu_us_per_frame"]
     rows = []
     for name, text in _TEXTS.items():
-        ratio = "" if name == LCM_GEN else table_cell(_against_lcm_gen(values, name))
+        ratio = "" if name == LCM_GEN else table_cell(_compared_with_lcm_gen(values, name))
         rows.append([text, f"{statistics.median(values[name]):.2f}", ratio])
-    return [Table(TITLE, ["what", "CPU µs per frame", "lcm-gen's cost is so many times it"], rows)]
+    return [Table(TITLE, ["what", "CPU µs per frame", "lcm-gen takes this many times as long"], rows)]
 
 
 def goals(result: dict[str, Any]) -> list[Goal]:
-    """Return the cost, and how much less it is than lcm-gen's."""
+    """Return the CPU time per frame, absolute and compared with lcm-gen's."""
     values = result["cpu_us_per_frame"]
     cost_us = statistics.median(values[GATEWAY])
-    times, times_batch = (_against_lcm_gen(values, name).ratio for name in (GATEWAY, BATCH))
+    times, times_batch = (_compared_with_lcm_gen(values, name).ratio for name in (GATEWAY, BATCH))
     return [
         Goal(
             "own cost per five-component frame",
@@ -196,24 +199,24 @@ def goals(result: dict[str, Any]) -> list[Goal]:
             cost_us <= GOAL_US,
         ),
         Goal(
-            "own cost, against lcm-gen's decode and encode",
+            "own cost, compared with lcm-gen's decode and encode",
             f"at least {GOAL_TIMES:g} times less",
-            f"{times:.0f} times less with a frame in each read, {times_batch:.0f} with {_BATCH_FRAMES}",
+            f"{times:.0f} times less with one frame per read, {times_batch:.0f} with {_BATCH_FRAMES}",
             times >= GOAL_TIMES,
         ),
     ]
 
 
-def _against_lcm_gen(values: dict[str, list[float]], name: str) -> Pair:
+def _compared_with_lcm_gen(values: dict[str, list[float]], name: str) -> Pair:
     return Pair.of({LCM_GEN: values[LCM_GEN], name: values[name]})
 
 
 def main() -> None:
-    """Measure one of them with pyperf, in one of its worker processes."""
+    """Measure one variant with pyperf, which calls this in each of its worker processes."""
     import pyperf  # noqa: PLC0415 - as above
 
     name = sys.argv.pop(1)
-    fed = functools.cache(_Fed)
+    fed = functools.cache(_FedGateway)
     decoded = functools.cache(lambda: [(message, type(decode(message))) for message in fed().messages()])
 
     def feed(loops: int) -> float:

@@ -1,4 +1,4 @@
-"""The parts of the benchmarks in order, and what is shown of their results."""
+"""The parts of the benchmarks, in order, and the tables of their results."""
 
 import importlib
 from types import ModuleType
@@ -6,16 +6,16 @@ from typing import Any, Final
 
 from benchmarks.report import Table, goals_table, machines_table
 
-NAMES: Final = ("own_cost", "ceiling", "latency", "loss", "watching", "scale", "queries")
+NAMES: Final = ("own_cost", "ceiling", "latency", "loss", "resources", "scale", "queries")
 
 
 def part(name: str) -> ModuleType:
-    """Return a part's module: ``expected_s``, ``measure``, ``tables`` and ``goals``."""
+    """Return the module of a part, with ``expected_s``, ``measure``, ``tables`` and ``goals``."""
     return importlib.import_module(f"benchmarks.{name}")
 
 
 def sections(results: dict[str, Any]) -> dict[str, list[Table]]:
-    """Return the tables of each part that has results, those of the goals and the machine with them."""
+    """Return the tables of each part that has results, and of the sections "machine" and "goals"."""
     measured: dict[str, Any] = {name: results[name] for name in NAMES if name in results}
     goals = [goal for name, result in measured.items() for goal in part(name).goals(result)]
     return {

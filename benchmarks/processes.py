@@ -1,6 +1,7 @@
-"""The processes of a benchmark: workers, the gateway, the relay and the router, and what they use.
+"""The processes of a benchmark: workers, the gateway, the relay and the router; their CPU time and memory.
 
-What is measured has one processor to itself, everything else the others, the same for all that is compared.
+The measured process has the first core to itself; all other processes share the other cores. This is the same
+for everything that is compared.
 """
 
 import contextlib
@@ -29,7 +30,7 @@ _END_S: Final = 10.0
 
 @contextlib.contextmanager
 def _on_measured_core() -> Iterator[None]:
-    """What is started within has the first processor, and no other: it is inherited."""
+    """Restrict processes started within the context to the first core; child processes inherit this."""
     before = os.sched_getaffinity(0)
     os.sched_setaffinity(0, _CORES[:1])
     try:
@@ -39,36 +40,36 @@ def _on_measured_core() -> Iterator[None]:
 
 
 def leave_measured_core() -> None:
-    """Keep this process, and what it starts from now on, off the measured processor."""
+    """Restrict this process, and those it starts from now on, to the cores that are not measured."""
     os.sched_setaffinity(0, _CORES[1:] or _CORES)
 
 
 def cpu_s(pid: int) -> float:
-    """Return the CPU time, user and system, that all threads of a process have used (clock_getcpuclockid)."""
+    """Return the user and system CPU time of all threads of a process, in s (see clock_getcpuclockid)."""
     return time.clock_gettime((~pid << 3) | 2)
 
 
 def memory_bytes(pid: int) -> int:
-    """Return what a process has in memory, native libraries' share included."""
+    """Return the resident memory of a process, with native libraries."""
     return _kib(f"/proc/{pid}/smaps_rollup", "Rss")
 
 
 def peak_memory_bytes(pid: int) -> int:
-    """Return the most that a process ever had in memory."""
+    """Return the peak resident memory of a process."""
     return _kib(f"/proc/{pid}/status", "VmHWM")
 
 
 def _kib(file: str, name: str) -> int:
     found = re.search(rf"^{name}:\s*(\d+) kB$", Path(file).read_text(), re.MULTILINE)
     if found is None:
-        raise RuntimeError(f"{file} has no {name}")
+        raise RuntimeError(f"{file} does not contain {name}")
     return int(found[1]) * 1024
 
 
 class Worker:
-    """A function in a process of its own: ``work(requests, *arguments)`` gives a reply to each request.
+    """A process that runs the generator ``work(*arguments)`` and exchanges requests and replies with it.
 
-    ``work`` is a generator: it is sent each request and yields the reply, the first reply unasked.
+    The generator first yields ``started``. Then it receives each request and yields the reply.
     """
 
     def __init__(self, work: Callable[..., Iterator[Any]], *arguments: object) -> None:
@@ -78,19 +79,19 @@ class Worker:
         self._process.start()
         there.close()
         self.started = self.reply()
-        """The first reply."""
+        """The first value that the generator yielded."""
 
     def ask(self, request: object) -> Any:
-        """Return the reply to ``request``; raises RuntimeError with the worker's traceback if it failed."""
+        """Return the reply to ``request``; raises RuntimeError with the traceback if the worker failed."""
         self._pipe.send(request)
         return self.reply()
 
     def send(self, request: object) -> None:
-        """Send a request whose reply is fetched later with ``reply``."""
+        """Send a request; ``reply`` returns the reply to it later."""
         self._pipe.send(request)
 
     def reply(self) -> Any:
-        """Wait for the next reply."""
+        """Wait for the next reply and return it; raises RuntimeError if the worker failed."""
         failed, value = self._pipe.recv()
         if failed:
             raise RuntimeError(value)
@@ -115,7 +116,7 @@ def _work(pipe: Connection, work: Callable[..., Any], *arguments: object) -> Non
             pipe.send((False, generator.send(pipe.recv())))
     except (EOFError, StopIteration, BrokenPipeError):
         pass
-    except BaseException:  # noqa: BLE001 - whatever it was, the asker has to know
+    except BaseException:  # noqa: BLE001 - passed on to the other process
         pipe.send((True, traceback.format_exc()))
     finally:
         generator.close()
@@ -123,7 +124,7 @@ def _work(pipe: Connection, work: Callable[..., Any], *arguments: object) -> Non
 
 @dataclass
 class Program:
-    """A program that runs as long as the context lasts; ``measured``, on the first processor."""
+    """A context in which a program runs, on the first core if it is ``measured``."""
 
     command: Sequence[str]
     measured: bool = False
@@ -132,7 +133,7 @@ class Program:
 
     def __enter__(self) -> Self:
         with _on_measured_core() if self.measured else contextlib.nullcontext():
-            self.process = subprocess.Popen(  # noqa: S603 - programs of ours
+            self.process = subprocess.Popen(  # noqa: S603 - the command is our own
                 self.command, cwd=ROOT, env=os.environ | dict(self.environment), stdout=subprocess.DEVNULL
             )
         return self
@@ -147,18 +148,18 @@ class Program:
 
     @property
     def pid(self) -> int:
-        """The process's number."""
+        """The process ID."""
         return self.process.pid
 
 
 PLAIN_PYTHON: Final = {"PYTHONPATH": str(ROOT)}
-"""The environment of a program that takes the gateway's modules from the sources, not from build/compiled."""
+"""The environment in which a program imports the gateway's sources instead of build/compiled."""
 
 
 def run_measured(command: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
-    """Run a program on the first processor to its end; raises RuntimeError with what it said if it failed."""
+    """Run a program on the first core until it ends; raises RuntimeError with its output if it failed."""
     with _on_measured_core():
-        done = subprocess.run(  # noqa: S603 - programs of ours
+        done = subprocess.run(  # noqa: S603 - the command is our own
             command,
             cwd=ROOT,
             env=os.environ | dict(environment or {}),
@@ -172,20 +173,21 @@ def run_measured(command: Sequence[str], environment: Mapping[str, str] | None =
 
 
 def gateway(file: Path, settings: dict[str, Any]) -> Program:
-    """Return the gateway as users run it, with ``settings`` in the configuration ``file``."""
+    """Return the gateway as users run it; writes ``settings`` to the configuration ``file``."""
     file.write_text(yaml.safe_dump(settings))
     command = [sys.executable, "-m", "gateway", "run", "--config", str(file), "--log-level", "error"]
     return Program(command, measured=True)
 
 
 def source(name: str, port: int, streams: list[dict[str, Any]] | None = None) -> dict[str, Any]:
-    """Return a gateway's source on a port of this machine, every frame of which counts."""
+    """Return the settings of a source at a local port, whose frames the gateway never skips."""
     return {
         "name": name,
         "host": "127.0.0.1",
         "port": port,
         "streams": streams or [{"components": ["all"], "backlog": "all"}],
-        # A blast is as late as it is long; nobody is to ask for less, nor to connect anew between two.
+        # At full speed, frames queue up and arrive late. The gateway must not request a lower rate because of
+        # that, nor reconnect in the pause before the next run.
         "max_lag_ms": 60_000,
         "stall_timeout_s": 3600.0,
         "reconnect": {"first_delay_s": 0.05, "max_delay_s": 0.1},
@@ -193,12 +195,14 @@ def source(name: str, port: int, streams: list[dict[str, Any]] | None = None) ->
 
 
 def relay(plan: dict[str, Any]) -> Program:
-    """Return the bare relay; ``plan`` is its only argument."""
+    """Return the bare relay; relay.py describes ``plan``."""
     return Program([sys.executable, "-m", "benchmarks.relay", json.dumps(plan)], measured=True)
 
 
-def zenoh_keys(mode: str, *, connect: Sequence[str] = (), listen: Sequence[str] = ()) -> dict[str, Any]:
-    """Return Zenoh's configuration of a session that meets others at these endpoints only."""
+def zenoh_session_config(
+    mode: str, *, connect: Sequence[str] = (), listen: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Return the configuration of a Zenoh session that connects only to these endpoints."""
     return {
         "mode": mode,
         "connect": {"endpoints": list(connect)},
@@ -209,7 +213,7 @@ def zenoh_keys(mode: str, *, connect: Sequence[str] = (), listen: Sequence[str] 
 
 
 def router(endpoint: str) -> contextlib.AbstractContextManager[object]:
-    """Return a Zenoh router that listens at ``endpoint`` while the context lasts: see ``router_kind``."""
+    """Return a context in which a Zenoh router listens at ``endpoint``; ``router_kind`` names the program."""
     if not ZENOHD.exists():
         return Worker(_python_router, endpoint)
     return Program(
@@ -218,24 +222,24 @@ def router(endpoint: str) -> contextlib.AbstractContextManager[object]:
 
 
 def router_kind() -> str:
-    """Return which router ``router`` runs, in words."""
+    """Return the name of the program that ``router`` runs."""
     return (
         "zenohd" if ZENOHD.exists() else "a Python session in mode router (`make zenohd` builds the real one)"
     )
 
 
 def _python_router(endpoint: str) -> Iterator[None]:
-    import zenoh  # noqa: PLC0415 - only this process has a session
+    import zenoh  # noqa: PLC0415 - only this process opens a session
 
-    keys = zenoh_keys("router", listen=[endpoint])
-    keys["scouting"].pop("gossip")
-    with zenoh.open(zenoh.Config.from_json5(json.dumps(keys))):
+    config = zenoh_session_config("router", listen=[endpoint])
+    config["scouting"].pop("gossip")
+    with zenoh.open(zenoh.Config.from_json5(json.dumps(config))):
         while True:
             yield None
 
 
 def wait_until(condition: Callable[[], object], what: str) -> None:
-    """Return once ``condition`` holds; raises TimeoutError, naming ``what`` was awaited, after 30 s."""
+    """Wait until ``condition`` holds; raises TimeoutError with ``what`` after 30 s."""
     deadline_s = time.monotonic() + _START_S
     while not condition():
         if time.monotonic() > deadline_s:

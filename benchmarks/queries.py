@@ -1,29 +1,30 @@
-"""Part 7: answers from the cache while the lab workload streams: how long they take, how many there are."""
+"""Part 7: the time and the rate of replies from the cache while the lab workload streams."""
 
 import threading
 import time
 from collections.abc import Iterator
 from typing import Any, Final
 
-from benchmarks.comparing import percentile
+from benchmarks.comparison import percentile
 from benchmarks.lab import Lab
 from benchmarks.processes import Worker
 from benchmarks.report import Goal, Progress, Table
-from benchmarks.stage import GATEWAY
-from benchmarks.subscribers import Heard
+from benchmarks.subscribers import Received
+from benchmarks.workbench import GATEWAY
 from gateway.outputs.zenoh.subscriber import open_zenoh
 
-TITLE: Final = "Queries: parameters from the gateway's cache, while the lab workload streams"
+TITLE: Final = "Queries for parameters, answered from the cache while the lab workload streams"
 GOAL_MS: Final = 2.0
 QUERIES_HZ: Final = 200
 _KEY: Final = f"mocap/{GATEWAY}/parameters"
 _WAIT_S: Final = 5.0
 
 
-def ask(endpoint: str, seconds: float) -> Iterator[Any]:
-    """Work of a Worker: ask at a steady pace whether answers have come or not, then one after the other.
+def send_queries(endpoint: str, seconds: float) -> Iterator[Any]:
+    """Send queries in a Worker.
 
-    The first request gives how long each answer took, ms; the second how many came per second.
+    On the first request, send queries at a fixed rate without waiting; yield the time to each reply in ms.
+    On the second, send each query after the reply to the last one; yield the replies per second.
     """
     with open_zenoh(endpoint) as session:
         while not any(reply.ok is not None for reply in session.get(_KEY, timeout=_WAIT_S)):
@@ -37,30 +38,30 @@ def ask(endpoint: str, seconds: float) -> Iterator[Any]:
 
 
 def _paced(session: Any, count: int) -> list[float]:
-    took_ms: list[float] = []
-    came = threading.Semaphore(0)
+    reply_ms: list[float] = []
+    replied = threading.Semaphore(0)
 
-    def ask_once() -> None:
-        asked_s = time.perf_counter()
+    def send_query() -> None:
+        sent_s = time.perf_counter()
 
-        def take(reply: Any) -> None:
+        def on_reply(reply: Any) -> None:
             if reply.ok is not None:
-                took_ms.append(1000 * (time.perf_counter() - asked_s))
-            came.release()
+                reply_ms.append(1000 * (time.perf_counter() - sent_s))
+            replied.release()
 
-        session.get(_KEY, take, timeout=_WAIT_S)
+        session.get(_KEY, on_reply, timeout=_WAIT_S)
 
     start_s = time.perf_counter()
     for number in range(count):
         time.sleep(max(0.0, start_s + number / QUERIES_HZ - time.perf_counter()))
-        ask_once()
+        send_query()
     for _ in range(count):
-        came.acquire(timeout=_WAIT_S)
-    return took_ms
+        replied.acquire(timeout=_WAIT_S)
+    return reply_ms
 
 
 def expected_s(quick: bool) -> float:
-    """Return about how long it takes."""
+    """Return the approximate duration in s."""
     return _seconds(quick) * 1.5 + 5
 
 
@@ -69,45 +70,45 @@ def _seconds(quick: bool) -> float:
 
 
 def measure(quick: bool, progress: Progress) -> dict[str, Any]:
-    """Return the times of the answers, their rate, and what the stream's subscribers lost meanwhile."""
+    """Return the times to the replies, their rate, and how many messages of the stream were lost."""
     seconds = _seconds(quick)
     progress.step(f"{1.5 * seconds:g} s", 0)
-    with Lab(reads=True) as lab, Worker(ask, lab.endpoint, seconds) as asker:
-        lab.take()
-        took_ms: list[float] = asker.ask("paced")
-        rate_hz: float = asker.ask("one after the other")
-        lost = [_gaps(heard) for heard in lab.take()]
+    with Lab(reads=True) as lab, Worker(send_queries, lab.endpoint, seconds) as client:
+        lab.take_received()
+        reply_ms: list[float] = client.ask("paced")
+        rate_hz: float = client.ask("one after another")
+        lost = [_gaps(received) for received in lab.take_received()]
     return {
         "asked": round(seconds * QUERIES_HZ),
-        "answered": len(took_ms),
-        "ms": {f"p{each:g}": round(percentile(took_ms, each), 3) for each in (50, 99, 99.9)},
+        "answered": len(reply_ms),
+        "ms": {f"p{each:g}": round(percentile(reply_ms, each), 3) for each in (50, 99, 99.9)},
         "answers_per_s": round(rate_hz),
         "lost": sum(lost),
     }
 
 
-def _gaps(heard: Heard) -> int:
-    """Return how many frame numbers are missing between the first and the last of each topic of frames."""
-    topics = [topic for topic in heard.numbers if not topic.lower().endswith("event")]
-    return sum(1 + max(n) - min(n) - len(set(n)) for n in (heard.numbers[topic] for topic in topics))
+def _gaps(received: Received) -> int:
+    """Return how many frame numbers are missing between the first and the last of all topics but events."""
+    topics = [topic for topic in received.numbers if not topic.lower().endswith("event")]
+    return sum(1 + max(n) - min(n) - len(set(n)) for n in (received.numbers[topic] for topic in topics))
 
 
 def tables(result: dict[str, Any]) -> list[Table]:
-    """Return what is shown of the figures."""
+    """Return the tables of the result."""
     rows = [
-        [f"answers to {result['asked']} questions, {QUERIES_HZ} per second", str(result["answered"])],
-        *([f"time to the answer, {name}", f"{ms:.2f} ms"] for name, ms in result["ms"].items()),
-        ["answers per second, one after the other", str(result["answers_per_s"])],
+        [f"replies to {result['asked']} queries, {QUERIES_HZ} per second", str(result["answered"])],
+        *([f"time to reply, {name}", f"{ms:.2f} ms"] for name, ms in result["ms"].items()),
+        ["replies per second, one query after another", str(result["answers_per_s"])],
         ["messages of the stream lost meanwhile", str(result["lost"])],
     ]
     return [Table(TITLE, ["what", "measured"], rows)]
 
 
 def goals(result: dict[str, Any]) -> list[Goal]:
-    """Return the median, and whether all were answered and nothing was lost."""
-    fine = result["asked"] == result["answered"] and not result["lost"] and result["ms"]["p50"] < GOAL_MS
+    """Return the median time, and whether all queries were answered and nothing was lost."""
+    reached = result["asked"] == result["answered"] and not result["lost"] and result["ms"]["p50"] < GOAL_MS
     unanswered = result["asked"] - result["answered"]
-    found = f"{result['ms']['p50']:.2f} ms; {unanswered} without answer, {result['lost']} lost"
+    measured = f"{result['ms']['p50']:.2f} ms; {unanswered} without reply, {result['lost']} lost"
     return [
-        Goal("answer from the cache, p50, and the stream", f"below {GOAL_MS:g} ms, nothing lost", found, fine)
+        Goal("time to reply from the cache, p50", f"below {GOAL_MS:g} ms, nothing lost", measured, reached)
     ]

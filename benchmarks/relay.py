@@ -1,6 +1,7 @@
-"""The ceiling: a relay that publishes what comes on a TCP connection without looking into it.
+"""The bare relay: it publishes what arrives on a TCP connection without decoding it.
 
-For each packet it cuts out as many bytes as the gateway's messages have, and hands them to the same calls.
+From each packet it cuts as many bytes as the gateway's messages have, and passes them to the same calls.
+Whatever the gateway costs beyond that is its own cost.
 """
 
 import asyncio
@@ -18,17 +19,17 @@ from gateway.outputs.zenoh.config import zenoh_config
 
 
 class Relay(asyncio.Protocol):
-    """One connection; ``cuts`` are (first byte, last byte, the calls that take what is between)."""
+    """One connection; ``cuts`` are (first byte, end, functions that publish the bytes between)."""
 
     def __init__(self, cuts: list[tuple[int, int, list[Any]]], ended: asyncio.Event) -> None:
         self.cuts, self.ended = cuts, ended
-        self.rest = bytes(16)  # the gateway's prefix is longer than what precedes the first component
+        self.unread = bytes(16)  # fewer bytes precede the first component than the gateway's prefix has
 
     def connection_made(self, transport: Any) -> None:  # noqa: D102
         transport.write(b"\0\0\0\x1e\0\0\0\x01StreamFrames AllFrames")
 
     def data_received(self, data: bytes) -> None:  # noqa: D102
-        data = self.rest + data
+        data = self.unread + data
         at, end = 16, len(data)
         while end - at >= 8 and end - at >= (size := int.from_bytes(data[at : at + 4])):
             if data[at + 7] == 3:
@@ -37,14 +38,14 @@ class Relay(asyncio.Protocol):
                     for send in sends:
                         send(message)
             at += size
-        self.rest = data[at - 16 :]
+        self.unread = data[at - 16 :]
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002, D102
         self.ended.set()
 
 
 async def main(plan: dict[str, Any]) -> None:
-    """Connect, again and again, until the process is ended."""
+    """Connect, and reconnect after every connection, until the process is ended."""
     session = zenoh.open(zenoh_config(plan["zenoh"])) if plan["zenoh"] else None
     channels = lcm.LCM(plan["lcm"]) if plan["lcm"] else None
     cuts: list[tuple[int, int, list[Any]]] = []

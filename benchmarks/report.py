@@ -1,4 +1,4 @@
-"""What the benchmarks found: results in a file, tables for people, and those of docs/performance.md."""
+"""The results of the benchmarks: a file, tables on the terminal, and tables in docs/performance.md."""
 
 import json
 import os
@@ -27,7 +27,7 @@ QUICK_RESULTS: Final = ROOT / "benchmarks" / "results-quick.json"
 
 @dataclass(frozen=True)
 class Table:
-    """A table for people; ``note`` stands below it."""
+    """A table of text, with ``note`` below it."""
 
     title: str
     columns: Sequence[str]
@@ -35,7 +35,7 @@ class Table:
     note: str = ""
 
     def markdown(self) -> str:
-        """Return the table as Markdown has it, its first column to the left."""
+        """Return the table in Markdown, with only the first column left-aligned."""
         lines = [
             f"**{self.title}**",
             "",
@@ -46,7 +46,7 @@ class Table:
         return "\n".join([*lines, "", self.note] if self.note else lines)
 
     def show(self, console: Console) -> None:
-        """Print it."""
+        """Print the table on ``console``."""
         table = RichTable(title=self.title, title_justify="left", caption=self.note or None)
         for number, name in enumerate(self.columns):
             table.add_column(name, justify="right" if number else "left")
@@ -56,22 +56,25 @@ class Table:
 
 
 class Goal(NamedTuple):
-    """What was to be reached, and whether it was."""
+    """A target value, and whether the measured value reaches it."""
 
     what: str
     goal: str
-    found: str
+    measured: str
     reached: bool
 
 
 def goals_table(goals: Iterable[Goal]) -> Table:
-    """Return what was to be reached and what was."""
+    """Return the table of all goals."""
     rows = [(*goal[:3], "yes" if goal.reached else "**no**") for goal in goals]
     return Table("Goals", ["what", "goal", "measured", "reached"], rows)
 
 
 class Progress:
-    """Tells which part runs, how far all is, and how long it may take yet, one line each."""
+    """Prints progress, one line per step: the part, the time so far, and the expected remaining time.
+
+    ``expected_s`` maps each selected part to its expected duration.
+    """
 
     def __init__(self, expected_s: dict[str, float]) -> None:
         self._expected_s = expected_s
@@ -79,11 +82,11 @@ class Progress:
         self._part = ""
 
     def begin(self, part: str) -> None:
-        """Note that a part begins."""
+        """Start a part."""
         self._part = part
 
     def step(self, text: str, done: float) -> None:
-        """Tell what comes next in the part, of which ``done`` (0 to 1) is done."""
+        """Print the next step of the part; ``done`` (0 to 1) is the finished share of the part."""
         names = list(self._expected_s)
         at = names.index(self._part)
         left_s = sum(list(self._expected_s.values())[at:]) - done * self._expected_s[self._part]
@@ -97,10 +100,13 @@ class Progress:
 
 @cache
 def machine() -> dict[str, str]:
-    """Return on what and with what the figures are measured; found out once, for results change the tree."""
+    """Return the hardware and the software versions of this run.
+
+    Cached, because the results change files, and with them the output of git describe.
+    """
     model = re.search(r"^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text(), re.MULTILINE)
     commit = subprocess.run(
-        ["git", "describe", "--always", "--dirty"],  # noqa: S607 - wherever git is
+        ["git", "describe", "--always", "--dirty"],  # noqa: S607 - git is found through PATH
         cwd=ROOT,
         capture_output=True,
         text=True,
@@ -127,13 +133,13 @@ def load(file: Path) -> dict[str, Any]:
 
 
 def merge(file: Path, part: str, result: dict[str, Any]) -> None:
-    """Put a part's result into the file; those of other parts stay."""
+    """Store the result of one part in the file and keep those of the other parts."""
     results = load(file) | {part: {"machine": machine(), **result}}
     file.write_text(json.dumps(results, indent=1, ensure_ascii=False) + "\n")
 
 
 def machines_table(results: dict[str, Any]) -> Table:
-    """Return on what the parts were measured, a column for those that were measured alike."""
+    """Return the table of machines, with one column for all parts measured on the same one."""
     names = list(dict.fromkeys(name for result in results.values() for name in result["machine"]))
     parts: dict[tuple[str, ...], list[str]] = {}
     for part, result in results.items():
@@ -143,7 +149,7 @@ def machines_table(results: dict[str, Any]) -> Table:
 
 
 def rendered(document: str, sections: dict[str, list[Table]]) -> str:
-    """Return the document with each section's tables between its markers; what has none stays as it is."""
+    """Return the document with each section's tables between its markers, if the document has them."""
     for name, tables in sections.items():
         text = "\n\n".join(table.markdown() for table in tables)
         before, start, rest = document.partition(f"<!-- {name} -->\n")

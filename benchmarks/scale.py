@@ -1,17 +1,17 @@
-"""Part 6: the gateway's CPU per frame with ever more subscribers of the lab's 3D messages, as a curve."""
+"""Part 6: the gateway's CPU time per frame with 1 to 64 subscribers to 3D messages of the lab workload."""
 
 import statistics
 from typing import Any, Final
 
 from benchmarks.processes import ROOT
 from benchmarks.report import Goal, Progress, Table
-from benchmarks.stage import GATEWAY, Stage
+from benchmarks.workbench import GATEWAY, Workbench
 from benchmarks.workloads import LAB
 
-TITLE: Final = "Scale: the gateway's CPU per frame, and its subscribers"
-PICTURE: Final = ROOT / "docs" / "performance.png"
+TITLE: Final = "Scaling: the gateway's CPU time per frame, by number of subscribers"
+PLOT: Final = ROOT / "docs" / "performance.png"
 GOAL: Final = 1.5
-_WAYS: Final = {
+_CONNECTIONS: Final = {
     "Zenoh, direct": (True, False),
     "Zenoh, through a router": (True, True),
     "LCM": (False, False),
@@ -20,34 +20,48 @@ _PER_PROCESS: Final = 16
 _COLOURS: Final = ("#1f6fb4", "#d1702a", "#3c8d40")
 
 
-def _counts(way: str, quick: bool) -> list[int]:
+def _counts(connection: str, quick: bool) -> list[int]:
     if quick:
-        return [1, 4] if way == "LCM" else [1, 8]
-    return [1, 2, 4, 8, 16] if way == "LCM" else [1, 2, 4, 8, 16, 32, 64]
+        return [1, 4] if connection == "LCM" else [1, 8]
+    return [1, 2, 4, 8, 16] if connection == "LCM" else [1, 2, 4, 8, 16, 32, 64]
 
 
 def _plan(quick: bool) -> tuple[int, float]:
-    """Return the rounds, and how long each run lasts, s."""
+    """Return the number of rounds, and the duration of each run in s."""
     return (1, 1.0) if quick else (2, 4.0)
 
 
 def expected_s(quick: bool) -> float:
-    """Return about how long it takes."""
+    """Return the approximate duration in s."""
     rounds, lasting_s = _plan(quick)
-    return rounds * sum((lasting_s + 3) * len(_counts(way, quick)) for way in _WAYS)
+    return rounds * sum((lasting_s + 3) * len(_counts(connection, quick)) for connection in _CONNECTIONS)
 
 
 def measure(quick: bool, progress: Progress) -> dict[str, Any]:
-    """Return, of each way and number of subscribers, the CPU time per frame of every round."""
+    """Return the CPU times per frame, for each kind of connection and number of subscribers."""
     rounds, lasting_s = _plan(quick)
-    runs = [(way, count) for _ in range(rounds) for way in _WAYS for count in _counts(way, quick)]
+    runs = [
+        (connection, count)
+        for _ in range(rounds)
+        for connection in _CONNECTIONS
+        for count in _counts(connection, quick)
+    ]
     rows: dict[tuple[str, int], dict[str, Any]] = {}
-    for number, (way, count) in enumerate(runs):
-        progress.step(f"{way}, {count}", number / len(runs))
-        new = {"way": way, "subscribers": count, "cpu_us_per_frame": [], "sent": 0, "lost": 0, "sent_hz": []}
-        row = rows.setdefault((way, count), new)
-        _run(row, *_WAYS[way], round(lasting_s * LAB.rate_hz))
-    ordered = sorted(rows.values(), key=lambda row: (list(_WAYS).index(row["way"]), row["subscribers"]))
+    for number, (connection, count) in enumerate(runs):
+        progress.step(f"{connection}, {count}", number / len(runs))
+        new = {
+            "connection": connection,
+            "subscribers": count,
+            "cpu_us_per_frame": [],
+            "sent": 0,
+            "lost": 0,
+            "sent_hz": [],
+        }
+        row = rows.setdefault((connection, count), new)
+        _run(row, *_CONNECTIONS[connection], round(lasting_s * LAB.rate_hz))
+    ordered = sorted(
+        rows.values(), key=lambda row: (list(_CONNECTIONS).index(row["connection"]), row["subscribers"])
+    )
     result = {"rate_hz": LAB.rate_hz, "rows": ordered}
     if not quick:
         draw(result)
@@ -58,7 +72,7 @@ def _run(row: dict[str, Any], zenoh: bool, routed: bool, frames: int) -> None:
     count = row["subscribers"]
     in_processes = [min(_PER_PROCESS, count - first) for first in range(0, count, _PER_PROCESS)]
     subscribers = [(each, 0) if zenoh else (0, each) for each in in_processes]
-    with Stage(
+    with Workbench(
         LAB,
         zenoh=zenoh,
         lcm=not zenoh,
@@ -67,10 +81,10 @@ def _run(row: dict[str, Any], zenoh: bool, routed: bool, frames: int) -> None:
         reads=True,
         component="3d",
         clients=(GATEWAY,),
-    ) as stage:
-        sent, cpu_s = stage.pace(GATEWAY, frames, LAB.rate_hz)
-        stage.settle(frames)
-        lost = sum(heard.missing(sent.first, frames, 1) for heard in stage.take())
+    ) as workbench:
+        sent, cpu_s = workbench.pace(GATEWAY, frames, LAB.rate_hz)
+        workbench.settle(frames)
+        lost = sum(received.missing(sent.first, frames, 1) for received in workbench.take_received())
     row["cpu_us_per_frame"].append(round(1e6 * cpu_s / frames, 1))
     row["sent"] += frames * count
     row["lost"] += lost
@@ -78,10 +92,10 @@ def _run(row: dict[str, Any], zenoh: bool, routed: bool, frames: int) -> None:
 
 
 def tables(result: dict[str, Any]) -> list[Table]:
-    """Return what is shown of the figures."""
+    """Return the tables of the result."""
     rows = [
         [
-            row["way"],
+            row["connection"],
             str(row["subscribers"]),
             f"{statistics.median(row['cpu_us_per_frame']):.0f}",
             "–".join(f"{edge:.0f}" for edge in (min(row["cpu_us_per_frame"]), max(row["cpu_us_per_frame"]))),
@@ -90,48 +104,60 @@ def tables(result: dict[str, Any]) -> list[Table]:
         ]
         for row in result["rows"]
     ]
-    columns = ["way", "subscribers", "gateway CPU µs/frame", "rounds", "times that with 1", "lost"]
+    columns = [
+        "connection",
+        "subscribers",
+        "gateway CPU µs/frame",
+        "range",
+        "compared with 1 subscriber",
+        "lost",
+    ]
     note = (
-        f"Frames of the lab workload, all five components, at {result['rate_hz']:g} Hz; subscribers take 3D."
+        f"Frames of the lab workload at {result['rate_hz']:g} Hz with all five components; "
+        "each subscriber receives 3D."
     )
     return [Table(TITLE, columns, rows, note)]
 
 
 def goals(result: dict[str, Any]) -> list[Goal]:
-    """Return what the most subscribers behind the router cost, against one."""
-    row = [row for row in result["rows"] if row["way"] == "Zenoh, through a router"][-1]
+    """Return the CPU time with the most subscribers behind the router, compared with one."""
+    row = [row for row in result["rows"] if row["connection"] == "Zenoh, through a router"][-1]
     times = _times_one(result, row)
     what = f"gateway CPU with {row['subscribers']} subscribers behind the router"
     return [Goal(what, f"at most {GOAL:g} times that with 1", f"{times:.2f} times", times <= GOAL)]
 
 
 def _times_one(result: dict[str, Any], row: dict[str, Any]) -> float:
-    """Return by how much a row costs more than one subscriber: the median of the rounds' ratios."""
-    [one] = [each for each in result["rows"] if each["way"] == row["way"] and each["subscribers"] == 1]
+    """Return the ratio of a row's CPU time to that with one subscriber: the median over the rounds."""
+    [one] = [
+        each
+        for each in result["rows"]
+        if each["connection"] == row["connection"] and each["subscribers"] == 1
+    ]
     pairs = zip(row["cpu_us_per_frame"], one["cpu_us_per_frame"], strict=True)
     return float(statistics.median(many_us / one_us for many_us, one_us in pairs))
 
 
 def draw(result: dict[str, Any]) -> None:
-    """Write the picture of the document."""
-    import matplotlib as mpl  # noqa: PLC0415 - the tests of the benchmarks do without
+    """Write the plot in the document."""
+    import matplotlib as mpl  # noqa: PLC0415 - not needed by the tests
     from matplotlib.figure import Figure  # noqa: PLC0415 - as above
 
     mpl.rcParams.update({"font.size": 10, "axes.spines.top": False, "axes.spines.right": False})
     figure = Figure(figsize=(8, 4.2), layout="constrained")
     axes = figure.subplots()
-    for way, colour in zip(_WAYS, _COLOURS, strict=True):
-        rows = [row for row in result["rows"] if row["way"] == way]
+    for connection, colour in zip(_CONNECTIONS, _COLOURS, strict=True):
+        rows = [row for row in result["rows"] if row["connection"] == connection]
         counts = [row["subscribers"] for row in rows]
         costs = [row["cpu_us_per_frame"] for row in rows]
-        axes.plot(counts, [statistics.median(each) for each in costs], "o-", color=colour, label=way)
+        axes.plot(counts, [statistics.median(each) for each in costs], "o-", color=colour, label=connection)
         axes.fill_between(counts, list(map(min, costs)), list(map(max, costs)), color=colour, alpha=0.15)
     axes.set_xscale("log", base=2)
     ticks = sorted({row["subscribers"] for row in result["rows"]})
     axes.set_xticks(ticks, [str(tick) for tick in ticks])
     axes.set_ylim(bottom=0)
     axes.set(xlabel="subscribers", ylabel="gateway's CPU time per frame (µs)")
-    axes.set_title(f"What subscribers cost the gateway: lab workload, {result['rate_hz']:g} Hz", loc="left")
+    axes.set_title(f"CPU time by number of subscribers: lab workload, {result['rate_hz']:g} Hz", loc="left")
     axes.grid(axis="y", color="0.9")
     axes.legend(frameon=False)
-    figure.savefig(PICTURE, dpi=130)
+    figure.savefig(PLOT, dpi=130)

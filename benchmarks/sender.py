@@ -1,6 +1,7 @@
-"""A server that sends one and the same frame, with new numbers and time stamps, paced or as fast as it goes.
+"""A server that sends one frame again and again, with new numbers and time stamps.
 
-Time stamps are CLOCK_MONOTONIC in µs at the moment of sending, so that whoever receives one knows its age.
+It sends at a rate or at full speed. The time stamps are CLOCK_MONOTONIC in µs at the moment of sending, so
+that a subscriber can compute their age.
 """
 
 import queue
@@ -19,14 +20,14 @@ _WAIT_S: Final = 30.0
 
 
 class Blast(NamedTuple):
-    """Send so many frames to a client as fast as it takes them, and wait until it has taken the last."""
+    """A request to send frames to a client as fast as it reads them, until it has read the last one."""
 
     client: str
     frames: int
 
 
 class Paced(NamedTuple):
-    """Send so many frames to a client at a rate, by an absolute schedule."""
+    """A request to send frames to a client at a rate, on an absolute schedule."""
 
     client: str
     frames: int
@@ -34,7 +35,7 @@ class Paced(NamedTuple):
 
 
 class Sent(NamedTuple):
-    """What was sent: frame numbers from ``first``, and how long it took until the client closed, s."""
+    """What was sent: frame numbers from ``first``, and the time in s until the client closed."""
 
     first: int
     frames: int
@@ -42,25 +43,25 @@ class Sent(NamedTuple):
 
 
 def send(workload: Workload, clients: list[str]) -> Generator[dict[str, int] | Sent, Blast | Paced, None]:
-    """Work of a Worker: listen for each client on a port of its own, tell the ports, then do as asked.
+    """Run the server in a Worker. The first reply has the port of each client; requests are Blast or Paced.
 
-    A client is sent its frames on one connection, which ends then; the next request waits for the next.
+    Each request uses one connection and then closes it; the next request waits until the client reconnects.
     """
-    doors = {name: _Door(encode_parameters(workload.scene().parameters)) for name in clients}
+    listeners = {name: _Listener(encode_parameters(workload.scene().parameters)) for name in clients}
     one, block = Frames(workload.packet(), 1), Frames(workload.packet(), _BLOCK_FRAMES)
     numbers = dict.fromkeys(clients, 1)
-    request = yield {name: door.port for name, door in doors.items()}
+    request = yield {name: listener.port for name, listener in listeners.items()}
     while True:
         first = numbers[request.client]
         numbers[request.client] += request.frames
-        connection = doors[request.client].connections.get(timeout=_WAIT_S)
+        connection = listeners[request.client].connections.get(timeout=_WAIT_S)
         began_s = time.monotonic()
         if isinstance(request, Blast):
             _blast(connection, block, first, request.frames)
         else:
             _pace(connection, one, first, request.frames, 1 / request.rate_hz)
         connection.shutdown(socket.SHUT_WR)
-        while connection.recv(4096):  # until the client has read all, and closes for its part
+        while connection.recv(4096):  # the client reads everything, then closes its side
             pass
         connection.close()
         request = yield Sent(first, request.frames, time.monotonic() - began_s)
@@ -84,8 +85,8 @@ def _pace(connection: socket.socket, one: Frames, first: int, frames: int, perio
         connection.sendall(one.data)
 
 
-class _Door:
-    """Listens, shakes hands, and keeps connections that ask for frames in ``connections``."""
+class _Listener:
+    """Listens for one client; puts each connection into ``connections`` once it has requested frames."""
 
     def __init__(self, parameters_xml: bytes) -> None:
         self._xml = encode_packet(PacketType.XML, parameters_xml)
@@ -98,10 +99,10 @@ class _Door:
         while True:
             connection, _ = self._listener.accept()
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            if self._shake_hands(connection):
+            if self._handshake(connection):
                 self.connections.put(connection)
 
-    def _shake_hands(self, connection: socket.socket) -> bool:
+    def _handshake(self, connection: socket.socket) -> bool:
         while True:
             header = connection.recv(PACKET_HEADER.size, socket.MSG_WAITALL)
             if len(header) < PACKET_HEADER.size:

@@ -1,4 +1,4 @@
-"""Subscribers of what the gateway and the relay publish, several in one process, each for itself."""
+"""Subscribers to the gateway and the relay; several run in one process, each with its own session."""
 
 import json
 import socket
@@ -19,19 +19,19 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.rtc3d.packets import PACKET_HEADER, PacketType, encode_packet
 
 LCM_BUFFER_BYTES: Final = 4_000_000
-"""What subscribers that must lose nothing give as ``recv_buf_size``, as the documents tell."""
+"""``recv_buf_size`` of subscribers that must lose nothing; docs/performance.md explains it."""
 
 _QUEUE_MESSAGES: Final = 100_000
-_CONTENT: Final = struct.Struct(">iq")  # frame number and time stamp, behind the prefix in every message
+_CONTENT: Final = struct.Struct(">iq")  # frame number and time stamp, after the prefix of every message
 _KEPT: Final = 1000
 
 
 @dataclass(frozen=True)
 class Subscription:
-    """Who subscribes to what: ``zenoh`` and ``lcm`` subscribers, each with a session of its own.
+    """The subscribers of one process: ``zenoh`` on Zenoh and ``lcm`` on LCM, each with its own session.
 
-    ``component`` is one, or "*" for all five; with ``reads`` every message is taken up in Python, else by the
-    libraries alone, which is the least that a subscriber can cost its host.
+    ``component`` is one component, or "*" for all five. With ``reads``, Python reads every message.
+    Otherwise only the libraries receive them, which costs the host the least.
     """
 
     zenoh_config: dict[str, Any]
@@ -43,16 +43,16 @@ class Subscription:
 
 
 @dataclass
-class Heard:
-    """What one subscriber received: messages and bytes by topic; frame numbers and ages by topic."""
+class Received:
+    """What one subscriber received, by topic: messages, bytes, frame numbers, and ages in µs."""
 
     messages: Counter[str] = field(default_factory=Counter)
     message_bytes: Counter[str] = field(default_factory=Counter)
     numbers: dict[str, list[int]] = field(default_factory=dict)
     ages_us: dict[str, list[float]] = field(default_factory=dict)
 
-    def take(self, topic: str, message: bytes) -> None:
-        """Note one message of a component."""
+    def record(self, topic: str, message: bytes) -> None:
+        """Record one message; topics other than those of components are ignored."""
         now_us = time.monotonic_ns() / 1000
         if topic.rpartition("/")[2] not in _COMPONENTS and topic.rpartition("_")[2] not in _COMPONENTS:
             return
@@ -63,7 +63,7 @@ class Heard:
         self.ages_us.setdefault(topic, []).append(now_us - stamp_us)
 
     def missing(self, first: int, frames: int, components: int) -> int:
-        """Return how many messages of the frames from ``first`` are missing; doubled ones count once."""
+        """Return how many messages of ``frames`` frames from ``first`` are missing; duplicates count once."""
         wanted = set(range(first, first + frames))
         return frames * components - sum(len(wanted.intersection(each)) for each in self.numbers.values())
 
@@ -72,58 +72,59 @@ _COMPONENTS: Final = frozenset(COMPONENTS_BY_KEY) | frozenset(map(str.upper, COM
 
 
 def subscribe(wanted: Subscription) -> Generator[Any, str, None]:
-    """Work of a Worker, whose requests are about all that each subscriber has had so far.
+    """Run subscribers in a Worker.
 
-    "heard" gives how many messages of each topic, "take" gives a ``Heard``, and forgets.
+    The reply to "counts" is the number of messages of each topic, for each subscriber. The reply to "take" is
+    a ``Received`` for each subscriber, which then starts again from zero.
     """
-    parts: list[_ZenohSubscriber | _LcmSubscriber] = [
+    subscribers: list[_ZenohSubscriber | _LcmSubscriber] = [
         *(_ZenohSubscriber(wanted) for _ in range(wanted.zenoh)),
         *(_LcmSubscriber(wanted) for _ in range(wanted.lcm)),
     ]
     try:
         request = yield None
         while True:
-            if request == "heard":
-                request = yield [part.counts() for part in parts]
+            if request == "counts":
+                request = yield [subscriber.counts() for subscriber in subscribers]
             else:
-                request = yield [part.take() for part in parts]
+                request = yield [subscriber.take() for subscriber in subscribers]
     finally:
-        for part in parts:
-            part.close()
+        for subscriber in subscribers:
+            subscriber.close()
 
 
 class _ZenohSubscriber:
     def __init__(self, wanted: Subscription) -> None:
         self._session = zenoh.open(zenoh.Config.from_json5(json.dumps(wanted.zenoh_config)))
-        self._heard = Heard()
+        self._received = Received()
         self._reads = wanted.reads
         handler: Any = self._on_sample if wanted.reads else zenoh.handlers.RingChannel(_KEPT)
         self._subscriber = self._session.declare_subscriber(f"mocap/*/{wanted.component}", handler)
 
     def _on_sample(self, sample: zenoh.Sample) -> None:
-        self._heard.take(str(sample.key_expr), sample.payload.to_bytes())
+        self._received.record(str(sample.key_expr), sample.payload.to_bytes())
 
     def counts(self) -> Counter[str]:
         if not self._reads:
             while (sample := self._subscriber.handler.try_recv()) is not None:
                 self._on_sample(sample)
-        return self._heard.messages
+        return self._received.messages
 
-    def take(self) -> Heard:
-        heard, self._heard = self._heard, Heard()
-        return heard
+    def take(self) -> Received:
+        received, self._received = self._received, Received()
+        return received
 
     def close(self) -> None:
         self._session.close()
 
 
 class _LcmSubscriber:
-    """Listens on each URL. Without ``reads`` LCM's own threads take messages, and its queues drop them."""
+    """Subscribes on each URL. Without ``reads``, LCM's threads receive messages and its queues drop them."""
 
     def __init__(self, wanted: Subscription) -> None:
         component = ".+" if wanted.component == "*" else wanted.component.upper()
         self._lcms = [lcm.LCM(f"{url}&recv_buf_size={LCM_BUFFER_BYTES}") for url in wanted.lcm_urls]
-        self._heard = Heard()
+        self._received = Received()
         self._reads = wanted.reads
         self._subscriptions = [
             each.subscribe(f"MOCAP_[A-Z]+_{component}", self._on_message) for each in self._lcms
@@ -137,7 +138,7 @@ class _LcmSubscriber:
                 thread.start()
 
     def _on_message(self, channel: str, message: bytes) -> None:
-        self._heard.take(channel, message)
+        self._received.record(channel, message)
 
     def _handle(self, connection: lcm.LCM) -> None:
         while not self._stop.is_set():
@@ -147,14 +148,14 @@ class _LcmSubscriber:
         for each in self._lcms:
             while not self._reads and each.handle_timeout(0):
                 pass
-        return self._heard.messages
+        return self._received.messages
 
-    def take(self) -> Heard:
+    def take(self) -> Received:
         if not self._reads:
             for subscription in self._subscriptions:
                 subscription.set_queue_capacity(1)
-        heard, self._heard = self._heard, Heard()
-        return heard
+        received, self._received = self._received, Received()
+        return received
 
     def close(self) -> None:
         self._stop.set()
@@ -164,9 +165,9 @@ class _LcmSubscriber:
 
 
 def subscribe_tcp(port: int, packet_bytes: int, offset: int) -> Iterator[Any]:
-    """Work of a Worker: a plain TCP client. Each request gives the ages of the frames of one connection, µs.
+    """Run a plain TCP client in a Worker; each reply is the ages in µs of the frames of one connection.
 
-    ``offset`` is that of a frame number in the packets, which have ``packet_bytes`` each.
+    Each packet has ``packet_bytes`` bytes, with a frame number at ``offset``.
     """
     yield None
     while True:

@@ -1,4 +1,4 @@
-"""What the servers of the benchmarks send: how much, how often, and the bytes of it."""
+"""The workloads: what a server measures, at which rate, and the bytes of its packets."""
 
 import struct
 from dataclasses import dataclass
@@ -13,15 +13,15 @@ from gateway.rtc3d_server.frame_builder import FrameBuilder
 from gateway.simulator.synthetic import SyntheticScene
 
 _EVENT_US: Final = 500_000
-"""When the synthetic scene has its first event."""
+"""The time of the first event of the synthetic scene."""
 
 _COMPONENT: Final = struct.Struct(">II")
-"""A component's size and type (§7.1), which its message leaves out."""
+"""A component's size and type (§7.1), which are not in its message."""
 
 
 @dataclass(frozen=True)
 class Workload:
-    """What one server measures, and how often."""
+    """What one server measures, and its rates."""
 
     markers: int
     tools: int
@@ -42,7 +42,7 @@ class Workload:
         )
 
     def packet(self) -> bytes:
-        """Return the packet of one frame as the simulator encodes it: all five components, with one event."""
+        """Return the packet of one frame with all five components and one event, encoded by the simulator."""
         scene = self.scene()
         tick = round(_EVENT_US * self.rate_hz / 1e6)
         events = scene.events(_EVENT_US, _EVENT_US + 1)
@@ -50,10 +50,10 @@ class Workload:
 
 
 LAB: Final = Workload(markers=55, tools=6, analog=69, plates=2, rate_hz=200, analog_rate_hz=2000)
-"""A gait laboratory; its analog channels and force plates have a stream of their own."""
+"""A gait laboratory. Analog channels and force plates are in a stream of their own."""
 
 DENSE: Final = Workload(markers=100, tools=10, analog=32, plates=2, rate_hz=1000, analog_rate_hz=1000)
-"""Five components in every frame. The workload ``blast`` is this, as fast as TCP takes it."""
+"""Five components in every frame. The throughput is measured with the same frames at full speed."""
 
 LAB_STREAMS: Final[list[dict[str, Any]]] = [
     {"components": ["3d", "6d", "event"], "backlog": "all"},
@@ -62,9 +62,9 @@ LAB_STREAMS: Final[list[dict[str, Any]]] = [
 
 
 class Cut(NamedTuple):
-    """Which bytes of a packet a relay publishes, so that it publishes as many as the gateway.
+    """The bytes of a packet that the relay publishes for one component: as many as the gateway's message has.
 
-    ``first`` is negative where the gateway's prefix of 36 bytes is longer than what precedes the component.
+    ``first`` is negative if fewer bytes precede the component's content than the gateway's prefix has.
     """
 
     component: ComponentType
@@ -73,23 +73,23 @@ class Cut(NamedTuple):
 
 
 def cuts(packet: bytes) -> list[Cut]:
-    """Return, for each component of a packet, as many bytes as its message has, its content at their end."""
-    found = []
-    at = PACKET_HEADER.size + 4  # behind the packet's header and the count of components
+    """Return the bytes to publish for each component of a packet; they end with the component's content."""
+    result = []
+    at = PACKET_HEADER.size + 4  # after the packet header and the component count
     while at < len(packet):
         size, number = _COMPONENT.unpack_from(packet, at)
         first = at + _COMPONENT.size - CONTENT_OFFSET
-        found.append(Cut(ComponentType(number), first, at + size))
+        result.append(Cut(ComponentType(number), first, at + size))
         at += size
-    return found
+    return result
 
 
 class Frames:
-    """Packets of ``count`` frames in a row, whose numbers and time stamps can be set cheaply."""
+    """Packets of ``count`` consecutive frames, whose numbers and time stamps can be set quickly."""
 
     def __init__(self, packet: bytes, count: int) -> None:
         self.data = bytearray(packet * count)
-        """The packets, one behind the other."""
+        """All packets, without gaps."""
         self.packet_bytes = len(packet)
         contents = [cut.first + CONTENT_OFFSET for cut in cuts(packet)]
         self._numbers = [self._fields(">i4", at) for at in contents]
@@ -101,7 +101,7 @@ class Frames:
         return np.ndarray((count,), dtype, self.data, offset, (self.packet_bytes,))
 
     def stamp(self, number: int, time_us: int) -> None:
-        """Number the frames from ``number``, with time stamps from ``time_us`` that are 1 µs apart."""
+        """Number the frames from ``number``, and set time stamps from ``time_us`` that are 1 µs apart."""
         numbers, stamps_us = self._steps + number, self._steps + time_us
         for field in self._numbers:
             field[:] = numbers

@@ -1,42 +1,42 @@
-"""The benchmarks compare like with like, and their documents are made of their results."""
+"""Tests that the gateway and the relay of the benchmarks do the same work."""
 
 import math
 import re
 
 import pytest
 
-from benchmarks.stage import GATEWAY, RELAY, Stage
-from benchmarks.subscribers import Heard
+from benchmarks.subscribers import Received
+from benchmarks.workbench import GATEWAY, RELAY, Workbench
 from benchmarks.workloads import DENSE, Frames, cuts
 from gateway.rtc3d.components import ComponentType
 
 FRAMES = 200
 
 
-def published(heard: Heard, name: str) -> dict[str, tuple[int, int]]:
-    """Return the messages and bytes of each component that one subscriber had from the source ``name``."""
+def published(received: Received, name: str) -> dict[str, tuple[int, int]]:
+    """Return how many messages and bytes of each component one subscriber received from source ``name``."""
     return {
-        re.split("[/_]", topic)[2].lower(): (heard.messages[topic], heard.message_bytes[topic])
-        for topic in heard.messages
+        re.split("[/_]", topic)[2].lower(): (received.messages[topic], received.message_bytes[topic])
+        for topic in received.messages
         if re.split("[/_]", topic)[1].lower() == name
     }
 
 
 @pytest.mark.netns
 def test_the_gateway_and_the_relay_publish_the_same_number_of_messages_and_bytes() -> None:
-    with Stage(DENSE, subscribers=[(1, 1)], reads=True) as stage:
-        stage.settle(math.inf)  # what was sent until all subscribers were there
-        stage.take()
+    with Workbench(DENSE, subscribers=[(1, 1)], reads=True) as workbench:
+        workbench.settle(math.inf)  # the frames sent while subscribers connected
+        workbench.take_received()
         for name in (GATEWAY, RELAY):
-            stage.pace(name, FRAMES, DENSE.rate_hz)
-        stage.settle(2 * 5 * FRAMES)
-        sides = stage.take()
+            workbench.pace(name, FRAMES, DENSE.rate_hz)
+        workbench.settle(2 * 5 * FRAMES)
+        subscribers = workbench.take_received()
     packet = DENSE.packet()
     expected = {cut.component.key: (FRAMES, FRAMES * (cut.last - cut.first)) for cut in cuts(packet)}
     assert set(expected) == {component.key for component in ComponentType}
-    for heard in sides:
-        assert published(heard, GATEWAY) == expected
-        assert published(heard, RELAY) == expected
+    for received in subscribers:
+        assert published(received, GATEWAY) == expected
+        assert published(received, RELAY) == expected
 
 
 def test_frames_are_numbered_and_stamped_in_every_component() -> None:

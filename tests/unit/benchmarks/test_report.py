@@ -1,4 +1,4 @@
-"""Benchmarks: what their figures say, and that the document says nothing else."""
+"""Tests of the statistics and the report of the benchmarks, and that the document matches the results."""
 
 import json
 from pathlib import Path
@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks import parts, report
-from benchmarks.comparing import Pair, percentile
+from benchmarks.comparison import Pair, percentile
 from benchmarks.report import Table, rendered
 
 
@@ -17,13 +17,13 @@ def test_the_document_has_the_figures_of_the_results() -> None:
     assert rendered(document, parts.sections(report.load(report.RESULTS))) == document
 
 
-def test_the_document_has_a_place_for_every_part() -> None:
+def test_the_document_has_markers_for_every_part() -> None:
     document = report.DOCUMENT.read_text()
     for name in ("goals", "machine", *parts.NAMES):
         assert rendered(document, {name: [Table("A title", ["a"], [["12345"]])]}) != document, name
 
 
-def test_a_section_is_replaced_and_nothing_else() -> None:
+def test_only_the_sections_between_markers_are_replaced() -> None:
     document = "before\n<!-- loss -->\nold\n<!-- end of loss -->\nafter\n"
     table = Table("Lost", ["who", "how many"], [["a", "0"]], "In a minute.")
     expected = "**Lost**\n\n| who | how many |\n|---|---:|\n| a | 0 |\n\nIn a minute."
@@ -32,7 +32,7 @@ def test_a_section_is_replaced_and_nothing_else() -> None:
     assert rendered(new, {"loss": [table]}) == new
 
 
-def test_a_part_measured_again_leaves_the_others(tmp_path: Path) -> None:
+def test_measuring_a_part_again_keeps_the_results_of_the_others(tmp_path: Path) -> None:
     file = tmp_path / "results.json"
     for part, value in (("loss", 1), ("scale", 2), ("loss", 3)):
         report.merge(file, part, {"value": value})
@@ -40,9 +40,9 @@ def test_a_part_measured_again_leaves_the_others(tmp_path: Path) -> None:
     assert json.loads(file.read_text())["loss"]["machine"]["cores"]
 
 
-def test_a_pair_s_ratio_is_that_of_neighbours() -> None:
+def test_the_ratio_of_a_pair_compares_neighbouring_runs() -> None:
     pair = Pair("a", "b")
-    for a, b in ((1, 2), (3, 4), (50, 10)):  # the third pair was measured while all was slow
+    for a, b in ((1, 2), (3, 4), (50, 10)):  # the machine was slow during the third pair
         pair.add("a", a)
         pair.add("b", b)
     assert pair.ratios == [0.5, 0.75, 5.0]
@@ -51,7 +51,9 @@ def test_a_pair_s_ratio_is_that_of_neighbours() -> None:
 
 
 @given(st.lists(st.floats(0, 1e6), min_size=1), st.floats(0.1, 100))
-def test_so_many_per_cent_are_not_above_the_percentile(values: list[float], per_cent: float) -> None:
+def test_the_percentile_is_the_smallest_value_that_enough_values_do_not_exceed(
+    values: list[float], per_cent: float
+) -> None:
     found = percentile(values, per_cent)
     assert found in values
     assert sum(value <= found for value in values) >= len(values) * per_cent / 100 - 1e-9

@@ -1,4 +1,4 @@
-"""The gateway and the bare relay side by side: one sender, both measured, and their subscribers."""
+"""The workbench: a sender, the gateway and the bare relay, both measured, and their subscribers."""
 
 import contextlib
 import math
@@ -11,37 +11,39 @@ from pathlib import Path
 from typing import Any, Final, Self
 
 from benchmarks import processes
-from benchmarks.processes import Program, Worker, zenoh_keys
+from benchmarks.processes import Program, Worker, zenoh_session_config
 from benchmarks.sender import Blast, Paced, Sent, send
-from benchmarks.subscribers import Subscription, subscribe
+from benchmarks.subscribers import Received, Subscription, subscribe
 from benchmarks.workloads import Workload, cuts
 from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name
 from tests.networks import free_port
 
 GATEWAY: Final = "lab"
 RELAY: Final = "raw"
-"""The names of the sources: as long as each other, so that keys and channels are."""
+"""The names of the sources. They have the same length, so that keys and channels do, too."""
 
-PLAIN: Final = "tcp"
-"""A client that is neither, but reads the TCP connection itself."""
+PLAIN_TCP: Final = "tcp"
+"""The name of a client that only reads the TCP connection."""
 
 _BOTH: Final = (GATEWAY, RELAY)
 _FIRST_FRAMES: Final = 20
 
 
 def lcm_url(port: int) -> str:
-    """Return an LCM URL; another port for each who publishes, and ten apart: gateways take the next one, too.
+    """Return an LCM URL with this port.
 
-    Whoever listens on a URL is sent all that anybody sends there, and has the work of sorting it out.
+    Every publisher needs its own port, because a subscriber receives and filters everything sent to its URL.
+    The next port must be free, too: a gateway uses it for queries.
     """
     return f"udpm://239.255.76.67:{port}?ttl=0"
 
 
 @dataclass
-class Stage:
+class Workbench:
     """A context in which the gateway and the relay serve ``subscribers`` on Zenoh, LCM, or both.
 
-    Subscribers are processes of several each: (Zenoh subscribers, LCM subscribers) in each tuple.
+    Each tuple of ``subscribers`` is one process: its number of Zenoh subscribers and of LCM subscribers.
+    If ``routed``, Zenoh sessions connect only to a router. ``reads`` and ``component`` as in Subscription.
     """
 
     workload: Workload
@@ -53,7 +55,7 @@ class Stage:
     component: str = "*"
     clients: Sequence[str] = _BOTH
     programs: dict[str, Program] = field(init=False, default_factory=dict)
-    listeners: list[Worker] = field(init=False, default_factory=list)
+    subscriber_processes: list[Worker] = field(init=False, default_factory=list)
 
     def __enter__(self) -> Self:
         with contextlib.ExitStack() as stack:
@@ -67,14 +69,14 @@ class Stage:
             for name in _BOTH:
                 if name in self.clients:
                     self.programs[name] = stack.enter_context(self._program(name, folder, endpoints))
-            meet = ["router"] if self.routed else [name for name in _BOTH if name in self.clients]
+            reachable = ["router"] if self.routed else [name for name in _BOTH if name in self.clients]
             mode = "client" if self.routed else "peer"
-            keys = zenoh_keys(mode, connect=[endpoints[name] for name in meet])
+            config = zenoh_session_config(mode, connect=[endpoints[name] for name in reachable])
             urls = [self.lcm_urls[name] for name in self.programs]
             for zenoh, lcm in self.subscribers:
-                wanted = Subscription(keys, tuple(urls), zenoh, lcm, self.component, self.reads)
-                self.listeners.append(stack.enter_context(Worker(subscribe, wanted)))
-            self._await_subscribers()
+                wanted = Subscription(config, tuple(urls), zenoh, lcm, self.component, self.reads)
+                self.subscriber_processes.append(stack.enter_context(Worker(subscribe, wanted)))
+            self._wait_for_subscribers()
             self._stack = stack.pop_all()
         return self
 
@@ -83,26 +85,26 @@ class Stage:
 
     def _program(self, name: str, folder: Path, endpoints: dict[str, str]) -> Program:
         if self.routed:
-            keys = zenoh_keys("client", connect=[endpoints["router"]])
+            config = zenoh_session_config("client", connect=[endpoints["router"]])
         else:
-            keys = zenoh_keys("peer", listen=[endpoints[name]])
+            config = zenoh_session_config("peer", listen=[endpoints[name]])
         if name == GATEWAY:
-            return processes.gateway(folder / "gateway.yaml", self._settings(keys))
-        return processes.relay(self._plan(keys))
+            return processes.gateway(folder / "gateway.yaml", self._settings(config))
+        return processes.relay(self._plan(config))
 
-    def _settings(self, keys: dict[str, Any]) -> dict[str, Any]:
+    def _settings(self, zenoh_config: dict[str, Any]) -> dict[str, Any]:
         return {
             "sources": [processes.source(GATEWAY, self.ports[GATEWAY])],
-            "zenoh": {"enabled": self.zenoh, "config": keys},
+            "zenoh": {"enabled": self.zenoh, "config": zenoh_config},
             "lcm": {"enabled": self.lcm, "url": self.lcm_urls[GATEWAY]},
             "metrics": {"port": free_port()},
         }
 
-    def _plan(self, keys: dict[str, Any]) -> dict[str, Any]:
+    def _plan(self, zenoh_config: dict[str, Any]) -> dict[str, Any]:
         return {
             "name": RELAY,
             "port": self.ports[RELAY],
-            "zenoh": keys if self.zenoh else None,
+            "zenoh": zenoh_config if self.zenoh else None,
             "lcm": self.lcm_urls[RELAY] if self.lcm else None,
             "cuts": [
                 (cut.first, cut.last, cut.component.key, lcm_type_name(MESSAGE_TYPES[cut.component]))
@@ -110,30 +112,30 @@ class Stage:
             ],
         }
 
-    def _await_subscribers(self) -> None:
-        """Send frames until every subscriber has heard everyone it is to hear."""
+    def _wait_for_subscribers(self) -> None:
+        """Send frames until every subscriber has received every topic that it should receive."""
         components = 1 if self.component != "*" else len(MESSAGE_TYPES)
-        wanted = components * len(self.programs)
+        topics = components * len(self.programs)
 
-        def all_heard() -> bool:
+        def all_received() -> bool:
             for name in self.programs:
                 self.pace(name, _FIRST_FRAMES, 1000)
-            return all(len(counts) >= wanted for counts in self.heard())
+            return all(len(counts) >= topics for counts in self.received_counts())
 
         try:
-            processes.wait_until(all_heard, f"every subscriber hears {wanted} topics")
+            processes.wait_until(all_received, f"every subscriber receives {topics} topics")
         except TimeoutError as error:
-            error.add_note(f"so far they have had {self.heard()}")
+            error.add_note(f"received so far: {self.received_counts()}")
             raise
         self.settle(math.inf, quiet_s=0.2)
-        self.take()
+        self.take_received()
 
     def blast(self, name: str, frames: int) -> tuple[Sent, float]:
-        """Send as fast as it goes; return what was sent and the CPU time it cost the program, s."""
+        """Send at full speed; return what was sent, and the program's CPU time in s."""
         return self._measured(name, Blast(name, frames))
 
     def pace(self, name: str, frames: int, rate_hz: float) -> tuple[Sent, float]:
-        """Send at a rate; return what was sent and the CPU time it cost the program, s."""
+        """Send at a rate; return what was sent, and the program's CPU time in s."""
         return self._measured(name, Paced(name, frames, rate_hz))
 
     def _measured(self, name: str, request: Blast | Paced) -> tuple[Sent, float]:
@@ -142,17 +144,17 @@ class Stage:
         sent: Sent = self.sender.ask(request)
         return sent, 0.0 if program is None else processes.cpu_s(program.pid) - before_s
 
-    def heard(self) -> list[Counter[str]]:
-        """Return how many messages of each topic every subscriber has had since the last ``take``."""
-        return [counts for listener in self.listeners for counts in listener.ask("heard")]
+    def received_counts(self) -> list[Counter[str]]:
+        """Return how many messages of each topic each subscriber has received since ``take_received``."""
+        return [counts for process in self.subscriber_processes for counts in process.ask("counts")]
 
     def settle(self, messages: float, quiet_s: float = 1.0) -> None:
-        """Return once every subscriber has had so many messages in all, or ``quiet_s`` brought none."""
+        """Wait until each subscriber has received ``messages`` in total, or none arrive for ``quiet_s``."""
         before: list[Counter[str]] = []
-        while (heard := self.heard()) != before and any(each.total() < messages for each in heard):
-            before = heard
+        while (counts := self.received_counts()) != before and any(c.total() < messages for c in counts):
+            before = counts
             time.sleep(quiet_s)
 
-    def take(self) -> list[Any]:
-        """Return what every subscriber heard since the last time, a ``Heard`` each."""
-        return [heard for listener in self.listeners for heard in listener.ask("take")]
+    def take_received(self) -> list[Received]:
+        """Return what each subscriber has received since the last call."""
+        return [received for process in self.subscriber_processes for received in process.ask("take")]

@@ -1,4 +1,4 @@
-"""Part 5: what the gateway takes of its host: CPU, memory at most, and memory over ten minutes."""
+"""Part 5: the gateway's CPU use, its peak memory, and its memory over ten minutes."""
 
 import time
 from typing import Any, Final
@@ -7,34 +7,34 @@ from benchmarks.lab import Lab
 from benchmarks.processes import cpu_s, memory_bytes, peak_memory_bytes
 from benchmarks.report import Goal, Progress, Table
 from benchmarks.sender import Paced
-from benchmarks.stage import GATEWAY, Stage
+from benchmarks.workbench import GATEWAY, Workbench
 from benchmarks.workloads import DENSE
 
-TITLE: Final = "What the gateway takes of its host, with a subscriber on each side"
+TITLE: Final = "CPU and memory of the gateway, with one Zenoh subscriber and one LCM subscriber"
 GOAL_MIB: Final = 2.0
-_SETTLING_S: Final = 20.0
-"""Before the first figure: buffers have grown by then to what they need."""
+_SETTLE_S: Final = 20.0
+"""The wait before the first measurement, in which buffers grow to their final size."""
 
 
 def _plan(quick: bool) -> tuple[int, float, float]:
-    """Return how often memory is looked at, how long there is between, and how long all settles before, s."""
-    return (2, 4.0, 1.0) if quick else (10, 60.0, _SETTLING_S)
+    """Return the number of memory readings, their interval in s, and the wait before them in s."""
+    return (2, 4.0, 1.0) if quick else (10, 60.0, _SETTLE_S)
 
 
 def expected_s(quick: bool) -> float:
-    """Return about how long it takes."""
+    """Return the approximate duration in s."""
     times, period_s, settling_s = _plan(quick)
     return times * period_s + settling_s + 8
 
 
 def measure(quick: bool, progress: Progress) -> dict[str, Any]:
-    """Return the figures of two gateways that run at the same time, one of each workload."""
+    """Return the results of two gateways that run at the same time, one per workload."""
     times, period_s, settling_s = _plan(quick)
-    progress.step("settling", 0)
-    with Lab() as lab, Stage(DENSE, subscribers=[(1, 1)], clients=(GATEWAY,)) as stage:
-        pids = {"lab": lab.gateway.pid, "dense": stage.programs[GATEWAY].pid}
+    progress.step("waiting for buffers to grow", 0)
+    with Lab() as lab, Workbench(DENSE, subscribers=[(1, 1)], clients=(GATEWAY,)) as workbench:
+        pids = {"lab": lab.gateway.pid, "dense": workbench.programs[GATEWAY].pid}
         lasting_s = settling_s + times * period_s + 2
-        stage.sender.send(Paced(GATEWAY, round(lasting_s * DENSE.rate_hz), DENSE.rate_hz))
+        workbench.sender.send(Paced(GATEWAY, round(lasting_s * DENSE.rate_hz), DENSE.rate_hz))
         time.sleep(settling_s)
         began_s = time.monotonic()
         cpu_before_s = {name: cpu_s(pid) for name, pid in pids.items()}
@@ -53,12 +53,12 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
             }
             for name, pid in pids.items()
         }
-        stage.sender.reply()
+        workbench.sender.reply()
     return {"period_s": period_s, "rows": rows}
 
 
 def tables(result: dict[str, Any]) -> list[Table]:
-    """Return what is shown of the figures."""
+    """Return the tables of the result."""
     rows = [
         [
             name,
@@ -69,12 +69,12 @@ def tables(result: dict[str, Any]) -> list[Table]:
         ]
         for name, row in result["rows"].items()
     ]
-    columns = ["workload", "CPU, share of one core", "peak memory MiB", "most less least MiB"]
+    columns = ["workload", "CPU of one core", "peak memory, MiB", "largest − smallest, MiB"]
     return [Table(TITLE, [*columns, f"memory every {result['period_s']:g} s, MiB"], rows)]
 
 
 def goals(result: dict[str, Any]) -> list[Goal]:
-    """Return how flat memory was."""
+    """Return how much the memory varied."""
     most_mib = max(_mib(_growth_bytes(row)) for row in result["rows"].values())
     minutes = result["period_s"] * (len(result["rows"]["lab"]["memory_bytes"]) - 1) / 60
     what = f"memory over {minutes:.1g} minutes" if minutes < 1 else f"memory over {minutes:g} minutes"
