@@ -156,24 +156,24 @@ class Soak:
             f"Random faults for {self.minutes:g} minutes at {RATE_HZ:g} Hz (`make soak SOAK_MINUTES="
             f"{self.minutes:g}`, seed {self.seed}), {datetime.now(UTC):%Y-%m-%d}, version {version_text()}, "
             f"Python {platform.python_version()}, uvloop {version('uvloop')}, {platform.machine()}. "
-            "Each round begins one fault of the simulator (see `rtc3d-gateway simulate --list-faults`), "
-            "ends it 0.3 to 3 s later, and waits for data. "
-            f"The gateway's stall_timeout_s is {STALL_S:g}, its longest wait to reconnect {BACKOFF_S:g} s.",
+            "Each round starts one fault of the simulator (see `rtc3d-gateway simulate --list-faults`), "
+            "ends it 0.3 to 3 s later, and waits until data flows again. "
+            f"The gateway's stall_timeout_s is {STALL_S:g} and its reconnect.max_delay_s is {BACKOFF_S:g}.",
             "",
             "| what | count |",
             "|---|--:|",
             f"| rounds | {len(self.rounds)} |",
-            f"| rounds after which data did not flow again | {sum(r is None for _, r in self.rounds)} |",
+            f"| rounds after which no data flowed | {sum(r is None for _, r in self.rounds)} |",
             f"| reconnects | {stream.reconnects} |",
-            f"| messages that were malformed | {messages.malformed} |",
-            f"| messages published twice | {messages.repeated} |",
+            f"| malformed messages | {messages.malformed} |",
+            f"| messages received twice | {messages.repeated} |",
             f"| memory at the start, MiB | {start_kib / 1024:.1f} |",
             f"| memory at the end, MiB | {end_kib / 1024:.1f} |",
-            f"| memory at most, MiB | {max(self.memory_kib) / 1024:.1f} |",
+            f"| peak memory, MiB | {max(self.memory_kib) / 1024:.1f} |",
             "",
-            "Frames of the simulator and messages at the subscriber, by component. Lost ones were in transit "
-            "on connections that a fault ended, or are counted as drops below. A gap is a sequence number "
-            "that was lost between gateway and subscriber.",
+            "Frames that the simulator sent and messages that the subscriber received, by component. Lost "
+            "frames were in transit on connections that a fault ended, or are counted as drops below. A gap "
+            "is a sequence number that was lost between gateway and subscriber.",
             "",
             "| component | sent | received | lost | gaps |",
             "|---|--:|--:|--:|--:|",
@@ -192,8 +192,8 @@ class Soak:
                 for count in output.drops
             ),
             "",
-            "How long after the end of a fault data flowed again, including the time that the gateway needed "
-            "to notice the fault and waited before it reconnected:",
+            "The time from the end of a fault until data flowed again. It includes the time that the gateway "
+            "took to notice the fault and waited to reconnect:",
             "",
             "| fault | rounds | median s | longest s |",
             "|---|--:|--:|--:|",
