@@ -1,9 +1,9 @@
-"""Environment variables that stand over a configuration file, for containers.
+"""Environment variables that override the configuration file, for containers.
 
-``RTC3D_GATEWAY__LCM__URL`` sets ``lcm.url``, ``RTC3D_GATEWAY__SOURCES__0__HOST`` the first source's
-``host``: two underscores go one level down, a number is the index in a list, and the value is YAML, as
-it would stand in the file. Names with one underscore after the program's are others': Kubernetes sets
-RTC3D_GATEWAY_SERVICE_HOST where a service has that name.
+``RTC3D_GATEWAY__LCM__URL`` sets ``lcm.url``, and ``RTC3D_GATEWAY__SOURCES__0__HOST`` sets the ``host`` of
+the first source. Two underscores separate levels, and a number is an index in a list. The value is YAML, as
+in the file. Variables with a single underscore after RTC3D_GATEWAY are ignored, because Kubernetes sets some:
+RTC3D_GATEWAY_SERVICE_HOST, for example, if a service has the name rtc3d-gateway.
 """
 
 import re
@@ -18,20 +18,20 @@ VARIABLE_PREFIX: Final = "RTC3D_GATEWAY__"
 
 
 def variable_name(location: Location) -> str:
-    """Return the name of the variable that sets the value that ``location`` leads to."""
+    """Return the name of the variable that sets the value at ``location``."""
     return VARIABLE_PREFIX + "__".join(str(step).upper() for step in location)
 
 
 def apply_overrides(document: Document, environ: Mapping[str, str]) -> None:
-    """Set in ``document`` what the variables say, each variable as the position of what it sets.
+    """Set the values of the variables in ``document``, with the variable's name as their position.
 
-    Raises ConfigError, the variable as its position, for a name that leads nowhere, or a value that is no
-    YAML. Whether keys and values are accepted is seen later, as with those of the file.
+    Raises ConfigError with the variable's name if the name does not lead to a place for a value, or if the
+    value is not valid YAML. Unknown keys and invalid values are found later, together with those of the file.
     """
     if not isinstance(document.values, dict):
-        return  # a file of something else, which will be told
+        return  # validation reports that the file does not hold a mapping
     names = [name for name in environ if name.startswith(VARIABLE_PREFIX)]
-    # A mapping comes before its keys, and list items in order: a variable may add the next one.
+    # Sort mappings before their keys, and list items by index, because a variable may append an item.
     for name in sorted(names, key=lambda name: [step.zfill(9) for step in _steps(name)]):
         _Override(document, name).set(environ[name])
 
@@ -45,7 +45,7 @@ def _holds(container: Any, key: Any) -> bool:
 
 
 class _Override:
-    """One variable on its way into the document."""
+    """One variable, to be set in the document."""
 
     def __init__(self, document: Document, name: str) -> None:
         self._document = document
@@ -55,7 +55,7 @@ class _Override:
     def set(self, text: str) -> None:
         if not all(self._steps):
             raise self._position.error(
-                (), f"names no key; expected a name such as {variable_name(('lcm', 'url'))}"
+                (), f"does not name a key; expected a name such as {variable_name(('lcm', 'url'))}"
             )
         container = self._document.values
         location: Location = ()
@@ -71,7 +71,7 @@ class _Override:
             container = container[key]
 
     def _key(self, container: object, location: Location, step: str) -> Any:
-        """Return ``step`` as the key or index in ``container``, the value that ``location`` leads to."""
+        """Return ``step`` as a key or index of ``container``, the value at ``location``."""
         match container:
             case dict():
                 return step
@@ -85,7 +85,7 @@ class _Override:
         position = self._document.nearest_position(location)
         raise self._position.error(
             location,
-            f"this value has no keys, it is {describe(container)} ({position}); "
+            f"this value is {describe(container)} ({position}), which has no keys; "
             f"set the whole value with {variable_name(location)}",
         )
 
@@ -103,7 +103,7 @@ class _Override:
             all_positions.update({(*location, *inner): position for inner, position in new_positions.items()})
 
     def _read(self, text: str, location: Location) -> Document:
-        """Return the variable's value; a secret is text as it stands, whatever YAML would make of it."""
+        """Return the value of the variable. A secret is taken literally, not as YAML."""
         if not is_secret_key(location[-1]):
             read = read_yaml(text, self._position.origin, has_lines=False)
             return Document(read.values, {(): self._position, **read.positions}, read.key_positions)

@@ -1,4 +1,4 @@
-"""Settings from YAML files and environment variables; every mistake is reported with its position."""
+"""Read settings from YAML files and environment variables. Every mistake is reported with its position."""
 
 import json
 import os

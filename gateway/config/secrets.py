@@ -1,6 +1,6 @@
-"""What is secret in a configuration, and how it is kept out of sight.
+"""Finding and masking the secrets in a configuration.
 
-Zenoh's own keys hold the secrets there are: passwords, and private keys as text. Their paths are none.
+Secrets are the passwords and private keys in Zenoh's own keys. The path of a key's file is not a secret.
 """
 
 import re
@@ -8,13 +8,13 @@ from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
 MASK: Final = "***"
-"""What stands where a secret is."""
+"""The text that replaces a secret."""
 
 _SECRET_KEY: Final = re.compile(r"(?:.*_)?(?:password|passphrase|secret|private_key_(?:pem|base64|raw))")
-# Zenoh keeps what is below this key, in a plugin's configuration, out of its admin space.
+# Zenoh does not show what is below this key of a plugin's configuration in its admin space.
 _PRIVATE: Final = "private"
 
-# An endpoint may carry configuration: tls/lab:7447#connect_private_key_base64=…;….
+# An endpoint may contain configuration: tls/lab:7447#connect_private_key_base64=…;….
 _IN_ENDPOINT: Final = re.compile(r"((?:password|private_key_(?:raw|base64|pem))=)[^;\s\"'\])]+")
 _IN_URL: Final = re.compile(r"(://[^/\s:@]*:)[^/\s@]+(?=@)")
 _PEM: Final = re.compile(
@@ -25,12 +25,12 @@ _Steps = tuple[str | int, ...]
 
 
 def is_secret_key(key: object) -> bool:
-    """Return whether the value of ``key`` is a secret, whatever it looks like."""
+    """Return whether the value of ``key`` is a secret, whatever the value is."""
     return isinstance(key, str) and (key == _PRIVATE or _SECRET_KEY.fullmatch(key.lower()) is not None)
 
 
 def find_secrets(value: Any, location: _Steps = ()) -> Iterator[tuple[_Steps, Any]]:
-    """Yield each secret in nested mappings and lists, with the keys and indices that lead to it."""
+    """Yield each secret in nested mappings and lists, with its location."""
     match value:
         case Mapping():
             for key, item in value.items():
@@ -47,7 +47,10 @@ def find_secrets(value: Any, location: _Steps = ()) -> Iterator[tuple[_Steps, An
 
 
 def file_key_for(key: object) -> str:
-    """Return the key that takes the path of what ``key`` takes as text: connect_private_key, …; or ""."""
+    """Return the key for the path of the file instead of its content, such as connect_private_key.
+
+    Returns "" if there is no such key.
+    """
     match str(key).rpartition("_"):
         case (stem, "_", "base64"):
             return stem
@@ -72,7 +75,7 @@ def mask_secrets(value: Any) -> Any:
 
 
 def mask_secrets_in_text(text: str) -> str:
-    """Return ``text`` with MASK for passwords in URLs, for keys in endpoints, and for keys as PEM."""
+    """Return ``text`` with MASK for passwords in URLs, keys in endpoints, and keys in PEM format."""
     text = _PEM.sub(MASK, text)
     text = _IN_ENDPOINT.sub(rf"\g<1>{MASK}", text)
     return _IN_URL.sub(rf"\g<1>{MASK}", text)

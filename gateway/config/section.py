@@ -1,4 +1,4 @@
-"""The base class of all parts of the configuration: frozen, and with error texts of its own."""
+"""The base class of all parts of the configuration: frozen, and with the gateway's error texts."""
 
 import difflib
 from collections.abc import Iterable, Mapping
@@ -77,7 +77,7 @@ def expects(what: str) -> WrapValidator:
         except ValidationError as error:
             first = error.errors(include_url=False)[0]
             if first["loc"]:
-                raise  # the error is in an item of the value, which has a text of its own
+                raise  # the error is in an item of the value, and already has its own text
             unquoted = first["type"] == "string_type" and isinstance(value, bool | int | float)
             hint = " (use quotes to make it text)" if unquoted else ""
             raise validation_error(f"found {describe(value)}{hint}; expected {what}") from None

@@ -78,7 +78,7 @@ class SourceSettings(Section):
     """One RTC3D server and how to stream from it."""
 
     name: SourceName
-    """The name of this source in keys and channels. Channels have it in upper case, with '_' for '-'."""
+    """The name of this source in keys and channels. In channels, it is in upper case, and '-' becomes '_'."""
 
     host: Host
     """The host name or IP address of the server."""

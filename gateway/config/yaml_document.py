@@ -1,4 +1,7 @@
-"""YAML text to plain values, and the position of each: for errors, and to tell where a value came from."""
+"""Convert YAML text to plain values with their positions.
+
+Errors and ``config show`` use the positions.
+"""
 
 import re
 from dataclasses import dataclass
@@ -10,25 +13,25 @@ from gateway.config.section import describe
 from gateway.errors import ConfigError
 
 MAX_VALUES: Final = 10_000
-"""How many values a text may hold; what an alias repeats counts again."""
+"""The maximum number of values in a text. Values that an alias repeats count again."""
 
 MAX_DEPTH: Final = 32
-"""How many levels of values may be nested."""
+"""The maximum number of nested levels."""
 
 MAX_NUMBER_LENGTH: Final = 40
-"""How many characters a number may have."""
+"""The maximum number of characters in a number."""
 
 Location = tuple[str | int, ...]
-"""The keys and indices that lead to a value: ("sources", 0, "port")."""
+"""The keys and indices that lead to a value, such as ("sources", 0, "port")."""
 
 _YAML: Final = "tag:yaml.org,2002:"
 
 
 class Position(NamedTuple):
-    """Where a key or value stands: in a file, or in what has no lines, such as an environment variable.
+    """The position of a key or value in a file, or the name of an environment variable.
 
-    ``origin`` is the file's path or the variable's name. ``line`` and ``column`` count from 1; both are
-    0 where there are none.
+    ``origin`` is the path of the file or the name of the variable. ``line`` and ``column`` count from 1. Both
+    are 0 for variables.
     """
 
     origin: str
@@ -44,13 +47,13 @@ class Position(NamedTuple):
         return f"{self.origin}:{self.line}" if self.line else self.origin
 
     def error(self, location: Location, text: str) -> ConfigError:
-        """Return the error with this position, the key that ``location`` leads to, and ``text``."""
+        """Return an error with this position, the key at ``location``, and ``text``."""
         key = key_path(location)
         return ConfigError(f"{self}: {key}{': ' if key else ''}{text}")
 
 
 class _Loader(yaml.SafeLoader):
-    """Makes nodes as SafeLoader does, nested to MAX_DEPTH only: it recurses, and Python's stack ends."""
+    """A SafeLoader that limits nesting to MAX_DEPTH, because deep recursion would overflow the stack."""
 
     _depth = 0
 
@@ -66,30 +69,30 @@ class _Loader(yaml.SafeLoader):
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """The values of one YAML document, mappings with keys of text, and the position of each value and key."""
+    """The values of one YAML document, and the position of each value and key. All keys are text."""
 
     values: Any
     positions: dict[Location, Position]
     key_positions: dict[Location, Position]
 
     def nearest_position(self, location: Location) -> Position:
-        """Return where the value is; where it would belong if it is missing or a default."""
+        """Return the position of the value, or of the nearest mapping or list around it if it is missing."""
         while location not in self.positions:
             location = location[:-1]
         return self.positions[location]
 
 
 def read_yaml(text: str, origin: str, *, has_lines: bool = True) -> Document:
-    """Return the document in ``text``; one that holds nothing at all has the value None and no positions.
+    """Return the document in ``text``. An empty document has the value None and no positions.
 
-    Raises ConfigError with the position of the first mistake. ``origin`` begins every position; without
-    ``has_lines`` it is all of it.
+    Raises ConfigError with the position of the first mistake. Positions consist of ``origin``, line and
+    column, or of ``origin`` alone if ``has_lines`` is false.
     """
     return _Reader(origin, has_lines).read(text)
 
 
 class _Reader:
-    """Reads one document: mappings, lists, texts, numbers, truth values and None."""
+    """Reads one document: mappings, lists, text, numbers, booleans and None."""
 
     def __init__(self, origin: str, has_lines: bool) -> None:
         self._origin = origin
@@ -109,7 +112,7 @@ class _Reader:
             root = loader.get_single_node()
         except yaml.MarkedYAMLError as error:
             raise self._not_yaml(error, loader.get_mark()) from None
-        except (ValueError, OverflowError):  # from chr() and int() within PyYAML
+        except (ValueError, OverflowError):  # raised by chr() and int() in PyYAML
             position = self._position_of(loader.get_mark())
             raise position.error((), "not YAML: a number here is out of range") from None
         values = None if root is None else self._value(root, ())
@@ -127,10 +130,8 @@ class _Reader:
                 return self._mapping(node, location)
             case yaml.SequenceNode(), "seq":
                 return [self._value(item, (*location, index)) for index, item in enumerate(node.value)]
-            case (
-                yaml.ScalarNode(),
-                "str" | "timestamp" | "value" | "merge",
-            ):  # a source may be named 2026-06-01
+            # A timestamp is text, because a source may be named 2026-06-01.
+            case yaml.ScalarNode(), "str" | "timestamp" | "value" | "merge":
                 return self._text(node, location)
             case yaml.ScalarNode(), "bool" | "int" | "float":
                 return self._number(node, location)
@@ -158,13 +159,13 @@ class _Reader:
         if len(node.value) <= MAX_NUMBER_LENGTH:
             try:
                 return yaml.constructor.SafeConstructor().construct_object(node)
-            except (ValueError, LookupError):  # such as 0x_, or a text that is tagged !!int or !!bool
+            except (ValueError, LookupError):  # such as 0x_, or text with the tag !!int or !!bool
                 pass
         text = f"found {describe(node.value)}; expected a number of at most {MAX_NUMBER_LENGTH} characters"
         raise self._position_of(node.start_mark).error(location, text)
 
     def _text(self, node: yaml.ScalarNode, location: Location) -> str:
-        """Return a key or a text; half a surrogate pair, which an escape can write, is none."""
+        """Return a key or text. Raises ConfigError for half a surrogate pair, which an escape can produce."""
         text: str = node.value
         if not is_encodable(text):
             found = f"found {describe(text)}; expected text that UTF-8 can encode"
@@ -187,7 +188,7 @@ class _Reader:
 
 
 def is_encodable(text: str) -> bool:
-    """Return whether ``text`` has no half of a surrogate pair, which cannot be printed or encoded."""
+    """Return whether UTF-8 can encode ``text``. It cannot encode half a surrogate pair."""
     try:
         text.encode()
     except UnicodeEncodeError:
@@ -207,6 +208,6 @@ def key_path(location: Location) -> str:
 
 
 def line_and_column_after(text: str) -> tuple[int, int]:
-    """Return line and column, both from 1, of what follows ``text``."""
+    """Return the line and column directly after ``text``, both counted from 1."""
     lines = text.split("\n")
     return len(lines), len(lines[-1]) + 1

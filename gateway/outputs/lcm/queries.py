@@ -92,8 +92,8 @@ class LcmQueries:
     @staticmethod
     def _new_sender(url: str) -> LcmSender | LcmThreadSender:
         if scheme_of(url) in BLOCKING_SCHEMES:
-            return LcmThreadSender(url, lambda: None)
-        return LcmSender(url, None, lambda: None)
+            return LcmThreadSender(url, lambda: None, "replies")
+        return LcmSender(url, None, lambda: None, "replies")
 
     def start(self) -> None:
         """Receive requests. Called in any thread, after the output has opened."""

@@ -25,13 +25,16 @@ class LcmSender:
     """One LCM object for the schemes that publish without blocking: multicast, or in memory.
 
     ``shared`` is an existing LCM object to use, because memq:// connects only users of one object.
-    ``on_open`` is called after LCM has opened.
+    ``on_open`` is called after LCM has opened. ``what`` names the messages in the log.
     """
 
-    def __init__(self, url: str, shared: lcm.LCM | None, on_open: Callable[[], None]) -> None:
+    def __init__(
+        self, url: str, shared: lcm.LCM | None, on_open: Callable[[], None], what: str = "messages"
+    ) -> None:
         self.problem = NOT_OPEN
         """Why nothing can be sent now, and what to do; "" if it can."""
         self._url = url
+        self._what = what
         self._shared = shared
         self._on_open = on_open
         self._lcm: lcm.LCM | None = None
@@ -49,7 +52,7 @@ class LcmSender:
             self._retry_at_s = time.monotonic() + RETRY_S
         else:
             self.problem = ""
-            self._opening.succeeded(f"sending to {self._url}")
+            self._opening.succeeded(f"sending {self._what} to {self._url}")
             self._on_open()
 
     def send(self, channel: str, message: bytes) -> None:
@@ -64,7 +67,7 @@ class LcmSender:
             raise OutputError(self.problem, cause="send failed") from error
         if self._sending.failing:
             self.problem = ""
-            self._sending.recovered(f"sending to {self._url}")
+            self._sending.recovered(f"sending {self._what} to {self._url}")
 
     def maintain(self) -> None:
         """Try to open LCM again, RETRY_S after an attempt that failed."""

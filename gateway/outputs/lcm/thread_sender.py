@@ -26,13 +26,14 @@ class LcmThreadSender:
     """Opens LCM and publishes in a thread, from a bounded queue. It has the methods of LcmSender.
 
     A peer that accepts the connection but never reads blocks only this thread. ``on_open`` is called in the
-    thread after LCM has opened.
+    thread after LCM has opened. ``what`` names the messages in the log.
     """
 
-    def __init__(self, url: str, on_open: Callable[[], None]) -> None:
+    def __init__(self, url: str, on_open: Callable[[], None], what: str = "messages") -> None:
         self.problem = NOT_OPEN
         """Why nothing can be sent now, and what to do; "" if it can."""
         self._url = url
+        self._what = what
         self._on_open = on_open
         self._lcm: lcm.LCM | None = None
         self._queue: deque[tuple[str, bytes]] = deque()
@@ -112,7 +113,7 @@ class LcmThreadSender:
                 return None
             self._lcm = connection
             self.problem = ""
-            self._opening.succeeded(f"sending to {self._url}")
+            self._opening.succeeded(f"sending {self._what} to {self._url}")
             self._on_open()
             return connection
         return None
@@ -126,4 +127,4 @@ class LcmThreadSender:
         else:
             if self._sending.failing:
                 self.problem = ""
-                self._sending.recovered(f"sending to {self._url}")
+                self._sending.recovered(f"sending {self._what} to {self._url}")

@@ -161,8 +161,8 @@ MISTAKES: list[tuple[str, str, str]] = [
     (
         "SOURCES__0__STREAMS__0__RATE__DIVISOR",
         "2",
-        "SOURCES__0__STREAMS__0__RATE__DIVISOR: sources[0].streams[0].rate: this value has no keys, it is "
-        "'all' (lab.yaml:5:34); set the whole value with SOURCES__0__STREAMS__0__RATE",
+        "SOURCES__0__STREAMS__0__RATE__DIVISOR: sources[0].streams[0].rate: this value is "
+        "'all' (lab.yaml:5:34), which has no keys; set the whole value with SOURCES__0__STREAMS__0__RATE",
     ),
     (
         "LCM",
@@ -171,8 +171,8 @@ MISTAKES: list[tuple[str, str, str]] = [
         "'<stream end>'; check indentation, colons, quotes and brackets here",
     ),
     ("LCM__URL", "\udcff", "LCM__URL: found the character U+DCFF, which YAML does not allow"),
-    ("", "1", ": names no key; expected a name such as LCM__URL"),
-    ("LCM__", "1", "LCM__: names no key; expected a name such as LCM__URL"),
+    ("", "1", ": does not name a key; expected a name such as LCM__URL"),
+    ("LCM__", "1", "LCM__: does not name a key; expected a name such as LCM__URL"),
     (
         "ZENOH__CONFIG__MODES",
         "peer",

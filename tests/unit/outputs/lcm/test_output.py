@@ -133,7 +133,7 @@ def test_it_is_opened_again_once_it_can_be(tmp_path: Path, caplog: pytest.LogCap
     # Closing frees the object, which writes what it still held.
     assert [(event.channel, event.data) for event in lcm.EventLog(str(log))] == [("MOCAP_LAB_3D", b"message")]
     assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.INFO]
-    assert caplog.messages[1].startswith(f"lcm: sending to file://{log}?mode=w, after ")
+    assert caplog.messages[1].startswith(f"lcm: sending messages to file://{log}?mode=w, after ")
 
 
 @pytest.mark.parametrize("url", ["memq://", "file:///x?mode=w", "tcpq://127.0.0.1:7700", "nosuch://"])
@@ -191,4 +191,4 @@ def test_a_route_lost_and_found_is_told_once_each(caplog: pytest.LogCaptureFixtu
     output.close()
     assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.INFO]
     assert caplog.messages[0].startswith(f"lcm: no multicast to {url}: ")
-    assert caplog.messages[1].startswith(f"lcm: sending to {url}, after ")
+    assert caplog.messages[1].startswith(f"lcm: sending messages to {url}, after ")
