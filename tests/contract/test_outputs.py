@@ -2,157 +2,19 @@
 
 import itertools
 from collections.abc import Iterator
-from typing import Protocol
 
-import lcm
 import pytest
-import zenoh
 
 from gateway.errors import OutputError
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import Output, Publisher
-from gateway.outputs.lcm.output import LcmOutput
-from gateway.outputs.lcm.settings import LcmSettings
-from gateway.outputs.lcm.subscriber import LcmSubscriber
-from gateway.outputs.memory import MemoryOutput
-from gateway.outputs.zenoh.output import ZenohOutput
-from gateway.outputs.zenoh.settings import ZenohSettings
-from gateway.outputs.zenoh.subscriber import ZenohSubscriber
-from tests.networks import (
-    add_multicast_route,
-    free_endpoint,
-    lcm_url,
-    open_zenoh,
-    remove_multicast_route,
-    zenoh_keys,
-)
+from tests.contract.rigs import ANALOG, MARKERS, PROBE, LcmRelayRig, LcmRig, MemoryRig, Rig, ZenohRig
 from tests.waiting import wait_until
-
-MARKERS = Topic("lab", ("3d",), "rtc3d.markers_t")
-ANALOG = Topic("lab", ("analog",), "rtc3d.analog_t")
-PROBE = Topic("hall-2", ("6d", "Probe 1"), "rtc3d.tool_pose_t")
-
-
-class Rig(Protocol):
-    """An output and the network around it, which is whole at first."""
-
-    @property
-    def output(self) -> Output: ...
-
-    @property
-    def names(self) -> dict[Topic, str]:
-        """What the network calls each topic."""
-
-    @property
-    def remedies(self) -> tuple[str, ...]:
-        """What ``health`` says to do when the network is cut: one of these."""
-
-    @property
-    def received(self) -> list[tuple[str, bytes]]:
-        """Names and messages that came out of the network since ``listen``."""
-
-    def listen(self) -> None:
-        """Begin to receive all that the output sends."""
-
-    def cut(self) -> None:
-        """Make the output unable to send."""
-
-    def mend(self) -> None:
-        """Make the network whole again; the output has to find out."""
-
-    def close(self) -> None:
-        """Clear the network away."""
-
-
-class MemoryRig:
-    remedies = ("start it",)
-
-    def __init__(self) -> None:
-        self.names = {MARKERS: "lab/3d", ANALOG: "lab/analog", PROBE: "hall-2/6d/Probe 1"}
-        self.output = MemoryOutput()
-
-    @property
-    def received(self) -> list[tuple[str, bytes]]:
-        return [("/".join((topic.source, *topic.path)), message) for topic, message in self.output.messages]
-
-    def listen(self) -> None: ...
-
-    def cut(self) -> None:
-        self.output.is_open = False
-
-    def mend(self) -> None:
-        self.output.is_open = True
-
-    def close(self) -> None: ...
-
-
-class ZenohRig:
-    """A client whose router comes and goes."""
-
-    remedies = ("start zenohd", "is the router running")
-
-    def __init__(self) -> None:
-        self.names = {
-            MARKERS: "mocap/lab/3d",
-            ANALOG: "mocap/lab/analog",
-            PROBE: "mocap/hall-2/6d/Probe%201",
-        }
-        self._endpoint = free_endpoint()
-        self._router = open_zenoh("router", listen=self._endpoint)
-        self._session: zenoh.Session | None = None
-        self.received: list[tuple[str, bytes]] = []
-        self.output = ZenohOutput(ZenohSettings(config=zenoh_keys("client", connect=self._endpoint)))
-
-    def listen(self) -> None:
-        self._session = open_zenoh("client", connect=self._endpoint)
-        self._listener = ZenohSubscriber(self._session, "mocap/**", lambda *each: self.received.append(each))
-
-    def cut(self) -> None:
-        self._router.close()
-
-    def mend(self) -> None:
-        self._router = open_zenoh("router", listen=self._endpoint)
-
-    def close(self) -> None:
-        if self._session is not None:
-            self._session.close()
-        self._router.close()
-
-
-class LcmRig:
-    """UDP multicast whose route comes and goes."""
-
-    remedies = ("ip route add 224.0.0.0/4",)
-
-    def __init__(self) -> None:
-        self.names = {
-            MARKERS: "MOCAP_LAB_3D",
-            ANALOG: "MOCAP_LAB_ANALOG",
-            PROBE: "MOCAP_HALL_2_6D_PROBE_1",
-        }
-        self._url = lcm_url()
-        self._listener: LcmSubscriber | None = None
-        self.received: list[tuple[str, bytes]] = []
-        self.output = LcmOutput(LcmSettings(url=self._url))
-
-    def listen(self) -> None:
-        self._listener = LcmSubscriber(lcm.LCM(self._url), ".*", lambda *each: self.received.append(each))
-
-    def cut(self) -> None:
-        remove_multicast_route()
-
-    def mend(self) -> None:
-        add_multicast_route()
-
-    def close(self) -> None:
-        if self._listener is not None:
-            self._listener.close()
-        self.mend()
-
 
 NETWORKED = [
     pytest.param(ZenohRig, id="zenoh"),
-    pytest.param(LcmRig, id="lcm", marks=pytest.mark.netns),
+    pytest.param(LcmRig, id="lcm-multicast", marks=pytest.mark.netns),
+    pytest.param(LcmRelayRig, id="lcm-relay"),
 ]
 without_memory = pytest.mark.parametrize("rig", NETWORKED, indirect=True)
 
@@ -167,19 +29,19 @@ def rig(request: pytest.FixtureRequest) -> Iterator[Rig]:
         rig.close()
 
 
-def connected(output: Output) -> bool:
-    """Return whether the output can send, after what the gateway does once a second."""
+def can_send(output: Output) -> bool:
+    """Call ``maintain``, as the gateway does once a second; return whether the output can send."""
     output.maintain()
     return output.health().connected
 
 
 def open_output(rig: Rig) -> None:
     rig.output.start()
-    wait_until(lambda: connected(rig.output))
+    wait_until(lambda: can_send(rig.output))
 
 
-def heard_publisher(rig: Rig, topic: Topic) -> Publisher:
-    """Return a publisher that the rig hears from its first message on."""
+def subscribed_publisher(rig: Rig, topic: Topic) -> Publisher:
+    """Return a publisher whose first message already reaches the rig's subscriber."""
     publisher = rig.output.publisher(topic)
     wait_until(lambda: publisher.wanted)
     return publisher
@@ -193,7 +55,7 @@ def refused(publisher: Publisher, message: bytes = b"refused") -> OutputError:
     return caught.value
 
 
-def says_what_to_do(rig: Rig) -> bool:
+def health_names_remedy(rig: Rig) -> bool:
     health = rig.output.health()
     return not health.connected and any(remedy in health.problem for remedy in rig.remedies)
 
@@ -221,10 +83,10 @@ class Sending:
 # Sending -------------------------------------------------------------------------------------
 
 
-def test_messages_arrive_as_they_are_in_order_under_their_own_name(rig: Rig) -> None:
+def test_messages_arrive_unchanged_and_in_order_under_their_own_name(rig: Rig) -> None:
     open_output(rig)
-    rig.listen()
-    publishers = {topic: heard_publisher(rig, topic) for topic in (MARKERS, ANALOG, PROBE)}
+    rig.subscribe()
+    publishers = {topic: subscribed_publisher(rig, topic) for topic in (MARKERS, ANALOG, PROBE)}
     sent: dict[str, list[bytes]] = {rig.names[topic]: [] for topic in publishers}
     for number in range(20):
         for topic, publisher in publishers.items():
@@ -237,11 +99,11 @@ def test_messages_arrive_as_they_are_in_order_under_their_own_name(rig: Rig) -> 
     assert len(rig.received) == 60
 
 
-def test_a_publisher_made_before_opening_sends_after_it(rig: Rig) -> None:
+def test_a_publisher_created_before_opening_sends_afterwards(rig: Rig) -> None:
     early = rig.output.publisher(MARKERS)
     open_output(rig)
-    rig.listen()
-    late = heard_publisher(rig, ANALOG)
+    rig.subscribe()
+    late = subscribed_publisher(rig, ANALOG)
     wait_until(lambda: early.wanted)
     early.publish(b"early")
     late.publish(b"late")
@@ -249,16 +111,16 @@ def test_a_publisher_made_before_opening_sends_after_it(rig: Rig) -> None:
     assert sorted(rig.received) == [(rig.names[MARKERS], b"early"), (rig.names[ANALOG], b"late")]
 
 
-def test_nobody_need_listen(rig: Rig) -> None:
+def test_publishing_needs_no_subscriber(rig: Rig) -> None:
     open_output(rig)
-    rig.output.publisher(MARKERS).publish(b"into the void")
+    rig.output.publisher(MARKERS).publish(b"to nobody")
     assert rig.output.health().connected
 
 
-def test_a_closed_publisher_refuses_and_the_others_go_on(rig: Rig) -> None:
+def test_a_closed_publisher_refuses_messages_and_the_others_still_send(rig: Rig) -> None:
     open_output(rig)
-    rig.listen()
-    closed, other = heard_publisher(rig, MARKERS), heard_publisher(rig, ANALOG)
+    rig.subscribe()
+    closed, other = subscribed_publisher(rig, MARKERS), subscribed_publisher(rig, ANALOG)
     closed.close()
     assert refused(closed).cause == "closed"
     other.publish(b"still here")
@@ -266,12 +128,12 @@ def test_a_closed_publisher_refuses_and_the_others_go_on(rig: Rig) -> None:
     assert rig.received == [(rig.names[ANALOG], b"still here")]
 
 
-def test_a_topic_given_up_can_be_taken_up_again_under_the_same_name(rig: Rig) -> None:
+def test_a_new_publisher_gets_the_name_of_a_closed_one(rig: Rig) -> None:
     open_output(rig)
-    rig.listen()
-    first = heard_publisher(rig, PROBE)
+    rig.subscribe()
+    first = subscribed_publisher(rig, PROBE)
     first.close()
-    second = heard_publisher(rig, PROBE)
+    second = subscribed_publisher(rig, PROBE)
     first.close()
     assert refused(first).cause == "closed"
     second.publish(b"again")
@@ -282,7 +144,7 @@ def test_a_topic_given_up_can_be_taken_up_again_under_the_same_name(rig: Rig) ->
 # Life cycle ----------------------------------------------------------------------------------
 
 
-def test_before_opening_messages_are_refused_and_health_says_why(rig: Rig) -> None:
+def test_before_opening_messages_are_refused_and_health_has_the_reason(rig: Rig) -> None:
     publisher = rig.output.publisher(MARKERS)
     health = rig.output.health()
     assert not health.connected
@@ -295,7 +157,7 @@ def test_an_open_output_is_healthy(rig: Rig) -> None:
     assert rig.output.health().problem == ""
 
 
-def test_after_closing_messages_are_refused_and_health_says_why(rig: Rig) -> None:
+def test_after_closing_messages_are_refused_and_health_has_the_reason(rig: Rig) -> None:
     open_output(rig)
     publisher = rig.output.publisher(MARKERS)
     rig.output.close()
@@ -305,13 +167,13 @@ def test_after_closing_messages_are_refused_and_health_says_why(rig: Rig) -> Non
     assert refused(rig.output.publisher(ANALOG)).cause == "not open"
 
 
-def test_closing_is_safe_from_any_state(rig: Rig) -> None:
+def test_an_output_that_was_never_started_can_be_closed_twice(rig: Rig) -> None:
     rig.output.close()
     rig.output.close()
     assert not rig.output.health().connected
 
 
-def test_closing_again_is_safe_for_output_and_publisher(rig: Rig) -> None:
+def test_closing_an_output_or_a_publisher_twice_is_safe(rig: Rig) -> None:
     open_output(rig)
     publisher = rig.output.publisher(MARKERS)
     rig.output.close()
@@ -329,56 +191,56 @@ def test_a_closed_output_stays_closed(rig: Rig) -> None:
     assert not rig.output.health().connected
 
 
-def test_sources_can_be_shown_in_any_state(rig: Rig) -> None:
+def test_sources_can_be_announced_and_withdrawn_in_any_state(rig: Rig) -> None:
     def show() -> None:
         rig.output.announce("lab")
-        for flowing in (True, True, False, False, True):
-            rig.output.show_streaming("lab", flowing)
+        for is_streaming in (True, True, False, False, True):
+            rig.output.show_streaming("lab", is_streaming)
         rig.output.withdraw("lab")
 
     show()
     open_output(rig)
     show()
-    assert connected(rig.output)
+    assert can_send(rig.output)
     rig.output.close()
     show()
 
 
-# Healing -------------------------------------------------------------------------------------
+# Reconnecting -------------------------------------------------------------------------------------
 
 
 @without_memory
-def test_without_a_network_starting_raises_nothing_and_health_says_what_to_do(rig: Rig) -> None:
+def test_without_a_network_starting_raises_nothing_and_health_health_names_remedy(rig: Rig) -> None:
     rig.cut()
     rig.output.start()
     refused(rig.output.publisher(MARKERS))
-    assert says_what_to_do(rig)
+    assert health_names_remedy(rig)
 
 
 @without_memory
-def test_an_output_started_without_a_network_sends_once_there_is_one(rig: Rig) -> None:
+def test_an_output_started_without_a_network_sends_once_the_network_works(rig: Rig) -> None:
     rig.cut()
     rig.output.start()
     publisher = rig.output.publisher(MARKERS)
-    rig.mend()
-    wait_until(lambda: connected(rig.output))
-    rig.listen()
+    rig.restore()
+    wait_until(lambda: can_send(rig.output))
+    rig.subscribe()
     wait_until(lambda: publisher.wanted)
-    publisher.publish(b"at last")
+    publisher.publish(b"the first")
     wait_until(lambda: rig.received)
-    assert rig.received == [(rig.names[MARKERS], b"at last")]
+    assert rig.received == [(rig.names[MARKERS], b"the first")]
 
 
-def test_a_network_lost_is_told_and_messages_go_out_again_once_it_is_back(rig: Rig) -> None:
+def test_a_lost_network_is_reported_and_messages_leave_again_once_it_is_back(rig: Rig) -> None:
     open_output(rig)
-    rig.listen()
-    sending = Sending(heard_publisher(rig, MARKERS))
+    rig.subscribe()
+    sending = Sending(subscribed_publisher(rig, MARKERS))
     assert not sending.is_refused()
     rig.cut()
     wait_until(sending.is_refused)
-    assert says_what_to_do(rig)
+    assert health_names_remedy(rig)
 
-    rig.mend()
+    rig.restore()
     before = len(sending.accepted)
 
     def arrives() -> bool:

@@ -20,7 +20,7 @@ from gateway.log import FailureLog, log_fields
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.contract import QueryService, ServerParameters
-from gateway.outputs.lcm.connection import BLOCKING_SCHEMES, open_lcm, scheme_of
+from gateway.outputs.lcm.connection import BLOCKING_SCHEMES, open_lcm, scheme_of, send_problem
 from gateway.outputs.lcm.sender import RETRY_S, LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.thread_sender import LcmThreadSender
@@ -124,6 +124,8 @@ class LcmQueries:
 
     def _receive(self) -> None:
         connection = self._open()
+        if connection is not None and self._reply_sender is not self._sender:
+            self._reply_sender.open()
         while connection is not None and not self._closing.is_set():
             self._subscribe(connection)
             try:
@@ -131,6 +133,8 @@ class LcmQueries:
             except OSError as error:
                 logger.debug("receiving LCM requests: %s", error)
                 self._closing.wait(_POLL_MS / 1000)
+                if scheme_of(self._url) == "tcpq":
+                    self._reconnect(connection)
 
     def _open(self) -> lcm.LCM | None:
         """Return the LCM object that receives requests, with retries; None if ``close`` is called first."""
@@ -141,12 +145,27 @@ class LcmQueries:
                 self._opening.failed(f"no requests can be received: {error} (this is lcm.queries_url)")
                 self._closing.wait(RETRY_S)
                 continue
-            if self._reply_sender is not self._sender:
-                self._reply_sender.open()
-            if self._opening.failing:
-                self._opening.recovered("requests can be received")
+            self._opening.recovered("requests can be received")
             return connection
         return None
+
+    def _reconnect(self, connection: lcm.LCM) -> None:
+        """Connect to the relay again; LCM then renews its subscriptions.
+
+        LCM does this when it publishes, but not when it waits for messages: so an empty message goes to a
+        channel without subscribers. A new LCM object is no alternative, because freeing the lost one would
+        connect, too, and stop every other thread of the gateway meanwhile.
+        """
+        while not self._closing.is_set():
+            try:
+                connection.publish(f"{self._prefix}_RECONNECTED", b"")
+            except OSError as error:
+                problem = send_problem(self._url, error)
+                self._opening.failed(f"no requests can be received: {problem} (this is lcm.queries_url)")
+                self._closing.wait(RETRY_S)
+            else:
+                self._opening.recovered("requests can be received")
+                return
 
     def _subscribe(self, connection: lcm.LCM) -> None:
         """Subscribe to requests about the sources that are new."""

@@ -1,5 +1,6 @@
 """Subscribing to a gateway's messages on LCM, for ``echo``, the demo and tests."""
 
+import logging
 import re
 import threading
 from typing import Final
@@ -15,6 +16,8 @@ QUEUE_MESSAGES: Final = 10_000
 """With LCM's own default, 30, messages are lost whenever this process pauses for a moment."""
 
 _POLL_MS: Final = 100
+
+logger = logging.getLogger(__name__)
 
 
 def channel_pattern(prefix: str, source: str | None, component: str | None) -> str:
@@ -33,19 +36,26 @@ class LcmSubscriber:
         self._lcm = connection
         self._subscription = connection.subscribe(channels, receive)
         self._subscription.set_queue_capacity(QUEUE_MESSAGES)
+        self._is_connected = True
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._receive, name="lcm-subscriber", daemon=True)
         self._thread.start()
 
     def _receive(self) -> None:
         while not self._stop.is_set():
-            self._lcm.handle_timeout(_POLL_MS)
+            try:
+                self._lcm.handle_timeout(_POLL_MS)
+            except OSError as error:
+                logger.warning("lcm: the connection is lost, so no more messages arrive: %s", error)
+                self._is_connected = False
+                return
 
     def close(self) -> None:
         """End the thread and unsubscribe."""
         self._stop.set()
         self._thread.join()
-        self._lcm.unsubscribe(self._subscription)
+        if self._is_connected:  # LCM would connect again first, and let no other thread run meanwhile
+            self._lcm.unsubscribe(self._subscription)
 
 
 def subscribe(request: SubscriptionRequest, receive: Receive) -> LcmSubscriber:

@@ -91,8 +91,9 @@ class ZenohQueries:
             declared = self._declared.pop(source, None)
         if declared is not None:
             declared.queryable.undeclare()
-            declared.publisher.undeclare()  # type: ignore[no-untyped-call] # Zenoh's stub has no types here
             declared.subscriber_watch.undeclare()
+            # The thread may be sending on this one, and Zenoh refuses to undeclare it meanwhile.
+            self._sender.submit(declared.publisher.undeclare)
 
     def _declare(self, session: zenoh.Session, source: str) -> _Declared:
         key = zenoh_key(self._prefix, source)

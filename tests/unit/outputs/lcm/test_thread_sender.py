@@ -1,0 +1,290 @@
+"""The sender for tcpq and file, with an LCM object that blocks and fails on request."""
+
+import logging
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from gateway.errors import OutputError
+from gateway.outputs.lcm import thread_sender
+from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN
+from gateway.outputs.lcm.thread_sender import LcmThreadSender
+from tests.lcm_relay import LcmRelay
+from tests.waiting import wait_until
+
+URL = "tcpq://192.0.2.9:7700"
+FULL = f"{URL} does not take messages fast enough; check the peer of lcm.url"
+
+
+class FakeLcm:
+    """Stands for LCM: ``opens`` and ``reads`` block the calls, ``error`` makes ``publish`` fail."""
+
+    def __init__(self) -> None:
+        self.opens = threading.Event()
+        self.reads = threading.Event()
+        self.opens.set()
+        self.reads.set()
+        self.open_error: OutputError | None = None
+        self.error: OSError | None = None
+        self.num_tried = 0
+        self.is_publishing = threading.Event()
+        self.published: list[tuple[str, bytes]] = []
+
+    def open(self, _url: str) -> "FakeLcm":
+        self.opens.wait()
+        if self.open_error is not None:
+            raise self.open_error
+        return self
+
+    def publish(self, channel: str, message: bytes) -> None:
+        self.is_publishing.set()
+        self.reads.wait()
+        self.num_tried += 1
+        if self.error is not None:
+            raise self.error
+        self.published.append((channel, message))
+
+
+@pytest.fixture
+def lcm(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeLcm]:
+    fake = FakeLcm()
+    monkeypatch.setattr(thread_sender, "open_lcm", fake.open)
+    monkeypatch.setattr(thread_sender, "RETRY_S", 0.001)
+    monkeypatch.setattr(thread_sender, "_JOIN_S", 0.01)
+    yield fake
+    fake.opens.set()
+    fake.reads.set()
+
+
+@pytest.fixture
+def sender(lcm: FakeLcm, monkeypatch: pytest.MonkeyPatch) -> Iterator[LcmThreadSender]:
+    """Return an open sender, whose ``close`` waits for the thread as long as it takes."""
+    sender = LcmThreadSender(URL, lambda: None)
+    sender.open()
+    wait_until(lambda: not sender.problem)
+    yield sender
+    lcm.reads.set()
+    lcm.error = None
+    monkeypatch.setattr(thread_sender, "_JOIN_S", 10.0)
+    sender.close()
+
+
+def send(sender: LcmThreadSender, *messages: bytes) -> None:
+    for message in messages:
+        sender.send("CHANNEL", message)
+
+
+def refusal(sender: LcmThreadSender, message: bytes = b"refused") -> OutputError:
+    with pytest.raises(OutputError) as caught:
+        sender.send("CHANNEL", message)
+    return caught.value
+
+
+def messages(lcm: FakeLcm) -> list[bytes]:
+    return [message for _, message in lcm.published]
+
+
+def block(lcm: FakeLcm, sender: LcmThreadSender) -> None:
+    """Block the thread in its first message, which stays queued."""
+    lcm.reads.clear()
+    send(sender, b"first")
+    assert lcm.is_publishing.wait(10)
+
+
+def test_messages_are_published_in_order_on_their_channels(lcm: FakeLcm, sender: LcmThreadSender) -> None:
+    sent = [(f"CHANNEL_{number}", bytes([number])) for number in range(50)]
+    for channel, message in sent:
+        sender.send(channel, message)
+    wait_until(lambda: len(lcm.published) == 50)
+    assert lcm.published == sent
+
+
+# The queue -----------------------------------------------------------------------------------
+
+
+def test_the_queue_is_limited_in_messages(
+    lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(thread_sender, "MAX_QUEUED_MESSAGES", 3)
+    block(lcm, sender)
+    send(sender, b"second", b"third")
+    error = refusal(sender)
+    assert (error.cause, str(error)) == ("queue full", FULL)
+    lcm.reads.set()
+    wait_until(lambda: len(lcm.published) == 3)
+    assert messages(lcm) == [b"first", b"second", b"third"]
+
+
+def test_the_queue_is_limited_in_bytes(
+    lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(thread_sender, "MAX_QUEUED_BYTES", 100)
+    block(lcm, sender)
+    send(sender, bytes(95))
+    assert refusal(sender, b"x").cause == "queue full"
+    lcm.reads.set()
+    wait_until(lambda: len(lcm.published) == 2)
+    wait_until(lambda: not sender._queue)
+    send(sender, bytes(100))  # the bytes of published messages no longer count
+    assert refusal(sender, bytes(101)).cause == "queue full"
+
+
+def test_a_full_queue_is_a_problem_until_the_peer_reads_again(
+    lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(thread_sender, "MAX_QUEUED_MESSAGES", 1)
+    block(lcm, sender)
+    assert sender.problem == ""
+    refusal(sender)
+    assert sender.problem == FULL
+    lcm.reads.set()
+    wait_until(lambda: not sender._queue)
+    send(sender, b"second")
+    assert sender.problem == ""
+    wait_until(lambda: messages(lcm) == [b"first", b"second"])
+
+
+@pytest.mark.usefixtures("no_hold")
+def test_a_full_queue_and_its_end_are_logged_once(
+    lcm: FakeLcm,
+    sender: LcmThreadSender,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO, "gateway.outputs")
+    monkeypatch.setattr(thread_sender, "MAX_QUEUED_MESSAGES", 1)
+    block(lcm, sender)
+    for _ in range(3):
+        refusal(sender)
+    lcm.reads.set()
+    wait_until(lambda: not sender._queue)
+    send(sender, b"second")
+    wait_until(lambda: not sender._queue)
+    send(sender, b"third")
+    assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.INFO]
+    assert caplog.messages[0] == f"lcm: {FULL}"
+    assert caplog.messages[1].startswith("lcm: the peer reads again, after ")
+
+
+# Failures ------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("no_hold")
+def test_a_message_that_fails_is_sent_again_and_others_are_refused_meanwhile(
+    lcm: FakeLcm, sender: LcmThreadSender, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "gateway.outputs")
+    lcm.error = BrokenPipeError("of the test")
+    send(sender, b"first")
+    wait_until(lambda: lcm.num_tried >= 3)
+    error = refusal(sender)
+    assert (error.cause, str(error)) == ("send failed", sender.problem)
+    assert sender.problem == f"LCM did not send to {URL}: of the test; check lcm.url"
+    lcm.error = None
+    wait_until(lambda: not sender.problem)
+    send(sender, b"second")
+    wait_until(lambda: messages(lcm) == [b"first", b"second"])
+    assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.INFO]
+    assert caplog.messages[1].startswith(f"lcm: sending messages to {URL}, after ")
+
+
+def test_opening_is_tried_again_until_it_succeeds(lcm: FakeLcm, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG, "gateway.outputs")
+    opened = threading.Event()
+    sender = LcmThreadSender(URL, opened.set)
+    assert (refusal(sender).cause, sender.problem) == ("not open", NOT_OPEN)
+    lcm.open_error = OutputError("nobody listens; start the relay", cause="not open")
+    sender.open()
+    wait_until(lambda: len(caplog.records) >= 3)
+    assert (refusal(sender).cause, sender.problem) == ("not open", "nobody listens; start the relay")
+    assert not opened.is_set()
+    lcm.open_error = None
+    assert opened.wait(10)
+    send(sender, b"message")
+    sender.close()
+    assert messages(lcm) == [b"message"]
+    levels = [record.levelno for record in caplog.records]
+    assert (levels[0], levels[-1], set(levels[1:-1])) == (logging.WARNING, logging.INFO, {logging.DEBUG})
+
+
+def test_while_opening_takes_long_the_problem_names_the_url(lcm: FakeLcm) -> None:
+    lcm.opens.clear()
+    sender = LcmThreadSender(URL, lambda: None)
+    sender.open()
+    error = refusal(sender)
+    assert (error.cause, str(error)) == ("not open", f"LCM has not opened {URL} yet; check lcm.url")
+    assert sender.problem == str(error)
+    sender.close()
+
+
+# Closing -------------------------------------------------------------------------------------
+
+
+def test_closing_sends_what_is_queued(
+    lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(thread_sender, "_JOIN_S", 10.0)
+    block(lcm, sender)
+    send(sender, b"second", b"third")
+    threading.Timer(0.01, lcm.reads.set).start()
+    sender.close()
+    assert messages(lcm) == [b"first", b"second", b"third"]
+    assert sender.problem == CLOSED
+    assert (refusal(sender).cause, str(refusal(sender))) == ("not open", CLOSED)
+    assert not caplog.records
+
+
+def test_closing_does_not_wait_for_a_blocked_peer_and_logs_the_loss(
+    lcm: FakeLcm, sender: LcmThreadSender, caplog: pytest.LogCaptureFixture
+) -> None:
+    block(lcm, sender)
+    send(sender, b"second")
+    sender.close()
+    assert caplog.messages == [f"lcm: closing with 2 messages that {URL} did not take"]
+    lcm.reads.set()
+    wait_until(lambda: not sender._thread.is_alive())
+    assert (messages(lcm), sender.problem) == ([b"first"], CLOSED)
+
+
+def test_closing_ends_the_attempts_to_send_again(lcm: FakeLcm, sender: LcmThreadSender) -> None:
+    lcm.error = BrokenPipeError("of the test")
+    send(sender, b"first")
+    wait_until(lambda: sender.problem)
+    sender.close()
+    wait_until(lambda: not sender._thread.is_alive())
+    assert sender.problem == CLOSED
+
+
+def test_what_opens_only_after_closing_is_not_used(lcm: FakeLcm) -> None:
+    opened: list[bool] = []
+    lcm.opens.clear()
+    sender = LcmThreadSender(URL, lambda: opened.append(True))
+    sender.open()
+    sender.close()
+    lcm.opens.set()
+    wait_until(lambda: not sender._thread.is_alive())
+    assert (opened, sender.problem) == ([], CLOSED)
+    assert refusal(sender).cause == "not open"
+
+
+# With a real relay ---------------------------------------------------------------------------
+
+
+def test_a_relay_that_reads_again_gets_every_message_that_was_accepted() -> None:
+    relay = LcmRelay()
+    sender = LcmThreadSender(relay.url, lambda: None)
+    sender.open()
+    wait_until(lambda: not sender.problem)
+    relay.stop_reading()
+    accepted = 0
+    while not sender.problem:
+        try:
+            send(sender, bytes(100_000))
+        except OutputError:
+            break
+        accepted += 1
+    relay.read_again()
+    wait_until(lambda: relay.num_published == accepted)
+    sender.close()
+    relay.close()
