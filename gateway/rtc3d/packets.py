@@ -112,22 +112,27 @@ class PacketReader:
         """
         if self.error is not None:
             return []
+        packets: list[Packet] = []
+        used = 0
         if self._partial:
-            self._partial += data
+            # Copy only what completes the packet; a read can contain a hundred more, which are cut in place.
+            # If even the header is incomplete, copy the whole read: an error quotes the bytes after a header.
+            missing = self._partial_goal - len(self._partial)
+            used = len(data) if self._partial_goal == PACKET_HEADER_BYTES else min(missing, len(data))
+            self._partial += data[:used]
             if len(self._partial) < self._partial_goal:
                 return []
-            data = bytes(self._partial)
+            completed = bytes(self._partial)
             self._partial.clear()
-        packets, used = self._cut(data)
+            self._cut(completed, 0, packets)
         if used < len(data):
-            self._partial += data[used:]
+            self._cut(data, used, packets)
         return packets
 
-    def _cut(self, data: bytes) -> tuple[list[Packet], int]:
-        """Return the complete packets at the start of ``data``, and how many of its bytes they take."""
-        packets: list[Packet] = []
+    def _cut(self, data: bytes, first: int, packets: list[Packet]) -> None:
+        """Append the complete packets in ``data`` from offset ``first``; keep the rest in ``_partial``."""
         available = len(data)
-        start = 0
+        start = first
         # Struct's methods return Any. Annotated as int, compiled code compares and slices with C integers.
         size: int
         packet_type: int
@@ -136,8 +141,9 @@ class PacketReader:
             limit = self._max_c3d_bytes if packet_type == _C3D else self._max_packet_bytes
             if not PACKET_HEADER_BYTES <= size <= limit:
                 begin = data[start : start + _MAX_BEGIN_BYTES]
-                self.error = _size_error(size, packet_type, self._offset + start, limit, begin)
-                return packets, available
+                offset = self._offset + start - first
+                self.error = _size_error(size, packet_type, offset, limit, begin)
+                return
             end = start + size
             if end > available:
                 self._partial_goal = size
@@ -146,8 +152,9 @@ class PacketReader:
             start = end
         else:
             self._partial_goal = PACKET_HEADER_BYTES
-        self._offset += start
-        return packets, start
+        self._offset += start - first
+        if start < available:
+            self._partial += data[start:]
 
 
 def _size_error(size: int, packet_type: int, offset: int, limit: int, first_bytes: bytes) -> PacketError:

@@ -285,6 +285,21 @@ def test_the_memory_of_a_large_packet_is_freed() -> None:
     assert held < 100_000
 
 
+def test_a_long_read_after_an_incomplete_packet_is_not_copied_as_a_whole() -> None:
+    packet = encode_packet(PacketType.DATA, bytes(1992))
+    reader = PacketReader()
+    reader.feed(packet[:1000])
+    rest = packet[1000:] + packet * 500 + packet[:10]
+    tracemalloc.start()
+    try:
+        packets = reader.feed(rest)
+        held, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert (len(packets), reader.buffered_bytes) == (501, 10)
+    assert peak - held < len(rest) / 10
+
+
 # Text of bodies -------------------------------------------------------------------------------
 
 
