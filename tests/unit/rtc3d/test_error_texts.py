@@ -4,10 +4,12 @@ import struct
 
 import pytest
 
-from gateway.errors import CommandError, FrameError
+from gateway.errors import CommandError, FrameError, ParametersError
 from gateway.rtc3d.commands import parse_command
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import PacketReader
+from gateway.rtc3d.parameters import General, Parameters
+from gateway.rtc3d.parameters_xml import MAX_XML_BYTES, parse_parameters
 
 
 def size_error(header: bytes) -> str:
@@ -104,4 +106,39 @@ def test_a_component_whose_size_and_count_contradict_each_other(num_items: int, 
     announced = num_items if size == 24 else 0
     assert frame_error((b"\0\0\0\1" + component).hex()) == (
         f"3d component of {size} bytes announces {announced} items"
+    )
+
+
+def parameters_error(xml: bytes) -> str:
+    with pytest.raises(ParametersError) as caught:
+        parse_parameters(xml)
+    return str(caught.value)
+
+
+def test_parameters_that_are_too_large() -> None:
+    assert parameters_error(b"x" * (MAX_XML_BYTES + 1)) == (
+        f"the server's parameters take {MAX_XML_BYTES + 1} bytes, above the limit of {MAX_XML_BYTES}: "
+        "this is not an RTC3D server, or it is faulty; check host and port"
+    )
+
+
+def test_parameters_of_exactly_the_largest_size_are_read() -> None:
+    start, end = b"<RT_Parameters><General>", b"</General></RT_Parameters>"
+    xml = start + b" " * (MAX_XML_BYTES - len(start) - len(end)) + end
+    assert len(xml) == MAX_XML_BYTES
+    assert parse_parameters(xml).parameters == Parameters(general=General())
+
+
+def test_parameters_with_entities() -> None:
+    assert parameters_error(b"<!DOCTYPE x [<!ENTITY e 'metre'>]><RT_Parameters/>") == (
+        "the server's parameters declare XML entities, which RTC3D does not have, so they are not read; "
+        "check host and port"
+    )
+
+
+@pytest.mark.parametrize(("length", "ending"), [(60, "'"), (61, "'…")])
+def test_xml_without_parameters_is_shown_up_to_60_characters(length: int, ending: str) -> None:
+    assert parameters_error(b"x" * length) == (
+        f"the server's XML has no parameters but begins with '{'x' * 60}{ending}; "
+        "check host and port, and that this is an RTC3D server"
     )
