@@ -1,0 +1,137 @@
+"""The doctor's findings about LCM, word for word."""
+
+import pytest
+
+from gateway.findings import Finding, MessageLoad, Result
+from gateway.outputs.lcm import checks
+from gateway.outputs.lcm.checks import charged_bytes, check_lcm
+from gateway.outputs.lcm.settings import LcmSettings
+from tests.networks import lcm_url
+
+LOADS = (MessageLoad(rate_hz=100.0, largest_bytes=8000), MessageLoad(rate_hz=50.0, largest_bytes=1000))
+URL = "udpm://239.255.76.67:7667?ttl=0"
+
+
+def found(url: str, *loads: MessageLoad) -> tuple[Finding, Finding]:
+    route, buffers = check_lcm(LcmSettings(url=url), ("lab",), loads, 0.1)
+    return route, buffers
+
+
+@pytest.fixture
+def buffer_bytes(monkeypatch: pytest.MonkeyPatch) -> dict[int | None, int]:
+    """What the kernel grants for each size that a socket requests; None requests nothing."""
+    granted: dict[int | None, int] = {None: 212_992, 2**30: 425_984}
+    monkeypatch.setattr(checks, "receive_buffer_bytes", granted.__getitem__)
+    return granted
+
+
+def test_memory_needs_neither_multicast_nor_a_buffer() -> None:
+    assert found("memq://", *LOADS) == (
+        Finding("lcm", "route", Result.PASSING, "memq:// does not need multicast"),
+        Finding("lcm", "buffers", Result.NOT_TESTED, "memq does not need a receive buffer"),
+    )
+
+
+def test_a_relay_that_does_not_run_fails() -> None:
+    route, buffers = found("tcpq://127.0.0.1:9")
+    assert route == Finding(
+        "lcm",
+        "route",
+        Result.FAILING,
+        "LCM does not open tcpq://127.0.0.1:9: Couldn't create LCM",
+        "Start LCM's TCP relay, or correct lcm.url.",
+    )
+    assert buffers.found == "tcpq does not need a receive buffer"
+
+
+@pytest.mark.netns
+@pytest.mark.parametrize(
+    ("query", "found_text"),
+    [
+        ("", "works and stays on this computer (ttl=0)"),
+        ("?ttl=0", "works and stays on this computer (ttl=0)"),
+        ("?ttl=1", "works, with ttl=1"),
+        ("?recv_buf_size=9&ttl=12", "works, with ttl=12"),
+    ],
+)
+def test_multicast_that_works_passes_with_its_reach(query: str, found_text: str) -> None:
+    address = lcm_url().partition("?")[0]
+    route, _ = found(address + query)
+    name = address.removeprefix("udpm://")
+    assert route == Finding("lcm", "route", Result.PASSING, f"multicast to {name} {found_text}")
+
+
+@pytest.mark.netns
+def test_the_group_of_lcm_is_named_if_the_url_has_none() -> None:
+    route, _ = found("udpm://?ttl=0")
+    assert route.found == "multicast to the default group works and stays on this computer (ttl=0)"
+
+
+@pytest.mark.netns
+def test_a_url_that_lcm_rejects_fails() -> None:
+    route, _ = found("udpm://not-an-address:7667")
+    assert route == Finding(
+        "lcm",
+        "route",
+        Result.FAILING,
+        "LCM does not open udpm://not-an-address:7667: Couldn't create LCM",
+        "Correct lcm.url.",
+    )
+
+
+def test_a_remedy_begins_with_a_capital_letter_and_keeps_its_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checks, "multicast_problem", lambda url: f"no multicast to {url}; add; a route")
+    route, _ = found(URL)
+    assert route == Finding("lcm", "route", Result.FAILING, f"no multicast to {URL}", "Add; a route.")
+
+
+@pytest.mark.netns
+class TestBuffers:
+    def test_a_pause_of_20_ms_must_fit(self, buffer_bytes: dict[int | None, int]) -> None:
+        # 2 messages of 16640 bytes and 1 of 2304, of which the kernel has granted exactly as much.
+        assert (charged_bytes(8000), charged_bytes(1000)) == (16_640, 2_304)
+        needed = 2 * 16_640 + 2_304
+        text = (
+            "a subscriber's receive buffer has 35 KiB; a pause of 20 ms needs 35 KiB, "
+            "with messages of up to 8000 bytes"
+        )
+        buffer_bytes[None] = needed
+        assert found(URL, *LOADS)[1] == Finding("lcm", "buffers", Result.PASSING, text)
+        buffer_bytes[None] = needed - 1
+        assert found(URL, *LOADS)[1] == Finding(
+            "lcm",
+            "buffers",
+            Result.FAILING,
+            text,
+            f"Add recv_buf_size={needed // 2} to the LCM URL of every subscriber.",
+        )
+
+    def test_two_of_the_largest_messages_must_fit_however_rare(
+        self, buffer_bytes: dict[int | None, int]
+    ) -> None:
+        rare = MessageLoad(rate_hz=1.0, largest_bytes=8000)
+        buffer_bytes[None] = 2 * 16_640
+        assert found(URL, rare)[1].result is Result.PASSING
+        buffer_bytes[None] = 2 * 16_640 - 1
+        assert found(URL, rare)[1].result is Result.FAILING
+
+    def test_a_limit_of_the_kernel_is_named_with_the_command_that_raises_it(
+        self, buffer_bytes: dict[int | None, int]
+    ) -> None:
+        buffer_bytes |= {None: 100, 2**30: 2 * 16_640 + 2_304}
+        assert "sysctl" not in found(URL, *LOADS)[1].remedy
+        buffer_bytes[2**30] -= 1
+        assert found(URL, *LOADS)[1].remedy == (
+            "Add recv_buf_size=17792 to the LCM URL of every subscriber, and allow it on their computers: "
+            "sysctl -w net.core.rmem_max=17792."
+        )
+
+    def test_the_size_that_the_url_requests_is_checked(self, buffer_bytes: dict[int | None, int]) -> None:
+        buffer_bytes[50_000] = 100_000
+        _, buffers = found(f"{URL}&recv_buf_size=50000", *LOADS)
+        assert buffers.found.startswith("a subscriber's receive buffer has 98 KiB; ")
+
+    def test_without_frames_nothing_is_tested(self) -> None:
+        assert found(URL)[1] == Finding(
+            "lcm", "buffers", Result.NOT_TESTED, "no frames arrived, so the sizes of messages are unknown"
+        )
