@@ -46,6 +46,7 @@ class Connection(asyncio.Transport):
         self.commands: list[str] = []
         self.is_open = True
         self.got_eof = False
+        self.num_recording_packets = 0
 
     # The client's side.
 
@@ -58,6 +59,8 @@ class Connection(asyncio.Transport):
             size, packet_type = struct.unpack_from(">II", data)
             if packet_type == 1:
                 self._on_command(data[8:size].decode("ascii"))
+            elif packet_type == 3:  # field note 16
+                self.num_recording_packets += 1
             data = data[size:]
 
     def write_eof(self) -> None:
