@@ -1,0 +1,409 @@
+"""A whole gateway in virtual time: its life cycle, and what a reload changes and keeps."""
+
+import asyncio
+import dataclasses
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.config.settings import MetricsSettings, Settings, SourceSettings, SpoolSettings
+from gateway.errors import ConfigError
+from gateway.gateway import Gateway
+from gateway.messages.decode import decode
+from gateway.outputs.contract import Output
+from gateway.outputs.kind import SubscriptionRequest
+from gateway.outputs.memory import MemoryOutput
+from gateway.outputs.registry import OUTPUTS, settings_type
+from gateway.rtc3d.components import ComponentType
+from tests.example_output import EXAMPLE, UNREACHABLE, ExampleOutput, ExampleSettings, ExampleSubscription
+from tests.servers import packet
+from tests.unit.scripted_sources import Servers, SlowThreads, use_scripted_servers
+from tests.unit.stream.scripted_server import XML
+from tests.unit.stream.virtual_time import settle, until
+
+REFUSED = "refused"
+
+
+class RecordingOutput(ExampleOutput):
+    """Appends its start and its end to the ``events`` of its class."""
+
+    events: list[tuple[str, str]] = []  # noqa: RUF012 - a fixture replaces it for each test
+
+    def __init__(self, settings: ExampleSettings) -> None:
+        if settings.address == REFUSED:
+            raise ConfigError("example.address is refused")
+        super().__init__(settings)
+
+    def start(self) -> None:
+        self.events.append(("start", self.settings.address))
+        super().start()
+
+    async def stop_queries(self) -> None:
+        self.events.append(("stop queries", self.settings.address))
+        await super().stop_queries()
+
+    def close(self) -> None:
+        self.events.append(("close", self.settings.address))
+        super().close()
+
+
+class OtherOutput(RecordingOutput):
+    """A second output, with other commands."""
+
+    name = "other"
+    commands = {}  # noqa: RUF012 - it is never changed
+
+
+@pytest.fixture(autouse=True)
+def events(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
+    """Register the outputs; return what happens to them."""
+    events: list[tuple[str, str]] = []
+    monkeypatch.setattr(RecordingOutput, "events", events)
+    monkeypatch.setitem(OUTPUTS, "example", dataclasses.replace(EXAMPLE, create=RecordingOutput))
+    monkeypatch.setitem(OUTPUTS, "other", dataclasses.replace(EXAMPLE, name="other", create=OtherOutput))
+    return events
+
+
+@pytest.fixture(autouse=True)
+async def servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
+    """Connect all sources to scripted servers, by the name of their host."""
+    return use_scripted_servers(monkeypatch)
+
+
+@pytest.fixture(autouse=True)
+async def threads() -> SlowThreads:
+    return SlowThreads()
+
+
+def settings(*sources: str, example: str = "local", other: str | None = None, **sections: Any) -> Settings:
+    """Return settings with these sources, each NAME or NAME@HOST, and the addresses of the outputs."""
+    names = [source.partition("@") for source in sources or ("lab",)]
+    section = ExampleSettings(enabled=True, address=example)
+    return settings_type().model_validate(
+        {
+            "sources": [SourceSettings(name=name, host=host or name) for name, _, host in names],
+            "zenoh": {"enabled": False},
+            "lcm": {"enabled": False},
+            "metrics": MetricsSettings(enabled=False),
+            "example": section,
+            "other": section.model_copy(update={"enabled": other is not None, "address": other or ""}),
+            **sections,
+        }
+    )
+
+
+@asynccontextmanager
+async def running(
+    settings: Settings, outputs: list[Output] | None = None
+) -> AsyncIterator[tuple[Gateway, asyncio.Event]]:
+    """Run a gateway until the block ends; the event stops it earlier."""
+    gateway = Gateway(settings, outputs)
+    stop = asyncio.Event()
+    task = asyncio.create_task(gateway.run(stop))
+    await gateway.opened.wait()
+    yield gateway, stop
+    stop.set()
+    await task
+
+
+async def connected(gateway: Gateway) -> None:
+    await until(lambda: all(each.session for source in gateway.sources for each in source.supervisors))
+    await settle()
+
+
+def example(gateway: Gateway, index: int = 0) -> ExampleOutput:
+    output = gateway.outputs[index]
+    assert isinstance(output, ExampleOutput)
+    return output
+
+
+def subscribe(address: str, *, component: str = "3d") -> list[Any]:
+    """Return a list that collects the messages published at an address."""
+    messages: list[Any] = []
+    request = SubscriptionRequest(component=component)
+    ExampleSubscription(address, request, lambda _, message: messages.append(decode(message)))
+    return messages
+
+
+# Life cycle ----------------------------------------------------------------------------------
+
+
+async def test_outputs_start_before_sources_connect_and_close_after_bye(
+    servers: Servers, events: list[tuple[str, str]]
+) -> None:
+    async with running(settings(other="elsewhere")) as (gateway, _):
+        assert events == [("start", "local"), ("start", "elsewhere")]
+        assert not servers["lab"].connections
+        await connected(gateway)
+    assert servers["lab"].connection.commands[-1] == "Bye"
+    assert sorted(events[2:]) == sorted(
+        (event, address) for event in ("stop queries", "close") for address in ("local", "elsewhere")
+    )
+
+
+async def test_sources_start_although_an_output_does_not_open(servers: Servers) -> None:
+    loop = asyncio.get_running_loop()
+    begin_s = loop.time()
+    async with running(settings(example=UNREACHABLE)) as (gateway, _):
+        assert loop.time() - begin_s == pytest.approx(2.0, abs=0.1)
+        await connected(gateway)
+        assert servers["lab"].connection.is_open
+
+
+async def test_stopping_while_outputs_open_closes_them(
+    servers: Servers, events: list[tuple[str, str]]
+) -> None:
+    gateway = Gateway(settings(example=UNREACHABLE))
+    stop = asyncio.Event()
+    task = asyncio.create_task(gateway.run(stop))
+    await settle()
+    stop.set()
+    await task
+    assert events[-1] == ("close", UNREACHABLE)
+    assert not servers["lab"].connections
+
+
+async def test_outputs_are_maintained_and_status_is_published_every_second() -> None:
+    statuses = subscribe("local", component="status")
+    async with running(settings()) as (gateway, _):
+        output = example(gateway)
+        await asyncio.sleep(0.9)
+        assert (output.num_maintained, len(statuses)) == (0, 0)
+        await asyncio.sleep(3.0)
+        assert (output.num_maintained, len(statuses)) == (3, 3)
+    await asyncio.sleep(3.0)
+    assert (output.num_maintained, len(statuses)) == (3, 3)
+
+
+async def test_outputs_are_closed_although_a_source_has_a_defect(
+    events: list[tuple[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gateway = Gateway(settings())
+
+    async def fail() -> None:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(gateway.sources[0], "run", fail)
+    with pytest.raises(ExceptionGroup):
+        await gateway.run(asyncio.Event())
+    assert events[-1] == ("close", "local")
+
+
+async def test_outputs_call_their_commands_and_queries_through_one_service() -> None:
+    async with running(settings(other="elsewhere")) as (gateway, _):
+        for index in (0, 1):
+            answer = await example(gateway, index).query("lab/greet", name="the operator")
+            assert answer.payload == b"lab greets the operator"
+            assert decode((await example(gateway, index).query("lab/status")).payload).source == "lab"
+
+
+async def test_parameters_and_files_reach_every_output(servers: Servers, tmp_path: Path) -> None:
+    spool = SpoolSettings(directory=str(tmp_path))
+    async with running(settings(other="elsewhere", spool=spool)) as (gateway, _):
+        await connected(gateway)
+        servers["lab"].connection.send(packet(5, b"a file"))
+        await settle()
+        for index in (0, 1):
+            assert [(name, each.xml) for name, each in example(gateway, index).parameters] == [
+                ("lab", XML[8:])
+            ]
+            assert [(name, each["bytes"]) for name, each in example(gateway, index).files] == [("lab", 6)]
+
+
+# Reloading outputs ---------------------------------------------------------------------------
+
+
+async def test_equal_settings_change_nothing(servers: Servers, events: list[tuple[str, str]]) -> None:
+    async with running(settings()) as (gateway, _):
+        await connected(gateway)
+        outputs, sources = list(gateway.outputs), list(gateway.sources)
+        assert await gateway.reload(settings()) == []
+        assert (list(gateway.outputs), list(gateway.sources)) == (outputs, sources)
+        assert events == [("start", "local")]
+        assert len(servers["lab"].connections) == 1
+        assert servers["lab"].connection.is_open
+
+
+async def test_a_changed_output_is_replaced_and_its_numbers_continue(
+    servers: Servers, events: list[tuple[str, str]]
+) -> None:
+    before, after = subscribe("local"), subscribe("new")
+    async with running(settings(other="elsewhere")) as (gateway, _):
+        await connected(gateway)
+        other = gateway.outputs[1]
+        servers["lab"].connection.send_frames(1, 2)
+        assert await gateway.reload(settings(example="new", other="elsewhere")) == ["output example changed"]
+        servers["lab"].connection.send_frames(3)
+        assert ([each.sequence for each in before], [each.sequence for each in after]) == ([0, 1], [2])
+        [(output, status), (kept, _)] = gateway.sources[0].fan_out.outputs
+        assert (output, kept) == (gateway.outputs[0], other)
+        assert status.messages["3d"] == 3
+        assert len(servers["lab"].connections) == 1
+    assert events[2:5] == [("stop queries", "local"), ("close", "local"), ("start", "new")]
+
+
+async def test_a_new_output_gets_the_known_parameters_and_the_state_of_every_source(servers: Servers) -> None:
+    async with running(settings("lab", "hall")) as (gateway, _):
+        await connected(gateway)
+        servers["lab"].connection.send_frames(1)
+        await gateway.reload(settings("lab", "hall", example="new"))
+        output = example(gateway)
+        assert [(name, each.xml, each.session) for name, each in output.parameters] == [
+            ("lab", XML[8:], 1),
+            ("hall", XML[8:], 1),
+        ]
+        assert (output.announced, output.streaming) == ({"lab", "hall"}, {"lab"})
+        assert decode((await output.query("hall/status")).payload).source == "hall"
+
+
+async def test_outputs_can_be_added_and_removed(events: list[tuple[str, str]]) -> None:
+    async with running(settings()) as (gateway, _):
+        assert await gateway.reload(settings(other="elsewhere")) == ["output other added"]
+        assert [output.name for output in gateway.outputs] == ["example", "other"]
+        other = example(gateway, 1)
+        assert (other.is_open, other.announced) == (True, {"lab"})
+        assert await gateway.reload(settings()) == ["output other removed"]
+        assert (other.is_open, other.announced) == (False, set())
+        assert events[-1] == ("close", "elsewhere")
+
+
+async def test_a_removed_output_takes_its_commands_with_it() -> None:
+    async with running(settings(other="elsewhere")) as (gateway, _):
+        off = ExampleSettings(enabled=False)
+        await gateway.reload(settings(other="elsewhere").model_copy(update={"example": off}))
+        [output] = gateway.outputs
+        assert output.name == "other"
+        with pytest.raises(Exception, match="unknown key 'greet'"):
+            await example(gateway).query("lab/greet", name="the operator")
+
+
+async def test_given_outputs_stay_at_a_reload(servers: Servers) -> None:
+    output = MemoryOutput()
+    async with running(settings("lab@first"), [output]) as (gateway, _):
+        assert await gateway.reload(settings("lab@second", example="new")) == ["source lab changed"]
+        assert list(gateway.outputs) == [output]
+        assert output.is_open
+        await connected(gateway)
+        assert servers["second"].connection.is_open
+
+
+async def test_a_configuration_that_an_output_refuses_changes_nothing(servers: Servers) -> None:
+    async with running(settings()) as (gateway, _):
+        await connected(gateway)
+        before, outputs = gateway.settings, list(gateway.outputs)
+        with pytest.raises(ConfigError, match="is refused"):
+            await gateway.reload(settings("hall", example=REFUSED))
+        assert (gateway.settings, list(gateway.outputs)) == (before, outputs)
+        assert [source.name for source in gateway.sources] == ["lab"]
+        assert servers["lab"].connection.is_open
+
+
+# Reloading sources ---------------------------------------------------------------------------
+
+
+async def test_a_changed_source_connects_again_and_continues_its_numbers(servers: Servers) -> None:
+    markers, statuses = subscribe("local"), subscribe("local", component="status")
+    async with running(settings("lab@first", "hall")) as (gateway, _):
+        await connected(gateway)
+        hall = gateway.sources[1]
+        servers["first"].connection.send_frames(1, 2)
+        await asyncio.sleep(1.5)
+        assert await gateway.reload(settings("lab@second", "hall")) == ["source lab changed"]
+        assert servers["first"].connection.commands[-1] == "Bye"
+        await connected(gateway)
+        servers["second"].connection.send_frames(1)
+        assert [(each.session, each.sequence) for each in markers] == [(1, 0), (1, 1), (2, 2)]
+        await asyncio.sleep(1.0)
+        assert [each.sequence for each in statuses if each.source == "lab"] == [1, 2]
+        assert gateway.sources[1] is hall
+        assert len(servers["hall"].connections) == 1
+        assert gateway.sources[0].fan_out.frames[ComponentType.MARKERS] == 3
+
+
+async def test_sources_can_be_added_and_removed(servers: Servers) -> None:
+    async with running(settings("lab", "hall")) as (gateway, _):
+        await connected(gateway)
+        output = example(gateway)
+        servers["hall"].connection.send_frames(1)
+        assert await gateway.reload(settings("new", "lab")) == ["source hall removed", "source new added"]
+        assert [source.name for source in gateway.sources] == ["new", "lab"]
+        assert servers["hall"].connection.commands[-1] == "Bye"
+        assert (output.announced, output.streaming) == ({"lab", "new"}, set())
+        await connected(gateway)
+        assert servers["new"].connection.is_open
+        with pytest.raises(KeyError):
+            await output.query("hall/status")
+        assert decode((await output.query("new/status")).payload).source == "new"
+        assert len(servers["lab"].connections) == 1
+
+
+async def test_a_changed_spool_is_used_by_running_sources(servers: Servers, tmp_path: Path) -> None:
+    before, after = (SpoolSettings(directory=str(tmp_path / name)) for name in ("before", "after"))
+    async with running(settings(spool=before)) as (gateway, _):
+        await connected(gateway)
+        assert await gateway.reload(settings(spool=after)) == ["spool changed"]
+        servers["lab"].connection.send(packet(5, b"a file"))
+        await settle()
+        assert gateway.sources[0].spool.newest("lab") is not None
+        assert await gateway.reload(settings("lab", "new", spool=after)) == ["source new added"]
+        assert gateway.sources[1].spool is gateway.sources[0].spool
+    assert not (tmp_path / "before").exists()
+    assert (tmp_path / "after").exists()
+
+
+# Stopping and reloading at the same time -----------------------------------------------------
+
+
+async def test_stopping_waits_for_a_reload_and_then_closes_everything(
+    servers: Servers, events: list[tuple[str, str]], threads: SlowThreads
+) -> None:
+    gateway = Gateway(settings("lab@first"))
+    stop = asyncio.Event()
+    task = asyncio.create_task(gateway.run(stop))
+    await gateway.opened.wait()
+    await connected(gateway)
+    threads.is_slow = True  # closing the old output takes long
+    reload = asyncio.create_task(gateway.reload(settings("lab@second", example="new")))
+    await settle()
+    stop.set()
+    await settle()
+    assert not task.done()
+    assert servers["first"].connection.is_open
+    threads.is_slow = False
+    threads.finish()
+    await task
+    assert reload.result() == ["output example changed", "source lab changed"]
+    assert events[-1] == ("close", "new")
+    assert not any(each.is_open for host in ("first", "second") for each in servers[host].connections)
+
+
+async def test_no_reload_begins_after_stopping(servers: Servers) -> None:
+    gateway = Gateway(settings("lab@first"))
+    stop = asyncio.Event()
+    task = asyncio.create_task(gateway.run(stop))
+    await gateway.opened.wait()
+    stop.set()
+    await task
+    reload = asyncio.create_task(gateway.reload(settings("lab@second")))
+    await settle()
+    assert not reload.done()
+    assert not servers["second"].connections
+    reload.cancel()
+
+
+async def test_two_reloads_run_one_after_the_other(servers: Servers, threads: SlowThreads) -> None:
+    async with running(settings("lab@first")) as (gateway, _):
+        threads.is_slow = True
+        first = asyncio.create_task(gateway.reload(settings("lab@first", example="new")))
+        second = asyncio.create_task(gateway.reload(settings("lab@second", example="new")))
+        await settle()
+        assert not second.done()
+        threads.is_slow = False
+        threads.finish()
+        assert await first == ["output example changed"]
+        assert await second == ["output example changed", "source lab changed"]
+        await connected(gateway)
+        assert servers["second"].connection.is_open
