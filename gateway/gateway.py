@@ -110,11 +110,11 @@ class Gateway:
         again; an output that differs is closed and opened again. Session and sequence numbers continue.
         Raises ConfigError, and changes nothing, if an output refuses its configuration.
         """
-        outputs = [
-            next((running for running in self._outputs if running.is_configured_like(output)), output)
-            for output in self._build_outputs(settings)
-        ]
         async with self._reload_lock:
+            outputs = [
+                next((running for running in self._outputs if running.is_configured_like(output)), output)
+                for output in self._build_outputs(settings)
+            ]
             before, self.settings = self.settings, settings
             changes = [*await self._change_outputs(outputs), *await self._change_sources(settings.sources)]
             if settings.spool != before.spool:

@@ -8,7 +8,7 @@ import pytest
 
 from tests.unit.stream.virtual_time import VirtualTimeLoop
 
-_IN_VIRTUAL_TIME: Final = {"test_gateway.py", "test_source.py"}
+_IN_VIRTUAL_TIME: Final = {"test_daemon.py", "test_gateway.py", "test_source.py"}
 
 
 def pytest_asyncio_loop_factories(

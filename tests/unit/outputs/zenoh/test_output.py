@@ -128,6 +128,16 @@ def test_a_topic_is_wanted_while_somebody_subscribes_to_its_key(lab: Lab) -> Non
     wait_until(lambda: not early.wanted and not late.wanted)
 
 
+def test_a_missed_notification_of_subscribers_is_made_up_for(lab: Lab) -> None:
+    lab.open()
+    publisher = lab.output.publisher(MARKERS)
+    with lab.hear("mocap/lab/3d"):
+        wait_until(lambda: publisher.wanted)
+        publisher.wanted = False  # as if Zenoh had not notified
+        lab.output.maintain()
+        assert publisher.wanted
+
+
 def test_a_closed_publisher_is_not_wanted(lab: Lab) -> None:
     lab.open()
     subscriber = lab.hear("mocap/**")

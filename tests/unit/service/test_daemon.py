@@ -1,0 +1,195 @@
+"""The daemon in virtual time: signals, reloads and the notifications for systemd."""
+
+import asyncio
+import os
+import signal
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+
+import pytest
+
+from gateway.config.settings import MetricsSettings, Settings, SourceSettings
+from gateway.errors import ConfigError
+from gateway.gateway import Gateway
+from gateway.outputs.memory import MemoryOutput
+from gateway.service.daemon import Daemon
+from tests.unit.scripted_sources import Servers, SlowThreads, use_scripted_servers
+from tests.unit.stream.virtual_time import settle, until
+
+
+class Notifications:
+    """Records what the daemon notifies systemd of."""
+
+    period_s = 0.5
+
+    def __init__(self) -> None:
+        self.sent: list[str] = []
+
+    def notify_ready(self) -> None:
+        self.sent.append("READY")
+
+    def notify_reloading(self) -> None:
+        self.sent.append("RELOADING")
+
+    def notify_stopping(self) -> None:
+        self.sent.append("STOPPING")
+
+    def notify_alive(self, status: str) -> None:
+        self.sent.append(f"STATUS={status}")
+
+
+@pytest.fixture(autouse=True)
+async def servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
+    return use_scripted_servers(monkeypatch)
+
+
+@pytest.fixture(autouse=True)
+async def threads() -> SlowThreads:
+    return SlowThreads()
+
+
+@pytest.fixture
+def systemd(monkeypatch: pytest.MonkeyPatch) -> Notifications:
+    notifications = Notifications()
+    monkeypatch.setattr("gateway.service.daemon.SystemdNotifier", lambda: notifications)
+    return notifications
+
+
+def settings(*names: str) -> Settings:
+    return Settings(
+        sources=tuple(SourceSettings(name=name, host="server") for name in names),
+        metrics=MetricsSettings(enabled=False),
+    )
+
+
+class Configuration:
+    """The configuration file: ``load`` returns its settings, or raises its error."""
+
+    def __init__(self) -> None:
+        self.content: Settings | ConfigError = settings("lab")
+        self.num_loaded = 0
+
+    def load(self) -> Settings:
+        self.num_loaded += 1
+        if isinstance(self.content, ConfigError):
+            raise self.content
+        return self.content
+
+
+@asynccontextmanager
+async def running(configuration: Configuration) -> AsyncIterator[tuple[Gateway, asyncio.Task[None]]]:
+    """Run a daemon, and stop it with SIGTERM at the end of the block."""
+    gateway = Gateway(settings("lab"), [MemoryOutput()])
+    task = asyncio.create_task(Daemon(configuration.load, gateway).run())
+    await gateway.opened.wait()
+    await settle()
+    yield gateway, task
+    if not task.done():
+        os.kill(os.getpid(), signal.SIGTERM)
+    await task
+
+
+def names(gateway: Gateway) -> list[str]:
+    return [source.settings.name for source in gateway.sources]
+
+
+async def hang_up(systemd: Notifications) -> list[str]:
+    """Send SIGHUP, and return the notifications until the reload has ended."""
+    systemd.sent.clear()
+    os.kill(os.getpid(), signal.SIGHUP)
+    await until(lambda: "READY" in systemd.sent)
+    return systemd.sent[systemd.sent.index("RELOADING") :]
+
+
+async def test_the_start_is_reported_with_a_status_and_then_repeated(systemd: Notifications) -> None:
+    async with running(Configuration()):
+        assert systemd.sent[0].startswith("STATUS=lab: ")
+        assert systemd.sent[1] == "READY"
+        systemd.sent.clear()
+        await asyncio.sleep(5.1 * systemd.period_s)
+        assert len(systemd.sent) == 5
+        assert all(text.startswith("STATUS=lab: ") for text in systemd.sent)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+async def test_a_signal_stops_the_gateway_and_all_tasks(
+    systemd: Notifications, servers: Servers, number: signal.Signals
+) -> None:
+    async with running(Configuration()) as (gateway, task):
+        await until(lambda: gateway.sources[0].supervisors[0].session)
+        await settle()
+        os.kill(os.getpid(), number)
+        await asyncio.wait([task], timeout=5)
+        assert task.done()
+        assert servers["server"].connection.commands[-1] == "Bye"
+        assert systemd.sent[-1] == "STOPPING"
+        assert asyncio.all_tasks() == {asyncio.current_task()}
+
+
+async def test_sighup_applies_the_new_configuration(
+    systemd: Notifications, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level("INFO")
+    configuration = Configuration()
+    async with running(configuration) as (gateway, _):
+        configuration.content = settings("lab", "hall")
+        sent = await hang_up(systemd)
+        assert (sent[0], sent[-1]) == ("RELOADING", "READY")
+        assert names(gateway) == ["lab", "hall"]
+        assert "configuration reloaded: source hall added" in caplog.messages
+        await hang_up(systemd)
+        assert "configuration reloaded: nothing changed" in caplog.messages
+
+
+async def test_a_refused_configuration_shows_in_the_status_until_one_is_accepted(
+    systemd: Notifications, caplog: pytest.LogCaptureFixture
+) -> None:
+    configuration = Configuration()
+    async with running(configuration) as (gateway, _):
+        configuration.content = ConfigError("lab.yaml:3:1: one\nlab.yaml:4:1: two\nlab.yaml:5:1: three")
+        sent = await hang_up(systemd)
+        problem = (
+            "new configuration refused, the old one stays in use: lab.yaml:3:1: one (and 2 more in the log)"
+        )
+        assert sent[1].startswith(f"STATUS={problem}; lab: ")
+        assert [text for text in caplog.messages if text.startswith("new configuration refused: ")] == [
+            f"new configuration refused: lab.yaml:{line}:1: {word}"
+            for line, word in ((3, "one"), (4, "two"), (5, "three"))
+        ]
+        assert names(gateway) == ["lab"]
+        configuration.content = settings("hall")
+        sent = await hang_up(systemd)
+        assert sent[1].startswith("STATUS=hall: ")
+
+
+async def test_signals_during_a_reload_cause_one_more_reload(
+    systemd: Notifications, threads: SlowThreads
+) -> None:
+    configuration = Configuration()
+    async with running(configuration):
+        threads.is_slow = True
+        for _ in range(3):
+            os.kill(os.getpid(), signal.SIGHUP)
+            await settle()
+        assert threads.num_waiting == 1
+        threads.is_slow = False
+        threads.finish()
+        await until(lambda: systemd.sent.count("READY") == 3)  # the start, and two reloads
+        await asyncio.sleep(5)
+        assert configuration.num_loaded == 2
+
+
+async def test_the_end_of_the_terminal_stops_a_gateway_that_it_started(
+    systemd: Notifications, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    has_terminal = True
+    monkeypatch.setattr("os.isatty", lambda _: has_terminal)
+    configuration = Configuration()
+    async with running(configuration) as (_, task):
+        os.kill(os.getpid(), signal.SIGHUP)
+        await until(lambda: configuration.num_loaded == 1)
+        has_terminal = False
+        os.kill(os.getpid(), signal.SIGHUP)
+        await asyncio.wait([task], timeout=5)
+        assert task.done()
+        assert systemd.sent[-1] == "STOPPING"
