@@ -7,11 +7,10 @@ import lcm
 
 from gateway.messages.topics import Topic, lcm_channel, unique_name
 from gateway.outputs.contract import Output, QueryService, ServerParameters
-from gateway.outputs.lcm.connection import BLOCKING_SCHEMES, scheme_of
 from gateway.outputs.lcm.queries import LcmQueries
-from gateway.outputs.lcm.sender import LcmPublisher, LcmSender
+from gateway.outputs.lcm.sender import LcmPublisher
 from gateway.outputs.lcm.settings import LcmSettings
-from gateway.outputs.lcm.thread_sender import LcmThreadSender
+from gateway.outputs.lcm.thread_sender import new_sender
 from gateway.outputs.status import OutputHealth
 
 
@@ -31,11 +30,7 @@ class LcmOutput(Output):
         self._shared = shared
         self._channels: set[str] = set()
         self._queries: LcmQueries | None = None
-        url = settings.effective_url
-        if scheme_of(url) in BLOCKING_SCHEMES:
-            self._sender: LcmSender | LcmThreadSender = LcmThreadSender(url, self._on_open)
-        else:
-            self._sender = LcmSender(url, shared, self._on_open)
+        self._sender = new_sender(settings.effective_url, shared, self._on_open)
 
     def _on_open(self) -> None:
         if self._queries is not None:

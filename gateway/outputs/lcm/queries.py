@@ -20,10 +20,10 @@ from gateway.log import FailureLog, log_fields
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.contract import QueryService, ServerParameters
-from gateway.outputs.lcm.connection import BLOCKING_SCHEMES, open_lcm, scheme_of, send_problem
+from gateway.outputs.lcm.connection import open_lcm, scheme_of, send_problem
 from gateway.outputs.lcm.sender import RETRY_S, LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
-from gateway.outputs.lcm.thread_sender import LcmThreadSender
+from gateway.outputs.lcm.thread_sender import LcmThreadSender, new_sender
 
 MAX_PENDING: Final = 64
 """The maximum number of requests in progress. Further ones are dropped and counted."""
@@ -74,7 +74,7 @@ class LcmQueries:
         self._url = settings.effective_queries_url
         is_own_url = self._url != settings.effective_url
         self._shared = None if is_own_url else shared
-        self._reply_sender = self._new_sender(self._url) if is_own_url else sender
+        self._reply_sender = new_sender(self._url, None, lambda: None, "replies") if is_own_url else sender
         self._sources: set[str] = set()
         self._subscriptions: dict[str, lcm.LCMSubscription] = {}  # by the source's name
         self._thread = threading.Thread(target=self._receive, name="lcm-requests", daemon=True)
@@ -88,12 +88,6 @@ class LcmQueries:
         self._publications: dict[str, _Publication] = {}
         self.results: Counter[str] = Counter()
         """Requests by result: ok, or the code of the error."""
-
-    @staticmethod
-    def _new_sender(url: str) -> LcmSender | LcmThreadSender:
-        if scheme_of(url) in BLOCKING_SCHEMES:
-            return LcmThreadSender(url, lambda: None, "replies")
-        return LcmSender(url, None, lambda: None, "replies")
 
     def start(self) -> None:
         """Receive requests. Called in any thread, after the output has opened."""

@@ -10,8 +10,8 @@ import lcm
 
 from gateway.errors import OutputError
 from gateway.log import HOLD_S, FailureLog
-from gateway.outputs.lcm.connection import open_lcm, send_problem
-from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN, RETRY_S
+from gateway.outputs.lcm.connection import BLOCKING_SCHEMES, open_lcm, scheme_of, send_problem
+from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN, RETRY_S, LcmSender
 
 MAX_QUEUED_BYTES: Final = 8 * 1024 * 1024
 MAX_QUEUED_MESSAGES: Final = 10_000
@@ -154,3 +154,12 @@ class LcmThreadSender:
         with self._changed:
             if not self._closing.is_set():  # close() sets the last one
                 self._problem = problem
+
+
+def new_sender(
+    url: str, shared: lcm.LCM | None, on_open: Callable[[], None], what: str = "messages"
+) -> LcmSender | LcmThreadSender:
+    """Return the sender for the scheme of ``url``, not yet open. Blocking schemes do not use ``shared``."""
+    if scheme_of(url) in BLOCKING_SCHEMES:
+        return LcmThreadSender(url, on_open, what)
+    return LcmSender(url, shared, on_open, what)
