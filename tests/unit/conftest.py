@@ -1,4 +1,4 @@
-"""The event loop of tests that need neither sockets nor threads: its time is virtual."""
+"""Fixtures of tests that need neither sockets nor threads, and their event loop, whose time is virtual."""
 
 import asyncio
 from collections.abc import Callable, Mapping
@@ -6,6 +6,7 @@ from typing import Final
 
 import pytest
 
+from tests.unit.scripted_sources import Servers, SlowThreads, use_scripted_servers
 from tests.unit.stream.virtual_time import VirtualTimeLoop
 
 _IN_VIRTUAL_TIME: Final = {"test_daemon.py", "test_gateway.py", "test_source.py"}
@@ -17,3 +18,15 @@ def pytest_asyncio_loop_factories(
     if item.path.name in _IN_VIRTUAL_TIME:
         return {"virtual": VirtualTimeLoop}
     return None  # as tests/conftest.py says
+
+
+@pytest.fixture
+async def servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
+    """Connect all sources to scripted servers, by the name of their host."""
+    return use_scripted_servers(monkeypatch)
+
+
+@pytest.fixture
+async def threads() -> SlowThreads:
+    """Make the calls of asyncio.to_thread without threads."""
+    return SlowThreads()

@@ -20,10 +20,11 @@ from gateway.outputs.registry import OUTPUTS, settings_type
 from gateway.rtc3d.components import ComponentType
 from tests.example_output import EXAMPLE, UNREACHABLE, ExampleOutput, ExampleSettings, ExampleSubscription
 from tests.servers import packet
-from tests.unit.scripted_sources import Servers, SlowThreads, use_scripted_servers
+from tests.unit.scripted_sources import Servers, SlowThreads
 from tests.unit.stream.scripted_server import XML
 from tests.unit.stream.virtual_time import settle, until
 
+pytestmark = pytest.mark.usefixtures("servers", "threads")
 REFUSED = "refused"
 
 
@@ -65,17 +66,6 @@ def events(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str]]:
     monkeypatch.setitem(OUTPUTS, "example", dataclasses.replace(EXAMPLE, create=RecordingOutput))
     monkeypatch.setitem(OUTPUTS, "other", dataclasses.replace(EXAMPLE, name="other", create=OtherOutput))
     return events
-
-
-@pytest.fixture(autouse=True)
-async def servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
-    """Connect all sources to scripted servers, by the name of their host."""
-    return use_scripted_servers(monkeypatch)
-
-
-@pytest.fixture(autouse=True)
-async def threads() -> SlowThreads:
-    return SlowThreads()
 
 
 def settings(*sources: str, example: str = "local", other: str | None = None, **sections: Any) -> Settings:

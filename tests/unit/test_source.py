@@ -26,7 +26,7 @@ from tests.servers import packet
 from tests.spec_parameters import in_root
 from tests.toy_output import ToyOutput, ToyPublisher
 from tests.unit.publish.test_tool_poses import IN_VIEW, tools_frame
-from tests.unit.scripted_sources import Servers, SlowThreads, use_scripted_servers
+from tests.unit.scripted_sources import Servers, SlowThreads
 from tests.unit.stream.scripted_server import XML, ScriptedServer, obliging
 from tests.unit.stream.virtual_time import settle, until
 
@@ -84,11 +84,6 @@ class Lab:
         return sum(
             each.startswith(command) for connection in self.server.connections for each in connection.commands
         )
-
-
-@pytest.fixture
-async def servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
-    return use_scripted_servers(monkeypatch)
 
 
 @pytest.fixture

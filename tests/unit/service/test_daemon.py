@@ -13,8 +13,10 @@ from gateway.errors import ConfigError
 from gateway.gateway import Gateway
 from gateway.outputs.memory import MemoryOutput
 from gateway.service.daemon import Daemon
-from tests.unit.scripted_sources import Servers, SlowThreads, use_scripted_servers
+from tests.unit.scripted_sources import Servers, SlowThreads
 from tests.unit.stream.virtual_time import settle, until
+
+pytestmark = pytest.mark.usefixtures("servers", "threads")
 
 
 class Notifications:
@@ -36,16 +38,6 @@ class Notifications:
 
     def notify_alive(self, status: str) -> None:
         self.sent.append(f"STATUS={status}")
-
-
-@pytest.fixture(autouse=True)
-async def servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
-    return use_scripted_servers(monkeypatch)
-
-
-@pytest.fixture(autouse=True)
-async def threads() -> SlowThreads:
-    return SlowThreads()
 
 
 @pytest.fixture
