@@ -45,8 +45,11 @@ class StreamSettings(Section):
     rate: StreamRate = AllFrames()
     """The rate to request: all, {frequency_hz: NUMBER} or {divisor: WHOLE NUMBER}."""
 
-    backlog: Backlog = "latest"
-    """While frames are late: publish only the newest frame, or all frames. Events are never skipped."""
+    backlog: Backlog = "all"
+    """While frames are late: publish all frames, or only the newest one. Events are never skipped."""
+
+    adapt_rate: Switch = False
+    """Whether to request a lower rate from the server while frames are late."""
 
     on_demand: Switch = False
     """Whether to stream only while someone subscribes. No effect while LCM is enabled."""
@@ -110,7 +113,7 @@ class SourceSettings(Section):
     """How long a stream may be silent while a measurement runs."""
 
     max_lag_ms: Milliseconds = 50.0
-    """How late frames may be before the gateway requests a lower rate."""
+    """How late frames may be: see `backlog` and `adapt_rate` of the streams."""
 
     max_packet_bytes: ByteLimit = DEFAULT_MAX_PACKET_BYTES
     """The largest accepted packet, except for C3D files."""

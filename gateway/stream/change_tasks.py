@@ -44,9 +44,17 @@ class ChangeTasks:
         if self._stream.on_demand:
             self._start_task(self._follow_demand())
 
-    def request_rate(self, halvings: int) -> None:
-        """Start to request the configured rate, halved ``halvings`` times; return at once."""
-        self._start_task(self._change_rate(halvings))
+    def lateness_changed(self, halvings: int) -> None:
+        """React to late frames: with ``adapt_rate``, start to request the rate halved ``halvings`` times.
+
+        Without it, only log that frames are late, or in time again if ``halvings`` is 0. Returns at once.
+        """
+        if self._stream.adapt_rate:
+            self._start_task(self._change_rate(halvings))
+        elif halvings:
+            self._lateness.failed(f"frames arrive {1000 * self._status.lag_s:.0f} ms late")
+        else:
+            self._lateness.recovered("frames arrive in time")
 
     def cancel(self) -> None:
         """Cancel all tasks."""

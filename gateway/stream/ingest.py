@@ -7,7 +7,7 @@ from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.messages.stamp import Stamp
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
-from gateway.stream.rate_control import LagControl
+from gateway.stream.rate_control import MAX_HALVINGS, LagControl
 from gateway.stream.status import StreamStatus
 
 Publish = Callable[[Frame, Stamp, frozenset[ComponentType]], None]
@@ -19,7 +19,7 @@ _EVENTS: Final = frozenset({ComponentType.EVENT})
 class Ingest:
     """Takes the frames of one session, in the batches in which they arrive from the network.
 
-    It calls ``request_rate`` with the number of halvings when the server should send at another rate, and
+    It calls ``on_lateness`` with the number of halvings that LagControl decides on whenever that changes, and
     ``on_restart`` when the server's frame numbers or time stamps start again within the session.
     """
 
@@ -29,7 +29,7 @@ class Ingest:
         stream: StreamSettings,
         status: StreamStatus,
         publish: Publish,
-        request_rate: Callable[[int], None],
+        on_lateness: Callable[[int], None],
         on_restart: Callable[[], None],
     ) -> None:
         self._wanted = frozenset(stream.components)
@@ -37,12 +37,12 @@ class Ingest:
         self._skips_when_behind = stream.backlog == "latest"
         self._status = status
         self._publish = publish
-        self._request_rate = request_rate
+        self._on_lateness = on_lateness
         self._on_restart = on_restart
         self._clock = status.clock  # outlives the session: it detects a restart of the server by itself
         self._followed_type: ComponentType | None = None
         self._frame_number = 0  # the newest of a component of _followed_type
-        self._lag = LagControl(source.max_lag_ms / 1000)
+        self._lag = LagControl(source.max_lag_ms / 1000, MAX_HALVINGS if stream.adapt_rate else 1)
 
     def receive(self, frames: list[Frame], utime: int, now_s: float) -> None:
         """Take frames that arrived together, oldest first.
@@ -78,7 +78,7 @@ class Ingest:
         elif clock.has_clock:
             self._status.lag_measured(lag_s)
             if self._lag.observe(now_s, lag_s):
-                self._request_rate(self._lag.halvings)
+                self._on_lateness(self._lag.halvings)
         return Stamp(utime, capture_utime, self._status.session, clock.has_clock)
 
     def _follow_frame_number(self, first_component_type: ComponentType | None, frame_number: int) -> None:

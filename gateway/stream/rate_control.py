@@ -56,10 +56,14 @@ class LagControl:
     time it undoes one halving (a step up), until the rate is as configured. A step up fails if a step down
     follows within ``wait_s``; then ``wait_s`` doubles, up to MAX_WAIT_S. If a step down follows later,
     ``wait_s`` returns to FIRST_WAIT_S. This avoids retrying the full rate on a link that carries half of it.
+
+    If the rate must not change (``adapt_rate: false``), let ``max_halvings`` be 1: one halving then means
+    that frames are late, and none that they are in time. It is logged as rarely as a rate would change.
     """
 
-    def __init__(self, max_lag_s: float) -> None:
+    def __init__(self, max_lag_s: float, max_halvings: int = MAX_HALVINGS) -> None:
         self._max_lag_s = max_lag_s
+        self._max_halvings = max_halvings
         self.halvings = 0
         self.behind = False
         """Whether the newest frame was late."""
@@ -85,7 +89,7 @@ class LagControl:
         self._since_s = None
 
     def _step_down(self, now_s: float) -> bool:
-        if self.halvings >= MAX_HALVINGS:
+        if self.halvings >= self._max_halvings:
             return False
         if self._stepped_up_s is not None:
             failed = now_s - self._stepped_up_s < self.wait_s

@@ -111,7 +111,7 @@ class Supervisor:
             self._stream,
             self._status,
             self._callbacks.publish,
-            lambda halvings: changes.request_rate(halvings),  # noqa: PLW0108 - assigned below
+            lambda halvings: changes.lateness_changed(halvings),  # noqa: PLW0108 - assigned below
             self._callbacks.on_restart,
         )
         session = Session(

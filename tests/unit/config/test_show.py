@@ -41,7 +41,7 @@ def test_every_value_is_shown_with_its_origin(file: Path) -> None:
         "port: 3020 # default",
         "- components: [6d] # lab.yaml:4",
         "frequency_hz: 60.0 # lab.yaml:4",
-        "backlog: latest # default",
+        "backlog: all # default",
         "mode: client # lab.yaml:6",
         "endpoints: ['tcp/192.0.2.10:7447', 'tcp/192.0.2.12:7447'] "
         "# lab.yaml:6, ZENOH__CONFIG__CONNECT__ENDPOINTS__1",

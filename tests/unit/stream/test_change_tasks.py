@@ -104,11 +104,11 @@ async def test_other_streams_run_without_subscribers() -> None:
 
 async def test_lateness_is_a_warning_once_and_its_end_is_reported(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG, "gateway.stream.change_tasks")
-    lab = Lab()
+    lab = Lab(adapt_rate=True)
     await lab.start()
     for halvings, lag_s in ((1, 0.3), (2, 0.3), (1, 0.0), (0, 0.0)):
         lab.status.lag_measured(lag_s)
-        lab.adaptation.request_rate(halvings)
+        lab.adaptation.lateness_changed(halvings)
         await settle()
     assert lab.requests == [HALF, "StreamFrames FrequencyDivisor:4", HALF, START]
     assert lab.status.rate == "AllFrames"
@@ -120,13 +120,28 @@ async def test_lateness_is_a_warning_once_and_its_end_is_reported(caplog: pytest
     assert last.startswith("lab (3d): frames arrive in time; asked the server for AllFrames, after ")
 
 
-async def test_a_lag_of_exactly_the_maximum_is_in_time(caplog: pytest.LogCaptureFixture) -> None:
+async def test_by_default_the_server_is_asked_for_nothing(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG, "gateway.stream.change_tasks")
     lab = Lab()
     await lab.start()
+    lab.status.lag_measured(0.3)
+    for halvings in (1, 0):
+        lab.adaptation.lateness_changed(halvings)
+        await settle()
+    assert lab.requests == []
+    assert [record.levelname for record in caplog.records] == ["WARNING", "INFO"]
+    late, in_time = caplog.messages
+    assert late == "lab (3d): frames arrive 300 ms late"
+    assert in_time.startswith("lab (3d): frames arrive in time, after ")
+
+
+async def test_a_lag_of_exactly_the_maximum_is_in_time(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.DEBUG, "gateway.stream.change_tasks")
+    lab = Lab(adapt_rate=True)
+    await lab.start()
     for lag_s in (0.05, 0.051, 2.0):
         lab.status.lag_measured(lag_s)
-        lab.adaptation.request_rate(1)
+        lab.adaptation.lateness_changed(1)
         await settle()
     assert caplog.messages == [
         "lab (3d): frames arrive in time; asked the server for FrequencyDivisor:2",
@@ -138,22 +153,22 @@ async def test_a_lag_of_exactly_the_maximum_is_in_time(caplog: pytest.LogCapture
 async def test_a_request_for_the_default_rate_is_logged_as_such(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    lab = Lab()
+    lab = Lab(adapt_rate=True)
     await lab.start()
     lab.server.answer = refusing("StreamFrames")
     lab.status.rate_agreed("")
     lab.status.lag_measured(0.3)
-    lab.adaptation.request_rate(1)
+    lab.adaptation.lateness_changed(1)
     await settle()
     assert "lab (3d): frames arrive 300 ms late; asked the server for its default rate" in caplog.messages
 
 
 async def test_the_end_of_the_connection_ends_a_change_quietly(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG, "gateway.stream.change_tasks")
-    lab = Lab()
+    lab = Lab(adapt_rate=True)
     await lab.start()
     lab.server.answer = silent_to("StreamFrames")
-    lab.adaptation.request_rate(1)
+    lab.adaptation.lateness_changed(1)
     await settle()
     lab.server.connection.end()
     await settle()
@@ -165,10 +180,10 @@ async def test_the_end_of_the_connection_ends_a_change_quietly(caplog: pytest.Lo
 
 async def test_cancelling_ends_every_task() -> None:
     tasks_before = asyncio.all_tasks()
-    lab = Lab(on_demand=True)
+    lab = Lab(on_demand=True, adapt_rate=True)
     await lab.start()
     lab.server.answer = silent_to("StreamFrames")
-    lab.adaptation.request_rate(1)
+    lab.adaptation.lateness_changed(1)
     await settle()
     assert len(asyncio.all_tasks() - tasks_before) == 2
     lab.adaptation.cancel()

@@ -39,14 +39,16 @@ def frame_of(tick: int, *numbered: tuple[ComponentType, int]) -> Frame:
 class Lab:
     """An ingest; ``published`` are the frame numbers and component keys that it passed on."""
 
-    def __init__(self, backlog: str) -> None:
+    def __init__(self, backlog: str, *, adapt_rate: bool = True) -> None:
         self.backlog = backlog
         self.status = StreamStatus("3d event", name="lab (3d event)")
         self.published: list[tuple[int, list[str]]] = []
         self.stamps: list[Stamp] = []
         self.halvings: list[int] = []
         self.restarts = 0
-        stream = StreamSettings.model_validate({"components": ["all"], "backlog": backlog})
+        stream = StreamSettings.model_validate(
+            {"components": ["all"], "backlog": backlog, "adapt_rate": adapt_rate}
+        )
         source = SourceSettings(name="lab", host="127.0.0.1")
         self.ingest = Ingest(
             source, stream, self.status, self._publish, self.halvings.append, self._on_restart
@@ -109,6 +111,16 @@ def test_frames_that_stay_late_request_lower_rates(lab: Lab) -> None:
     for number in range(600, 600 + 2 * RATE_HZ + RATE_HZ // 10):
         lab.receive(frame(number), late_us=200_000 + 500 * (number - 600))
     assert lab.halvings == [1, 2]
+
+
+def test_without_adapt_rate_lateness_is_reported_once() -> None:
+    lab = Lab("all", adapt_rate=False)
+    for number in range(600 + 5 * RATE_HZ):
+        lab.receive(frame(number), late_us=0 if number < 600 else 200_000 + 500 * (number - 600))
+    assert lab.halvings == [1]
+    for number in range(600 + 5 * RATE_HZ, 600 + 16 * RATE_HZ):
+        lab.receive(frame(number))
+    assert lab.halvings == [1, 0]
 
 
 def test_a_restart_of_the_server_is_reported_and_does_not_count_as_lateness(lab: Lab) -> None:

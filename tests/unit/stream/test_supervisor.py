@@ -269,7 +269,7 @@ async def test_frames_that_stay_late_halve_the_rate(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(
         "gateway.stream.session.now_utime", lambda: 1_700_000_000_000_000 + int(1e6 * loop.time())
     )
-    lab = Lab()
+    lab = Lab(adapt_rate=True)
     async with running(lab):
         await lab.ready()
         for time_ms in range(0, 5000, 10):
