@@ -1,0 +1,202 @@
+"""Sending on LCM from the event loop: the states of a sender, what it logs, and when it retries."""
+
+import logging
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+
+import lcm
+import pytest
+
+from gateway.errors import OutputError
+from gateway.outputs.lcm import sender as sender_module
+from gateway.outputs.lcm.connection import DEFAULT_GROUP, multicast_problem, open_lcm, send_problem
+from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN, RETRY_S, LcmPublisher, LcmSender
+from gateway.outputs.lcm.thread_sender import LcmThreadSender, new_sender
+from tests.networks import add_multicast_route, lcm_url, remove_multicast_route
+
+BAD_URL = "udpm://not-an-address:7667"
+
+
+@pytest.fixture
+def shared() -> lcm.LCM:
+    return lcm.LCM("memq://")
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """The sender's clock; its attribute ``now_s`` is the time."""
+    clock = SimpleNamespace(now_s=100.0)
+    monkeypatch.setattr(sender_module, "time", SimpleNamespace(monotonic=lambda: clock.now_s))
+    return clock
+
+
+def refusal(send: Callable[[], object]) -> tuple[str, str]:
+    """Return the text and the cause of the error."""
+    with pytest.raises(OutputError) as caught:
+        send()
+    return str(caught.value), caught.value.cause
+
+
+def send(sender: LcmSender) -> None:
+    sender.send("CHANNEL", b"message")
+
+
+# Opening and closing -------------------------------------------------------------------------
+
+
+def test_a_sender_refuses_messages_before_opening_and_after_closing(shared: lcm.LCM) -> None:
+    sender = LcmSender("memq://", shared, lambda: None)
+    assert sender.problem == NOT_OPEN
+    assert refusal(lambda: send(sender)) == (NOT_OPEN, "not open")
+    sender.maintain()
+    assert sender.problem == NOT_OPEN
+    sender.open()
+    assert sender.problem == ""
+    sender.close()
+    sender.maintain()
+    assert sender.problem == CLOSED
+    assert refusal(lambda: send(sender)) == (CLOSED, "not open")
+
+
+def test_opening_is_reported_and_logged(shared: lcm.LCM, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gateway.outputs")
+    opened: list[str] = []
+    sender = LcmSender("memq://", shared, lambda: opened.append(sender.problem))
+    sender.open()
+    assert opened == [""]
+    assert caplog.messages == ["lcm: sending messages to memq://"]
+    LcmSender("memq://", shared, lambda: None, "replies").open()
+    assert caplog.messages[1] == "lcm: sending replies to memq://"
+
+
+def test_messages_go_to_the_shared_object(shared: lcm.LCM) -> None:
+    received: list[tuple[str, bytes]] = []
+    shared.subscribe(".*", lambda *each: received.append(each))
+    sender = LcmSender("memq://", shared, lambda: None)
+    sender.open()
+    send(sender)
+    shared.handle_timeout(0)
+    assert received == [("CHANNEL", b"message")]
+
+
+def test_opening_is_tried_again_after_a_second_and_logged_once(
+    clock: SimpleNamespace, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG, "gateway.outputs")
+    sender = LcmSender(BAD_URL, None, lambda: None)
+    sender.open()
+    problem = f"LCM does not open {BAD_URL}: Couldn't create LCM; check lcm.url"
+    assert sender.problem == problem
+    assert refusal(lambda: send(sender)) == (problem, "not open")
+    clock.now_s += RETRY_S - 0.001
+    sender.maintain()
+    assert len(caplog.records) == 1
+    clock.now_s += 0.001
+    sender.maintain()
+    sender.maintain()
+    assert [(record.levelname, record.message) for record in caplog.records] == [
+        ("WARNING", f"lcm: {problem}"),
+        ("DEBUG", f"lcm: {problem} (failure 2 in a row)"),
+    ]
+
+
+def test_a_sender_that_is_open_is_not_opened_again(
+    shared: lcm.LCM, clock: SimpleNamespace, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "gateway.outputs")
+    sender = LcmSender("memq://", shared, lambda: None)
+    sender.open()
+    clock.now_s += 3600.0
+    sender.maintain()
+    assert len(caplog.records) == 1
+
+
+@pytest.mark.parametrize(
+    ("url", "sender_class"),
+    [
+        ("udpm://", LcmSender),
+        ("mpudpm://", LcmSender),
+        ("memq://", LcmSender),
+        ("tcpq://lab:7700", LcmThreadSender),
+        ("file:///tmp/log", LcmThreadSender),
+    ],
+)
+def test_only_the_schemes_that_block_send_from_a_thread(url: str, sender_class: type) -> None:
+    assert type(new_sender(url, None, lambda: None)) is sender_class
+
+
+@pytest.mark.parametrize("url", [BAD_URL, "tcpq://127.0.0.1:9"])
+def test_a_url_that_does_not_open_is_an_error_with_the_remedy(url: str) -> None:
+    text = f"LCM does not open {url}: Couldn't create LCM; check lcm.url"
+    assert refusal(lambda: open_lcm(url)) == (text, "not open")
+
+
+# Failures ------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def without_route() -> Iterator[None]:
+    remove_multicast_route()
+    yield
+    add_multicast_route()
+
+
+NO_ROUTE = (
+    "no multicast to {url}: [Errno 101] Network is unreachable; bring a network interface up, or give it a "
+    "multicast route: ip route add 224.0.0.0/4 dev INTERFACE"
+)
+
+
+@pytest.mark.netns
+@pytest.mark.usefixtures("without_route")
+@pytest.mark.parametrize("url", ["udpm://", f"udpm://{DEFAULT_GROUP}:7667", "mpudpm://239.1.2.3"])
+def test_a_missing_route_is_the_reason_of_every_failure(url: str) -> None:
+    text = NO_ROUTE.format(url=url)
+    assert multicast_problem(url) == text
+    assert refusal(lambda: open_lcm(url)) == (text, "not open")
+    assert send_problem(url, OSError("of the test")) == text
+
+
+def test_other_failures_to_send_have_the_reason_of_lcm() -> None:
+    text = "LCM did not send to memq://: of the test; check lcm.url"
+    assert send_problem("memq://", OSError("of the test")) == text
+
+
+@pytest.mark.netns
+@pytest.mark.usefixtures("no_hold")
+def test_a_lost_route_is_a_problem_until_a_message_is_sent(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gateway.outputs")
+    url = lcm_url()
+    sender = LcmSender(url, None, lambda: None, "replies")
+    sender.open()
+    remove_multicast_route()
+    try:
+        failure = refusal(lambda: send(sender))
+    finally:
+        add_multicast_route()
+    assert failure == (NO_ROUTE.format(url=url), "send failed")
+    assert sender.problem == failure[0]
+    send(sender)
+    assert sender.problem == ""
+    sender.close()
+    assert caplog.messages[:2] == [f"lcm: sending replies to {url}", f"lcm: {failure[0]}"]
+    assert caplog.messages[2].startswith(f"lcm: sending replies to {url}, after ")
+
+
+# Publishers ----------------------------------------------------------------------------------
+
+
+def test_a_closed_publisher_says_so_and_frees_its_channel_once() -> None:
+    sent: list[tuple[str, bytes]] = []
+    forgotten: list[LcmPublisher] = []
+    publisher = LcmPublisher("MOCAP_LAB_3D", lambda *each: sent.append(each), forgotten.append)
+    assert publisher.wanted
+    publisher.publish(b"message")
+    publisher.close()
+    publisher.close()
+    assert refusal(lambda: publisher.publish(b"late")) == (
+        "LCM channel MOCAP_LAB_3D is closed; ask for a new publisher",
+        "closed",
+    )
+    assert sent == [("MOCAP_LAB_3D", b"message")]
+    assert forgotten == [publisher]
