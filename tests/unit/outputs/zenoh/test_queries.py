@@ -1,0 +1,260 @@
+"""Queries, parameters and files of the Zenoh output, with a service that the test sets."""
+
+import asyncio
+import json
+from collections.abc import AsyncIterator, Mapping, Sequence
+from typing import Any
+
+import pytest
+import zenoh
+
+from gateway.errors import QueryError
+from gateway.log import current_log_fields
+from gateway.outputs.contract import Answer, KeyPath, ServerParameters
+from gateway.outputs.zenoh import queries as queries_module
+from gateway.outputs.zenoh.output import ZenohOutput
+from gateway.outputs.zenoh.settings import ZenohSettings
+from tests.networks import free_endpoint, open_zenoh, zenoh_keys
+from tests.queried_gateway import Reply, query, query_all
+from tests.waiting import wait_until_async
+
+XML = b"<RT_Parameters/>"
+STATUS, C3D = ("status",), ("c3d",)
+
+
+class Service:
+    """Answers every key with itself, or raises ``error``."""
+
+    def __init__(self) -> None:
+        self.sources = {"lab", "hall"}
+        self.error: Exception | None = None
+        self.payload = b"payload"
+        self.received: list[tuple[str, Sequence[Any], dict[str, str]]] = []
+        self.log_fields: dict[str, str] = {}
+
+    def serves(self, source: str) -> bool:
+        return source in self.sources
+
+    def keys(self, _source: str) -> list[KeyPath]:
+        return [STATUS, C3D, ("parameters", "3d")]
+
+    def accepted_keys(self, _source: str) -> str:
+        return "status, c3d"
+
+    async def answer(self, source: str, path: KeyPath, options: Mapping[str, str]) -> Answer:
+        self.received.append((source, path, dict(options)))
+        self.log_fields = dict(current_log_fields())
+        if self.error is not None:
+            raise self.error
+        return Answer(self.payload, "text/plain", {"age_s": 1.5})
+
+    async def answer_all(
+        self, source: str, paths: Sequence[KeyPath], options: Mapping[str, str]
+    ) -> dict[KeyPath, Answer]:
+        self.received.append((source, list(paths), dict(options)))
+        return {path: Answer("/".join(path).encode(), "text/plain") for path in paths}
+
+
+class Lab:
+    """An output that serves the source "lab", and a client connected to it."""
+
+    def __init__(self) -> None:
+        self.service = Service()
+        self.endpoint = free_endpoint()
+        keys = zenoh_keys("peer", listen=self.endpoint) | {"timestamping": {"enabled": True}}
+        self.output = ZenohOutput(ZenohSettings(config=keys))
+        self.output.serve_queries(self.service)  # type: ignore[arg-type]  # it has the methods that are called
+        self.samples: list[zenoh.Sample] = []
+
+    async def open(self) -> None:
+        self.output.announce("lab")
+        self.output.start()
+        await wait_until_async(lambda: self.output.health().connected)
+        self.peer = open_zenoh("client", connect=self.endpoint)
+
+    def subscribe(self, keys: str) -> None:
+        self.peer.declare_subscriber(keys, self.samples.append)
+
+    def payloads(self, key: str) -> list[bytes]:
+        return [each.payload.to_bytes() for each in self.samples if str(each.key_expr) == key]
+
+    async def query(self, selector: str) -> Reply:
+        return await query(self.peer, selector)
+
+
+@pytest.fixture
+async def lab() -> AsyncIterator[Lab]:
+    lab = Lab()
+    await lab.open()
+    yield lab
+    await lab.output.stop_queries()
+    lab.output.close()
+    lab.peer.close()
+
+
+# Queries -------------------------------------------------------------------------------------
+
+
+async def test_the_service_receives_source_path_and_options(lab: Lab) -> None:
+    reply = await lab.query("mocap/lab/parameters/3d?format=json;fresh;_time=now;a=b=c")
+    assert reply == ("mocap/lab/parameters/3d", b"payload", "text/plain", {"age_s": 1.5}, "", "")
+    options = {"format": "json", "fresh": "", "a": "b=c"}
+    assert lab.service.received == [("lab", ("parameters", "3d"), options)]
+    assert lab.service.log_fields == {"source": "lab"}
+    await wait_until_async(lambda: lab.output.query_results == {"ok": 1})
+
+
+async def test_a_selector_with_wildcards_gets_one_reply_for_each_key(lab: Lab) -> None:
+    replies = await query_all(lab.peer, "mocap/lab/**?format=json")
+    assert sorted((reply.key, reply.payload, reply.attachment) for reply in replies) == [
+        ("mocap/lab/parameters/3d", b"parameters/3d", {}),
+        ("mocap/lab/status", b"status", {}),
+    ]
+    assert lab.service.received == [("lab", [STATUS, ("parameters", "3d")], {"format": "json"})]
+    replies = await query_all(lab.peer, "mocap/*/c3d")
+    assert [(reply.key, reply.payload) for reply in replies] == [("mocap/lab/c3d", b"c3d")]
+
+
+@pytest.mark.parametrize(
+    ("selector", "error"),
+    [
+        (
+            "mocap/lab/x/*",
+            "nothing of source 'lab' matches mocap/lab/x/*; accepted below mocap/lab/: status, c3d",
+        ),
+        (
+            "mocap/*/recording",
+            "recording is controlled for one source at a time; accepted: mocap/lab/recording",
+        ),
+    ],
+)
+async def test_a_selector_that_matches_nothing_is_an_error_with_the_accepted_keys(
+    lab: Lab, selector: str, error: str
+) -> None:
+    reply = await lab.query(selector)
+    assert (reply.error, reply.code) == (error, "bad-request")
+    assert lab.service.received == []
+    await wait_until_async(lambda: lab.output.query_results == {"bad-request": 1})
+
+
+async def test_errors_are_replies_with_their_code_and_are_counted(
+    lab: Lab, caplog: pytest.LogCaptureFixture
+) -> None:
+    lab.service.error = QueryError("the server refuses", code="refused")
+    for _ in range(2):
+        reply = await lab.query("mocap/lab/status")
+        assert (reply.error, reply.encoding) == ("the server refuses", "text/plain;refused")
+    lab.service.error = ZeroDivisionError("of the test")
+    reply = await lab.query("mocap/lab/status?a=1")
+    assert reply.error == "a defect in the gateway: ZeroDivisionError('of the test')"
+    assert reply.encoding == "text/plain;defect"
+    [record] = caplog.records
+    assert record.message == "lab: query mocap/lab/status?a=1"
+    assert record.exc_info is not None
+    await wait_until_async(lambda: lab.output.query_results == {"refused": 2, "defect": 1})
+
+
+async def test_sources_are_served_between_announcement_and_withdrawal(lab: Lab) -> None:
+    assert await query_all(lab.peer, "mocap/hall/status") == []
+    lab.output.announce("hall")
+    lab.output.announce("hall")
+    reply = await lab.query("mocap/hall/status")
+    assert reply.key == "mocap/hall/status"
+    lab.output.withdraw("hall")
+    lab.output.withdraw("hall")
+    assert await query_all(lab.peer, "mocap/hall/status") == []
+    assert (await lab.query("mocap/lab/status")).payload == b"payload"
+
+
+async def test_a_source_that_the_gateway_no_longer_has_gets_no_reply(lab: Lab) -> None:
+    lab.service.sources.discard("lab")
+    assert await query_all(lab.peer, "mocap/lab/status") == []
+    assert lab.service.received == []
+
+
+async def test_long_answers_arrive_unchanged_and_are_sent_by_a_thread_of_their_own(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(queries_module, "LONG_ANSWER_BYTES", 7)
+    queries = lab.output._queries
+    assert queries is not None
+    used: list[str] = []
+    for name, sender in (("short", queries._sender), ("long", queries._long_sender)):
+        submit = sender.submit
+
+        def record(call: Any, name: str = name, submit: Any = submit) -> Any:
+            used.append(name)
+            return submit(call)
+
+        monkeypatch.setattr(sender, "submit", record)
+    assert (await lab.query("mocap/lab/status")).payload == b"payload"
+    lab.service.payload = b"8 bytes."
+    assert (await lab.query("mocap/lab/status")).payload == b"8 bytes."
+    assert used == ["short", "long"]
+
+
+# Parameters and files ------------------------------------------------------------------------
+
+
+async def test_parameters_are_published_with_their_encoding_and_a_low_priority(lab: Lab) -> None:
+    lab.subscribe("mocap/lab/parameters")
+    lab.output.publish_parameters("lab", ServerParameters(XML, 1))
+    await wait_until_async(lambda: lab.samples)
+    sample = lab.samples[0]
+    assert (sample.payload.to_bytes(), str(sample.encoding)) == (XML, "application/xml")
+    assert sample.congestion_control == zenoh.CongestionControl.BLOCK
+    assert sample.priority == zenoh.Priority.DATA_LOW
+
+
+async def test_files_are_announced_as_json_on_the_key_that_returns_them(lab: Lab) -> None:
+    lab.subscribe("mocap/lab/*")
+    await lab.query("mocap/lab/status")
+    description = {"name": "Käfig.c3d", "bytes": 7}
+
+    def announced() -> list[bytes]:
+        lab.output.announce_file("lab", description)
+        return lab.payloads("mocap/lab/c3d")
+
+    await wait_until_async(announced)
+    [sample, *_] = lab.samples
+    assert sample.payload.to_bytes() == '{"name":"Käfig.c3d","bytes":7}'.encode()
+    assert json.loads(sample.payload.to_bytes()) == description
+    assert str(sample.encoding) == "application/json"
+    assert sample.congestion_control == zenoh.CongestionControl.BLOCK
+    assert sample.priority == zenoh.Priority.DATA_LOW
+
+
+async def test_parameters_published_before_opening_follow_when_the_session_opens() -> None:
+    lab = Lab()
+    lab.output.publish_parameters("lab", ServerParameters(b"<old/>", 1))
+    lab.output.publish_parameters("lab", ServerParameters(XML, 1))
+    lab.output.announce_file("lab", {"name": "early.c3d"})
+    await lab.open()
+    lab.subscribe("mocap/lab/*")
+    await wait_until_async(lambda: lab.payloads("mocap/lab/parameters"))
+    assert set(lab.payloads("mocap/lab/parameters")) == {XML}
+    await lab.output.stop_queries()
+    lab.output.close()
+    lab.peer.close()
+
+
+async def test_a_source_that_returns_does_not_publish_its_old_parameters(lab: Lab) -> None:
+    lab.output.announce("hall")
+    lab.output.publish_parameters("hall", ServerParameters(b"<old/>", 1))
+    lab.output.withdraw("hall")
+    lab.output.announce("hall")
+    lab.subscribe("mocap/**")
+    lab.output.publish_parameters("lab", ServerParameters(XML, 1))
+    await wait_until_async(lambda: lab.payloads("mocap/lab/parameters"))
+    await lab.query("mocap/hall/status")
+    assert lab.payloads("mocap/hall/parameters") == []
+
+
+async def test_an_output_without_queries_has_no_results() -> None:
+    output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer")))
+    output.publish_parameters("lab", ServerParameters(XML, 1))
+    output.announce_file("lab", {"name": "early.c3d"})
+    output.withdraw("lab")
+    assert output.query_results is None
+    await output.stop_queries()
+    await asyncio.to_thread(output.close)
