@@ -13,10 +13,11 @@ from gateway.simulator.faults.base import Fault
 from gateway.simulator.faults.kinds import KINDS
 from gateway.simulator.faults.momentary_faults import Garbage, Undersize
 from gateway.simulator.faults.reply_faults import MissingAcknowledgements, ReplyText
-from gateway.simulator.faults.server_faults import ChangeScene, NoMeasurement, Restart
+from gateway.simulator.faults.server_faults import ChangeScene, NoMeasurement, Rename, Restart
 from gateway.simulator.faults.stream_faults import Delay, HalfOpen
 from gateway.simulator.scene_settings import SceneSettings
 from gateway.simulator.simulator import Simulator
+from gateway.simulator.synthetic import SyntheticScene
 from tests.integration.faulty import FAST_HZ, NEVER_MS, VERSION, clear_and_check, only_connection, playing
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
@@ -186,6 +187,30 @@ async def test_a_changed_scene_keeps_the_scenarios_other_settings() -> None:
         assert simulator.scene.rates_hz[MARKERS] == 50  # type: ignore[index] # its keys are integers
         assert simulator.scene.parameters.tools is not None
         assert len(simulator.scene.parameters.tools.tools) == 1
+
+
+async def test_names_can_change_while_frames_continue() -> None:
+    scene = SyntheticScene(markers=2, tools=1, rate_hz=FAST_HZ)
+    async with Simulator(scene) as simulator, connected(simulator) as client:
+
+        async def labels() -> list[str]:
+            _, xml = await client.ask("SendParameters 3D 6D")
+            parameters = parse_parameters(xml).parameters
+            assert parameters.markers is not None
+            assert parameters.tools is not None
+            markers = [marker.label for marker in parameters.markers.markers]
+            return markers + [tool.label for tool in parameters.tools.tools]
+
+        before = await labels()
+        rename = simulator.faults.begin(Rename(prefix="Left "))
+        assert await labels() == [f"Left {label}" for label in before]
+        await client.ask("StreamFrames 3D")
+        frames = await client.frames(5)
+        simulator.faults.end(rename)
+        frames += await client.frames(5)
+        assert consecutive(frames)
+        client.send(command("StreamFrames Stop"))
+        assert simulator.scene is scene
 
 
 # Which connections, when and how often ------------------------------------------------------

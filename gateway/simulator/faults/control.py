@@ -9,11 +9,13 @@ import numpy as np
 
 from gateway.errors import GatewayError
 from gateway.rtc3d_server.connection_filter import FilteredConnection
+from gateway.rtc3d_server.scene import Scene
 from gateway.rtc3d_server.server import RtServer
 from gateway.simulator.faults.base import ActiveFault, Fault, LastingConnectionFault, MomentaryFault
 from gateway.simulator.faults.kinds import KINDS
 from gateway.simulator.faults.pipeline import ActiveConnectionFaults, FaultPipeline
 from gateway.simulator.faults.server_faults import NoMeasurement, Restart
+from gateway.simulator.renamed_scene import RenamedScene
 from gateway.simulator.scene_settings import SceneSettings
 
 _RETRY_S: Final = 1.0  # between attempts to listen on a port that another program has taken
@@ -127,9 +129,11 @@ class Faults:
 
     def change_scene(self, changes: SceneSettings) -> Callable[[], None]:
         """See FaultyServer."""
-        before = self._server.scene
-        self._server.change_scene(self.scene.with_changes(changes).build())
-        return lambda: self._server.change_scene(before)
+        return self._serve(self.scene.with_changes(changes).build())
+
+    def rename_items(self, prefix: str) -> Callable[[], None]:
+        """See FaultyServer."""
+        return self._serve(RenamedScene(self._server.scene, prefix))
 
     def crash(self) -> None:
         """See FaultyServer."""
@@ -141,6 +145,11 @@ class Faults:
             self._restarting = asyncio.get_running_loop().create_task(self._restart())
 
     # Internals ------------------------------------------------------------------------------
+
+    def _serve(self, scene: Scene) -> Callable[[], None]:
+        before = self._server.scene
+        self._server.change_scene(scene)
+        return lambda: self._server.change_scene(before)
 
     def _new_active_fault(self, fault: Fault) -> ActiveFault:
         self._num_added += 1

@@ -47,6 +47,10 @@ class FaultyServer(Protocol):
         """Serve the scenario's scene with changes; return a function that restores the previous scene."""
         ...
 
+    def rename_items(self, prefix: str) -> Callable[[], None]:
+        """Put ``prefix`` before the names of markers and tools; return a function that restores the scene."""
+        ...
+
     def crash(self) -> None:
         """End as if the process died."""
         ...

@@ -1,11 +1,11 @@
-"""Faults of the server as a whole: no measurement, another scene, a restart."""
+"""Faults of the server as a whole: no measurement, another scene, other names, a restart."""
 
 from collections.abc import Callable
 from typing import ClassVar, Final
 
 from gateway.simulator.faults.base import ActiveFault, Fault, LastingFault
 from gateway.simulator.faults.parameters import Seconds
-from gateway.simulator.scene_settings import SceneSettings
+from gateway.simulator.scene_settings import Label, SceneSettings
 
 
 class NoMeasurement(LastingFault):
@@ -32,6 +32,19 @@ class ChangeScene(LastingFault):
         return active.server.change_scene(self.scene)
 
 
+class Rename(LastingFault):
+    """Somebody renames all markers and tools; when the fault ends, they have their former names."""
+
+    kind: ClassVar[str] = "rename"
+
+    prefix: Label = "New "
+    """The text before each former name."""
+
+    def begin(self, active: ActiveFault) -> Callable[[], None]:
+        """See Fault."""
+        return active.server.rename_items(self.prefix)
+
+
 class Restart(Fault):
     """The server crashes and comes back on the same port with a new measurement."""
 
@@ -56,4 +69,4 @@ class Restart(Fault):
         return active.server.restart
 
 
-SERVER_FAULTS: Final[tuple[type[Fault], ...]] = (NoMeasurement, ChangeScene, Restart)
+SERVER_FAULTS: Final[tuple[type[Fault], ...]] = (NoMeasurement, ChangeScene, Rename, Restart)

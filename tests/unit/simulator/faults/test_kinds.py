@@ -18,7 +18,7 @@ def test_every_kind_of_fault_has_defaults_for_all_parameters() -> None:
         *("oversize", "undersize", "wrong_counts", "wrong_byte_order", "unknown_component"),
         *("refused_commands", "minimal_server", "reply_text", "frames_first"),
         *("doubled_acknowledgements", "missing_acknowledgements", "late_acknowledgements"),
-        *("no_measurement", "restart", "change_scene", "occlusion"),
+        *("no_measurement", "restart", "change_scene", "rename", "occlusion"),
         *("frozen_timestamps", "jumping_timestamps", "constant_frame_numbers", "short_events"),
     }
     for name, kind in KINDS.items():
