@@ -9,8 +9,8 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-_POSE: Final = struct.Struct(">8sqqqiiq?3f4ff")  # tool_pose_t, 81 bytes
-_MARKERS: Final = struct.Struct(">8sqqqiiqi")  # markers_t without its items
+_POSE: Final = struct.Struct(">8sqqqiiiq?3f4ff")  # tool_pose_t, 85 bytes
+_MARKERS: Final = struct.Struct(">8sqqqiiiqi")  # markers_t without its items
 _FLOAT: Final = np.dtype(">f4")
 _MM_PER_M: Final = 1000
 
@@ -46,13 +46,13 @@ class Cloud(NamedTuple):
 
 def pose(message: bytes) -> Pose | None:
     """Return the pose in a ``tool_pose_t``, or None if the tool is out of view: ROS has no NaN poses."""
-    _, _, capture_utime, _, _, _, _, visible, x, y, z, qx, qy, qz, qw, _ = _POSE.unpack(message)
+    _, _, capture_utime, _, _, _, _, _, visible, x, y, z, qx, qy, qz, qw, _ = _POSE.unpack(message)
     return Pose(Stamp.of(capture_utime), (x, y, z), (qx, qy, qz, qw)) if visible else None
 
 
 def cloud(message: bytes) -> Cloud:
     """Return the markers of a ``markers_t`` in mm as points in m. A missing marker becomes a NaN point."""
-    _, _, capture_utime, _, _, _, _, count = _MARKERS.unpack_from(message)
+    _, _, capture_utime, _, _, _, _, _, count = _MARKERS.unpack_from(message)
     markers = np.frombuffer(message, _FLOAT, 4 * count, _MARKERS.size).reshape(-1, 4)
     points_m = (markers[:, :3] / _MM_PER_M).astype("<f4")
     return Cloud(Stamp.of(capture_utime), count, points_m.tobytes())

@@ -20,7 +20,8 @@ static void on_markers(const lcm_recv_buf_t *buffer, const char *channel, const 
 {
     (void)buffer;
     (void)user;
-    printf("%s sequence %lld frame %d:", channel, (long long)message->sequence, message->frame_number);
+    printf("%s sequence %lld frame %d with parameters %d:", channel, (long long)message->sequence,
+           message->frame_number, message->parameters_version);
     for (int i = 0; i < message->num_markers; i++) {
         const rtc3d_marker_t *marker = &message->markers[i];
         if (isnan(marker->x))

@@ -25,7 +25,7 @@ def main() -> None:
             first = visible[0]
             position = f", the first at {first.x:.3f}, {first.y:.3f}, {first.z:.3f} mm"
         print(
-            f"#{message.sequence} frame {message.frame_number}: "
+            f"#{message.sequence} frame {message.frame_number} with parameters {message.parameters_version}: "
             f"{len(visible)} of {message.num_markers} markers in view{position}"
         )
         frames_left -= 1

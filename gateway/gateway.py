@@ -147,7 +147,9 @@ class Gateway:
         for name, source in self._sources.items():
             xml = source.queries.parameters.xml
             if xml is not None:
-                output.publish_parameters(name, ServerParameters(xml, source.queries.session))
+                output.publish_parameters(
+                    name, ServerParameters(xml, source.queries.session, source.queries.parameters_version)
+                )
 
     async def _change_sources(self, wanted_sources: Sequence[SourceSettings]) -> list[str]:
         wanted = {settings.name: settings for settings in wanted_sources}

@@ -16,6 +16,7 @@ from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.queries.server_requests import SendCommand, StreamAccess
 from gateway.queries.source_queries import SourceQueries
+from gateway.rtc3d.parameters import Parameters, without_statistics
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.stream.state import StreamState
 from gateway.stream.status import FrameRate, StreamStatus
@@ -32,8 +33,8 @@ class Source:
 
     ``publish_parameters`` is called with the source's name and its parameters, for every connection and when
     they change; ``announce_file`` with the name and the description of every C3D file that was stored.
-    ``before`` is the source that this one replaces after a reload; its session and sequence numbers
-    continue.
+    ``before`` is the source that this one replaces after a reload; its session and sequence numbers and
+    the version of its parameters continue.
     """
 
     def __init__(
@@ -49,8 +50,7 @@ class Source:
         self.spool = spool
         self.fan_out = fan_out
         self.fan_out.on_items_changed = self._refresh_parameters_soon
-        session = 0 if before is None else max(status.session for status in before.statuses)
-        self.statuses: list[StreamStatus] = [self._new_status(stream, session) for stream in settings.streams]
+        self.statuses: list[StreamStatus] = [self._new_status(stream, before) for stream in settings.streams]
         self.supervisors = [
             Supervisor(settings, stream, status, self._callbacks(stream))
             for stream, status in zip(settings.streams, self.statuses, strict=True)
@@ -61,6 +61,8 @@ class Source:
         self._frame_rates = [FrameRate() for _ in settings.streams]
         self._frame_rates_hz = [0.0 for _ in settings.streams]
         self._tasks: set[asyncio.Task[None]] = set()
+        self.parameters: Parameters | None = None if before is None else before.parameters
+        """The newest parameters, without the server's statistics; None before the first."""
         self._num_unstored_files = 0
         self._is_refresh_planned = False
         self.sequence: int = 0 if before is None else before.sequence
@@ -130,10 +132,13 @@ class Source:
         encoded: bytes = message.encode()
         return encoded
 
-    def _new_status(self, stream: StreamSettings, session: int) -> StreamStatus:
+    def _new_status(self, stream: StreamSettings, before: "Source | None") -> StreamStatus:
         components = " ".join(component.key for component in stream.components)
-        name = f"{self.name} ({components})"
-        return StreamStatus(components, name=name, on_state=self._on_state, session=session)
+        status = StreamStatus(components, name=f"{self.name} ({components})", on_state=self._on_state)
+        if before is not None:
+            status.session = max(each.session for each in before.statuses)
+            status.parameters_version = before.queries.parameters_version
+        return status
 
     def _on_state(self, _state: StreamState) -> None:
         is_streaming = any(status.state is StreamState.STREAMING for status in self.statuses)
@@ -163,8 +168,15 @@ class Source:
         self._start_task(self.queries.parameters.fill())
 
     def _publish_new_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
-        self.fan_out.set_parameters(parsed.parameters)
-        self._publish_parameters(self.name, ServerParameters(xml, self.queries.session))
+        """Publish parameters; if they differ from the former ones, they are a new version."""
+        parameters = without_statistics(parsed.parameters)
+        if parameters != self.parameters:
+            self.parameters = parameters
+            for status in self.statuses:
+                status.parameters_changed(status.parameters_version + 1)
+        self.fan_out.set_parameters(parameters)
+        version = self.queries.parameters_version
+        self._publish_parameters(self.name, ServerParameters(xml, self.queries.session, version))
 
     def _refresh_parameters_soon(self) -> None:
         """Request the parameters again after ``fresh_interval_s``: the scene may have changed."""

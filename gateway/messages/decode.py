@@ -1,11 +1,13 @@
 """Decoding LCM messages of the gateway, and converting them to JSON."""
 
 import math
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import rtc3d
 
 from gateway.errors import ProtocolError
+from gateway.messages.encode import FINGERPRINT_BYTES
+from gateway.messages.stamp import PREFIX
 
 MESSAGE_TYPES_BY_NAME: Final[dict[str, type[Any]]] = {
     message_type.__name__: message_type
@@ -29,6 +31,21 @@ _MESSAGE_TYPES_BY_FINGERPRINT: Final = {
     message_type._get_packed_fingerprint(): message_type  # noqa: SLF001 - lcm-gen offers no other way
     for message_type in MESSAGE_TYPES_BY_NAME.values()
 }
+
+
+class Prefix(NamedTuple):
+    """The prefix of a message; docs/reference/messages.md describes the fields."""
+
+    utime: int
+    capture_utime: int
+    sequence: int
+    session: int
+    parameters_version: int
+
+
+def prefix_of(message: bytes) -> Prefix:
+    """Return the prefix of one of the gateway's messages."""
+    return Prefix(*PREFIX.unpack_from(message, FINGERPRINT_BYTES))
 
 
 def message_type(message: bytes) -> type[Any]:

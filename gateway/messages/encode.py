@@ -36,10 +36,10 @@ MESSAGE_TYPES: Final[dict[ComponentType, type[Any]]] = {
 FINGERPRINT_BYTES: Final = 8
 
 CONTENT_OFFSET: Final = FINGERPRINT_BYTES + PREFIX.size
-"""The offset of the component's content in a message: 36."""
+"""The offset of the component's content in a message: 40."""
 
 ITEMS_OFFSET: Final = CONTENT_OFFSET + 16
-"""The offset of the items in a message, after frame number, time stamp and count: 52."""
+"""The offset of the items in a message, after frame number, time stamp and count: 56."""
 
 _FINGERPRINTS: Final[dict[ComponentType, bytes]] = {
     component: message_type._get_packed_fingerprint()  # noqa: SLF001 - lcm-gen offers no other way

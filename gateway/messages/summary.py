@@ -21,7 +21,8 @@ def summarise(message: Any) -> str:
         case rtc3d.clock_t():
             return f"#{message.sequence} {_clock(message.clock)} ({message.components})"
         case rtc3d.parameters_t():
-            return f"#{message.sequence} session {message.session}: {summarise_xml(message.xml.encode())}"
+            version = f"session {message.session}, version {message.parameters_version}"
+            return f"#{message.sequence} {version}: {summarise_xml(message.xml.encode())}"
         case rtc3d.parameters_request_t():
             sections = " ".join(message.sections) or "all"
             fresh = ", fresh" if message.fresh else ""

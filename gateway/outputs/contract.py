@@ -68,10 +68,14 @@ class Answer(NamedTuple):
 
 
 class ServerParameters(NamedTuple):
-    """A server's parameters (§6): the XML as received, the number of its session, and its age in s."""
+    """A server's parameters (§6): the XML as received.
+
+    ``session`` is the number of its session, ``version`` grows whenever the parameters change.
+    """
 
     xml: bytes
     session: int
+    version: int
     age_s: float = 0.0
 
 

@@ -43,6 +43,7 @@ def status_message(
     message.utime = message.capture_utime = now_utime()
     message.sequence = sequence
     message.session = sum(stream.session for stream, _ in streams)
+    message.parameters_version = max((stream.parameters_version for stream, _ in streams), default=0)
     message.source = source
     message.server = server
     message.gateway_version = __version__
@@ -59,6 +60,7 @@ def clock_message(session: int, sequence: int, stream: StreamStatus) -> rtc3d.cl
     message.utime = message.capture_utime = now_utime()
     message.sequence = sequence
     message.session = session
+    message.parameters_version = stream.parameters_version
     message.components = stream.components
     message.clock = clock_model(stream.clock)
     return message

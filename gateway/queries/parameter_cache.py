@@ -7,7 +7,7 @@ import asyncio
 import logging
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Final, NamedTuple
 
@@ -16,7 +16,7 @@ from gateway.errors import ParametersError, QueryError
 from gateway.queries.answers import parameters_json
 from gateway.queries.server_requests import ServerRequests
 from gateway.rtc3d.commands import SendParameters
-from gateway.rtc3d.parameters import SECTIONS
+from gateway.rtc3d.parameters import SECTIONS, without_statistics
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 
 LONG_XML_BYTES: Final = 64 * 1024
@@ -55,10 +55,7 @@ class CachedParameters:
         """What is compared to find changes: the parameters without the server's statistics (§6.1)."""
         if self.parsed is None:
             return self.xml
-        parameters = self.parsed.parameters
-        if parameters.general is None:
-            return parameters
-        return replace(parameters, general=replace(parameters.general, frames_sent=None, frames_per_s=None))
+        return without_statistics(self.parsed.parameters)
 
 
 def parse_answer(sections: Sections, xml: bytes, session: int) -> CachedParameters:

@@ -41,6 +41,11 @@ class ServerRequests:
         return sum(stream.status.session for stream in self._streams)
 
     @property
+    def parameters_version(self) -> int:
+        """The version of the server's parameters; 0 before the first."""
+        return self._streams[0].status.parameters_version
+
+    @property
     def is_connected(self) -> bool:
         """Whether any stream has a connection."""
         return any(stream.sender() is not None for stream in self._streams)

@@ -8,9 +8,10 @@ from typing import Any
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import FrameError, QueryError
-from gateway.messages.encode import FINGERPRINT_BYTES, encode_message
+from gateway.messages.decode import prefix_of
+from gateway.messages.encode import encode_message
 from gateway.messages.host_time import now_utime
-from gateway.messages.stamp import NOT_PUBLISHED, PREFIX, Stamp
+from gateway.messages.stamp import NOT_PUBLISHED, Stamp
 from gateway.outputs.contract import Answer
 from gateway.outputs.encodings import JSON, XML, json_bytes
 from gateway.queries.answers import message_answer, schema_answer
@@ -58,6 +59,11 @@ class SourceQueries:
         """A number that grows with every connection of any stream."""
         return self._requests.session
 
+    @property
+    def parameters_version(self) -> int:
+        """The version of the server's parameters; 0 before the first."""
+        return self._requests.parameters_version
+
     async def answer(self, question: Question) -> Answer:
         """Return the answer; raises QueryError at the latest after query_timeout_s."""
         match question.kind:
@@ -77,7 +83,11 @@ class SourceQueries:
     async def _parameters(self, question: Question) -> Answer:
         sections = (question.name,) if question.name else ()
         cached = await self.parameters.get(sections, fresh=question.fresh, stale_ok=question.stale_ok)
-        attachment: dict[str, Any] = {"age_s": round(cached.age_s, 3), "session": cached.session}
+        attachment: dict[str, Any] = {
+            "age_s": round(cached.age_s, 3),
+            "session": cached.session,
+            "parameters_version": self.parameters_version,
+        }
         if not self._requests.is_connected:
             attachment["stale"] = True
         if not question.as_json:
@@ -100,7 +110,7 @@ class SourceQueries:
             raise self._requests.no_connection_error()
         if stream.status.state is StreamState.STREAMING:
             message = self._newest_messages().get(component)
-            if message is None or _session_of(message) != session:
+            if message is None or prefix_of(message).session != session:
                 raise QueryError(
                     f"no {component.key} has arrived from source {self._settings.name!r} in this session",
                     code="nothing-yet",
@@ -110,8 +120,11 @@ class SourceQueries:
                 ("frame", component), lambda: self._current_frame(component, stream)
             )
             utime = now_utime()
-            message = encode_message(current, Stamp(utime, utime, session), NOT_PUBLISHED)
-        return message_answer(message, question, {"session": session})
+            message = encode_message(
+                current, Stamp(utime, utime, session, self.parameters_version), NOT_PUBLISHED
+            )
+        attachment = {"session": session, "parameters_version": prefix_of(message).parameters_version}
+        return message_answer(message, question, attachment)
 
     async def _current_frame(self, component: ComponentType, stream: StreamAccess) -> Component:
         """Request a component of the current frame (§5.3.4).
@@ -144,8 +157,3 @@ class SourceQueries:
         if not self._record(question.set == "start"):
             raise self._requests.no_connection_error()
         return Answer(json_bytes({"source": self._settings.name, "sent": question.set}), JSON)
-
-
-def _session_of(message: bytes) -> int:
-    session: int = PREFIX.unpack_from(message, FINGERPRINT_BYTES)[3]
-    return session

@@ -4,7 +4,7 @@ A text that the server did not send is "" (or its default in §6, such as mm), a
 server's own texts: numbers may start anywhere (field note 9), and an event's id may be hexadecimal.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import nan
 from typing import Any, Final, NamedTuple
 
@@ -199,3 +199,10 @@ SECTIONS: Final = {
 def sections_of(parameters: Parameters) -> frozenset[str]:
     """Return the keys in SECTIONS of the sections that ``parameters`` has."""
     return frozenset(key for key, section in SECTIONS.items() if section.of(parameters) is not None)
+
+
+def without_statistics(parameters: Parameters) -> Parameters:
+    """Return the parameters without the server's statistics (§6.1), which differ in every reply."""
+    if parameters.general is None:
+        return parameters
+    return replace(parameters, general=replace(parameters.general, frames_sent=None, frames_per_s=None))

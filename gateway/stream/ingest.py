@@ -79,7 +79,9 @@ class Ingest:
             self._status.lag_measured(lag_s)
             if self._lag.observe(now_s, lag_s):
                 self._on_lateness(self._lag.halvings)
-        return Stamp(utime, capture_utime, self._status.session, clock.has_clock)
+        return Stamp(
+            utime, capture_utime, self._status.session, self._status.parameters_version, clock.has_clock
+        )
 
     def _follow_frame_number(self, first_component_type: ComponentType | None, frame_number: int) -> None:
         """Keep ``frame_number`` if the followed type comes first in the frame.

@@ -38,11 +38,12 @@ class StreamStatus:
     Most methods are named after the event that they report.
 
     ``components`` are the configured components, separated by spaces. ``name`` begins the stream's log
-    lines. ``on_state`` is called with each new state. ``last_frame_utime`` is when the newest frame arrived,
-    in µs since the Unix epoch, 0 before the first. ``tries`` counts the attempts to connect since the last
-    completed handshake, ``reconnects`` all attempts except the first. ``restarts`` counts how often the
-    server's time or frame numbers started again within a connection. ``drops`` counts by cause what arrived
-    and was not published. ``limitations`` lists what the current connection lacks.
+    lines. ``on_state`` is called with each new state. ``parameters_version`` is that of the server's
+    parameters, 0 before the first; all streams of a source have the same. ``last_frame_utime`` is when the
+    newest frame arrived, in µs since the Unix epoch, 0 before the first. ``tries`` counts the attempts to
+    connect since the last completed handshake, ``reconnects`` all attempts except the first. ``restarts``
+    counts how often the server's time or frame numbers started again within a connection. ``drops`` counts
+    by cause what arrived and was not published. ``limitations`` lists what the current connection lacks.
     """
 
     components: str
@@ -52,6 +53,7 @@ class StreamStatus:
     byte_order: str = ""
     rate: str = ""
     session: int = 0
+    parameters_version: int = 0
     frames_in: int = 0
     last_frame_utime: int = 0
     bytes_in: int = 0
@@ -138,6 +140,10 @@ class StreamStatus:
         self.drops["unknown component"] += count
 
     # What the server and the gateway agreed on, and errors.
+
+    def parameters_changed(self, version: int) -> None:
+        """Note the version of the server's parameters; the frames after this belong to it."""
+        self.parameters_version = version
 
     def rate_agreed(self, rate: str) -> None:
         """Note the rate at which the server streams; empty for its default, or while it does not stream."""

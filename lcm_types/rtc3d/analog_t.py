@@ -13,11 +13,11 @@ class analog_t(object):
     in the units of the Analog parameters (mV by default).
     """
 
-    __slots__ = ["utime", "capture_utime", "sequence", "session", "frame_number", "timestamp", "num_channels", "voltages"]
+    __slots__ = ["utime", "capture_utime", "sequence", "session", "parameters_version", "frame_number", "timestamp", "num_channels", "voltages"]
 
-    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "int64_t", "int32_t", "float"]
+    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "int32_t", "int64_t", "int32_t", "float"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, ["num_channels"]]
+    __dimensions__ = [None, None, None, None, None, None, None, None, ["num_channels"]]
 
     def __init__(self):
         self.utime = 0
@@ -41,6 +41,12 @@ class analog_t(object):
         self.session = 0
         """
         Grows by one with each connection to the server.
+        LCM Type: int32_t
+        """
+
+        self.parameters_version = 0
+        """
+        The version of the parameters (parameters_t) that describe this frame; 0 before the first.
         LCM Type: int32_t
         """
 
@@ -68,7 +74,7 @@ class analog_t(object):
         return buf.getvalue()
 
     def _encode_one(self, buf):
-        buf.write(struct.pack(">qqqiiqi", self.utime, self.capture_utime, self.sequence, self.session, self.frame_number, self.timestamp, self.num_channels))
+        buf.write(struct.pack(">qqqiiiqi", self.utime, self.capture_utime, self.sequence, self.session, self.parameters_version, self.frame_number, self.timestamp, self.num_channels))
         buf.write(struct.pack('>%df' % self.num_channels, *self.voltages[:self.num_channels]))
 
     @staticmethod
@@ -84,14 +90,14 @@ class analog_t(object):
     @staticmethod
     def _decode_one(buf):
         self = analog_t()
-        self.utime, self.capture_utime, self.sequence, self.session, self.frame_number, self.timestamp, self.num_channels = struct.unpack(">qqqiiqi", buf.read(44))
+        self.utime, self.capture_utime, self.sequence, self.session, self.parameters_version, self.frame_number, self.timestamp, self.num_channels = struct.unpack(">qqqiiiqi", buf.read(48))
         self.voltages = struct.unpack('>%df' % self.num_channels, buf.read(self.num_channels * 4))
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if analog_t in parents: return 0
-        tmphash = (0xe58323ac7abda997) & 0xffffffffffffffff
+        tmphash = (0x66a1d4eea3334df6) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

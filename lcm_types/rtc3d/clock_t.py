@@ -12,11 +12,11 @@ import rtc3d
 class clock_t(object):
     """ The clock model of one source, published once per second. """
 
-    __slots__ = ["utime", "capture_utime", "sequence", "session", "components", "clock"]
+    __slots__ = ["utime", "capture_utime", "sequence", "session", "parameters_version", "components", "clock"]
 
-    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "string", "rtc3d.clock_model_t"]
+    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "string", "rtc3d.clock_model_t"]
 
-    __dimensions__ = [None, None, None, None, None, None]
+    __dimensions__ = [None, None, None, None, None, None, None]
 
     def __init__(self):
         self.utime = 0
@@ -43,6 +43,12 @@ class clock_t(object):
         LCM Type: int32_t
         """
 
+        self.parameters_version = 0
+        """
+        The version of the newest parameters (parameters_t); 0 before the first.
+        LCM Type: int32_t
+        """
+
         self.components = ""
         """
         The components of the stream that the clock model belongs to.
@@ -59,7 +65,7 @@ class clock_t(object):
         return buf.getvalue()
 
     def _encode_one(self, buf):
-        buf.write(struct.pack(">qqqi", self.utime, self.capture_utime, self.sequence, self.session))
+        buf.write(struct.pack(">qqqii", self.utime, self.capture_utime, self.sequence, self.session, self.parameters_version))
         __components_encoded = self.components.encode('utf-8')
         buf.write(struct.pack('>I', len(__components_encoded)+1))
         buf.write(__components_encoded)
@@ -80,7 +86,7 @@ class clock_t(object):
     @staticmethod
     def _decode_one(buf):
         self = clock_t()
-        self.utime, self.capture_utime, self.sequence, self.session = struct.unpack(">qqqi", buf.read(28))
+        self.utime, self.capture_utime, self.sequence, self.session, self.parameters_version = struct.unpack(">qqqii", buf.read(32))
         __components_len = struct.unpack('>I', buf.read(4))[0]
         self.components = buf.read(__components_len)[:-1].decode('utf-8', 'replace')
         self.clock = rtc3d.clock_model_t._decode_one(buf)
@@ -90,7 +96,7 @@ class clock_t(object):
     def _get_hash_recursive(parents):
         if clock_t in parents: return 0
         newparents = parents + [clock_t]
-        tmphash = (0x196651e67363b577+ rtc3d.clock_model_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0xae9a6386cfb1b9f1+ rtc3d.clock_model_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

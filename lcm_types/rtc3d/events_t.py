@@ -12,11 +12,11 @@ import rtc3d
 class events_t(object):
     """ The Event component of one frame (RTC3D §7.7). """
 
-    __slots__ = ["utime", "capture_utime", "sequence", "session", "frame_number", "timestamp", "num_events", "events"]
+    __slots__ = ["utime", "capture_utime", "sequence", "session", "parameters_version", "frame_number", "timestamp", "num_events", "events"]
 
-    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "int64_t", "int32_t", "rtc3d.event_t"]
+    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "int32_t", "int64_t", "int32_t", "rtc3d.event_t"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, ["num_events"]]
+    __dimensions__ = [None, None, None, None, None, None, None, None, ["num_events"]]
 
     def __init__(self):
         self.utime = 0
@@ -40,6 +40,12 @@ class events_t(object):
         self.session = 0
         """
         Grows by one with each connection to the server.
+        LCM Type: int32_t
+        """
+
+        self.parameters_version = 0
+        """
+        The version of the parameters (parameters_t) that describe this frame; 0 before the first.
         LCM Type: int32_t
         """
 
@@ -67,7 +73,7 @@ class events_t(object):
         return buf.getvalue()
 
     def _encode_one(self, buf):
-        buf.write(struct.pack(">qqqiiqi", self.utime, self.capture_utime, self.sequence, self.session, self.frame_number, self.timestamp, self.num_events))
+        buf.write(struct.pack(">qqqiiiqi", self.utime, self.capture_utime, self.sequence, self.session, self.parameters_version, self.frame_number, self.timestamp, self.num_events))
         for i0 in range(self.num_events):
             assert self.events[i0]._get_packed_fingerprint() == rtc3d.event_t._get_packed_fingerprint()
             self.events[i0]._encode_one(buf)
@@ -85,7 +91,7 @@ class events_t(object):
     @staticmethod
     def _decode_one(buf):
         self = events_t()
-        self.utime, self.capture_utime, self.sequence, self.session, self.frame_number, self.timestamp, self.num_events = struct.unpack(">qqqiiqi", buf.read(44))
+        self.utime, self.capture_utime, self.sequence, self.session, self.parameters_version, self.frame_number, self.timestamp, self.num_events = struct.unpack(">qqqiiiqi", buf.read(48))
         self.events = []
         for i0 in range(self.num_events):
             self.events.append(rtc3d.event_t._decode_one(buf))
@@ -95,7 +101,7 @@ class events_t(object):
     def _get_hash_recursive(parents):
         if events_t in parents: return 0
         newparents = parents + [events_t]
-        tmphash = (0x50c9c6faf9cf8fa3+ rtc3d.event_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x74be49a749b02d2d+ rtc3d.event_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -10,11 +10,11 @@ import struct
 class parameters_reply_t(object):
     """ The reply to a parameters_request_t. """
 
-    __slots__ = ["request_id", "requester", "xml", "age_s", "error", "error_code"]
+    __slots__ = ["request_id", "requester", "xml", "parameters_version", "age_s", "error", "error_code"]
 
-    __typenames__ = ["int64_t", "string", "string", "double", "string", "string"]
+    __typenames__ = ["int64_t", "string", "string", "int32_t", "double", "string", "string"]
 
-    __dimensions__ = [None, None, None, None, None, None]
+    __dimensions__ = [None, None, None, None, None, None, None]
 
     def __init__(self):
         self.request_id = 0
@@ -25,6 +25,12 @@ class parameters_reply_t(object):
         """
         The server's XML, unchanged; "" if there is an error.
         LCM Type: string
+        """
+
+        self.parameters_version = 0
+        """
+        The version of the parameters, as in the prefix of other messages; 0 if there is an error.
+        LCM Type: int32_t
         """
 
         self.age_s = 0.0
@@ -62,7 +68,7 @@ class parameters_reply_t(object):
         buf.write(struct.pack('>I', len(__xml_encoded)+1))
         buf.write(__xml_encoded)
         buf.write(b"\0")
-        buf.write(struct.pack(">d", self.age_s))
+        buf.write(struct.pack(">id", self.parameters_version, self.age_s))
         __error_encoded = self.error.encode('utf-8')
         buf.write(struct.pack('>I', len(__error_encoded)+1))
         buf.write(__error_encoded)
@@ -90,7 +96,7 @@ class parameters_reply_t(object):
         self.requester = buf.read(__requester_len)[:-1].decode('utf-8', 'replace')
         __xml_len = struct.unpack('>I', buf.read(4))[0]
         self.xml = buf.read(__xml_len)[:-1].decode('utf-8', 'replace')
-        self.age_s = struct.unpack(">d", buf.read(8))[0]
+        self.parameters_version, self.age_s = struct.unpack(">id", buf.read(12))
         __error_len = struct.unpack('>I', buf.read(4))[0]
         self.error = buf.read(__error_len)[:-1].decode('utf-8', 'replace')
         __error_code_len = struct.unpack('>I', buf.read(4))[0]
@@ -100,7 +106,7 @@ class parameters_reply_t(object):
     @staticmethod
     def _get_hash_recursive(parents):
         if parameters_reply_t in parents: return 0
-        tmphash = (0xf094e877d28c837d) & 0xffffffffffffffff
+        tmphash = (0x2f11d4df49ce5253) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -10,11 +10,11 @@ import struct
 class parameters_t(object):
     """ The parameters of a source, published at every connection, when they change, and every few seconds. """
 
-    __slots__ = ["utime", "capture_utime", "sequence", "session", "xml"]
+    __slots__ = ["utime", "capture_utime", "sequence", "session", "parameters_version", "xml"]
 
-    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "string"]
+    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "string"]
 
-    __dimensions__ = [None, None, None, None, None]
+    __dimensions__ = [None, None, None, None, None, None]
 
     def __init__(self):
         self.utime = 0
@@ -41,6 +41,12 @@ class parameters_t(object):
         LCM Type: int32_t
         """
 
+        self.parameters_version = 0
+        """
+        Grows by one whenever the server's parameters change. Every message carries the version that describes it.
+        LCM Type: int32_t
+        """
+
         self.xml = ""
         """
         The server's XML, unchanged.
@@ -55,7 +61,7 @@ class parameters_t(object):
         return buf.getvalue()
 
     def _encode_one(self, buf):
-        buf.write(struct.pack(">qqqi", self.utime, self.capture_utime, self.sequence, self.session))
+        buf.write(struct.pack(">qqqii", self.utime, self.capture_utime, self.sequence, self.session, self.parameters_version))
         __xml_encoded = self.xml.encode('utf-8')
         buf.write(struct.pack('>I', len(__xml_encoded)+1))
         buf.write(__xml_encoded)
@@ -74,7 +80,7 @@ class parameters_t(object):
     @staticmethod
     def _decode_one(buf):
         self = parameters_t()
-        self.utime, self.capture_utime, self.sequence, self.session = struct.unpack(">qqqi", buf.read(28))
+        self.utime, self.capture_utime, self.sequence, self.session, self.parameters_version = struct.unpack(">qqqii", buf.read(32))
         __xml_len = struct.unpack('>I', buf.read(4))[0]
         self.xml = buf.read(__xml_len)[:-1].decode('utf-8', 'replace')
         return self
@@ -82,7 +88,7 @@ class parameters_t(object):
     @staticmethod
     def _get_hash_recursive(parents):
         if parameters_t in parents: return 0
-        tmphash = (0xef2085ca6c5a7b46) & 0xffffffffffffffff
+        tmphash = (0xdc43e55521ec18c5) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

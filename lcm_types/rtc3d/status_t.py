@@ -12,11 +12,11 @@ import rtc3d
 class status_t(object):
     """ The status of the gateway and its connections to one source, published once per second. """
 
-    __slots__ = ["utime", "capture_utime", "sequence", "session", "source", "server", "gateway_version", "num_streams", "streams", "num_outputs", "outputs"]
+    __slots__ = ["utime", "capture_utime", "sequence", "session", "parameters_version", "source", "server", "gateway_version", "num_streams", "streams", "num_outputs", "outputs"]
 
-    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "string", "string", "string", "int32_t", "rtc3d.stream_status_t", "int32_t", "rtc3d.output_status_t"]
+    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "string", "string", "string", "int32_t", "rtc3d.stream_status_t", "int32_t", "rtc3d.output_status_t"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, None, ["num_streams"], None, ["num_outputs"]]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None, ["num_streams"], None, ["num_outputs"]]
 
     def __init__(self):
         self.utime = 0
@@ -40,6 +40,12 @@ class status_t(object):
         self.session = 0
         """
         The sum of the session numbers of all streams.
+        LCM Type: int32_t
+        """
+
+        self.parameters_version = 0
+        """
+        The version of the newest parameters (parameters_t); 0 before the first.
         LCM Type: int32_t
         """
 
@@ -69,7 +75,7 @@ class status_t(object):
         return buf.getvalue()
 
     def _encode_one(self, buf):
-        buf.write(struct.pack(">qqqi", self.utime, self.capture_utime, self.sequence, self.session))
+        buf.write(struct.pack(">qqqii", self.utime, self.capture_utime, self.sequence, self.session, self.parameters_version))
         __source_encoded = self.source.encode('utf-8')
         buf.write(struct.pack('>I', len(__source_encoded)+1))
         buf.write(__source_encoded)
@@ -104,7 +110,7 @@ class status_t(object):
     @staticmethod
     def _decode_one(buf):
         self = status_t()
-        self.utime, self.capture_utime, self.sequence, self.session = struct.unpack(">qqqi", buf.read(28))
+        self.utime, self.capture_utime, self.sequence, self.session, self.parameters_version = struct.unpack(">qqqii", buf.read(32))
         __source_len = struct.unpack('>I', buf.read(4))[0]
         self.source = buf.read(__source_len)[:-1].decode('utf-8', 'replace')
         __server_len = struct.unpack('>I', buf.read(4))[0]
@@ -125,7 +131,7 @@ class status_t(object):
     def _get_hash_recursive(parents):
         if status_t in parents: return 0
         newparents = parents + [status_t]
-        tmphash = (0x118c551e857c726c+ rtc3d.stream_status_t._get_hash_recursive(newparents)+ rtc3d.output_status_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x15685d12b81a2d14+ rtc3d.stream_status_t._get_hash_recursive(newparents)+ rtc3d.output_status_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -10,11 +10,11 @@ import struct
 class tool_pose_t(object):
     """ The pose of one tool, for robots: SI units and a quaternion with the scalar last. """
 
-    __slots__ = ["utime", "capture_utime", "sequence", "session", "frame_number", "timestamp", "visible", "position_m", "orientation_xyzw", "error_m"]
+    __slots__ = ["utime", "capture_utime", "sequence", "session", "parameters_version", "frame_number", "timestamp", "visible", "position_m", "orientation_xyzw", "error_m"]
 
-    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "int64_t", "boolean", "float", "float", "float"]
+    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "int32_t", "int64_t", "boolean", "float", "float", "float"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, [3], [4], None]
+    __dimensions__ = [None, None, None, None, None, None, None, None, [3], [4], None]
 
     def __init__(self):
         self.utime = 0
@@ -38,6 +38,12 @@ class tool_pose_t(object):
         self.session = 0
         """
         Grows by one with each connection to the server.
+        LCM Type: int32_t
+        """
+
+        self.parameters_version = 0
+        """
+        The version of the parameters (parameters_t) that describe this frame; 0 before the first.
         LCM Type: int32_t
         """
 
@@ -85,7 +91,7 @@ class tool_pose_t(object):
         return buf.getvalue()
 
     def _encode_one(self, buf):
-        buf.write(struct.pack(">qqqiiqb", self.utime, self.capture_utime, self.sequence, self.session, self.frame_number, self.timestamp, self.visible))
+        buf.write(struct.pack(">qqqiiiqb", self.utime, self.capture_utime, self.sequence, self.session, self.parameters_version, self.frame_number, self.timestamp, self.visible))
         buf.write(struct.pack('>3f', *self.position_m[:3]))
         buf.write(struct.pack('>4f', *self.orientation_xyzw[:4]))
         buf.write(struct.pack(">f", self.error_m))
@@ -103,7 +109,7 @@ class tool_pose_t(object):
     @staticmethod
     def _decode_one(buf):
         self = tool_pose_t()
-        self.utime, self.capture_utime, self.sequence, self.session, self.frame_number, self.timestamp = struct.unpack(">qqqiiq", buf.read(40))
+        self.utime, self.capture_utime, self.sequence, self.session, self.parameters_version, self.frame_number, self.timestamp = struct.unpack(">qqqiiiq", buf.read(44))
         self.visible = bool(struct.unpack('b', buf.read(1))[0])
         self.position_m = struct.unpack('>3f', buf.read(12))
         self.orientation_xyzw = struct.unpack('>4f', buf.read(16))
@@ -113,7 +119,7 @@ class tool_pose_t(object):
     @staticmethod
     def _get_hash_recursive(parents):
         if tool_pose_t in parents: return 0
-        tmphash = (0x3d451fe808849b01) & 0xffffffffffffffff
+        tmphash = (0x5fcc2a20e52cd73d) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -12,11 +12,11 @@ import rtc3d
 class tools_t(object):
     """ The 6D component of one frame (RTC3D §7.6). Tools are in the order of the 6D parameters. """
 
-    __slots__ = ["utime", "capture_utime", "sequence", "session", "frame_number", "timestamp", "num_tools", "tools"]
+    __slots__ = ["utime", "capture_utime", "sequence", "session", "parameters_version", "frame_number", "timestamp", "num_tools", "tools"]
 
-    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "int64_t", "int32_t", "rtc3d.tool_t"]
+    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "int32_t", "int64_t", "int32_t", "rtc3d.tool_t"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, ["num_tools"]]
+    __dimensions__ = [None, None, None, None, None, None, None, None, ["num_tools"]]
 
     def __init__(self):
         self.utime = 0
@@ -40,6 +40,12 @@ class tools_t(object):
         self.session = 0
         """
         Grows by one with each connection to the server.
+        LCM Type: int32_t
+        """
+
+        self.parameters_version = 0
+        """
+        The version of the parameters (parameters_t) that describe this frame; 0 before the first.
         LCM Type: int32_t
         """
 
@@ -67,7 +73,7 @@ class tools_t(object):
         return buf.getvalue()
 
     def _encode_one(self, buf):
-        buf.write(struct.pack(">qqqiiqi", self.utime, self.capture_utime, self.sequence, self.session, self.frame_number, self.timestamp, self.num_tools))
+        buf.write(struct.pack(">qqqiiiqi", self.utime, self.capture_utime, self.sequence, self.session, self.parameters_version, self.frame_number, self.timestamp, self.num_tools))
         for i0 in range(self.num_tools):
             assert self.tools[i0]._get_packed_fingerprint() == rtc3d.tool_t._get_packed_fingerprint()
             self.tools[i0]._encode_one(buf)
@@ -85,7 +91,7 @@ class tools_t(object):
     @staticmethod
     def _decode_one(buf):
         self = tools_t()
-        self.utime, self.capture_utime, self.sequence, self.session, self.frame_number, self.timestamp, self.num_tools = struct.unpack(">qqqiiqi", buf.read(44))
+        self.utime, self.capture_utime, self.sequence, self.session, self.parameters_version, self.frame_number, self.timestamp, self.num_tools = struct.unpack(">qqqiiiqi", buf.read(48))
         self.tools = []
         for i0 in range(self.num_tools):
             self.tools.append(rtc3d.tool_t._decode_one(buf))
@@ -95,7 +101,7 @@ class tools_t(object):
     def _get_hash_recursive(parents):
         if tools_t in parents: return 0
         newparents = parents + [tools_t]
-        tmphash = (0xa3c7aaae4a1902b2+ rtc3d.tool_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x3df0ccd2c1a5c3b2+ rtc3d.tool_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

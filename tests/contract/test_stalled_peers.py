@@ -191,7 +191,7 @@ async def test_no_call_of_the_event_loop_blocks(peer: StalledPeer) -> None:
     def do_everything_else() -> None:
         output.announce("lab")
         output.show_streaming("lab", True)
-        output.publish_parameters("lab", ServerParameters(bytes(100_000), 1))
+        output.publish_parameters("lab", ServerParameters(bytes(100_000), 1, 1))
         output.announce_file("lab", {"name": "take.c3d", "bytes": 7})
         output.publisher(MARKERS).close()
         output.show_streaming("lab", False)

@@ -33,7 +33,7 @@ with atheris.instrument_imports(include=["gateway"]):
 from tests.vectors import COMPONENTS, FRAME_WITH_UNKNOWN, FULL_FRAME, PACKETS
 
 ROOT = Path(__file__).parents[2]
-STAMP = Stamp(1, 2, 3)
+STAMP = Stamp(1, 2, 3, 4)
 
 
 def packets(data: bytes) -> None:

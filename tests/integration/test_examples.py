@@ -64,9 +64,10 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
 
 
 def printed_positions(text: str) -> list[tuple[int, list[float]]]:
-    """Return the frame number and the first position of each printed frame."""
+    """Return the number and the first position of each printed frame with version 1 of the parameters."""
     found = re.findall(
-        r"frame (\d+):[^\n]*?(?:\n[^#\n]*?)?(-?\d+\.\d+),\s?(-?\d+\.\d+),\s?(-?\d+\.\d+)", text
+        r"frame (\d+) with parameters 1:[^\n]*?(?:\n[^#\n]*?)?(-?\d+\.\d+),\s?(-?\d+\.\d+),\s?(-?\d+\.\d+)",
+        text,
     )
     return [(int(number), [float(value) for value in position]) for number, *position in found]
 

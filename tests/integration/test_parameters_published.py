@@ -1,6 +1,7 @@
 """Parameters published without a query, to present and to late subscribers."""
 
 import asyncio
+import json
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 
@@ -39,15 +40,20 @@ class Subscribers:
     def __init__(self, session: zenoh.Session, url: str) -> None:
         self._session = session
         self.plain: list[bytes] = []
+        self.versions: list[int] = []
+        """The version that came with each message of ``plain``."""
         self.with_history: list[bytes] = []
         self.lcm: list[rtc3d.parameters_t] = []
-        self._subscribers = [
-            session.declare_subscriber(KEY, lambda sample: self.plain.append(sample.payload.to_bytes()))
-        ]
+        self._subscribers = [session.declare_subscriber(KEY, self._receive)]
         self._advanced = subscribe_with_history(session, self.with_history)
         self._lcm_subscriber = LcmSubscriber(
             open_lcm(url), "MOCAP_LAB_PARAMETERS", lambda _channel, data: self.lcm.append(decode(data))
         )
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        assert sample.attachment is not None
+        self.versions.append(json.loads(sample.attachment.to_bytes())["parameters_version"])
+        self.plain.append(sample.payload.to_bytes())
 
     async def wait_for(self, xml: bytes) -> None:
         """Wait until ``xml`` is the newest message that each subscriber has received."""
@@ -112,13 +118,17 @@ async def test_parameters_are_published_for_every_connection(
         async with ScriptedServer(first.script, port):
             await subscribers.wait_for(first.xml)
             [message, *_] = subscribers.lcm
-            assert (message.sequence, message.session) == (0, 1)
+            assert (message.sequence, message.session, message.parameters_version) == (0, 1, 1)
+            assert set(subscribers.versions) == {1}
             assert message.capture_utime <= message.utime
         async with ScriptedServer(second.script, port):
             await subscribers.wait_for(second.xml)
             assert subscribers.lcm[-1].session > message.session
+            assert (subscribers.lcm[-1].parameters_version, subscribers.versions[-1]) == (2, 2)
             with zenoh_peer(router) as peer:
-                assert (await query(peer, KEY)).payload == second.xml
+                reply = await query(peer, KEY)
+                assert (reply.payload, reply.attachment["parameters_version"]) == (second.xml, 2)
+                assert (await query(peer, "mocap/lab/3d")).attachment["parameters_version"] == 2
 
 
 async def test_parameters_are_published_again_after_a_restart_of_the_gateway(

@@ -320,5 +320,5 @@ async def test_echo_prints_published_parameters(monkeypatch: pytest.MonkeyPatch)
         on_zenoh = await echo
     size = len(at.server.xml)
     assert on_zenoh.stdout.startswith(f"mocap/lab/parameters {size} bytes of XML: 1 marker, 0 tools")
-    assert "session 1: " in lcm.stdout
+    assert "session 1, version 1: " in lcm.stdout
     assert f"{size} bytes of XML: 1 marker, 0 tools" in lcm.stdout

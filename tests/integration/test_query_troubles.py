@@ -11,7 +11,7 @@ import zenoh
 
 from gateway.c3d_spool import Spool
 from gateway.errors import QueryError
-from gateway.outputs.contract import Answer, KeyPath
+from gateway.outputs.contract import Answer, KeyPath, ServerParameters
 from gateway.outputs.zenoh import queries as zenoh_queries
 from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.queries.service import SourceQueryService
@@ -91,7 +91,7 @@ async def test_without_time_stamps_the_log_says_how_to_enable_the_cache_for_late
             peer.declare_subscriber(
                 "mocap/lab/parameters", lambda sample: received.append(sample.payload.to_bytes())
             )
-            queries.publish_parameters("lab", b"<RT_Parameters/>")
+            queries.publish_parameters("lab", ServerParameters(b"<RT_Parameters/>", 3, 2))
             await wait_until_async(lambda: received)
         await queries.close()
     finally:
@@ -120,10 +120,10 @@ async def test_publishing_parameters_after_zenoh_has_closed_is_ignored() -> None
     queries = ZenohQueries("mocap", SilentService(), asyncio.get_running_loop())
     queries.open(session, ["lab"])
     session.close()
-    queries.publish_parameters("lab", b"<RT_Parameters/>")
+    queries.publish_parameters("lab", ServerParameters(b"<RT_Parameters/>", 3, 2))
     queries.announce_file("lab", {"name": "a.c3d"})
     await queries.close()
-    queries.publish_parameters("lab", b"<RT_Parameters/>")
+    queries.publish_parameters("lab", ServerParameters(b"<RT_Parameters/>", 3, 2))
 
 
 async def test_a_file_that_cannot_be_stored_is_logged_and_the_stream_continues(
@@ -172,5 +172,5 @@ async def test_a_deleted_file_is_an_error(tmp_path: Path, monkeypatch: pytest.Mo
 async def test_a_gateway_runs_and_stops_while_zenoh_is_not_open() -> None:
     async with run_gateway(1, router=free_endpoint()) as gateway:
         queries = output_queries(gateway)
-        queries.publish_parameters("lab", b"<RT_Parameters/>")
+        queries.publish_parameters("lab", ServerParameters(b"<RT_Parameters/>", 3, 2))
         assert gateway.sources

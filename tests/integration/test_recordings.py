@@ -122,7 +122,7 @@ def assert_equal_to_file(messages: list[bytes], component: str, expected: Bits) 
     """Compare every value of every message with the file; frames are numbered from 1 and the take loops."""
     seen = set()
     for message in messages:
-        number = int.from_bytes(message[36:40], "big", signed=True) - 1
+        number = int.from_bytes(message[40:44], "big", signed=True) - 1
         items = np.frombuffer(message, ITEM_DTYPES[COMPONENTS_BY_KEY[component]], offset=ITEMS_OFFSET)
         bits = items.view(">u4").reshape(len(items), -1)[:, : expected.shape[2]]
         np.testing.assert_array_equal(bits, expected[number % len(expected)])

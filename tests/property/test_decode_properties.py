@@ -18,7 +18,7 @@ from gateway.stream.status import StreamStatus
 from tests.strategies import damaged
 from tests.vectors import FULL_FRAME
 
-STAMP = Stamp(1, 2, 3)
+STAMP = Stamp(1, 2, 3, 4)
 COMPONENTS = split_frame(FULL_FRAME["big"], "big").components
 TOOLS = next(component for component in COMPONENTS if component.type is ComponentType.TOOLS)
 STATUS = status_message(

@@ -25,7 +25,7 @@ ODD_FLOATS = [
 
 int32s = st.integers(-(2**31), 2**31 - 1)
 int64s = st.integers(-(2**63), 2**63 - 1)
-stamps = st.builds(Stamp, int64s, int64s, int32s)
+stamps = st.builds(Stamp, int64s, int64s, int32s, int32s)
 words = st.integers(0, 2**32 - 1) | st.sampled_from(ODD_FLOATS)
 kinds = st.sampled_from(ComponentType)
 
@@ -74,7 +74,9 @@ def test_both_byte_orders_give_the_same_message_bit_for_bit(
         time = struct.pack(">q", timestamp_us)
         events = [items[at : at + 16] for at in range(0, len(items), 16)]
         items = b"".join(event[:4] + time + event[4:] for event in events)
-    ours = struct.pack(">qqqi", stamp.utime, stamp.capture_utime, sequence, stamp.session)
+    ours = struct.pack(
+        ">qqqii", stamp.utime, stamp.capture_utime, sequence, stamp.session, stamp.parameters_version
+    )
     assert big[8:] == ours + struct.pack(">iqi", frame_number, timestamp_us, count) + items
 
 
@@ -90,11 +92,8 @@ def test_lcm_gen_decodes_and_encodes_a_message_to_the_same_bytes(
     values = data.draw(word_lists(kind, words.filter(survives_python)))
     message = encode_message(component(kind, frame_number, timestamp_us, values, "big"), stamp, sequence)
     decoded = MESSAGE_TYPES[kind].decode(message)
-    assert (decoded.utime, decoded.capture_utime, decoded.session) == (
-        stamp.utime,
-        stamp.capture_utime,
-        stamp.session,
-    )
+    assert (decoded.utime, decoded.capture_utime) == (stamp.utime, stamp.capture_utime)
+    assert (decoded.session, decoded.parameters_version) == (stamp.session, stamp.parameters_version)
     assert (decoded.sequence, decoded.frame_number, decoded.timestamp) == (
         sequence,
         frame_number,
@@ -103,10 +102,11 @@ def test_lcm_gen_decodes_and_encodes_a_message_to_the_same_bytes(
     assert decoded.encode() == message
 
 
-@given(int64s, int64s, int32s, st.lists(st.integers(-2, 2) | int64s, min_size=1))
+@given(int64s, int64s, int32s, int32s, st.lists(st.integers(-2, 2) | int64s, min_size=1))
 def test_a_prefix_has_the_requested_sequence_number(
-    utime: int, capture_utime: int, session: int, sequences: list[int]
+    utime: int, capture_utime: int, session: int, version: int, sequences: list[int]
 ) -> None:
-    stamp = Stamp(utime, capture_utime, session)
+    stamp = Stamp(utime, capture_utime, session, version)
     for sequence in sequences:
-        assert stamp.prefix(sequence) == struct.pack(">qqqi", utime, capture_utime, sequence, session)
+        expected = struct.pack(">qqqii", utime, capture_utime, sequence, session, version)
+        assert stamp.prefix(sequence) == expected

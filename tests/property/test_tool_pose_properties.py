@@ -12,7 +12,7 @@ from gateway.rtc3d.frames import split_frame
 
 int32s = st.integers(-(2**31), 2**31 - 1)
 int64s = st.integers(-(2**63), 2**63 - 1)
-stamps = st.builds(Stamp, int64s, int64s, int32s)
+stamps = st.builds(Stamp, int64s, int64s, int32s, int32s)
 floats = st.floats(width=32) | st.sampled_from([math.nan, 0.0, -0.0])
 tool_values = st.lists(st.tuples(*8 * [floats]), max_size=4)
 units = st.sampled_from([1.0, 1e-2, 1e-3, 1e-6, 0.0254])

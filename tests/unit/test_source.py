@@ -26,6 +26,7 @@ from tests.servers import packet
 from tests.spec_parameters import in_root
 from tests.toy_output import ToyOutput, ToyPublisher
 from tests.unit.publish.test_tool_poses import IN_VIEW, tools_frame
+from tests.unit.queries.fake_source import parameters_xml
 from tests.unit.scripted_sources import Servers, SlowThreads
 from tests.unit.stream.scripted_server import XML, ScriptedServer, obliging
 from tests.unit.stream.virtual_time import settle, until
@@ -192,9 +193,11 @@ async def test_the_source_shows_streaming_while_any_stream_has_frames(servers: S
 async def test_a_source_that_replaces_another_continues_its_numbers(servers: Servers, spool: Spool) -> None:
     before = Lab(servers, spool, streams=TWO_STREAMS)
     before.source.statuses[0].session, before.source.statuses[1].session = 3, 5
+    for status in before.source.statuses:
+        status.parameters_changed(7)
     before.source.publish_status()
     after = Lab(servers, spool, before.source)
-    assert [status.session for status in after.source.statuses] == [5]
+    assert [(each.session, each.parameters_version) for each in after.source.statuses] == [(5, 7)]
     after.source.publish_status()
     assert [message.sequence for message in after.messages("status")] == [2]
 
@@ -206,11 +209,11 @@ async def test_parameters_are_published_with_every_connection(servers: Servers, 
     lab = Lab(servers, spool)
     async with running(lab):
         await lab.connected()
-        assert lab.parameters == [("lab", ServerParameters(XML[8:], 1))]
+        assert lab.parameters == [("lab", ServerParameters(XML[8:], 1, 1))]
         lab.server.connection.end()
         await settle()
         await lab.connected()
-        assert lab.parameters[1:] == [("lab", ServerParameters(XML[8:], 2))]
+        assert lab.parameters[1:] == [("lab", ServerParameters(XML[8:], 2, 1))]
 
 
 async def test_the_cache_is_filled_after_connecting(servers: Servers, spool: Spool) -> None:
@@ -288,7 +291,40 @@ async def test_changed_parameters_are_published_and_every_section_is_requested_a
         before = lab.count("SendParameters Force")
         lab.source.fan_out.on_items_changed()
         await until(lambda: lab.count("SendParameters Force") == before + 1)
-        assert lab.parameters[1:] == [("lab", ServerParameters(OTHER_XML[8:], 1))]
+        assert lab.parameters[1:] == [("lab", ServerParameters(OTHER_XML[8:], 1, 2))]
+
+
+async def test_every_message_carries_the_version_of_the_parameters(servers: Servers, spool: Spool) -> None:
+    lab = Lab(servers, spool, streams=TWO_STREAMS)
+
+    async def check_version(version: int) -> None:
+        """Check the version of a new frame, of the status and of the clock."""
+        lab.server.connections[0].send_frames(1)
+        lab.source.publish_status()
+        await settle()
+        newest = [lab.messages(name)[-1] for name in ("3d", "status", "clock")]
+        assert [message.parameters_version for message in newest] == [version] * 3
+
+    async def change_parameters(xml: bytes) -> None:
+        lab.server.answer = lambda command: (
+            packet(2, xml.decode()) if command.startswith("SendParameters") else obliging(command)
+        )
+        await lab.source.queries.answer(Question("parameters", fresh=True))
+        await settle()
+
+    assert [status.parameters_version for status in lab.source.statuses] == [0, 0]
+    async with running(lab):
+        await lab.connected(2)
+        await check_version(1)
+        for xml, version in (
+            (parameters_xml("cm"), 2),
+            (parameters_xml("cm", frames_sent=2), 2),
+            (parameters_xml("m"), 3),
+            (parameters_xml("cm"), 4),
+        ):
+            await change_parameters(xml)
+            await check_version(version)
+            assert lab.parameters[-1][1].version == version
 
 
 async def test_background_tasks_end_with_the_source(servers: Servers, spool: Spool) -> None:

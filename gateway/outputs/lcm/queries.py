@@ -206,6 +206,7 @@ class LcmQueries:
             reply.error, reply.error_code = f"a defect in the gateway: {error!r}", "defect"
         else:
             reply.xml, reply.age_s = _text(parameters.xml), parameters.age_s
+            reply.parameters_version = parameters.version
         finally:
             self._free_slots.release()  # before the reply is sent: its receiver may ask again at once
         self.results[reply.error_code or "ok"] += 1
@@ -217,6 +218,7 @@ class LcmQueries:
         publication.message.xml = _text(parameters.xml)
         publication.message.capture_utime = now_utime()
         publication.message.session = parameters.session
+        publication.message.parameters_version = parameters.version
         self._publish_again(source, publication)
 
     def maintain(self) -> None:

@@ -210,7 +210,7 @@ class ZenohOutput(Output):
     def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
         """Publish the XML on PREFIX/SOURCE/parameters, now and for each later subscriber."""
         if self._queries is not None:
-            self._queries.publish_parameters(source, parameters.xml)
+            self._queries.publish_parameters(source, parameters)
 
     def announce_file(self, source: str, description: Mapping[str, Any]) -> None:
         """Publish the description of a C3D file on PREFIX/SOURCE/c3d, the key that returns it."""

@@ -19,7 +19,7 @@ import zenoh.ext
 from gateway.errors import QueryError
 from gateway.log import log_fields
 from gateway.messages.topics import zenoh_key
-from gateway.outputs.contract import Answer, KeyPath, QueryService
+from gateway.outputs.contract import Answer, KeyPath, QueryService, ServerParameters
 from gateway.outputs.encodings import JSON, TEXT, XML, json_bytes
 from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.outputs.zenoh.send_thread import SendThread
@@ -61,7 +61,7 @@ class ZenohQueries:
         self._lock = threading.Lock()  # of _session and _declared, shared with the thread that opens
         self._session: zenoh.Session | None = None
         self._declared: dict[str, _Declared] = {}  # by the source's name
-        self._newest_xml: dict[str, bytes] = {}
+        self._parameters: dict[str, ServerParameters] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         # Sending to a peer that has stopped reading blocks for 5 s, until Zenoh closes the link. So a thread
         # sends. There is only one for short answers: two threads that block stop all of Zenoh meanwhile.
@@ -86,7 +86,7 @@ class ZenohQueries:
 
     def remove(self, source: str) -> None:
         """Stop answering queries about a source."""
-        self._newest_xml.pop(source, None)
+        self._parameters.pop(source, None)
         with self._lock:
             declared = self._declared.pop(source, None)
         if declared is not None:
@@ -120,19 +120,22 @@ class ZenohQueries:
 
     # Parameters and files.
 
-    def publish_parameters(self, source: str, xml: bytes) -> None:
+    def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
         """Publish a source's parameters as the server sent them."""
-        self._newest_xml[source] = xml
+        self._parameters[source] = parameters
         self._publish_again(source)
 
     def _publish_all(self) -> None:
-        for source in self._newest_xml:
+        for source in self._parameters:
             self._publish_again(source)
 
     def _publish_again(self, source: str) -> None:
         declared = self._declared.get(source)
-        if declared is not None and source in self._newest_xml:
-            self._send(declared.publisher.put, self._newest_xml[source])
+        parameters = self._parameters.get(source)
+        if declared is not None and parameters is not None:
+            attachment = {"session": parameters.session, "parameters_version": parameters.version}
+            put = functools.partial(declared.publisher.put, attachment=json_bytes(attachment))
+            self._send(put, parameters.xml)
 
     def announce_file(self, source: str, description: Mapping[str, Any]) -> None:
         """Announce a C3D file on the key that returns it."""

@@ -24,6 +24,7 @@ def printed(name: str, message: bytes, *, as_json: bool = False) -> str:
 def parameters() -> bytes:
     message = rtc3d.parameters_t()
     message.sequence, message.session, message.xml = 4, 2, spec_xml("3d").decode()
+    message.parameters_version = 3
     return bytes(message.encode())
 
 
@@ -67,7 +68,7 @@ def reply(error: str = "") -> bytes:
         (
             "MOCAP_LAB_PARAMETERS",
             parameters(),
-            f"MOCAP_LAB_PARAMETERS #4 session 2: {MARKERS_BYTES} bytes of XML: 1 marker",
+            f"MOCAP_LAB_PARAMETERS #4 session 2, version 3: {MARKERS_BYTES} bytes of XML: 1 marker",
         ),
         (
             "MOCAP_LAB_PARAMETERS_REQUEST",

@@ -14,7 +14,7 @@ from gateway.rtc3d.frames import split_frame
 from gateway.stream.status import StreamStatus
 from tests.vectors import TOOLS, ByteOrder, ComponentVector
 
-STAMP = Stamp(utime=2_000, capture_utime=1_000, session=3)
+STAMP = Stamp(utime=2_000, capture_utime=1_000, session=3, parameters_version=5)
 
 
 def received(vector: ComponentVector, order: ByteOrder = "big") -> Component:

@@ -67,6 +67,7 @@ def test_json_has_every_field() -> None:
         "capture_utime": 1_000,
         "sequence": 41,
         "session": 3,
+        "parameters_version": 5,
         "frame_number": 6,
         "timestamp": 12500,
         "num_events": 2,

@@ -22,10 +22,12 @@ from tests.vectors import (
     ComponentVector,
 )
 
-STAMP = Stamp(utime=1_700_000_000_000_001, capture_utime=1_700_000_000_000_000, session=3)
+STAMP = Stamp(
+    utime=1_700_000_000_000_001, capture_utime=1_700_000_000_000_000, session=3, parameters_version=5
+)
 SEQUENCE = 41
-# fingerprint, utime, capture_utime, sequence, session, frame number, time stamp, count
-HEADER = struct.Struct(">8sqqqiiqi")
+# fingerprint, utime, capture_utime, sequence, session, parameters version, frame number, time stamp, count
+HEADER = struct.Struct(">8sqqqiiiqi")
 
 LCM_TYPES: dict[int, type[Any]] = {
     1: rtc3d.markers_t,
@@ -44,7 +46,7 @@ both_orders = pytest.mark.parametrize("order", ["big", "little"])
 def header_of(vector: ComponentVector) -> bytes:
     return HEADER.pack(
         LCM_TYPES[vector.type]._get_packed_fingerprint(),
-        1_700_000_000_000_001, 1_700_000_000_000_000, 41, 3,
+        1_700_000_000_000_001, 1_700_000_000_000_000, 41, 3, 5,
         vector.frame_number, vector.timestamp_us, vector.num_items,
     )  # fmt: skip
 
@@ -68,6 +70,7 @@ def test_every_byte_of_a_markers_message_is_as_documented() -> None:
         + struct.pack(">q", 1_700_000_000_000_000)
         + struct.pack(">q", 41)
         + struct.pack(">i", 3)
+        + struct.pack(">i", 5)
         + struct.pack(">iqi", 16909060, 4328719365, 2)
         + struct.pack(">4f", 1.0, -2.5, 1000.25, 0.5)
         + missing + missing + missing + struct.pack(">f", 999.0)
@@ -87,8 +90,14 @@ def test_events_of_16_bytes_get_the_time_stamp_of_their_component(order: ByteOrd
 @each_component
 def test_lcm_gen_decodes_every_field(vector: ComponentVector, order: ByteOrder) -> None:
     message = LCM_TYPES[vector.type].decode(encode_message(received(vector, order), STAMP, SEQUENCE))
-    prefix = (message.utime, message.capture_utime, message.sequence, message.session)
-    assert prefix == (STAMP.utime, STAMP.capture_utime, SEQUENCE, STAMP.session)
+    prefix = (
+        message.utime,
+        message.capture_utime,
+        message.sequence,
+        message.session,
+        message.parameters_version,
+    )
+    assert prefix == (STAMP.utime, STAMP.capture_utime, SEQUENCE, STAMP.session, STAMP.parameters_version)
     assert (message.frame_number, message.timestamp) == (vector.frame_number, vector.timestamp_us)
     assert getattr(message, COUNTS[vector.type]) == vector.num_items
     items: list[Any] = list(getattr(message, ITEMS[vector.type]))
@@ -118,14 +127,14 @@ def test_a_component_without_items_gives_a_message_without_items(
     (component,) = split_frame((1).to_bytes(4, order) + wire, order).components
     fingerprint = LCM_TYPES[kind]._get_packed_fingerprint()
     expected = struct.pack(
-        ">8sqqqiiqi", fingerprint, STAMP.utime, STAMP.capture_utime, SEQUENCE, STAMP.session, 7, 9, 0
+        ">8sqqqiiiqi", fingerprint, STAMP.utime, STAMP.capture_utime, SEQUENCE, STAMP.session, 5, 7, 9, 0
     )
     assert encode_message(component, STAMP, SEQUENCE) == expected
 
 
 def test_content_and_items_begin_at_the_documented_offsets() -> None:
     message = encode_message(received(ANALOG), STAMP, SEQUENCE)
-    assert (CONTENT_OFFSET, ITEMS_OFFSET) == (36, HEADER.size) == (36, 52)
+    assert (CONTENT_OFFSET, ITEMS_OFFSET) == (40, HEADER.size) == (40, 56)
     assert message[CONTENT_OFFSET:ITEMS_OFFSET] == ANALOG.wire["big"][8:24]
     assert message[ITEMS_OFFSET:] == ANALOG.wire["big"][24:]
 

@@ -13,10 +13,13 @@ from gateway.rtc3d.frames import split_frame
 from tests.unit.messages.samples import received
 from tests.vectors import ALL_ONES, TOOLS, ByteOrder
 
-STAMP = Stamp(utime=1_700_000_000_000_001, capture_utime=1_700_000_000_000_000, session=3)
+STAMP = Stamp(
+    utime=1_700_000_000_000_001, capture_utime=1_700_000_000_000_000, session=3, parameters_version=5
+)
 SEQUENCE = 41
-# fingerprint, utime, capture_utime, sequence, session, frame number, time stamp, visible, pose and error
-POSE = struct.Struct(">8sqqqiiqb8f")
+# fingerprint, utime, capture_utime, sequence, session, parameters version, frame number, time stamp, visible,
+# pose and error
+POSE = struct.Struct(">8sqqqiiiqb8f")
 NAN = math.nan
 
 both_orders = pytest.mark.parametrize("order", ["big", "little"])
@@ -41,12 +44,12 @@ def test_poses_are_in_metres_and_have_the_scalar_last(order: ByteOrder) -> None:
     stamp = (1_700_000_000_000_001, 1_700_000_000_000_000)
     visible, missing = tool_poses(received(TOOLS, order), STAMP, [41, 7])
     assert visible == POSE.pack(
-        fingerprint, *stamp, 41, 3, 4, 7500, 1,
+        fingerprint, *stamp, 41, 3, 5, 4, 7500, 1,
         0.1, -0.2, 1.6,
         *struct.unpack(">4f", bytes.fromhex("BECCCCCD 3ECCCCCD 3E4CCCCD 3F4CCCCD")),
         0.000125,
     )  # fmt: skip
-    assert missing == POSE.pack(fingerprint, *stamp, 7, 3, 4, 7500, 0, *8 * [NAN])
+    assert missing == POSE.pack(fingerprint, *stamp, 7, 3, 5, 4, 7500, 0, *8 * [NAN])
 
 
 @both_orders

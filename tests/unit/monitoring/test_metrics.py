@@ -135,11 +135,11 @@ async def test_drops_have_a_cause_and_common_causes_start_at_0(lab: Lab) -> None
 async def test_messages_and_bytes_are_counted_by_component_and_output(lab: Lab) -> None:
     fan_out = lab.source.fan_out
     for _ in range(4):
-        fan_out.publish(analog_frame(), Stamp(2, 1, 1), frozenset({ComponentType.ANALOG}))
+        fan_out.publish(analog_frame(), Stamp(2, 1, 1, 1), frozenset({ComponentType.ANALOG}))
     fan_out.publish_status(bytes(50))
     for name, counted in (
         ("messages_total", {"analog": 4, "status": 1}),
-        ("message_bytes_total", {"analog": 4 * (52 + 3 * 4), "status": 50}),
+        ("message_bytes_total", {"analog": 4 * (56 + 3 * 4), "status": 50}),
     ):
         samples = {
             labels["component"]: value for labels, value in lab.samples(name) if labels["output"] == "toy"
@@ -149,7 +149,7 @@ async def test_messages_and_bytes_are_counted_by_component_and_output(lab: Lab) 
 
 async def test_frames_are_counted_by_configured_component(lab: Lab) -> None:
     for _ in range(12):
-        lab.source.fan_out.publish(analog_frame(), Stamp(2, 1, 1), frozenset({ComponentType.ANALOG}))
+        lab.source.fan_out.publish(analog_frame(), Stamp(2, 1, 1, 1), frozenset({ComponentType.ANALOG}))
     samples = {labels["component"]: value for labels, value in lab.samples("component_frames_total")}
     assert samples == {"3d": 0, "6d": 0, "analog": 12}
 

@@ -12,7 +12,7 @@ from gateway.rtc3d.parameters import Parameters, Parameters3D
 from tests.toy_output import ToyOutput
 from tests.unit.publish.test_tool_poses import publish_tools
 
-STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1)
+STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1, parameters_version=1)
 ALL = frozenset(WIRE_ORDER)
 
 

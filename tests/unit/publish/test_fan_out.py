@@ -16,7 +16,7 @@ from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from tests.toy_output import ToyOutput
 from tests.vectors import EMPTY_FRAME, FULL_FRAME
 
-STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1)
+STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1, parameters_version=1)
 ALL = frozenset(WIRE_ORDER)
 MARKERS = frozenset({ComponentType.MARKERS})
 FULL = split_frame(FULL_FRAME["big"], "big")
@@ -66,7 +66,7 @@ def test_each_component_has_its_own_numbers_across_sessions(memory: MemoryOutput
     fan_out = FanOut("lab", [memory])
     fan_out.publish(FULL, STAMP, ALL)
     fan_out.publish(FULL, STAMP, MARKERS)
-    fan_out.publish(FULL, Stamp(STAMP.utime, STAMP.capture_utime, 2), ALL)
+    fan_out.publish(FULL, Stamp(STAMP.utime, STAMP.capture_utime, 2, 1), ALL)
     messages = [(topic.path, decode(message)) for topic, message in memory.messages]
     counted = {
         key: [(message.sequence, message.session) for path, message in messages if path == (key,)]

@@ -20,7 +20,7 @@ def published_numbers(times: list[tuple[int, int]], *, has_clock: bool) -> list[
     for number, (timestamp_us, utime) in enumerate(times):
         items = np.zeros(1, ITEM_DTYPES[ComponentType.MARKERS])
         component = encode_component(ComponentType.MARKERS, number, timestamp_us, items)
-        stamp = Stamp(utime=utime, capture_utime=utime, session=1, has_clock=has_clock)
+        stamp = Stamp(utime=utime, capture_utime=utime, session=1, parameters_version=1, has_clock=has_clock)
         fan_out.publish(split_frame(encode_frame([component]), "big"), stamp, MARKERS)
     return [decode(message).frame_number for _, message in output.messages]
 

@@ -33,6 +33,7 @@ def test_the_status_message_has_every_field() -> None:
         byte_order="little",
         rate="Frequency:60",
         session=3,
+        parameters_version=5,
         frames_in=2**40,
         bytes_in=2**41,
         reconnects=2,
@@ -43,7 +44,7 @@ def test_the_status_message_has_every_field() -> None:
         last_error="Verbindung weg – Kabel prüfen",
         last_error_utime=1_700_000_000_000_000,
     )
-    quiet = StreamStatus("analog", session=1)
+    quiet = StreamStatus("analog", session=1, parameters_version=5)
     zenoh = OutputStatus("zenoh", Counter({"6d": 8, "3d": 9}), Counter({"no router": 2}))
     lcm = OutputStatus("lcm")
     before = now_utime()
@@ -62,6 +63,7 @@ def test_the_status_message_has_every_field() -> None:
         "capture_utime": message["utime"],
         "sequence": 17,
         "session": 4,
+        "parameters_version": 5,
         "source": "lab",
         "server": "192.0.2.20:3020",
         "gateway_version": __version__,
@@ -136,7 +138,7 @@ def test_the_status_message_has_every_field() -> None:
 
 
 def test_the_clock_message_has_every_field() -> None:
-    stream = StreamStatus("3d 6d", session=1)
+    stream = StreamStatus("3d 6d", session=1, parameters_version=5)
     before = now_utime()
     message = fields_of(rtc3d.clock_t.decode(clock_message(3, 17, stream).encode()))
     assert before <= message["utime"] <= now_utime()
@@ -145,6 +147,7 @@ def test_the_clock_message_has_every_field() -> None:
         "capture_utime": message["utime"],
         "sequence": 17,
         "session": 3,
+        "parameters_version": 5,
         "components": "3d 6d",
         "clock": NO_CLOCK,
     }

@@ -13,7 +13,7 @@ from gateway.rtc3d.frames import Frame, split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters3D, Parameters6D, Tool
 from tests.toy_output import ToyOutput
 
-STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1)
+STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1, parameters_version=1)
 ALL = frozenset(WIRE_ORDER)
 IN_VIEW = (1.0, 0.0, 0.0, 0.0, 100.0, 200.0, 300.0, 0.5)
 
@@ -101,7 +101,7 @@ def test_topics_stay_open_while_the_labels_stay() -> None:
     fan_out = FanOut("lab", [output])
     for session in (1, 2):
         fan_out.set_parameters(parameters("Probe"))
-        fan_out.publish(tools_frame(IN_VIEW), Stamp(STAMP.utime, STAMP.capture_utime, session), ALL)
+        fan_out.publish(tools_frame(IN_VIEW), Stamp(STAMP.utime, STAMP.capture_utime, session, 1), ALL)
     counted = [(pose.sequence, pose.session) for pose in output.poses("Probe")]
     assert counted == [(0, 1), (1, 2)]
     assert output.closed_topics == []

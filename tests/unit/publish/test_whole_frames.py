@@ -10,7 +10,7 @@ from gateway.rtc3d.frames import Frame, split_frame
 from tests.toy_output import ToyOutput
 from tests.vectors import FULL_FRAME
 
-STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1)
+STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1, parameters_version=1)
 FULL = split_frame(FULL_FRAME["big"], "big")
 ALL = frozenset(WIRE_ORDER)
 MARKERS = frozenset({ComponentType.MARKERS})

@@ -18,7 +18,7 @@ from tests.vectors import FULL_FRAME
 def encoded_message(component_type: ComponentType) -> bytes:
     components = split_frame(FULL_FRAME["big"], "big").components
     [component] = [component for component in components if component.type is component_type]
-    return encode_message(component, Stamp(1, 2, 3), 4)
+    return encode_message(component, Stamp(1, 2, 3, 4), 4)
 
 
 @pytest.mark.parametrize("name", SCHEMA_TYPES)

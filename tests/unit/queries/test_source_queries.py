@@ -17,13 +17,14 @@ from tests.unit.queries.fake_source import FakeSource, parameters_xml
 FRAME = markers_frame(7, (1.0, 2.0, 3.0))[8:]
 
 
-async def test_parameters_are_answered_with_their_xml_age_and_session() -> None:
+async def test_parameters_are_answered_with_their_xml_age_session_and_version() -> None:
     source = FakeSource()
+    source.status.parameters_changed(4)
     source.store_parameters(parameters_xml("mm"))
     answer = await source.answer("parameters")
     assert (answer.payload, answer.encoding) == (parameters_xml("mm"), XML)
-    assert answer.attachment.keys() == {"age_s", "session"}
-    assert answer.attachment["session"] == 1
+    assert answer.attachment.keys() == {"age_s", "session", "parameters_version"}
+    assert (answer.attachment["session"], answer.attachment["parameters_version"]) == (1, 4)
 
 
 async def test_stale_parameters_are_marked_as_stale() -> None:
@@ -97,7 +98,7 @@ async def test_recording_without_a_connection_is_an_error() -> None:
 
 def markers_message(session: int) -> bytes:
     [component] = split_frame(FRAME, "big").components
-    return encode_message(component, Stamp(1, 1, session), 5)
+    return encode_message(component, Stamp(1, 1, session, 1), 5)
 
 
 async def test_while_streaming_a_component_is_answered_with_its_newest_message() -> None:
@@ -106,7 +107,7 @@ async def test_while_streaming_a_component_is_answered_with_its_newest_message()
     source.newest_messages[ComponentType.MARKERS] = markers_message(session=1)
     answer = await source.answer("component", "3d")
     assert answer.payload == markers_message(session=1)
-    assert answer.attachment == {"session": 1}
+    assert answer.attachment == {"session": 1, "parameters_version": 1}
     assert source.server.commands == []
 
 

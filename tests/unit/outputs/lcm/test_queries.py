@@ -27,7 +27,7 @@ class Service:
 
     def __init__(self) -> None:
         self.sources = {"lab", "hall"}
-        self.reply: ServerParameters | Exception = ServerParameters(XML, 3, 2.5)
+        self.reply: ServerParameters | Exception = ServerParameters(XML, 3, 4, 2.5)
         self.received: list[tuple[str, list[str], bool]] = []
         self.log_fields: list[dict[str, str]] = []
         self.may_answer = asyncio.Event()
@@ -108,6 +108,7 @@ async def test_a_reply_has_the_answer_of_the_service(lab: Lab) -> None:
     [reply] = await lab.receive()
     assert (reply.request_id, reply.requester) == (7, "test")
     assert (reply.xml, reply.age_s, reply.error, reply.error_code) == (XML.decode(), 2.5, "", "")
+    assert reply.parameters_version == 4
     assert lab.service.received == [("lab", ["3d", "force"], True)]
     assert lab.service.log_fields == [{"source": "lab"}]
     assert lab.output.query_results == {"ok": 1}
@@ -222,7 +223,7 @@ async def test_the_limits_of_a_request_are_exact(lab: Lab) -> None:
     ids=["UTF-8", "Latin-1", "NULs at the end", "other NULs"],
 )
 async def test_xml_is_sent_as_text_without_the_nuls_at_its_end(lab: Lab, xml: bytes, text: str) -> None:
-    lab.service.reply = ServerParameters(xml, 1)
+    lab.service.reply = ServerParameters(xml, 1, 4)
     lab.open()
     lab.send(request())
     [reply] = await lab.receive()
@@ -258,7 +259,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
 
 async def test_parameters_are_published_now_and_every_few_seconds(lab: Lab, clock: SimpleNamespace) -> None:
     lab.open()
-    lab.output.publish_parameters("lab", ServerParameters(XML + b"\0", 3))
+    lab.output.publish_parameters("lab", ServerParameters(XML + b"\0", 3, 4))
     for step_s in (0.0, REPEAT_S - 0.5, 0.5, 0.5, REPEAT_S):
         clock.now_s += step_s
         lab.output.maintain()
@@ -267,7 +268,7 @@ async def test_parameters_are_published_now_and_every_few_seconds(lab: Lab, cloc
     assert [message.utime for message in lab.parameters] == [round(1e6 * each) for each in sent_s]
     assert [message.sequence for message in lab.parameters] == [0, 1, 2]
     assert {message.capture_utime for message in lab.parameters} == {100_000_000}
-    assert {message.session for message in lab.parameters} == {3}
+    assert {(message.session, message.parameters_version) for message in lab.parameters} == {(3, 4)}
     assert {message.xml for message in lab.parameters} == {XML.decode()}
 
 
@@ -275,9 +276,9 @@ async def test_new_parameters_replace_the_old_ones_and_continue_the_sequence(
     lab: Lab, clock: SimpleNamespace
 ) -> None:
     lab.open()
-    lab.output.publish_parameters("lab", ServerParameters(b"<old/>", 1))
+    lab.output.publish_parameters("lab", ServerParameters(b"<old/>", 1, 4))
     clock.now_s += 1.0
-    lab.output.publish_parameters("lab", ServerParameters(b"<new/>", 2))
+    lab.output.publish_parameters("lab", ServerParameters(b"<new/>", 2, 4))
     clock.now_s += REPEAT_S
     lab.output.maintain()
     lab.deliver()
@@ -291,7 +292,7 @@ async def test_parameters_of_a_withdrawn_source_are_not_published_again(
     lab: Lab, clock: SimpleNamespace
 ) -> None:
     lab.open()
-    lab.output.publish_parameters("lab", ServerParameters(XML, 3))
+    lab.output.publish_parameters("lab", ServerParameters(XML, 3, 4))
     lab.output.withdraw("lab")
     lab.output.withdraw("lab")
     clock.now_s += REPEAT_S
@@ -301,7 +302,7 @@ async def test_parameters_of_a_withdrawn_source_are_not_published_again(
 
 
 async def test_parameters_published_before_lcm_opens_follow_later(lab: Lab, clock: SimpleNamespace) -> None:
-    lab.output.publish_parameters("lab", ServerParameters(XML, 3))
+    lab.output.publish_parameters("lab", ServerParameters(XML, 3, 4))
     lab.open()
     clock.now_s += REPEAT_S
     lab.output.maintain()
@@ -311,7 +312,7 @@ async def test_parameters_published_before_lcm_opens_follow_later(lab: Lab, cloc
 
 async def test_an_output_without_queries_has_no_results_and_no_drops() -> None:
     output = LcmOutput(LcmSettings(url="memq://"), lcm.LCM("memq://"))
-    output.publish_parameters("lab", ServerParameters(XML, 3))
+    output.publish_parameters("lab", ServerParameters(XML, 3, 4))
     output.maintain()
     assert output.query_results is None
     assert output.drops("lab") == {}

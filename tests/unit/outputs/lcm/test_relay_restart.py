@@ -24,7 +24,7 @@ class _Service:
         return True
 
     async def parameters(self, _source: str, _sections: Sequence[str], *, fresh: bool) -> ServerParameters:  # noqa: ARG002 - the contract's name
-        return ServerParameters(b"<The_3D/>", 1)
+        return ServerParameters(b"<The_3D/>", 1, 1)
 
 
 @pytest.fixture

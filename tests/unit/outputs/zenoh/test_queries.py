@@ -198,10 +198,12 @@ async def test_long_answers_arrive_unchanged_and_are_sent_by_a_thread_of_their_o
 
 async def test_parameters_are_published_with_their_encoding_and_a_low_priority(lab: Lab) -> None:
     lab.subscribe("mocap/lab/parameters")
-    lab.output.publish_parameters("lab", ServerParameters(XML, 1))
+    lab.output.publish_parameters("lab", ServerParameters(XML, 1, 4))
     await wait_until_async(lambda: lab.samples)
     sample = lab.samples[0]
     assert (sample.payload.to_bytes(), str(sample.encoding)) == (XML, "application/xml")
+    assert sample.attachment is not None
+    assert json.loads(sample.attachment.to_bytes()) == {"session": 1, "parameters_version": 4}
     assert sample.congestion_control == zenoh.CongestionControl.BLOCK
     assert sample.priority == zenoh.Priority.DATA_LOW
 
@@ -226,8 +228,8 @@ async def test_files_are_announced_as_json_on_the_key_that_returns_them(lab: Lab
 
 async def test_parameters_published_before_opening_follow_when_the_session_opens() -> None:
     lab = Lab()
-    lab.output.publish_parameters("lab", ServerParameters(b"<old/>", 1))
-    lab.output.publish_parameters("lab", ServerParameters(XML, 1))
+    lab.output.publish_parameters("lab", ServerParameters(b"<old/>", 1, 4))
+    lab.output.publish_parameters("lab", ServerParameters(XML, 1, 4))
     lab.output.announce_file("lab", {"name": "early.c3d"})
     await lab.open()
     lab.subscribe("mocap/lab/*")
@@ -240,11 +242,11 @@ async def test_parameters_published_before_opening_follow_when_the_session_opens
 
 async def test_a_source_that_returns_does_not_publish_its_old_parameters(lab: Lab) -> None:
     lab.output.announce("hall")
-    lab.output.publish_parameters("hall", ServerParameters(b"<old/>", 1))
+    lab.output.publish_parameters("hall", ServerParameters(b"<old/>", 1, 4))
     lab.output.withdraw("hall")
     lab.output.announce("hall")
     lab.subscribe("mocap/**")
-    lab.output.publish_parameters("lab", ServerParameters(XML, 1))
+    lab.output.publish_parameters("lab", ServerParameters(XML, 1, 4))
     await wait_until_async(lambda: lab.payloads("mocap/lab/parameters"))
     await lab.query("mocap/hall/status")
     assert lab.payloads("mocap/hall/parameters") == []
@@ -252,7 +254,7 @@ async def test_a_source_that_returns_does_not_publish_its_old_parameters(lab: La
 
 async def test_an_output_without_queries_has_no_results() -> None:
     output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer")))
-    output.publish_parameters("lab", ServerParameters(XML, 1))
+    output.publish_parameters("lab", ServerParameters(XML, 1, 4))
     output.announce_file("lab", {"name": "early.c3d"})
     output.withdraw("lab")
     assert output.query_results is None
