@@ -52,7 +52,7 @@ class Source:
         self.fan_out.on_items_changed = self._refresh_parameters_soon
         self.statuses: list[StreamStatus] = [self._new_status(stream, before) for stream in settings.streams]
         self.supervisors = [
-            Supervisor(settings, stream, status, self._callbacks(stream))
+            Supervisor(settings, stream, status, self._callbacks(stream, status))
             for stream, status in zip(settings.streams, self.statuses, strict=True)
         ]
         self.queries = self._new_queries()
@@ -103,6 +103,8 @@ class Source:
         finally:
             for task in self._tasks:
                 task.cancel()
+            for status in self.statuses:
+                status.losses.close()
 
     # Status.
 
@@ -118,6 +120,8 @@ class Source:
         best = min(self.statuses, key=_uncertainty_us)
         clock = clock_message(self.queries.session, self.sequence, best)
         with log_fields(source=self.name):
+            for status in self.statuses:
+                status.losses.check()
             self.fan_out.publish_status(self._newest_status)
             self.fan_out.publish_clock(clock.encode())
 
@@ -146,7 +150,7 @@ class Source:
 
     # Parameters.
 
-    def _callbacks(self, stream: StreamSettings) -> Callbacks:
+    def _callbacks(self, stream: StreamSettings, status: StreamStatus) -> Callbacks:
         components = frozenset(stream.components)
 
         def on_parameters(xml: bytes, parsed: ParsedParameters) -> None:
@@ -158,7 +162,7 @@ class Source:
             on_parameters=on_parameters,
             on_connected=lambda: self._start_task(self.queries.parameters.fill()),
             on_restart=self._refresh_parameters_soon,
-            on_file=self._on_file,
+            on_file=lambda content: self._on_file(status, content),
             has_subscribers=lambda: self.fan_out.has_subscribers(components),
         )
 
@@ -200,22 +204,21 @@ class Source:
 
     # C3D files and recordings.
 
-    def _on_file(self, content: bytes) -> None:
+    def _on_file(self, status: StreamStatus, content: bytes) -> None:
         if self._num_unstored_files >= _MAX_UNSTORED_FILES:
-            logger.error(
-                "%s: a C3D file of %d bytes is dropped: %d earlier files are still being written; "
-                "is the disk slow, or the server faulty?",
-                *(self.name, len(content), self._num_unstored_files),
+            status.file_lost(
+                f"a C3D file of {len(content)} bytes is dropped: {self._num_unstored_files} earlier files "
+                "are still being written; is the disk slow, or the server faulty?"
             )
             return
         self._num_unstored_files += 1
-        self._start_task(self._store_file(content))
+        self._start_task(self._store_file(status, content))
 
-    async def _store_file(self, content: bytes) -> None:
+    async def _store_file(self, status: StreamStatus, content: bytes) -> None:
         try:
             path = await asyncio.to_thread(self.spool.store, self.name, content)
         except SpoolError as error:
-            logger.error("%s: %s", self.name, error)  # noqa: TRY400 - no traceback needed
+            status.file_lost(str(error))
             return
         finally:
             self._num_unstored_files -= 1

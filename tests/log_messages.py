@@ -11,7 +11,10 @@ _LOGGERS: Final = {"logger", "_log"}
 _LOUD_METHODS: Final = {"warning", "error", "exception", "critical"}
 """Methods of loggers that log at WARNING and above; ``log`` can do so, too."""
 
-_WARNING_METHODS: Final = {"failed", "add_limitation"}
+_LOSS_METHODS: Final = {"lost", "message_lost"}
+"""Methods that log their second argument as WARNING, at least the first time; the first is a cause."""
+
+_WARNING_METHODS: Final = {"failed", "add_limitation", "file_lost", *_LOSS_METHODS}
 """Methods that log their argument as WARNING, at least the first time."""
 
 _LOGGED_CLASSES: Final = {
@@ -38,8 +41,10 @@ def message_patterns(package: Path) -> dict[str, str]:
             continue
         for scope in _scopes(module):
             for call in _logging_calls(scope):
+                is_loss = isinstance(call.func, ast.Attribute) and call.func.attr in _LOSS_METHODS
+                arguments = call.args[1:] if is_loss else call.args
                 texts = chain.from_iterable(
-                    _texts(node, scope, module, list(modules.values())) for node in call.args
+                    _texts(node, scope, module, list(modules.values())) for node in arguments
                 )
                 for text in filter(re.compile("[a-z]{3}").search, texts):
                     found.setdefault(text, f"{path.relative_to(package)}:{call.lineno}")

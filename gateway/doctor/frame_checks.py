@@ -8,6 +8,7 @@ from gateway.findings import Finding, Subject
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.stream.state import StreamState
+from gateway.stream.status import FRAME_REJECTED
 
 _MIN_VISIBLE: Final = 0.5
 """The check fails if a smaller share of the markers, or of the tools, is in view."""
@@ -26,7 +27,7 @@ def check_frames(subject: Subject, stream: ObservedStream, parameters: Parameter
             f"the server closed the connection{of_stream} while the doctor waited for frames",
             "Check whether another program takes over the stream, and read the server's own messages.",
         )
-    if stream.status.drops["frame rejected"]:
+    if stream.status.losses.frames(FRAME_REJECTED):
         return _malformed_frames(subject, stream, of_stream)
     if not stream.observed:
         return _no_frames(subject, stream, of_stream)
@@ -49,7 +50,7 @@ def check_frames(subject: Subject, stream: ObservedStream, parameters: Parameter
 
 
 def _malformed_frames(subject: Subject, stream: ObservedStream, of_stream: str) -> Finding:
-    rejected = stream.status.drops["frame rejected"]
+    rejected = stream.status.losses.frames(FRAME_REJECTED)
     return subject.failing(
         "frames",
         f"{rejected} of {rejected + stream.status.frames_in} frames{of_stream} are malformed: "

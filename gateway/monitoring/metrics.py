@@ -31,7 +31,7 @@ from gateway.stream.status import StreamStatus
 METRIC_PREFIX: Final = "rtc3d_gateway_"
 
 # Counters of these causes exist from the start, so that PromQL sees the first drop as an increase.
-_STREAM_DROP_CAUSES: Final = ("frame rejected", "unknown component", "skipped while behind")
+_STREAM_DROP_CAUSES: Final = ("frame rejected", "unknown component", "skipped while behind", "C3D file")
 
 Labels = tuple[str, ...]
 Sample = tuple[Labels, float]
@@ -166,12 +166,30 @@ class GatewayCollector(Collector):
         )
         yield _counter(
             "stream_drops",
-            "Frames or components that arrived but were not published, by cause.",
+            "Frames that arrived and lost a message before it was published, and C3D files lost, by cause.",
             (*labels, "cause"),
             [
                 sample
                 for stream, status in streams
-                for sample in _samples(stream, status.drops, _STREAM_DROP_CAUSES)
+                for sample in _samples(
+                    stream,
+                    {loss.cause: loss.frames or loss.messages for loss in status.losses.report()},
+                    _STREAM_DROP_CAUSES,
+                )
+            ],
+        )
+        yield _counter(
+            "stream_dropped_messages",
+            "Messages that were lost with these frames, by cause.",
+            (*labels, "cause"),
+            [
+                sample
+                for stream, status in streams
+                for sample in _samples(
+                    stream,
+                    {loss.cause: loss.messages for loss in status.losses.report()},
+                    _STREAM_DROP_CAUSES,
+                )
             ],
         )
 

@@ -86,7 +86,9 @@ def _stream_message(stream: StreamStatus, rate_hz: float) -> rtc3d.stream_status
     message.frame_rate_hz = rate_hz
     message.lag_ms = 1000 * stream.lag_s
     message.clock = clock_model(stream.clock)
-    message.drops = _counts(stream.drops)
+    message.drops = _counts(
+        Counter({loss.cause: loss.frames or loss.messages for loss in stream.losses.report()})
+    )
     message.num_drops = len(message.drops)
     message.limitations = list(stream.limitations)
     message.num_limitations = len(message.limitations)

@@ -16,7 +16,7 @@ from gateway.rtc3d.commands import (
 )
 from gateway.rtc3d.components import LONG_EVENT, ByteOrder, ComponentType, encode_component
 from gateway.rtc3d.frame_reader import FrameReader
-from gateway.rtc3d.frames import Frame, detect_byte_order, encode_frame, split_frame
+from gateway.rtc3d.frames import Frame, announced_components, detect_byte_order, encode_frame, split_frame
 from gateway.rtc3d.packets import (
     DEFAULT_MAX_C3D_BYTES,
     DEFAULT_MAX_PACKET_BYTES,
@@ -48,9 +48,13 @@ class Refused(NamedTuple):
 
 
 class FrameRejected(NamedTuple):
-    """A data frame contradicts itself and is lost. Later frames are not affected."""
+    """A data frame contradicts itself and is lost. Later frames are not affected.
+
+    ``num_components`` is the number of components that it announces, which need not be true.
+    """
 
     error: FrameError
+    num_components: int
 
 
 class FileReceived(NamedTuple):
@@ -187,7 +191,8 @@ class ClientProtocol:
         try:
             frame = self._read_frame(packet.body, events)
         except FrameError as error:
-            events.append(FrameRejected(error))
+            byte_order = self.byte_order or self._agreed_byte_order
+            events.append(FrameRejected(error, announced_components(packet.body, byte_order)))
             return
         pending = self._replies.pending
         if pending is not None and self._is_answered_by(frame, pending):

@@ -185,6 +185,14 @@ def _component_layout(type_number: int, size: int, count: int) -> ComponentLayou
     raise FrameError(f"{component.key} component of {size} bytes announces {count} items")
 
 
+def announced_components(body: bytes, byte_order: ByteOrder) -> int:
+    """Return the component count at the start of a type-3 packet's body, 0 if the body is too short."""
+    if len(body) < _COUNT_BYTES:
+        return 0
+    count: int = _COUNT[byte_order].unpack_from(body)[0]
+    return count
+
+
 def detect_byte_order(body: bytes, expected: ByteOrder) -> ByteOrder:
     """Return the byte order in which the frame makes sense; ``expected`` if it makes sense in both.
 

@@ -6,7 +6,7 @@ from typing import Final
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.messages.stamp import Stamp
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import Frame, FrameLayout
 from gateway.stream.rate_control import MAX_HALVINGS, LagControl
 from gateway.stream.status import StreamStatus
 
@@ -43,6 +43,9 @@ class Ingest:
         self._followed_type: ComponentType | None = None
         self._frame_number = 0  # the newest of a component of _followed_type
         self._lag = LagControl(source.max_lag_ms / 1000, MAX_HALVINGS if stream.adapt_rate else 1)
+        self._layout: FrameLayout | None = None  # of the newest frame
+        self._num_skippable = 0  # how many of its components are wanted and no events
+        self._unwanted = ""  # its components, if none of them is wanted
 
     def receive(self, frames: list[Frame], utime: int, now_s: float) -> None:
         """Take frames that arrived together, oldest first.
@@ -54,17 +57,32 @@ class Ingest:
         status = self._status
         status.frames_received(len(frames), utime)
         newest = frames[-1]
+        has_wanted = False
         for frame in frames:
+            if frame.layout is not self._layout:
+                self._set_layout(frame.layout)
+            has_wanted = has_wanted or not self._unwanted
             if frame.layout.unknown_types:
-                self._skip_unknown(frame.layout.unknown_types)
+                status.unknown_components_skipped(frame.layout.unknown_types)
             if not frame.layout.components:
                 continue
             stamp = self._stamp(frame, utime, now_s)
             if self._lag.behind and self._skips_when_behind and frame is not newest:
-                status.frame_skipped()
+                if self._num_skippable:
+                    status.frame_skipped(self._num_skippable)
                 self._publish(frame, stamp, self._wanted_events)
             else:
                 self._publish(frame, stamp, self._wanted)
+        status.components_received("" if has_wanted else self._unwanted, utime)
+
+    def _set_layout(self, layout: FrameLayout) -> None:
+        types = [component.type for component in layout.components]
+        self._layout = layout
+        self._num_skippable = sum(each in self._wanted and each not in _EVENTS for each in types)
+        if self._wanted.isdisjoint(types):
+            self._unwanted = " ".join(each.key for each in types) or "no components"
+        else:
+            self._unwanted = ""
 
     def _stamp(self, frame: Frame, utime: int, now_s: float) -> Stamp:
         frame_number, timestamp_us = frame.number_and_timestamp
@@ -93,7 +111,3 @@ class Ingest:
         if first_component_type is followed or followed is None or followed is ComponentType.EVENT:
             self._followed_type = first_component_type
             self._frame_number = frame_number
-
-    def _skip_unknown(self, types: tuple[int, ...]) -> None:
-        self._status.unknown_components_skipped(len(types))
-        self._status.add_limitation(f"components of unknown type {sorted(set(types))} are skipped")

@@ -10,7 +10,6 @@ from typing import Final
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import ClosedError, LinkError, ReplyTimeoutError, ServerError, SilenceError
-from gateway.log import HOLD_S, FailureLog
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.client_protocol import (
     Answered,
@@ -65,6 +64,7 @@ class Session:
     ) -> None:
         self.server = f"{source.host}:{source.port}"
         self._source = source
+        self._num_wanted = len(stream.components)
         self._only_events = set(stream.components) == {ComponentType.EVENT}
         self._status = status
         self._on_frames = on_frames
@@ -80,7 +80,6 @@ class Session:
         self._ask_lock = asyncio.Lock()  # held while a command is pending
         self._reply: asyncio.Future[Packet] | None = None  # to the command that ``ask`` has sent
         self._quiet_since_s = 0.0  # when the stall time-out last started
-        self._rejected = FailureLog(logger, source.name, HOLD_S)
 
     @property
     def is_open(self) -> bool:
@@ -203,7 +202,6 @@ class Session:
         if frames:
             self._quiet_since_s = now_s = self._monotonic()
             self._on_frames(frames, utime, now_s)
-            self._rejected.recovered("frames are valid again")
 
     def connection_lost(self, exc: Exception | None) -> None:
         """End the session, unless it has ended already: the connection is closed, by either side."""
@@ -220,9 +218,8 @@ class Session:
             case Refused(_, error):
                 if self._reply is not None and not self._reply.done():
                     self._reply.set_exception(error)
-            case FrameRejected(frame_error):
-                self._status.frame_rejected(f"frame rejected: {frame_error}")
-                self._rejected.failed(f"frame rejected: {frame_error}")
+            case FrameRejected(frame_error, num_components):
+                self._status.frame_rejected(str(frame_error), self._num_lost(num_components))
             case FileReceived(content):
                 self._on_file(content)
             case ByteOrderMismatch(byte_order):
@@ -238,6 +235,10 @@ class Session:
                     "%s: unexpected packet of type %d: %.200s",
                     self._source.name, packet.type, decode_text(packet.body[:200]),
                 )  # fmt: skip
+
+    def _num_lost(self, announced: int) -> int:
+        """Return how many messages a rejected frame would have had, as far as its component count tells."""
+        return min(announced, self._num_wanted) if 0 < announced <= len(ComponentType) else 1
 
     def _report_protocol(self) -> None:
         """Report the protocol's new state, and restart the stall time-out."""

@@ -2,11 +2,12 @@
 
 import logging
 import time
-from collections import Counter, deque
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+from gateway.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.stream.clock import ServerClock
@@ -17,6 +18,9 @@ MAX_ERROR_LENGTH: Final = 500
 
 MAX_LIMITATIONS: Final = 20
 """How many limitations of a connection are kept, and how many logged ones are remembered."""
+
+FRAME_REJECTED: Final = "frame rejected"
+"""The cause of loss of frames that contradict themselves."""
 
 _RECONNECTING: Final = (StreamState.CONNECTING, StreamState.HANDSHAKING, StreamState.WAITING)
 
@@ -42,8 +46,11 @@ class StreamStatus:
     parameters, 0 before the first; all streams of a source have the same. ``last_frame_utime`` is when the
     newest frame arrived, in µs since the Unix epoch, 0 before the first. ``tries`` counts the attempts to
     connect since the last completed handshake, ``reconnects`` all attempts except the first. ``restarts``
-    counts how often the server's time or frame numbers started again within a connection. ``drops`` counts
+    counts how often the server's time or frame numbers started again within a connection. ``losses`` counts
     by cause what arrived and was not published. ``limitations`` lists what the current connection lacks.
+
+    ``last_wanted_utime`` is when the newest frame with a component of this stream arrived, and
+    ``unwanted_components`` what the newest frame had if it had none of them.
     """
 
     components: str
@@ -62,12 +69,17 @@ class StreamStatus:
     restarts: int = 0
     lag_s: float = 0.0
     clock: ServerClock = field(default_factory=ServerClock)
-    drops: Counter[str] = field(default_factory=Counter)
+    last_wanted_utime: int = 0
+    unwanted_components: str = ""
+    losses: Losses = field(init=False)
     limitations: list[str] = field(default_factory=list)
     last_error: str = ""
     last_error_utime: int = 0
     _phase: Phase = field(default=Phase.WAITING, init=False)
     _logged_limitations: deque[str] = field(default_factory=lambda: deque(maxlen=MAX_LIMITATIONS), init=False)
+
+    def __post_init__(self) -> None:
+        self.losses = Losses(logger, self.name)
 
     # Reports of session and supervisor about the connection.
 
@@ -118,6 +130,15 @@ class StreamStatus:
         self.frames_in += count
         self.last_frame_utime = utime
 
+    def components_received(self, unwanted: str, utime: int) -> None:
+        """Note whether frames that arrived at ``utime`` had a component of this stream.
+
+        If not, ``unwanted`` are the components of the newest one.
+        """
+        self.unwanted_components = unwanted
+        if not unwanted:
+            self.last_wanted_utime = utime
+
     def lag_measured(self, lag_s: float) -> None:
         """Note how late the newest frame is."""
         self.lag_s = lag_s
@@ -126,18 +147,29 @@ class StreamStatus:
         """Count a restart of the server's time or frame numbers."""
         self.restarts += 1
 
-    def frame_rejected(self, error: str) -> None:
-        """Count a frame that contradicts itself."""
-        self.drops["frame rejected"] += 1
-        self.record_error(error)
+    def frame_rejected(self, error: str, num_messages: int) -> None:
+        """Count a frame that contradicts itself and would have had ``num_messages`` wanted components."""
+        text = f"frame rejected: {error}"
+        self.losses.lost(FRAME_REJECTED, text, messages=num_messages)
+        self.record_error(text)
 
-    def frame_skipped(self) -> None:
+    def frame_skipped(self, num_messages: int) -> None:
         """Count a frame of which only the events are published, because frames are late."""
-        self.drops["skipped while behind"] += 1
+        self.losses.lost(
+            "skipped while behind",
+            "frames arrive late and are skipped, except for the newest one (backlog: latest)",
+            messages=num_messages,
+        )
 
-    def unknown_components_skipped(self, count: int) -> None:
+    def unknown_components_skipped(self, types: Sequence[int]) -> None:
         """Count components of one frame whose types §7.2 does not define."""
-        self.drops["unknown component"] += count
+        text = f"components of unknown type {sorted(set(types))} are skipped"
+        self.losses.lost("unknown component", text, messages=len(types))
+        self._list_limitation(text)
+
+    def file_lost(self, text: str) -> None:
+        """Count a C3D file that the server sent and that is not stored."""
+        self.losses.lost("C3D file", text, frames=0, level=logging.ERROR)
 
     # What the server and the gateway agreed on, and errors.
 
@@ -154,14 +186,20 @@ class StreamStatus:
 
         Each text is logged as WARNING once, and as DEBUG if a later connection has the same limitation.
         """
-        if text in self.limitations or len(self.limitations) >= MAX_LIMITATIONS:
+        if not self._list_limitation(text):
             return
-        self.limitations.append(text)
         if text in self._logged_limitations:
             logger.debug("%s: %s", self.name, text)
             return
         self._logged_limitations.append(text)
         logger.warning("%s: %s", self.name, text)
+
+    def _list_limitation(self, text: str) -> bool:
+        """Add ``text`` to the limitations and return True, unless it is there or there are too many."""
+        if text in self.limitations or len(self.limitations) >= MAX_LIMITATIONS:
+            return False
+        self.limitations.append(text)
+        return True
 
     def record_error(self, text: str) -> None:
         """Keep ``text``, cut to MAX_ERROR_LENGTH, as the last error, with the time."""

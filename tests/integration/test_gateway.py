@@ -15,6 +15,7 @@ from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
+from tests.losses import amounts
 from tests.memory_gateway import run_gateway
 from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
 
@@ -214,11 +215,10 @@ async def test_components_that_were_not_requested_are_not_published() -> None:
         assert gateway.messages("3d") == []
 
 
-@pytest.mark.usefixtures("no_hold")
 async def test_bad_frames_are_counted_and_the_next_good_one_is_published(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    caplog.set_level(logging.DEBUG, "gateway.stream.session")
+    caplog.set_level(logging.DEBUG, "gateway.stream.status")
 
     async def script(client: Client) -> None:
         def answer(command: str) -> bytes:
@@ -230,13 +230,13 @@ async def test_bad_frames_are_counted_and_the_next_good_one_is_published(
     async with ScriptedServer(script) as server, run_gateway(server.port) as gateway:
         messages = await gateway.wait_for("3d", 2)
         assert [message.frame_number for message in messages] == [7, 8]
-        assert gateway.status.drops == {"frame rejected": 3}
+        assert amounts(gateway.status.losses.report()) == {"frame rejected": (3, 3)}
         records = [
             record
             for record in caplog.records
-            if "frame" in record.message and record.name == "gateway.stream.session"
+            if "frame rejected" in record.message and record.name == "gateway.stream.status"
         ]
-        assert [record.levelname for record in records] == ["WARNING", "DEBUG", "DEBUG", "INFO"]
+        assert [record.levelname for record in records] == ["WARNING"]
         assert "frame rejected" in gateway.status.last_error
 
 
@@ -251,7 +251,7 @@ async def test_unknown_components_are_counted_and_logged_once(caplog: pytest.Log
 
     async with ScriptedServer(script) as server, run_gateway(server.port) as gateway:
         await gateway.wait_for("3d", 2)
-        assert gateway.status.drops == {"unknown component": 2}
+        assert amounts(gateway.status.losses.report()) == {"unknown component": (2, 2)}
     assert sum("unknown type [9]" in record.message for record in caplog.records) == 1
 
 

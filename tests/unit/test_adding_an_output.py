@@ -326,7 +326,7 @@ async def test_it_receives_parameters_and_announcements_of_files(tmp_path: Path)
         source, parameters = lab.output.parameters[0]
         assert (source, parameters.session) == ("lab", 1)
         assert b"<The_3D>" in parameters.xml
-        lab.source._on_file(b"a take")
+        lab.source._on_file(lab.source.statuses[0], b"a take")
         await wait_until_async(lambda: lab.output.files)
         stop.set()
         await task

@@ -32,6 +32,7 @@ from tests.unit.stream.scripted_server import XML, ScriptedServer, obliging
 from tests.unit.stream.virtual_time import settle, until
 
 HOST = "192.0.2.20"
+STREAM = "lab (3d 6d analog force event)"
 OTHER_XML = packet(2, "<RT_Parameters Ver='1.00'><The_6D/></RT_Parameters>")
 TWO_STREAMS = (
     StreamSettings(components=(ComponentType.MARKERS,)),
@@ -368,7 +369,7 @@ async def test_at_most_four_files_wait_for_the_disk(
             await settle()
         [record] = [record for record in caplog.records if record.levelno == logging.ERROR]
         assert record.message == (
-            "lab: a C3D file of 5 bytes is dropped: 4 earlier files are still being written; "
+            f"{STREAM}: a C3D file of 5 bytes is dropped: 4 earlier files are still being written; "
             "is the disk slow, or the server faulty?"
         )
         lab.threads.is_slow = False
@@ -383,6 +384,7 @@ async def test_at_most_four_files_wait_for_the_disk(
 async def test_files_that_cannot_be_stored_are_logged_and_make_room_for_others(
     servers: Servers, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    caplog.set_level(logging.INFO)
     lab = Lab(servers, BrokenSpool(tmp_path, max_files=10, max_bytes=1000))
     async with running(lab):
         await lab.connected()
@@ -390,7 +392,9 @@ async def test_files_that_cannot_be_stored_are_logged_and_make_room_for_others(
             lab.server.connection.send(packet(5, b"a file"))
             await settle()
     errors = [record.message for record in caplog.records if record.levelno == logging.ERROR]
-    assert errors == ["lab: 6 bytes from lab cannot be kept; check the disk"] * 6
+    assert errors == [f"{STREAM}: 6 bytes from lab cannot be kept; check the disk"]
+    [end] = [message for message in caplog.messages if "lost within" in message]
+    assert end.endswith(" s: 6 messages (C3D file)")
     assert lab.files == []
 
 

@@ -102,8 +102,9 @@ async def test_exactly_one_state_of_a_stream_is_1(lab: Lab) -> None:
 
 
 async def test_drops_have_a_cause_and_common_causes_start_at_0(lab: Lab) -> None:
-    lab.markers.drops["frame rejected"] = 2
-    lab.markers.drops["quite unusual"] = 1
+    for _ in range(2):
+        lab.markers.frame_rejected("too short", 3)
+    lab.markers.losses.lost("quite unusual", "lost", frames=0)
     stalled, broken = (output for output, _ in lab.source.fan_out.outputs)
     errors = (OutputError("stalled", cause="queue full"), ValueError("oops"))
     for output, error in zip((stalled, broken), errors, strict=True):
@@ -119,6 +120,7 @@ async def test_drops_have_a_cause_and_common_causes_start_at_0(lab: Lab) -> None
         "frame rejected": 2,
         "unknown component": 0,
         "skipped while behind": 0,
+        "C3D file": 0,
         "quite unusual": 1,
     }
     drops = {

@@ -39,11 +39,13 @@ def test_the_status_message_has_every_field() -> None:
         reconnects=2,
         restarts=4,
         lag_s=0.0125,
-        drops=Counter({"unknown component": 5, "frame rejected": 1}),
         limitations=["the server refused Version 1.0: err-version", "no parameters"],
         last_error="Verbindung weg – Kabel prüfen",
         last_error_utime=1_700_000_000_000_000,
     )
+    for number in range(5):
+        stream.losses.lost("unknown component", f"component {number}")
+    stream.losses.lost("frame rejected", "too short")
     quiet = StreamStatus("analog", session=1, parameters_version=5)
     zenoh = OutputStatus("zenoh", Counter({"6d": 8, "3d": 9}), Counter({"no router": 2}))
     lcm = OutputStatus("lcm")

@@ -9,6 +9,7 @@ from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, enc
 from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.stream.ingest import Ingest
 from gateway.stream.status import StreamStatus
+from tests.losses import amounts
 
 BOOT_UTIME = 1_700_000_000_000_000
 PERIOD_US = 5_000
@@ -93,7 +94,7 @@ def test_capture_time_is_the_servers_time_on_the_hosts_clock(lab: Lab) -> None:
 def test_frames_that_arrive_together_but_in_time_are_all_published(lab: Lab) -> None:
     lab.receive(*(frame(number) for number in range(600, 605)))
     assert [number for number, _ in lab.published] == list(range(600, 605))
-    assert not lab.status.drops
+    assert not lab.status.losses.report()
 
 
 def test_while_behind_the_newest_is_published_and_no_event_is_skipped(lab: Lab) -> None:
@@ -101,10 +102,10 @@ def test_while_behind_the_newest_is_published_and_no_event_is_skipped(lab: Lab) 
     lab.receive(*late, late_us=200_000)
     if lab.backlog == "latest":
         assert lab.published == [(602, ["event"]), (604, ["3d"])]
-        assert lab.status.drops == {"skipped while behind": 4}
+        assert amounts(lab.status.losses.report()) == {"skipped while behind": (4, 4)}
     else:
         assert [number for number, _ in lab.published] == list(range(600, 605))
-        assert not lab.status.drops
+        assert not lab.status.losses.report()
 
 
 def test_frames_that_stay_late_request_lower_rates(lab: Lab) -> None:
@@ -202,6 +203,6 @@ def test_unknown_components_are_counted_and_the_others_published(
     for _ in range(3):
         lab.receive(split_frame(count + body[4:] + unknown, "big"))
     assert len(lab.published) == 3
-    assert lab.status.drops == {"unknown component": 3}
+    assert amounts(lab.status.losses.report()) == {"unknown component": (3, 3)}
     assert lab.status.limitations == ["components of unknown type [99] are skipped"]
     assert caplog.messages == ["lab (3d event): components of unknown type [99] are skipped"]

@@ -16,6 +16,7 @@ from gateway.rtc3d.frames import Frame
 from gateway.stream.session import Session
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
+from tests.losses import amounts
 from tests.servers import markers_frame, packet
 from tests.unit.stream.scripted_server import Connection, ScriptedServer, obliging, refusing, silent_to
 from tests.unit.stream.virtual_time import settle
@@ -166,7 +167,7 @@ async def test_a_rejected_frame_is_counted_and_the_next_is_passed_on(
     contradictory[32:36] = (9).to_bytes(4, "big")  # announces 9 markers
     lab.connection.send(bytes(contradictory) + good)
     assert [number for number, _ in lab.frames] == [2]
-    assert lab.status.drops == {"frame rejected": 1}
+    assert amounts(lab.status.losses.report()) == {"frame rejected": (1, 1)}
     assert lab.status.last_error.startswith("frame rejected: ")
     assert any(record.levelname == "WARNING" for record in caplog.records)
 

@@ -8,6 +8,7 @@ from gateway.messages.host_time import now_utime
 from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.stream.state import StreamState
 from gateway.stream.status import MAX_ERROR_LENGTH, MAX_LIMITATIONS, FrameRate, StreamStatus
+from tests.losses import amounts
 from tests.waiting import wait_until
 
 SERVER = "192.0.2.20:3020"
@@ -143,11 +144,18 @@ def test_the_frame_rate_is_exact_and_zero_if_no_time_has_passed(monkeypatch: pyt
 def test_every_frame_that_is_lost_is_counted_by_its_cause() -> None:
     status = StreamStatus("3d")
     for _ in range(2):
-        status.frame_rejected("too short")
-        status.frame_skipped()
-        status.unknown_components_skipped(3)
-    assert status.drops == {"frame rejected": 2, "skipped while behind": 2, "unknown component": 6}
-    assert status.last_error == "too short"
+        status.frame_rejected("too short", 5)
+        status.frame_skipped(3)
+        status.unknown_components_skipped((9, 9, 7))
+        status.file_lost("the disk is full")
+    assert amounts(status.losses.report()) == {
+        "frame rejected": (10, 2),
+        "skipped while behind": (6, 2),
+        "unknown component": (6, 2),
+        "C3D file": (2, 0),
+    }
+    assert status.last_error == "frame rejected: too short"
+    assert status.limitations == ["components of unknown type [7, 9] are skipped"]
 
 
 def test_repeated_events_are_added_up() -> None:

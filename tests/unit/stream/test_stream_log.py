@@ -6,6 +6,7 @@ import pytest
 
 from gateway.errors import ClosedError, LinkError, PacketError
 from gateway.rtc3d.parameters_xml import parse_parameters
+from tests.losses import amounts
 from tests.servers import error, markers_frame, packet
 from tests.unit.stream import test_session, test_stream_control
 from tests.unit.stream.scripted_server import obliging, refusing
@@ -51,8 +52,7 @@ async def test_each_state_from_connecting_to_streaming(caplog: pytest.LogCapture
     ]
 
 
-@pytest.mark.usefixtures("no_hold")
-async def test_rejected_frames_are_a_warning_once_and_their_end_is_logged(
+async def test_rejected_frames_are_a_warning_once_and_their_end_is_logged_with_the_total(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     lab = await session_with_frames()
@@ -60,24 +60,12 @@ async def test_rejected_frames_are_a_warning_once_and_their_end_is_logged(
     lab.connection.send(TOO_SHORT)
     lab.connection.send(TOO_SHORT)
     lab.connection.send_frames(2)
-    first, second, end = logged(caplog, "session")
-    text = "lab: frame rejected: data frame of 3 bytes: too short for its component count"
-    assert first == f"WARNING {text}"
-    assert second == f"DEBUG {text} (failure 2 in a row)"
-    assert end.startswith("INFO lab: frames are valid again, after ")
-    assert lab.status.drops == {"frame rejected": 2}
-
-
-async def test_frames_that_are_rejected_now_and_then_are_one_failure(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    lab = await session_with_frames()
-    caplog.clear()
-    for number in range(2, 5):
-        lab.connection.send(TOO_SHORT)
-        lab.connection.send_frames(number)
-    levels = [line.split()[0] for line in logged(caplog, "session")]
-    assert levels == ["WARNING", "DEBUG", "DEBUG"]
+    lab.status.losses.close()
+    first, end = (line for line in logged(caplog, "status") if "frame rejected" in line)
+    text = "frame rejected: data frame of 3 bytes: too short for its component count"
+    assert first == f"WARNING lab (3d): {text}"
+    assert end == "INFO lab (3d): lost within 0.0 s: 2 messages of 2 frames (frame rejected)"
+    assert amounts(lab.status.losses.report()) == {"frame rejected": (2, 2)}
 
 
 async def test_frames_in_another_byte_order_are_a_limitation() -> None:

@@ -1,0 +1,198 @@
+"""What was lost on one route, by cause: counted in messages and frames, and logged at its begin and end."""
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable
+from typing import Final, NamedTuple
+
+MIN_HOLD_S: Final = 5.0
+MAX_HOLD_S: Final = 60.0
+"""A period of loss ends when nothing has been lost for MIN_HOLD_S.
+
+If the next period begins soon after that, the wait doubles, up to MAX_HOLD_S. So loss that comes and goes
+does not fill the log.
+"""
+
+_MINUTE_S: Final = 60
+
+
+class Loss(NamedTuple):
+    """What was lost for one ``cause``, in total and in the last minute.
+
+    ``frames`` counts the frames that lost at least one message for this cause. It is 0 for what belongs to no
+    frame, such as status messages, files and requests. ``age_s`` is the time since the newest loss, and
+    ``text`` says what happened then and what to do.
+    """
+
+    cause: str
+    messages: int
+    frames: int
+    messages_last_minute: int
+    frames_last_minute: int
+    age_s: float
+    text: str
+
+
+class _Cause:
+    """The counters of one cause."""
+
+    def __init__(self) -> None:
+        self.messages = self.frames = 0
+        self.period_messages = self.period_frames = 0  # in the current period of loss
+        self.newest_s = 0.0
+        self.text = ""
+        self.frame: object | None = None  # the newest frame that lost a message
+        # One entry for each of the last seconds with a loss: the second, messages, frames.
+        self.recent: deque[tuple[int, int, int]] = deque(maxlen=_MINUTE_S + 1)
+
+    def add(self, now_s: float, messages: int, frames: int) -> None:
+        self.messages += messages
+        self.frames += frames
+        self.period_messages += messages
+        self.period_frames += frames
+        self.newest_s = now_s
+        second = int(now_s)
+        if self.recent and self.recent[-1][0] == second:
+            _, messages_before, frames_before = self.recent.pop()
+            messages, frames = messages + messages_before, frames + frames_before
+        self.recent.append((second, messages, frames))
+
+    def report(self, name: str, now_s: float) -> Loss:
+        recent = [entry for entry in self.recent if entry[0] > now_s - _MINUTE_S]
+        return Loss(
+            name,
+            self.messages,
+            self.frames,
+            sum(messages for _, messages, _ in recent),
+            sum(frames for _, _, frames in recent),
+            now_s - self.newest_s,
+            self.text,
+        )
+
+
+class Losses:
+    """Counts what is lost on one route, for example from a source to an output, and logs it.
+
+    In each period of loss, the first loss for each cause is logged, as WARNING unless ``lost`` says another
+    level. The end of the period is logged as INFO with the total. ``subject`` begins every log message. Any
+    thread may call the methods.
+    """
+
+    def __init__(
+        self, logger: logging.Logger, subject: str, monotonic: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._logger = logger
+        self._subject = subject
+        self._monotonic = monotonic
+        self._lock = threading.Lock()
+        self._causes: dict[str, _Cause] = {}
+        self._hold_s = MIN_HOLD_S
+        self._began_s: float | None = None  # when the current period of loss began; None if nothing is lost
+        self._newest_s = 0.0
+        self._ended_s = float("-inf")  # when the last period ended
+
+    def lost(
+        self,
+        cause: str,
+        text: str,
+        *,
+        messages: int = 1,
+        frames: int = 1,
+        level: int = logging.WARNING,
+    ) -> None:
+        """Count ``messages`` of ``frames``. ``text`` says what happened and what to do."""
+        now_s = self._monotonic()
+        self.check()
+        with self._lock:
+            counted = self._causes.setdefault(cause, _Cause())
+            is_first = not counted.period_messages
+            counted.add(now_s, messages, frames)
+            counted.text = text
+            self._newest_s = now_s
+            if self._began_s is None:
+                self._begin(now_s)
+        if is_first:
+            self._logger.log(level, "%s: %s", self._subject, text)
+
+    def message_lost(self, cause: str, text: str, frame: object | None) -> None:
+        """Count one message of ``frame``; None if the message belongs to no frame.
+
+        The messages of one frame come one after the other, so a frame counts once for each cause.
+        """
+        counted = self._causes.get(cause)
+        is_new = frame is not None and (counted is None or counted.frame is not frame)
+        self.lost(cause, text, frames=1 if is_new else 0)
+        self._causes[cause].frame = frame
+
+    def check(self) -> None:
+        """Log the end of a period of loss if nothing has been lost for long enough. Call it every second."""
+        if self._began_s is not None and self._monotonic() - self._newest_s >= self._hold_s:
+            self._end(f"; nothing lost for {self._hold_s:g} s")
+
+    def close(self) -> None:
+        """Log the end of a period of loss now, because the route ends. It may be used again."""
+        if self._began_s is not None:
+            self._end("")
+
+    def report(self) -> list[Loss]:
+        """Return what was lost so far, by cause."""
+        now_s = self._monotonic()
+        with self._lock:
+            return [counted.report(cause, now_s) for cause, counted in sorted(self._causes.items())]
+
+    def frames(self, cause: str) -> int:
+        """Return how many frames were lost for ``cause`` so far."""
+        counted = self._causes.get(cause)
+        return 0 if counted is None else counted.frames
+
+    def _begin(self, now_s: float) -> None:
+        is_soon = now_s - self._ended_s < MAX_HOLD_S
+        self._hold_s = min(2 * self._hold_s, MAX_HOLD_S) if is_soon else MIN_HOLD_S
+        self._began_s = now_s
+
+    def _end(self, ending: str) -> None:
+        with self._lock:
+            if self._began_s is None:
+                return
+            duration_s = self._newest_s - self._began_s
+            self._began_s = None
+            self._ended_s = self._newest_s + self._hold_s
+            counts = []
+            for cause, counted in sorted(self._causes.items()):
+                if counted.period_messages:
+                    counts.append((cause, counted.period_messages, counted.period_frames))
+                    counted.period_messages = counted.period_frames = 0
+        self._logger.info(
+            "%s: lost within %.1f s: %s%s", self._subject, duration_s, _counts_text(counts), ending
+        )
+
+
+def last_minute_text(losses: Iterable[Loss]) -> str:
+    """Return what was lost in the last minute; "" if nothing was.
+
+    For example "872 messages of 436 frames lost in the last minute (skipped while behind)".
+    """
+    counts = [
+        (loss.cause, loss.messages_last_minute, loss.frames_last_minute)
+        for loss in losses
+        if loss.messages_last_minute
+    ]
+    return f"lost in the last minute: {_counts_text(counts)}" if counts else ""
+
+
+def total_text(losses: Iterable[Loss]) -> str:
+    """Return what was lost so far; "" if nothing was."""
+    counts = [(loss.cause, loss.messages, loss.frames) for loss in losses]
+    return f"lost: {_counts_text(counts)}" if counts else ""
+
+
+def _counts_text(counts: Iterable[tuple[str, int, int]]) -> str:
+    """Return a text such as "872 messages of 436 frames (skipped while behind), 1 message (closed)"."""
+    return ", ".join(f"{_amount(messages, frames)} ({cause})" for cause, messages, frames in counts)
+
+
+def _amount(messages: int, frames: int) -> str:
+    text = f"{messages} message{'' if messages == 1 else 's'}"
+    return f"{text} of {frames} frame{'' if frames == 1 else 's'}" if frames else text
