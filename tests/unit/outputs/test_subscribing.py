@@ -1,7 +1,9 @@
 """Subscribing to an output as ``echo`` and the demo do: what is selected, and that messages arrive."""
 
+import threading
 from collections.abc import Iterator
 
+import lcm
 import pytest
 
 from gateway.errors import OutputError
@@ -120,6 +122,28 @@ def test_lcm_is_subscribed_to_at_a_url(received: list[tuple[str, bytes]]) -> Non
     subscription.close()
     output.close()
     assert set(received) == {("HALL_LAB_3D", b"message")}
+
+
+@pytest.mark.netns
+def test_no_message_is_lost_while_a_receiver_of_lcm_pauses() -> None:
+    url, received, may_continue = lcm_url(), [], threading.Event()
+
+    def receive(_channel: str, message: bytes) -> None:
+        received.append(message)
+        may_continue.wait(10)
+
+    subscribe = OUTPUTS["lcm"].subscribe
+    assert subscribe is not None
+    subscription = subscribe(SubscriptionRequest("lab", address=url), receive)
+    publisher = lcm.LCM(url)
+    sent = [b"%d" % number for number in range(100)]  # LCM's own queue has 30 places
+    for message in sent:
+        publisher.publish("MOCAP_LAB_3D", message)
+    wait_until(lambda: received)
+    may_continue.set()
+    wait_until(lambda: len(received) == len(sent))
+    subscription.close()
+    assert received == sent
 
 
 def test_an_endpoint_without_zenoh_is_named_with_what_to_check(received: list[tuple[str, bytes]]) -> None:

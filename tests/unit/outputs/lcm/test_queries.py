@@ -16,6 +16,7 @@ from gateway.outputs.contract import ServerParameters
 from gateway.outputs.lcm import queries as queries_module
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.queries import MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES, REPEAT_S
+from gateway.outputs.lcm.sender import LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
 from tests.waiting import wait_until_async
 
@@ -243,6 +244,23 @@ async def test_after_the_end_of_queries_no_request_is_answered() -> None:
     lab.deliver()
     assert lab.replies == []
     assert len(lab.service.received) == 1
+
+
+async def test_a_request_after_the_end_of_the_event_loop_is_ignored(lab: Lab) -> None:
+    loop = asyncio.new_event_loop()
+    loop.close()
+    sender = LcmSender("memq://", lab.lcm, lambda: None)
+    queries = queries_module.LcmQueries(
+        LcmSettings(url="memq://"),
+        lab.service,  # type: ignore[arg-type]  # it has the methods that LCM calls
+        loop,
+        sender,
+        lab.lcm,
+    )
+    queries.add("lab")
+    lab.send(request())
+    await queries.close()
+    assert queries.ignored("lab") == {}
 
 
 # Parameters ----------------------------------------------------------------------------------

@@ -1,5 +1,6 @@
 """What happens to requests and subscriptions when LCM's TCP relay goes away and comes back."""
 
+import logging
 from collections.abc import AsyncIterator, Iterator, Sequence
 
 import lcm
@@ -68,6 +69,22 @@ async def test_requests_are_answered_again_after_the_relay_restarts(
     await wait_until_async(lambda: not relay.subscribed)
     relay.open()
     assert await ask(relay, 2) == ["<The_3D/>"]
+
+
+async def test_a_lost_relay_is_logged_with_the_key_to_check(
+    relay: LcmRelay, output: LcmOutput, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "gateway.outputs.lcm.queries")
+    await wait_until_async(lambda: output.health().connected and relay.subscribed)
+    relay.close()
+    await wait_until_async(lambda: caplog.messages)
+    relay.open()
+    await wait_until_async(lambda: len(caplog.messages) >= 2)
+    lost, found = caplog.messages
+    assert lost.startswith(f"lcm: no requests can be received: LCM did not send to {relay.url}: ")
+    assert lost.endswith("; check lcm.url (this is lcm.queries_url)")
+    assert "None" not in lost
+    assert found.startswith("lcm: requests can be received, after ")
 
 
 def test_a_subscriber_logs_a_lost_relay_and_can_be_closed(

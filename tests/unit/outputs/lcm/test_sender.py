@@ -183,6 +183,24 @@ def test_a_lost_route_is_a_problem_until_a_message_is_sent(caplog: pytest.LogCap
     assert caplog.messages[2].startswith(f"lcm: sending replies to {url}, after ")
 
 
+@pytest.mark.netns
+def test_failures_in_quick_succession_are_logged_as_one(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gateway.outputs")
+    sender = LcmSender(lcm_url(), None, lambda: None)
+    sender.open()
+    caplog.clear()
+    for _ in range(2):
+        remove_multicast_route()
+        try:
+            refusal(lambda: send(sender))
+        finally:
+            add_multicast_route()
+        send(sender)
+        assert sender.problem == ""
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
+    sender.close()
+
+
 # Publishers ----------------------------------------------------------------------------------
 
 

@@ -167,6 +167,23 @@ def test_a_full_queue_and_its_end_are_logged_once(
     assert caplog.messages[1].startswith("lcm: the peer reads again, after ")
 
 
+def test_a_queue_that_is_often_full_is_logged_once(
+    lcm: FakeLcm,
+    sender: LcmThreadSender,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO, "gateway.outputs")
+    monkeypatch.setattr(thread_sender, "MAX_QUEUED_MESSAGES", 1)
+    for _ in range(2):
+        lcm.is_publishing.clear()
+        block(lcm, sender)
+        refusal(sender)
+        lcm.reads.set()
+        wait_until(lambda: not sender._queue)
+    assert caplog.messages == [f"lcm: {FULL}"]
+
+
 # Failures ------------------------------------------------------------------------------------
 
 
@@ -187,6 +204,19 @@ def test_a_message_that_fails_is_sent_again_and_others_are_refused_meanwhile(
     wait_until(lambda: messages(lcm) == [b"first", b"second"])
     assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.INFO]
     assert caplog.messages[1].startswith(f"lcm: sending messages to {URL}, after ")
+
+
+def test_failures_in_quick_succession_are_logged_as_one(
+    lcm: FakeLcm, sender: LcmThreadSender, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "gateway.outputs")
+    for _ in range(2):
+        lcm.error = BrokenPipeError("of the test")
+        send(sender, b"message")
+        wait_until(lambda: sender.problem)
+        lcm.error = None
+        wait_until(lambda: not sender._queue)
+    assert [record.levelno for record in caplog.records] == [logging.WARNING]
 
 
 def test_opening_is_tried_again_until_it_succeeds(lcm: FakeLcm, caplog: pytest.LogCaptureFixture) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import zenoh
 
-from gateway.errors import ConfigError
+from gateway.errors import ConfigError, OutputError
 from gateway.messages.topics import Topic
 from gateway.outputs.zenoh.config import zenoh_config
 from gateway.outputs.zenoh.output import ZenohOutput
@@ -146,6 +146,34 @@ def test_a_closed_publisher_is_not_wanted(lab: Lab) -> None:
     publisher.close()
     assert not publisher.wanted
     subscriber.undeclare()
+
+
+def test_a_message_for_a_closed_publisher_is_refused_with_its_key(lab: Lab) -> None:
+    publisher = lab.output.publisher(MARKERS)
+    publisher.close()
+    with pytest.raises(OutputError) as caught:
+        publisher.publish(b"message")
+    text = "Zenoh key mocap/lab/3d is closed; ask for a new publisher"
+    assert (str(caught.value), caught.value.cause) == (text, "closed")
+
+
+def test_a_client_that_has_lost_its_router_refuses_messages() -> None:
+    endpoint = free_endpoint()
+    router = open_zenoh("router", listen=endpoint)
+    output = ZenohOutput(ZenohSettings(config=zenoh_keys("client", connect=endpoint)))
+    try:
+        publisher = output.publisher(MARKERS)
+        output.start()
+        wait_until(lambda: output.health().connected)
+        publisher.publish(b"message")
+    finally:
+        router.close()
+    wait_until(lambda: not output.health().connected)
+    with pytest.raises(OutputError) as caught:
+        publisher.publish(b"message")
+    assert caught.value.cause == "no router"
+    assert str(caught.value) == output.health().problem
+    output.close()
 
 
 # Liveliness ----------------------------------------------------------------------------------

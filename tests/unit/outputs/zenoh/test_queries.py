@@ -58,10 +58,10 @@ class Service:
 class Lab:
     """An output that serves the source "lab", and a client connected to it."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, has_time_stamps: bool = True) -> None:
         self.service = Service()
         self.endpoint = free_endpoint()
-        keys = zenoh_keys("peer", listen=self.endpoint) | {"timestamping": {"enabled": True}}
+        keys = zenoh_keys("peer", listen=self.endpoint) | {"timestamping": {"enabled": has_time_stamps}}
         self.output = ZenohOutput(ZenohSettings(config=keys))
         self.output.serve_queries(self.service)  # type: ignore[arg-type]  # it has the methods that are called
         self.samples: list[zenoh.Sample] = []
@@ -196,7 +196,12 @@ async def test_long_answers_arrive_unchanged_and_are_sent_by_a_thread_of_their_o
 # Parameters and files ------------------------------------------------------------------------
 
 
-async def test_parameters_are_published_with_their_encoding_and_a_low_priority(lab: Lab) -> None:
+@pytest.mark.parametrize("has_time_stamps", [True, False])
+async def test_parameters_are_published_with_their_encoding_and_a_low_priority(
+    has_time_stamps: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    lab = Lab(has_time_stamps=has_time_stamps)
+    await lab.open()
     lab.subscribe("mocap/lab/parameters")
     lab.output.publish_parameters("lab", ServerParameters(XML, 1, 4))
     await wait_until_async(lambda: lab.samples)
@@ -206,6 +211,17 @@ async def test_parameters_are_published_with_their_encoding_and_a_low_priority(l
     assert json.loads(sample.attachment.to_bytes()) == {"session": 1, "parameters_version": 4}
     assert sample.congestion_control == zenoh.CongestionControl.BLOCK
     assert sample.priority == zenoh.Priority.DATA_LOW
+    if has_time_stamps:
+        assert caplog.messages == []
+    else:
+        [message] = caplog.messages
+        start = "zenoh: late subscribers have to query mocap/lab/parameters themselves: "
+        assert message.startswith(start)
+        assert message.endswith("; set timestamping: {enabled: true} in Zenoh's configuration file")
+        assert "imestamp" in message.removeprefix(start).partition(";")[0]
+    await lab.output.stop_queries()
+    lab.output.close()
+    lab.peer.close()
 
 
 async def test_files_are_announced_as_json_on_the_key_that_returns_them(lab: Lab) -> None:
@@ -260,3 +276,11 @@ async def test_an_output_without_queries_has_no_results() -> None:
     assert output.query_results is None
     await output.stop_queries()
     await asyncio.to_thread(output.close)
+
+
+async def test_an_event_loop_that_has_ended_is_no_error(lab: Lab) -> None:
+    loop = asyncio.new_event_loop()
+    loop.close()
+    queries = queries_module.ZenohQueries("mocap", lab.service, loop)  # type: ignore[arg-type]  # see Lab
+    queries.open(lab.peer, [])
+    await queries.close()

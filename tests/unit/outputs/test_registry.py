@@ -1,0 +1,31 @@
+"""The registry: which sections the configuration has, and which outputs it builds."""
+
+from gateway.config.settings import SourceSettings
+from gateway.outputs.lcm.output import LcmOutput
+from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.registry import OUTPUTS, build_outputs
+from gateway.outputs.zenoh.output import ZenohOutput
+from gateway.outputs.zenoh.settings import ZenohSettings
+from tests.configurations import make_settings
+
+SOURCES = (SourceSettings(name="lab", host="127.0.0.1"),)
+
+
+def test_every_output_has_its_section() -> None:
+    settings = make_settings(sources=SOURCES)
+    assert {name: type(section) for name, section in settings.outputs.items()} == {
+        "zenoh": ZenohSettings,
+        "lcm": LcmSettings,
+    }
+    assert list(OUTPUTS) == list(settings.outputs)
+
+
+def test_only_enabled_outputs_are_built_with_their_settings() -> None:
+    zenoh, lcm = ZenohSettings(prefix="hall"), LcmSettings(url="memq://", prefix="HALL")
+    first, second = build_outputs(make_settings(sources=SOURCES, zenoh=zenoh, lcm=lcm))
+    assert isinstance(first, ZenohOutput)
+    assert isinstance(second, LcmOutput)
+    assert (first.settings, second.settings) == (zenoh, lcm)
+    disabled = zenoh.model_copy(update={"enabled": False})
+    [only] = build_outputs(make_settings(sources=SOURCES, zenoh=disabled, lcm=lcm))
+    assert isinstance(only, LcmOutput)
