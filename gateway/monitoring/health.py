@@ -6,11 +6,11 @@ from typing import Any, Final
 
 from gateway.config.settings import StreamSettings
 from gateway.gateway import Gateway
-from gateway.messages.host_time import now_utime
 from gateway.monitoring.http_pages import Page
 from gateway.outputs.contract import Output
 from gateway.rtc3d.components import ComponentType
 from gateway.source import Source
+from gateway.stream.running_time import running_clock
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 
@@ -19,9 +19,9 @@ _ONLY_EVENTS: Final = {ComponentType.EVENT}
 
 def health_page(gateway: Gateway) -> Page:
     """Return the page /healthz: JSON with status 200, or 503 if a stream or an output has a problem."""
-    utime = now_utime()
+    now_s = running_clock().time()  # a stop of this process does not make the newest frames older
     streams = [
-        _stream_health(source, stream, status, utime)
+        _stream_health(source, stream, status, now_s)
         for source in gateway.sources
         for stream, status in zip(source.settings.streams, source.statuses, strict=True)
     ]
@@ -33,9 +33,9 @@ def health_page(gateway: Gateway) -> Page:
 
 
 def _stream_health(
-    source: Source, stream: StreamSettings, status: StreamStatus, utime: int
+    source: Source, stream: StreamSettings, status: StreamStatus, now_s: float
 ) -> dict[str, Any]:
-    age_s = (utime - status.last_frame_utime) / 1e6 if status.last_frame_utime else None
+    age_s = None if status.last_frame_s is None else now_s - status.last_frame_s
     return {
         "source": source.name,
         "stream": status.components,

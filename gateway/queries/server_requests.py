@@ -10,6 +10,7 @@ from gateway.messages.host_time import now_utime
 from gateway.rtc3d.commands import Command
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet
+from gateway.stream.running_time import running_timeout
 from gateway.stream.status import StreamStatus
 
 SendCommand = Callable[[Command], Awaitable[Packet]]
@@ -73,7 +74,7 @@ class ServerRequests:
         name, timeout_s = f"source {self._settings.name!r}", self._settings.query_timeout_s
         streams = self._streams if stream is None else [stream]
         try:
-            async with asyncio.timeout(timeout_s), self._lock:
+            async with running_timeout(timeout_s), self._lock:
                 try:
                     return command, await self._send(command, streams)
                 except QueryError:

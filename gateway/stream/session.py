@@ -27,6 +27,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.packets import Packet, decode_text
 from gateway.rtc3d.protocol_state import ProtocolState
+from gateway.stream.running_time import running_clock, running_timeout
 from gateway.stream.status import StreamStatus
 from gateway.stream.tcp import Connect, open_connection
 
@@ -46,7 +47,8 @@ class Session:
     """One connection of one stream: ``connect``, then ``ask`` and ``monitor``, then ``close``.
 
     The event loop calls ``on_frames`` and ``on_file``, which must not block. ``connect`` opens the
-    connection, ``monotonic`` is the clock that measures silence.
+    connection, ``monotonic`` is the clock for the times of arrival. Time-outs count only the time during
+    which this process runs, so a stop of the process is not the server's silence.
 
     The first error ends the session, and so does ``close``. Every call that is waiting then, and every later
     call, raises that first error; later errors change nothing.
@@ -71,6 +73,7 @@ class Session:
         self._on_file = on_file
         self._connect = connect
         self._monotonic = monotonic
+        self._running = running_clock()
         self._protocol = ClientProtocol(source.max_packet_bytes, source.max_c3d_bytes)
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
@@ -79,7 +82,7 @@ class Session:
         self._lost = asyncio.Event()  # the transport is closed
         self._ask_lock = asyncio.Lock()  # held while a command is pending
         self._reply: asyncio.Future[Packet] | None = None  # to the command that ``ask`` has sent
-        self._quiet_since_s = 0.0  # when the stall time-out last started
+        self._quiet_since_s = 0.0  # when the stall time-out last started, on the running clock
 
     @property
     def is_open(self) -> bool:
@@ -95,7 +98,7 @@ class Session:
         """Connect to the server. Raises ConnectError with the reason and what to check."""
         self._status.connecting(self.server)
         self._transport = await self._connect(self._source, self)
-        self._quiet_since_s = self._monotonic()
+        self._quiet_since_s = self._running.time()
         self._status.connected(self.server)
 
     async def ask(self, command: Command) -> Packet:
@@ -113,7 +116,7 @@ class Session:
             self._reply = self._loop.create_future()
             self._flush()
             try:
-                async with asyncio.timeout(self._source.reply_timeout_s):
+                async with running_timeout(self._source.reply_timeout_s):
                     return await self._reply
             except TimeoutError:
                 raise ReplyTimeoutError(
@@ -133,12 +136,12 @@ class Session:
         """Wait until the session ends or the server is silent; then raise LinkError with the reason."""
         while True:
             self._check_open()
-            wait_s = self._source.stall_timeout_s - (self._monotonic() - self._quiet_since_s)
+            wait_s = self._source.stall_timeout_s - (self._running.time() - self._quiet_since_s)
             if wait_s <= 0:
                 await self._check_silence()
                 continue
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(wait_s):
+                async with running_timeout(wait_s):
                     await self._ended.wait()
 
     async def _check_silence(self) -> None:
@@ -157,7 +160,7 @@ class Session:
             pass
         except ReplyTimeoutError as error:
             raise SilenceError(f"{error}, and sends no frames; connecting again") from None
-        self._quiet_since_s = self._monotonic()
+        self._quiet_since_s = self._running.time()
 
     async def close(self) -> None:
         """Send Bye, and close the connection when the server does, or after 0.5 s.
@@ -200,8 +203,9 @@ class Session:
         if self._protocol.state is not state_before and self._error is None:
             self._report_protocol()
         if frames:
-            self._quiet_since_s = now_s = self._monotonic()
-            self._on_frames(frames, utime, now_s)
+            self._quiet_since_s = self._running.time()
+            self._status.frames_read(self._quiet_since_s)
+            self._on_frames(frames, utime, self._monotonic())
 
     def connection_lost(self, exc: Exception | None) -> None:
         """End the session, unless it has ended already: the connection is closed, by either side."""
@@ -242,7 +246,7 @@ class Session:
 
     def _report_protocol(self) -> None:
         """Report the protocol's new state, and restart the stall time-out."""
-        self._quiet_since_s = self._monotonic()
+        self._quiet_since_s = self._running.time()
         self._status.protocol_changed(self._protocol.state, self._protocol.byte_order or "", self.server)
 
     def _check_open(self) -> None:

@@ -44,8 +44,9 @@ class StreamStatus:
     ``components`` are the configured components, separated by spaces. ``name`` begins the stream's log
     lines. ``on_state`` is called with each new state. ``parameters_version`` is that of the server's
     parameters, 0 before the first; all streams of a source have the same. ``last_frame_utime`` is when the
-    newest frame arrived, in µs since the Unix epoch, 0 before the first. ``tries`` counts the attempts to
-    connect since the last completed handshake, ``reconnects`` all attempts except the first. ``restarts``
+    newest frame arrived, in µs since the Unix epoch, 0 before the first; ``last_frame_s`` is the same on the
+    running clock (see ``gateway.stream.running_time``), None before the first. ``tries`` counts the attempts
+    to connect since the last completed handshake, ``reconnects`` all attempts except the first. ``restarts``
     counts how often the server's time or frame numbers started again within a connection. ``losses`` counts
     by cause what arrived and was not published. ``limitations`` lists what the current connection lacks.
 
@@ -63,6 +64,7 @@ class StreamStatus:
     parameters_version: int = 0
     frames_in: int = 0
     last_frame_utime: int = 0
+    last_frame_s: float | None = None
     bytes_in: int = 0
     tries: int = 0
     reconnects: int = 0
@@ -138,6 +140,10 @@ class StreamStatus:
         self.unwanted_components = unwanted
         if not unwanted:
             self.last_wanted_utime = utime
+
+    def frames_read(self, now_s: float) -> None:
+        """Note that frames were read from the socket at ``now_s`` on the running clock."""
+        self.last_frame_s = now_s
 
     def lag_measured(self, lag_s: float) -> None:
         """Note how late the newest frame is."""

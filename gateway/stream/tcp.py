@@ -7,6 +7,7 @@ from typing import Any
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import ConnectError
+from gateway.stream.running_time import running_timeout
 
 Connect = Callable[[SourceSettings, Any], Awaitable[asyncio.Transport]]
 """Connects a protocol, an object with the methods of ``asyncio.Protocol``, to a source's server."""
@@ -20,7 +21,7 @@ async def open_connection(source: SourceSettings, protocol: Any) -> asyncio.Tran
     server = f"{source.host}:{source.port}"
     loop = asyncio.get_running_loop()
     try:
-        async with asyncio.timeout(source.connect_timeout_s):
+        async with running_timeout(source.connect_timeout_s):
             # uvloop cannot cancel a look-up: it logs a late failure as an error, and the next look-up waits
             # for it. So a thread looks the name up first; create_connection then does so again.
             await asyncio.to_thread(socket.getaddrinfo, source.host, source.port)

@@ -7,10 +7,10 @@ import pytest
 
 from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
 from gateway.gateway import Gateway
-from gateway.messages.host_time import now_utime
 from gateway.monitoring.health import health_page
 from gateway.outputs.memory import MemoryOutput
 from gateway.rtc3d.components import ComponentType
+from gateway.stream.running_time import running_clock
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from tests.configurations import make_settings
@@ -52,7 +52,7 @@ class Lab:
 
 def set_state(status: StreamStatus, state: StreamState, age_s: float | None) -> None:
     status.state = state
-    status.last_frame_utime = 0 if age_s is None else now_utime() - round(age_s * 1e6)
+    status.last_frame_s = None if age_s is None else running_clock().time() - age_s
 
 
 @pytest.mark.parametrize("state", StreamState)

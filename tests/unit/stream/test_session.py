@@ -17,9 +17,9 @@ from gateway.stream.session import Session
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from tests.losses import amounts
-from tests.servers import markers_frame, packet
+from tests.servers import markers_frame, ok, packet
 from tests.unit.stream.scripted_server import Connection, ScriptedServer, obliging, refusing, silent_to
-from tests.unit.stream.virtual_time import settle
+from tests.unit.stream.virtual_time import settle, stop_process
 from tests.vectors import STOP_RECORDING
 
 NO_DATA = packet(4)
@@ -312,6 +312,34 @@ async def test_a_stream_of_events_alone_may_be_silent_during_a_measurement() -> 
     assert not monitoring.done()
     assert lab.connection.commands.count("Version 1.0") == 19
     monitoring.cancel()
+
+
+# --- a stop of this process
+
+
+@pytest.mark.parametrize("stop_s", [3.1, 30.0])
+async def test_a_stop_of_this_process_is_not_the_servers_silence(lab: Lab, stop_s: float) -> None:
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    monitoring = asyncio.create_task(lab.session.monitor())
+    await asyncio.sleep(2.7)
+    stop_process(stop_s)
+    asyncio.get_running_loop().call_later(0.05, lab.connection.send_frames, 2, 3)
+    await asyncio.sleep(2.9)
+    assert not monitoring.done()
+    assert [number for number, _ in lab.frames] == [1, 2, 3]
+    with pytest.raises(SilenceError, match="no frame from"):  # what is silent then is the server
+        await monitoring
+
+
+async def test_a_stop_of_this_process_is_not_a_server_that_does_not_answer(lab: Lab) -> None:
+    lab.server.answer = silent_to("Version")
+    await lab.session.connect()
+    asking = asyncio.create_task(lab.session.ask(Version()))
+    await asyncio.sleep(1)
+    stop_process(10)
+    asyncio.get_running_loop().call_later(0.7, lab.connection.send, ok("OK-Version"))
+    assert (await asking).body == b"OK-Version"
 
 
 # --- the end

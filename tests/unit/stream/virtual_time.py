@@ -34,6 +34,17 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
     def time(self) -> float:
         return self._jumping.now_s
 
+    def stop_process(self, seconds: float) -> None:
+        """Let time pass as while the process is stopped: no timer is called, and no socket is read."""
+        self._jumping.now_s += seconds
+
+
+def stop_process(seconds: float) -> None:
+    """Stop the process in virtual time; see VirtualTimeLoop."""
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualTimeLoop)
+    loop.stop_process(seconds)
+
 
 async def settle() -> None:
     """Run everything that is ready now."""
