@@ -165,31 +165,28 @@ class Losses:
                     counts.append((cause, counted.period_messages, counted.period_frames))
                     counted.period_messages = counted.period_frames = 0
         self._logger.info(
-            "%s: lost within %.1f s: %s%s", self._subject, duration_s, _counts_text(counts), ending
+            "%s: lost within %.1f s: %s%s", self._subject, duration_s, counts_text(counts), ending
         )
 
 
 def last_minute_text(losses: Iterable[Loss]) -> str:
     """Return what was lost in the last minute; "" if nothing was.
 
-    For example "872 messages of 436 frames lost in the last minute (skipped while behind)".
+    For example "lost in the last minute: 872 messages of 436 frames (skipped while behind)".
     """
     counts = [
         (loss.cause, loss.messages_last_minute, loss.frames_last_minute)
         for loss in losses
         if loss.messages_last_minute
     ]
-    return f"lost in the last minute: {_counts_text(counts)}" if counts else ""
+    return f"lost in the last minute: {counts_text(counts)}" if counts else ""
 
 
-def total_text(losses: Iterable[Loss]) -> str:
-    """Return what was lost so far; "" if nothing was."""
-    counts = [(loss.cause, loss.messages, loss.frames) for loss in losses]
-    return f"lost: {_counts_text(counts)}" if counts else ""
+def counts_text(counts: Iterable[tuple[str, int, int]]) -> str:
+    """Return a text for each (cause, messages, frames).
 
-
-def _counts_text(counts: Iterable[tuple[str, int, int]]) -> str:
-    """Return a text such as "872 messages of 436 frames (skipped while behind), 1 message (closed)"."""
+    For example "1 message (closed), 872 messages of 436 frames (skipped while behind)".
+    """
     return ", ".join(f"{_amount(messages, frames)} ({cause})" for cause, messages, frames in counts)
 
 

@@ -122,6 +122,7 @@ class Source:
         with log_fields(source=self.name):
             for status in self.statuses:
                 status.losses.check()
+            self.fan_out.check_losses()
             self.fan_out.publish_status(self._newest_status)
             self.fan_out.publish_clock(clock.encode())
 

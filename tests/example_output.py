@@ -11,6 +11,7 @@ from typing import Any, Final
 from gateway.config.settings import OutputSettings
 from gateway.config.values import Switch
 from gateway.errors import OutputError
+from gateway.losses import Losses
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import Answer, Command, Output, QueryService, ServerParameters
@@ -163,9 +164,9 @@ class ExampleOutput(Output):
         """Return whether the settings are the same."""
         return isinstance(other, ExampleOutput) and self.settings == other.settings
 
-    def drops(self, source: str) -> Mapping[str, int]:
-        """Return one ignored request for every source."""
-        return {f"request of {source} ignored": 1}
+    def count_losses(self, source: str, losses: Losses) -> None:
+        """Count one ignored request for every source."""
+        losses.lost(f"request of {source} ignored", "it came too early", frames=0)
 
     def announce(self, source: str) -> None:
         """Serve ``source``."""

@@ -11,7 +11,7 @@ _LOGGERS: Final = {"logger", "_log"}
 _LOUD_METHODS: Final = {"warning", "error", "exception", "critical"}
 """Methods of loggers that log at WARNING and above; ``log`` can do so, too."""
 
-_LOSS_METHODS: Final = {"lost", "message_lost"}
+_LOSS_METHODS: Final = {"lost", "message_lost", "_count_loss"}
 """Methods that log their second argument as WARNING, at least the first time; the first is a cause."""
 
 _WARNING_METHODS: Final = {"failed", "add_limitation", "file_lost", *_LOSS_METHODS}

@@ -183,13 +183,13 @@ class Soak:
                 for key in COMPONENTS
             ),
             "",
-            "| dropped, by cause | count |",
-            "|---|--:|",
-            *(f"| {count.name} | {count.count} |" for count in stream.drops),
+            "| lost, by cause | messages | frames |",
+            "|---|--:|--:|",
+            *(f"| {loss.cause} | {loss.messages} | {loss.frames} |" for loss in stream.drops),
             *(
-                f"| {output.name}: {count.name} | {count.count} |"
+                f"| {output.name}: {loss.cause} | {loss.messages} | {loss.frames} |"
                 for output in status.outputs
-                for count in output.drops
+                for loss in output.drops
             ),
             "",
             "The time from the end of a fault until data flowed again. It includes the time that the gateway "

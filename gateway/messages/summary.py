@@ -7,6 +7,7 @@ from typing import Any, Final
 import rtc3d
 
 from gateway.errors import ParametersError
+from gateway.losses import counts_text
 from gateway.rtc3d.parameters_xml import parse_parameters
 
 _MAX_SHOWN: Final = 4
@@ -114,9 +115,7 @@ def _clock(clock: Any) -> str:
 
 def _status(status: Any) -> str:
     streams = "; ".join(map(_stream, status.streams))
-    outputs = "; ".join(
-        f"{output.name} {'ok' if output.connected else output.problem}" for output in status.outputs
-    )
+    outputs = "; ".join(map(_output, status.outputs))
     return f"#{status.sequence} {status.source} at {status.server}: {streams}; outputs: {outputs}"
 
 
@@ -124,5 +123,15 @@ def _stream(stream: Any) -> str:
     error = f", last error: {stream.last_error}" if stream.last_error else ""
     return (
         f"[{stream.components}] {stream.state} {stream.frame_rate_hz:.1f} Hz, "
-        f"{stream.frames_in} frames, {stream.reconnects} reconnects{error}"
+        f"{stream.frames_in} frames, {stream.reconnects} reconnects{_losses(stream.drops)}{error}"
     )
+
+
+def _output(output: Any) -> str:
+    return f"{output.name} {'ok' if output.connected else output.problem}{_losses(output.drops)}"
+
+
+def _losses(losses: Sequence[Any]) -> str:
+    """Return what was lost, such as ", lost 872 messages of 436 frames (skipped while behind)"."""
+    text = counts_text((loss.cause, loss.messages, loss.frames) for loss in losses)
+    return f", lost {text}" if text else ""

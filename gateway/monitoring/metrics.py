@@ -8,7 +8,7 @@ bounded.
 import platform
 import resource
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from http import HTTPStatus
 from importlib.metadata import version
 from pathlib import Path
@@ -21,6 +21,7 @@ from prometheus_client.registry import Collector
 
 from gateway import __version__
 from gateway.gateway import Gateway
+from gateway.losses import Loss
 from gateway.monitoring.http_pages import Page
 from gateway.monitoring.loop_delay import LoopDelay
 from gateway.outputs.status import OutputStatus
@@ -108,6 +109,35 @@ _ROUTE_COUNTERS: Final[tuple[tuple[str, str, Callable[[OutputStatus], Mapping[st
 """Name, help text and value of the counters of a source's messages to one output."""
 
 
+_LOSS_COUNTERS: Final[Mapping[str, Sequence[tuple[str, str, Callable[[Loss], int]]]]] = {
+    "stream": (
+        (
+            "stream_drops",
+            "Frames that arrived and lost a message before any output, and C3D files not stored, by cause.",
+            lambda loss: loss.frames or loss.messages,
+        ),
+        (
+            "stream_dropped_messages",
+            "Messages of these frames that were lost, and C3D files not stored, by cause.",
+            lambda loss: loss.messages,
+        ),
+    ),
+    "output": (
+        (
+            "output_drops",
+            "Messages that the output did not accept, and queries that it did not answer, by cause.",
+            lambda loss: loss.messages,
+        ),
+        (
+            "output_dropped_frames",
+            "Frames that lost at least one message on the output, by cause.",
+            lambda loss: loss.frames,
+        ),
+    ),
+}
+"""Name, help text and value of the counters of what is lost."""
+
+
 def metrics_registry(gateway: Gateway, loop_delay: LoopDelay) -> CollectorRegistry:
     """Return the registry of all metrics of ``gateway``."""
     registry = CollectorRegistry()
@@ -164,33 +194,10 @@ class GatewayCollector(Collector):
                 for state in StreamState
             ],
         )
-        yield _counter(
-            "stream_drops",
-            "Frames that arrived and lost a message before it was published, and C3D files lost, by cause.",
-            (*labels, "cause"),
-            [
-                sample
-                for stream, status in streams
-                for sample in _samples(
-                    stream,
-                    {loss.cause: loss.frames or loss.messages for loss in status.losses.report()},
-                    _STREAM_DROP_CAUSES,
-                )
-            ],
-        )
-        yield _counter(
-            "stream_dropped_messages",
-            "Messages that were lost with these frames, by cause.",
-            (*labels, "cause"),
-            [
-                sample
-                for stream, status in streams
-                for sample in _samples(
-                    stream,
-                    {loss.cause: loss.messages for loss in status.losses.report()},
-                    _STREAM_DROP_CAUSES,
-                )
-            ],
+        yield from _loss_counters(
+            "stream",
+            labels,
+            [(stream, status.losses.report(), _STREAM_DROP_CAUSES) for stream, status in streams],
         )
 
     def _component_frames(self) -> Metric:
@@ -229,14 +236,12 @@ class GatewayCollector(Collector):
                     )
                 ],
             )
-        yield _counter(
-            "output_drops",
-            "Messages that the output did not accept, and LCM requests without an answer, by cause.",
-            (*labels, "cause"),
+        yield from _loss_counters(
+            "output",
+            labels,
             [
-                sample
+                ((source.name, output.name), status.losses, output.drop_causes)
                 for source, output, status in routes
-                for sample in _samples((source.name, output.name), status.drops, output.drop_causes)
             ],
         )
 
@@ -280,6 +285,26 @@ class GatewayCollector(Collector):
         yield CounterMetricFamily("process_cpu_seconds", "CPU time of the gateway.", value=cpu_s)
         yield GaugeMetricFamily(
             "process_resident_memory_bytes", "Resident memory of the gateway.", value=memory_bytes
+        )
+
+
+def _loss_counters(
+    kind: str, labels: Labels, losses: Sequence[tuple[Labels, Sequence[Loss], Iterable[str]]]
+) -> Iterator[Metric]:
+    """Yield the counters of lost messages and frames by cause, of each stream or of each output.
+
+    ``losses`` are label values, what was lost, and the causes that are shown from the start.
+    """
+    for name, help_text, count in _LOSS_COUNTERS[kind]:
+        yield _counter(
+            name,
+            help_text,
+            (*labels, "cause"),
+            [
+                sample
+                for values, lost, known in losses
+                for sample in _samples(values, {loss.cause: count(loss) for loss in lost}, known)
+            ],
         )
 
 

@@ -9,6 +9,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple, Protocol
 
+from gateway.losses import Losses
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.status import OutputHealth
@@ -159,9 +160,11 @@ class Output(ABC):
         """Return whether a reload can keep this output because ``other`` would behave the same."""
         return self is other
 
-    def drops(self, source: str) -> Mapping[str, int]:
-        """Return the number of requests about ``source`` that the output dropped itself, by cause."""
-        return {}
+    def count_losses(self, source: str, losses: Losses) -> None:
+        """Count in ``losses`` what the output itself loses of ``source``, such as requests of peers.
+
+        Called before ``announce``. Messages that ``publish`` refuses are counted by the gateway.
+        """
 
     # Liveliness.
 

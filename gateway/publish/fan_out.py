@@ -97,7 +97,7 @@ class FanOut:
         self._routes: list[OutputRoute] = []
         self._frame_routes: list[FrameRoute] = []
         self._last_routes: dict[str, OutputRoute] = {}  # by the output's name, including closed ones
-        self._tool_poses = ToolPoses(source)
+        self._tool_poses = ToolPoses()
         self._plan_for = lru_cache(_MAX_PLANS)(self._new_plan)
         self._plan: _Plan | None = None  # of the previous frame
         self._num_items: dict[ComponentType, int] = {}
@@ -210,6 +210,11 @@ class FanOut:
         self._is_streaming = is_streaming
         for route in self._routes:
             route.output.show_streaming(self._source, is_streaming)
+
+    def check_losses(self) -> None:
+        """Log the end of each period in which messages were lost. Called once a second."""
+        for route in self._routes:
+            route.losses.check()
 
     def publish_status(self, message: bytes) -> None:
         """Publish an encoded ``status_t``."""

@@ -7,7 +7,7 @@ from typing import Any
 import rtc3d
 
 from gateway.errors import OutputError
-from gateway.log import HOLD_S, FailureLog
+from gateway.losses import Losses
 from gateway.messages.encode import MESSAGE_TYPES, content_timestamp_us, encode_content, lcm_type_name
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
@@ -40,9 +40,9 @@ class OutputRoute:
         self.output = output
         self.sent: dict[str, SentCounter] = {} if predecessor is None else predecessor.sent
         """By component key, or by "status", "clock", "6d/tool" or "frame" (a whole frame)."""
-        self.drops: Counter[str] = Counter() if predecessor is None else predecessor.drops
-        """By cause."""
-        self._failures = FailureLog(logger, f"{source} to {output.name}", HOLD_S)
+        self.losses: Losses = (
+            Losses(logger, f"{source} to {output.name}") if predecessor is None else predecessor.losses
+        )
         frame_publisher = output.frame_publisher(source)
         self.frame_route: FrameRoute | None = None
         """For whole frames. An output that takes them gets no single components."""
@@ -58,28 +58,25 @@ class OutputRoute:
         }
         self.status_route = TopicRoute(self, ("status",), rtc3d.status_t, "status")
         self.clock_route = TopicRoute(self, ("clock",), rtc3d.clock_t, "clock")
+        output.count_losses(source, self.losses)
         output.announce(source)
 
     @property
     def status(self) -> OutputStatus:
-        """The messages sent so far, and the drops, including those that the output counts itself."""
+        """The messages sent so far, and what was lost, including what the output counts itself."""
         sent = {name: counter for name, counter in self.sent.items() if counter.messages}
         return OutputStatus(
             self.output.name,
             Counter({name: counter.messages for name, counter in sent.items()}),
-            self.drops + Counter(self.output.drops(self.source)),
+            self.losses.report(),
             Counter({name: counter.bytes for name, counter in sent.items()}),
         )
 
-    def count_failure(self, error: Exception) -> None:
-        """Count and log a message that the output did not accept."""
+    def count_loss(self, error: Exception, frame: object | None) -> None:
+        """Count a message of ``frame`` that the output did not accept; None if it belongs to no frame."""
         cause = error.cause if isinstance(error, OutputError) else type(error).__name__
-        self.drops[cause] += 1
-        self._failures.failed(str(error) if isinstance(error, OutputError) else f"{cause}: {error}")
-
-    def note_success(self) -> None:
-        """Log the recovery if a failure was logged."""
-        self._failures.recovered("sending again")
+        text = str(error) if isinstance(error, OutputError) else f"{cause}: {error}"
+        self.losses.message_lost(cause, text, frame)
 
     def close(self) -> None:
         """Close the publishers and withdraw the source from the output."""
@@ -87,7 +84,7 @@ class OutputRoute:
             route.close()
         if self.frame_route is not None:
             self.frame_route.close()
-        self.drops.update(self.output.drops(self.source))  # for the successor, which continues them
+        self.losses.close()
         self.output.withdraw(self.source)
 
 
@@ -103,16 +100,18 @@ class TopicRoute:
         self._output_route = output_route
         self._sent = output_route.sent.setdefault(counted_as, SentCounter())
 
-    def send(self, message: bytes) -> None:
-        """Publish and count one message; never raises, because outputs must not disturb each other."""
+    def send(self, message: bytes, frame: object | None = None) -> None:
+        """Publish and count one message; never raises, because outputs must not disturb each other.
+
+        ``frame`` is any object that all messages of one frame share, None if there is no frame.
+        """
         try:
             self._publish(message)
         except Exception as error:  # noqa: BLE001 - a defect in one output must not stop the others
-            self._output_route.count_failure(error)
+            self._output_route.count_loss(error, frame)
         else:
             self._sent.messages += 1
             self._sent.bytes += len(message)
-            self._output_route.note_success()
 
     def close(self) -> None:
         """Close the publisher."""
@@ -145,7 +144,7 @@ class ComponentRoute(TopicRoute):
                 return None
         message = encode_content(self._component, content, stamp, self.sequence)
         self.sequence += 1
-        self.send(message)
+        self.send(message, stamp)
         return message
 
 
@@ -168,11 +167,10 @@ class FrameRoute:
         try:
             self.publisher.publish(frame, stamp, sequence, wanted)
         except Exception as error:  # noqa: BLE001 - a defect in one output must not stop the others
-            self._output_route.count_failure(error)
+            self._output_route.count_loss(error, stamp)
         else:
             self._sent.messages += 1
             self._sent.bytes += len(frame.body)
-            self._output_route.note_success()
 
     def close(self) -> None:
         """Close the publisher."""

@@ -7,6 +7,7 @@ from typing import Final
 import rtc3d
 
 from gateway import __version__
+from gateway.losses import Loss
 from gateway.messages.host_time import now_utime
 from gateway.outputs.status import OutputHealth, OutputStatus
 from gateway.stream.clock import ServerClock
@@ -86,9 +87,7 @@ def _stream_message(stream: StreamStatus, rate_hz: float) -> rtc3d.stream_status
     message.frame_rate_hz = rate_hz
     message.lag_ms = 1000 * stream.lag_s
     message.clock = clock_model(stream.clock)
-    message.drops = _counts(
-        Counter({loss.cause: loss.frames or loss.messages for loss in stream.losses.report()})
-    )
+    message.drops = _losses(stream.losses.report())
     message.num_drops = len(message.drops)
     message.limitations = list(stream.limitations)
     message.num_limitations = len(message.limitations)
@@ -102,7 +101,7 @@ def _output_message(output: OutputStatus, health: OutputHealth) -> rtc3d.output_
     message.problem = health.problem
     message.messages = _counts(output.messages)
     message.num_messages = len(message.messages)
-    message.drops = _counts(output.drops)
+    message.drops = _losses(output.losses)
     message.num_drops = len(message.drops)
     return message
 
@@ -113,5 +112,14 @@ def _counts(counter: Counter[str]) -> list[rtc3d.count_t]:
         message = rtc3d.count_t()
         message.name = name
         message.count = count
+        messages.append(message)
+    return messages
+
+
+def _losses(losses: Iterable[Loss]) -> list[rtc3d.loss_t]:
+    messages = []
+    for loss in losses:
+        message = rtc3d.loss_t()
+        message.cause, message.messages, message.frames = loss.cause, loss.messages, loss.frames
         messages.append(message)
     return messages

@@ -1,12 +1,10 @@
 """Poses per tool: one topic per tool, named after its label, on the outputs that are configured for it."""
 
-import logging
 from collections.abc import Sequence
 from typing import Final
 
 import rtc3d
 
-from gateway.log import HOLD_S, FailureLog
 from gateway.messages.stamp import Stamp
 from gateway.messages.tool_pose import metres_per_unit, tool_poses
 from gateway.messages.topics import MAX_LABEL_LENGTH, unique_name
@@ -17,8 +15,6 @@ from gateway.rtc3d.parameters import Parameters
 
 _MAX_TOOLS: Final = 256
 """How many tools can have topics of their own. The server determines the number of tools in a frame."""
-
-logger = logging.getLogger(__name__)
 
 
 class _Tool:
@@ -41,14 +37,13 @@ class _Tool:
 class ToolPoses:
     """Publishes the poses of one source's tools, in SI units, on topics named after their labels."""
 
-    def __init__(self, source: str) -> None:
+    def __init__(self) -> None:
         self._output_routes: Sequence[OutputRoute] = ()
         self._labels: tuple[str, ...] = ()
+        self._unit = ""
         self._unit_m: float | None = 1e-3  # the unit of length in metres; None if it is unknown
         self._tools: list[_Tool] = []
         self._sequences: dict[str, int] = {}  # by the tools' names
-        self._too_many = FailureLog(logger, source, HOLD_S)
-        self._unknown_unit = FailureLog(logger, source)
 
     @property
     def is_used(self) -> bool:
@@ -67,30 +62,28 @@ class ToolPoses:
         if labels != self._labels:
             self._labels = labels
             self._close_topics()
-        unit = "mm" if parameters.markers is None else parameters.markers.unit
-        self._unit_m = metres_per_unit(unit)
-        if self._unit_m is None and self.is_used:
-            # Publish nothing: a robot that waits is better than one that moves by a guessed unit.
-            self._unknown_unit.failed(
-                f"unit of length {unit[:40]!r} is unknown: no tool poses are published; "
-                "set it to mm or m in the server"
-            )
-        elif self._unit_m is not None:
-            self._unknown_unit.recovered(f"unit of length is {unit!r}: tool poses are published")
+        self._unit = "mm" if parameters.markers is None else parameters.markers.unit
+        self._unit_m = metres_per_unit(self._unit)
 
     def publish(self, frame: Frame, index: int, stamp: Stamp) -> None:
         """Publish the pose of each tool in the frame's component at ``index``, if there are subscribers."""
-        if self._unit_m is None:
-            self._count_drop("unknown unit")
-            return
         num_tools = frame.layout.components[index].num_items
-        if num_tools > _MAX_TOOLS:
-            self._too_many.failed(
-                f"a frame of {num_tools} tools, more than {_MAX_TOOLS}: no tool poses are published"
+        if self._unit_m is None:
+            # Publish nothing: a robot that waits is better than one that moves by a guessed unit.
+            self._count_loss(
+                "unknown unit",
+                f"unit of length {self._unit[:40]!r} is unknown: no tool poses are published; "
+                "set it to mm or m in the server",
+                num_tools,
             )
-            self._count_drop("too many tools")
             return
-        self._too_many.recovered(f"frames of {num_tools} tools: tool poses are published")
+        if num_tools > _MAX_TOOLS:
+            self._count_loss(
+                "too many tools",
+                f"a frame of {num_tools} tools, more than {_MAX_TOOLS}: no tool poses are published",
+                num_tools,
+            )
+            return
         # Topics stay open when a frame has fewer tools: the number may go up and down.
         if num_tools > len(self._tools):
             self._open_topics(num_tools)
@@ -104,12 +97,12 @@ class ToolPoses:
         for tool, message in zip(tools, messages, strict=True):
             for route in tool.routes.values():
                 if route.publisher.wanted:
-                    route.send(message)
+                    route.send(message, stamp)
             self._sequences[tool.name] += 1
 
-    def _count_drop(self, cause: str) -> None:
-        for output_route in self._output_routes:
-            output_route.drops[cause] += 1
+    def _count_loss(self, cause: str, text: str, num_tools: int) -> None:
+        for output_route in self._output_routes if num_tools else ():
+            output_route.losses.lost(cause, text, messages=num_tools)
 
     def _open_topics(self, num_tools: int) -> None:
         """Open topics for ``num_tools`` tools. A name that had a topic before continues counting."""

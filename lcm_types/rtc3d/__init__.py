@@ -12,6 +12,7 @@ from .event_t import event_t as event_t
 from .events_t import events_t as events_t
 from .force_t import force_t as force_t
 from .forces_t import forces_t as forces_t
+from .loss_t import loss_t as loss_t
 from .marker_t import marker_t as marker_t
 from .markers_t import markers_t as markers_t
 from .output_status_t import output_status_t as output_status_t

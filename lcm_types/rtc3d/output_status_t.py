@@ -14,7 +14,7 @@ class output_status_t(object):
 
     __slots__ = ["name", "connected", "problem", "num_messages", "messages", "num_drops", "drops"]
 
-    __typenames__ = ["string", "boolean", "string", "int32_t", "rtc3d.count_t", "int32_t", "rtc3d.count_t"]
+    __typenames__ = ["string", "boolean", "string", "int32_t", "rtc3d.count_t", "int32_t", "rtc3d.loss_t"]
 
     __dimensions__ = [None, None, None, None, ["num_messages"], None, ["num_drops"]]
 
@@ -39,12 +39,12 @@ class output_status_t(object):
         """ LCM Type: rtc3d.count_t[num_messages] """
         self.num_drops = 0
         """
-        Number of messages not sent, by cause.
+        What was lost on this output, by cause.
         LCM Type: int32_t
         """
 
         self.drops = []
-        """ LCM Type: rtc3d.count_t[num_drops] """
+        """ LCM Type: rtc3d.loss_t[num_drops] """
 
     def encode(self):
         buf = BytesIO()
@@ -68,7 +68,7 @@ class output_status_t(object):
             self.messages[i0]._encode_one(buf)
         buf.write(struct.pack(">i", self.num_drops))
         for i0 in range(self.num_drops):
-            assert self.drops[i0]._get_packed_fingerprint() == rtc3d.count_t._get_packed_fingerprint()
+            assert self.drops[i0]._get_packed_fingerprint() == rtc3d.loss_t._get_packed_fingerprint()
             self.drops[i0]._encode_one(buf)
 
     @staticmethod
@@ -96,14 +96,14 @@ class output_status_t(object):
         self.num_drops = struct.unpack(">i", buf.read(4))[0]
         self.drops = []
         for i0 in range(self.num_drops):
-            self.drops.append(rtc3d.count_t._decode_one(buf))
+            self.drops.append(rtc3d.loss_t._decode_one(buf))
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if output_status_t in parents: return 0
         newparents = parents + [output_status_t]
-        tmphash = (0x6c38707991e3cfd0+ rtc3d.count_t._get_hash_recursive(newparents)+ rtc3d.count_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x6c38707991e3cfd0+ rtc3d.count_t._get_hash_recursive(newparents)+ rtc3d.loss_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

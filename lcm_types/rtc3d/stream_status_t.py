@@ -14,7 +14,7 @@ class stream_status_t(object):
 
     __slots__ = ["components", "state", "byte_order", "rate", "frame_rate_hz", "session", "frames_in", "bytes_in", "reconnects", "restarts", "lag_ms", "clock", "num_drops", "drops", "num_limitations", "limitations", "last_error", "last_error_utime"]
 
-    __typenames__ = ["string", "string", "string", "string", "float", "int32_t", "int64_t", "int64_t", "int64_t", "int64_t", "float", "rtc3d.clock_model_t", "int32_t", "rtc3d.count_t", "int32_t", "string", "string", "int64_t"]
+    __typenames__ = ["string", "string", "string", "string", "float", "int32_t", "int64_t", "int64_t", "int64_t", "int64_t", "float", "rtc3d.clock_model_t", "int32_t", "rtc3d.loss_t", "int32_t", "string", "string", "int64_t"]
 
     __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_drops"], None, ["num_limitations"], None, None]
 
@@ -77,12 +77,12 @@ class stream_status_t(object):
         """ LCM Type: rtc3d.clock_model_t """
         self.num_drops = 0
         """
-        Number of frames and components that were not published, by cause.
+        What arrived and was published on no output, by cause.
         LCM Type: int32_t
         """
 
         self.drops = []
-        """ LCM Type: rtc3d.count_t[num_drops] """
+        """ LCM Type: rtc3d.loss_t[num_drops] """
         self.num_limitations = 0
         """
         What the gateway works around on this connection, for example a command that the server refused.
@@ -132,7 +132,7 @@ class stream_status_t(object):
         self.clock._encode_one(buf)
         buf.write(struct.pack(">i", self.num_drops))
         for i0 in range(self.num_drops):
-            assert self.drops[i0]._get_packed_fingerprint() == rtc3d.count_t._get_packed_fingerprint()
+            assert self.drops[i0]._get_packed_fingerprint() == rtc3d.loss_t._get_packed_fingerprint()
             self.drops[i0]._encode_one(buf)
         buf.write(struct.pack(">i", self.num_limitations))
         for i0 in range(self.num_limitations):
@@ -172,7 +172,7 @@ class stream_status_t(object):
         self.num_drops = struct.unpack(">i", buf.read(4))[0]
         self.drops = []
         for i0 in range(self.num_drops):
-            self.drops.append(rtc3d.count_t._decode_one(buf))
+            self.drops.append(rtc3d.loss_t._decode_one(buf))
         self.num_limitations = struct.unpack(">i", buf.read(4))[0]
         self.limitations = []
         for i0 in range(self.num_limitations):
@@ -187,7 +187,7 @@ class stream_status_t(object):
     def _get_hash_recursive(parents):
         if stream_status_t in parents: return 0
         newparents = parents + [stream_status_t]
-        tmphash = (0xd074a25ffd94ea6f+ rtc3d.clock_model_t._get_hash_recursive(newparents)+ rtc3d.count_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0xd074a25ffd94ea6f+ rtc3d.clock_model_t._get_hash_recursive(newparents)+ rtc3d.loss_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -60,7 +60,7 @@ class LcmPeer:
         if not self.statuses:
             return 0
         [output] = self.statuses[-1].outputs
-        return sum(count.count for count in output.drops if count.name == cause)
+        return sum(loss.messages for loss in output.drops if loss.cause == cause)
 
     def close(self) -> None:
         for subscriber in self._subscribers:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 
 import lcm
 
+from gateway.losses import Losses
 from gateway.messages.topics import Topic, lcm_channel, unique_name
 from gateway.outputs.contract import Output, QueryService, ServerParameters
 from gateway.outputs.lcm.queries import LcmQueries
@@ -64,9 +65,10 @@ class LcmOutput(Output):
         """Return whether the settings are the same."""
         return isinstance(other, LcmOutput) and self.settings == other.settings
 
-    def drops(self, source: str) -> Mapping[str, int]:
-        """Return the number of ignored requests about ``source`` by cause."""
-        return {} if self._queries is None else self._queries.ignored(source)
+    def count_losses(self, source: str, losses: Losses) -> None:
+        """Count in ``losses`` ignored requests about ``source``, and parameters and replies not sent."""
+        if self._queries is not None:
+            self._queries.count_losses(source, losses)
 
     def announce(self, source: str) -> None:
         """Answer requests about ``source``. Its status messages show that it is served."""

@@ -17,6 +17,7 @@ import rtc3d
 
 from gateway.errors import OutputError, QueryError
 from gateway.log import FailureLog, log_fields
+from gateway.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.contract import QueryService, ServerParameters
@@ -32,10 +33,6 @@ MAX_REQUEST_BYTES: Final = 4096
 MAX_REQUESTER_BYTES: Final = 128
 REPEAT_S: Final = 5.0
 """How often the parameters are published again, for late subscribers."""
-
-_MALFORMED: Final = "malformed request"
-_QUEUE_FULL: Final = "request beyond the queue"
-"""The causes under which ignored requests are counted."""
 
 _POLL_MS: Final = 100
 _JOIN_S: Final = 1.0
@@ -81,9 +78,7 @@ class LcmQueries:
         self._closing = threading.Event()
         self._opening = FailureLog(logger, "lcm")
         self._free_slots = threading.BoundedSemaphore(MAX_PENDING)  # acquired in the receiving thread
-        self._ignored: dict[str, Counter[str]] = defaultdict(
-            Counter
-        )  # by source; the receiving thread counts
+        self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "lcm"))  # by source
         self._tasks: set[asyncio.Task[None]] = set()
         self._publications: dict[str, _Publication] = {}
         self.results: Counter[str] = Counter()
@@ -95,6 +90,10 @@ class LcmQueries:
             self._subscribe(self._shared)
         else:
             self._thread.start()
+
+    def count_losses(self, source: str, losses: Losses) -> None:
+        """Count in ``losses`` what is lost of ``source``: requests, replies and parameters."""
+        self._losses[source] = losses
 
     def add(self, source: str) -> None:
         """Answer requests about one more source."""
@@ -108,11 +107,6 @@ class LcmQueries:
         Its subscription stays: LCM's Python module would free it while the receiving thread may be using it.
         """
         self._publications.pop(source, None)
-
-    def ignored(self, source: str) -> dict[str, int]:
-        """Return the number of ignored requests about ``source`` by cause."""
-        counts = self._ignored.get(source, Counter())
-        return {cause: counts[cause] for cause in (_MALFORMED, _QUEUE_FULL) if counts[cause]}
 
     # In the receiving thread.
 
@@ -176,9 +170,19 @@ class LcmQueries:
         """Check a request and pass it to the event loop."""
         request = _decoded(data)
         if request is None:
-            self._ignored[source][_MALFORMED] += 1
+            self._losses[source].lost(
+                "malformed request",
+                f"a message on the channel of requests is ignored: {len(data)} bytes that are no "
+                "parameters_request_t; correct the program that sends it",
+                frames=0,
+            )
         elif not self._free_slots.acquire(blocking=False):
-            self._ignored[source][_QUEUE_FULL] += 1
+            self._losses[source].lost(
+                "request beyond the queue",
+                f"a request on LCM is ignored, because {MAX_PENDING} others are in progress; "
+                "ask less often, or subscribe to the parameters",
+                frames=0,
+            )
         else:
             with contextlib.suppress(RuntimeError):  # the loop has just ended
                 self._loop.call_soon_threadsafe(self._start_answer, source, request)
@@ -239,7 +243,7 @@ class LcmQueries:
         try:
             sender.send(lcm_channel(self._prefix, source, name), message.encode())
         except OutputError as error:
-            logger.debug("%s: %s not sent on LCM: %s", source, name, error)
+            self._losses[source].lost(error.cause, str(error), frames=0)
 
     async def close(self) -> None:
         """Stop receiving requests. Pending requests get no reply."""

@@ -14,6 +14,7 @@ import zenoh
 
 from gateway.errors import OutputError
 from gateway.log import FailureLog
+from gateway.losses import Losses
 from gateway.messages.topics import Topic, zenoh_key
 from gateway.outputs.contract import Output, QueryService, ServerParameters
 from gateway.outputs.status import OutputHealth
@@ -174,6 +175,11 @@ class ZenohOutput(Output):
         )
 
     # Sources: liveliness, queries, parameters.
+
+    def count_losses(self, source: str, losses: Losses) -> None:
+        """Count in ``losses`` refused queries about ``source``, and parameters and files not published."""
+        if self._queries is not None:
+            self._queries.count_losses(source, losses)
 
     def announce(self, source: str) -> None:
         """Declare the liveliness token PREFIX/SOURCE/alive, and answer queries about ``source``."""

@@ -9,7 +9,7 @@ import contextlib
 import functools
 import logging
 import threading
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
@@ -18,6 +18,7 @@ import zenoh.ext
 
 from gateway.errors import QueryError
 from gateway.log import log_fields
+from gateway.losses import Losses
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.contract import Answer, KeyPath, QueryService, ServerParameters
 from gateway.outputs.encodings import JSON, TEXT, XML, json_bytes
@@ -62,6 +63,7 @@ class ZenohQueries:
         self._session: zenoh.Session | None = None
         self._declared: dict[str, _Declared] = {}  # by the source's name
         self._parameters: dict[str, ServerParameters] = {}
+        self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "zenoh"))  # by source
         self._tasks: set[asyncio.Task[None]] = set()
         # Sending to a peer that has stopped reading blocks for 5 s, until Zenoh closes the link. So a thread
         # sends. There is only one for short answers: two threads that block stop all of Zenoh meanwhile.
@@ -77,6 +79,10 @@ class ZenohQueries:
             self._session = session
             self._declared = {source: self._declare(session, source) for source in sources}
         self._call_in_loop(self._publish_all)
+
+    def count_losses(self, source: str, losses: Losses) -> None:
+        """Count in ``losses`` what is lost of ``source``: queries, parameters and announcements."""
+        self._losses[source] = losses
 
     def add(self, source: str) -> None:
         """Answer queries about one more source."""
@@ -135,7 +141,7 @@ class ZenohQueries:
         if declared is not None and parameters is not None:
             attachment = {"session": parameters.session, "parameters_version": parameters.version}
             put = functools.partial(declared.publisher.put, attachment=json_bytes(attachment))
-            self._send(put, parameters.xml)
+            self._send(source, put, parameters.xml)
 
     def announce_file(self, source: str, description: Mapping[str, Any]) -> None:
         """Announce a C3D file on the key that returns it."""
@@ -144,11 +150,20 @@ class ZenohQueries:
             put = functools.partial(
                 self._session.put, encoding=JSON, congestion_control=_RELIABLE, priority=_LOW_PRIORITY
             )
-            self._send(put, key, json_bytes(description))
+            self._send(source, put, key, json_bytes(description))
 
-    def _send(self, put: Callable[..., None], *arguments: Any) -> None:
+    def _send(self, source: str, put: Callable[..., None], *arguments: Any) -> None:
         if not self._is_closed:
-            self._sender.submit(functools.partial(_put, put, *arguments))
+            self._sender.submit(functools.partial(self._put, source, put, *arguments))
+
+    def _put(self, source: str, put: Callable[..., None], *arguments: Any) -> None:
+        """Publish, in the sending thread."""
+        try:
+            put(*arguments)
+        except zenoh.ZError as error:
+            if not self._is_closed:
+                text = f"Zenoh did not take parameters or an announcement: {zenoh_reason(error)}"
+                self._losses[source].lost("put failed", text, frames=0)
 
     # Queries.
 
@@ -158,6 +173,8 @@ class ZenohQueries:
             return
         if len(self._tasks) >= MAX_PENDING:
             error = QueryError("the gateway has too many queries; try again", code="busy")
+            text = f"a query is refused as busy, because {MAX_PENDING} others are in progress; ask less often"
+            self._losses[source].lost("query beyond the queue", text, frames=0)
             self._sender.submit(functools.partial(_reply_error, query, error))
             self.results[error.code] += 1
             return
@@ -250,13 +267,6 @@ def _parameters_publisher(session: zenoh.Session, key: str) -> _AnyPublisher:
 
 
 # These functions may block, so they run in a SendThread.
-
-
-def _put(put: Callable[..., None], *arguments: Any) -> None:
-    try:
-        put(*arguments)
-    except zenoh.ZError as error:
-        logger.debug("zenoh: not published: %s", error)
 
 
 def _reply(query: zenoh.Query, answers: Mapping[str, Answer]) -> None:

@@ -40,28 +40,32 @@ def test_a_message_that_an_output_does_not_accept_is_logged(
     assert logged(caplog) == [f"WARNING lab to zenoh: {text}"]
 
 
-@pytest.mark.usefixtures("no_hold")
-def test_too_many_tools_are_logged_and_so_is_the_recovery(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "gateway.publish.tool_poses")
+def test_too_many_tools_are_logged_with_what_is_lost(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gateway.publish.routes")
     fan_out = FanOut("lab", [ToyOutput(has_tool_poses=True)])
     publish_tools(fan_out, 257)
     publish_tools(fan_out, 3)
-    start, end = logged(caplog)
-    assert start == "WARNING lab: a frame of 257 tools, more than 256: no tool poses are published"
-    assert end.startswith("INFO lab: frames of 3 tools: tool poses are published, after ")
+    fan_out.close()
+    assert logged(caplog) == [
+        "WARNING lab to toy: a frame of 257 tools, more than 256: no tool poses are published",
+        "INFO lab to toy: lost within 0.0 s: 257 messages of 1 frame (too many tools)",
+    ]
 
 
-def test_an_unknown_unit_is_logged_and_so_is_the_recovery(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "gateway.publish.tool_poses")
+def test_an_unknown_unit_is_logged_with_what_is_lost(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, "gateway.publish.routes")
     fan_out = FanOut("lab", [ToyOutput(has_tool_poses=True)])
     set_unit(fan_out, "x" * 41)
+    publish_tools(fan_out, 2)
+    publish_tools(fan_out, 0)
     set_unit(fan_out, "m")
-    start, end = logged(caplog)
-    assert start == (
-        f"WARNING lab: unit of length '{'x' * 40}' is unknown: no tool poses are published; "
-        "set it to mm or m in the server"
-    )
-    assert end.startswith("INFO lab: unit of length is 'm': tool poses are published, after ")
+    publish_tools(fan_out, 2)
+    fan_out.close()
+    assert logged(caplog) == [
+        f"WARNING lab to toy: unit of length '{'x' * 40}' is unknown: no tool poses are published; "
+        "set it to mm or m in the server",
+        "INFO lab to toy: lost within 0.0 s: 2 messages of 1 frame (unknown unit)",
+    ]
 
 
 def test_parameters_without_markers_are_in_millimetres(caplog: pytest.LogCaptureFixture) -> None:

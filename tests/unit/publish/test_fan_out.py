@@ -13,6 +13,7 @@ from gateway.outputs.memory import MemoryOutput
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, ComponentType, encode_component
 from gateway.rtc3d.frames import Frame, encode_frame, split_frame
+from tests.losses import amounts
 from tests.toy_output import ToyOutput
 from tests.vectors import EMPTY_FRAME, FULL_FRAME
 
@@ -128,13 +129,13 @@ def test_an_output_that_raises_is_counted_and_does_not_stop_others(error: Except
     broken, good = ToyOutput("broken"), ToyOutput("good")
     broken.error = error
     fan_out = FanOut("lab", [broken, good])
-    for _ in range(2):
-        fan_out.publish(FULL, STAMP, ALL)
+    for utime in (1, 2):
+        fan_out.publish(FULL, Stamp(utime, utime, 1, 1), ALL)
     fan_out.publish_status(b"status")
     statuses = {output.name: status for output, status in fan_out.outputs}
-    assert statuses["broken"].drops == {cause: 11}
+    assert amounts(statuses["broken"].losses) == {cause: (11, 2)}
     assert not statuses["broken"].messages
-    assert not statuses["good"].drops
+    assert not statuses["good"].losses
     each_twice = {"3d": 2, "6d": 2, "analog": 2, "force": 2, "event": 2}
     assert statuses["good"].messages == each_twice | {"status": 1}
     assert len(good.messages) == 11
@@ -148,21 +149,23 @@ def test_a_refused_message_uses_up_its_sequence_number() -> None:
     assert [decode(message).sequence for _, message in output.messages] == [0, 2]
 
 
-@pytest.mark.usefixtures("no_hold")
-def test_an_output_failure_is_logged_once_with_its_repeats_at_debug_and_its_end(
+def test_an_output_failure_is_logged_once_and_its_end_with_the_total(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.DEBUG, "gateway.publish.routes")
     output = ToyOutput()
     fan_out = FanOut("lab", [output])
     lost = OutputError("no Zenoh router is connected: start zenohd", cause="no router")
-    for output.error in (None, lost, lost, lost, None, None):
-        fan_out.publish(FULL, STAMP, MARKERS)
-    warning, *repeats, recovery = caplog.records
-    assert (warning.levelno, warning.getMessage()) == (logging.WARNING, f"lab to toy: {lost}")
-    assert [record.levelno for record in repeats] == [logging.DEBUG, logging.DEBUG]
-    assert recovery.levelno == logging.INFO
-    assert "lab to toy: sending again" in recovery.getMessage()
+    for output.error in (None, lost, None):
+        fan_out.publish(FULL, STAMP, ALL)
+    fan_out.check_losses()
+    fan_out.close()
+    start, end = caplog.records
+    assert (start.levelno, start.getMessage()) == (logging.WARNING, f"lab to toy: {lost}")
+    assert (end.levelno, end.getMessage()) == (
+        logging.INFO,
+        "lab to toy: lost within 0.0 s: 5 messages of 1 frame (no router)",
+    )
 
 
 def test_messages_that_fail_now_and_then_are_one_failure(caplog: pytest.LogCaptureFixture) -> None:

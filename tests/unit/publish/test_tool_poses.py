@@ -11,6 +11,7 @@ from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.rtc3d.frames import Frame, split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters3D, Parameters6D, Tool
+from tests.losses import amounts
 from tests.toy_output import ToyOutput
 
 STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1, parameters_version=1)
@@ -135,7 +136,7 @@ def test_too_many_tools_get_no_topics_and_are_counted(caplog: pytest.LogCaptureF
     for _ in range(2):
         publish_tools(fan_out, 257)
     assert output.tool_names() == []
-    assert fan_out.outputs[0][1].drops == {"too many tools": 2}
+    assert amounts(fan_out.outputs[0][1].losses) == {"too many tools": (514, 2)}
     assert [record.levelno for record in caplog.records] == [logging.WARNING]
     assert fan_out.outputs[0][1].messages == {"6d": 2}
     publish_tools(fan_out, 256)
@@ -161,7 +162,7 @@ def test_an_unknown_unit_is_logged_and_no_pose_is_published(caplog: pytest.LogCa
     fan_out.set_parameters(parameters("Probe", unit="furlong"))
     publish_tools(fan_out, 1)
     assert output.poses("Probe") == []
-    assert fan_out.outputs[0][1].drops == {"unknown unit": 1}
+    assert amounts(fan_out.outputs[0][1].losses) == {"unknown unit": (1, 1)}
     assert ["furlong" in record.getMessage() for record in caplog.records] == [True]
 
 

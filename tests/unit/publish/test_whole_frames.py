@@ -1,12 +1,12 @@
 """Outputs that take whole frames: what they get, how it is numbered and counted, and how they close."""
 
-from collections.abc import Mapping
-
 from gateway.errors import OutputError
+from gateway.losses import Losses
 from gateway.messages.stamp import Stamp
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import Frame, split_frame
+from tests.losses import amounts
 from tests.toy_output import ToyOutput
 from tests.vectors import FULL_FRAME
 
@@ -24,14 +24,14 @@ class FrameOutput(ToyOutput):
         self.frames: list[tuple[Frame, Stamp, int, frozenset[ComponentType]]] = []
         self.sources: list[str] = []
         self.closed = 0
-        self.own_drops: dict[str, int] = {}
+        self.losses: dict[str, Losses] = {}
 
     def frame_publisher(self, source: str) -> "FrameOutputPublisher":
         self.sources.append(source)
         return FrameOutputPublisher(self)
 
-    def drops(self, source: str) -> Mapping[str, int]:
-        return self.own_drops if source == "lab" else {}
+    def count_losses(self, source: str, losses: Losses) -> None:
+        self.losses[source] = losses
 
 
 class FrameOutputPublisher:
@@ -84,7 +84,7 @@ def test_a_frame_that_is_not_accepted_is_counted_and_uses_up_its_number() -> Non
     for output.error in (None, OutputError("the disk is full", cause="disk full"), None):
         fan_out.publish(FULL, STAMP, ALL)
     [(_, status)] = fan_out.outputs
-    assert status.drops == {"disk full": 1}
+    assert amounts(status.losses) == {"disk full": (1, 1)}
     assert status.messages == {"frame": 2}
     assert [sequence for _, _, sequence, _ in output.frames] == [0, 2]
 
@@ -100,13 +100,14 @@ def test_a_replacement_continues_the_numbers_and_the_former_one_is_closed() -> N
     assert fan_out.outputs[0][1].messages == {"frame": 2}
 
 
-def test_drops_that_an_output_counts_itself_are_added_and_outlive_it() -> None:
+def test_losses_that_an_output_counts_itself_outlive_it() -> None:
     before, after = FrameOutput(), FrameOutput()
-    before.own_drops, after.own_drops = {"malformed request": 3}, {"malformed request": 1}
     fan_out = FanOut("lab", [before])
-    assert fan_out.outputs[0][1].drops == {"malformed request": 3}
+    before.losses["lab"].lost("malformed request", "what is this?", messages=3, frames=0)
+    assert amounts(fan_out.outputs[0][1].losses) == {"malformed request": (3, 0)}
     fan_out.set_outputs([after])
-    assert fan_out.outputs[0][1].drops == {"malformed request": 4}
+    after.losses["lab"].lost("malformed request", "what is this?", frames=0)
+    assert amounts(fan_out.outputs[0][1].losses) == {"malformed request": (4, 0)}
 
 
 def test_an_output_of_frames_can_replace_one_of_components() -> None:
