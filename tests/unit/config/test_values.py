@@ -239,7 +239,14 @@ def test_configurations_that_zenoh_refuses_are_refused(config: object, text: str
 
 @pytest.mark.parametrize(
     "url",
-    [DEFAULT_LCM_URL, "udpm://?ttl=1", "mpudpm://", "memq://", "tcpq://lab:7700", "file:///tmp/x?mode=w"],
+    [
+        DEFAULT_LCM_URL,
+        "udpm://?ttl=1",
+        "mpudpm://",
+        "memq://",
+        "tcpq://lab:7700",
+        "file:///tmp/x@y?mode=w",
+    ],
 )
 def test_urls_of_all_lcm_providers_are_accepted(url: str) -> None:
     assert LcmSettings(url=url).effective_url == url

@@ -6,6 +6,7 @@ from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.registry import OUTPUTS, build_outputs
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.rtc3d.components import ComponentType
 from tests.configurations import make_settings
 
 SOURCES = (SourceSettings(name="lab", host="127.0.0.1"),)
@@ -29,3 +30,12 @@ def test_only_enabled_outputs_are_built_with_their_settings() -> None:
     disabled = zenoh.model_copy(update={"enabled": False})
     [only] = build_outputs(make_settings(sources=SOURCES, zenoh=disabled, lcm=lcm))
     assert isinstance(only, LcmOutput)
+
+
+def test_outputs_have_the_limits_and_the_tool_poses_of_their_settings() -> None:
+    rates = {ComponentType.ANALOG: 50.0}
+    for has_tool_poses in (True, False):
+        zenoh = ZenohOutput(ZenohSettings(max_rate_hz=rates, tool_poses=has_tool_poses))
+        lcm = LcmOutput(LcmSettings(max_rate_hz=rates, tool_poses=has_tool_poses))
+        assert [zenoh.max_rate_hz, lcm.max_rate_hz] == [rates, rates]
+        assert [zenoh.has_tool_poses, lcm.has_tool_poses] == [has_tool_poses, has_tool_poses]

@@ -326,7 +326,10 @@ async def test_parameters_of_a_withdrawn_source_are_not_published_again(
     assert len(lab.parameters) == 1
 
 
-async def test_parameters_published_before_lcm_opens_follow_later(lab: Lab, clock: SimpleNamespace) -> None:
+async def test_parameters_published_before_lcm_opens_follow_later(
+    lab: Lab, clock: SimpleNamespace, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG, "gateway.outputs.lcm.queries")
     lab.output.publish_parameters("lab", ServerParameters(XML, 3, 4))
     lab.open()
     clock.now_s += REPEAT_S

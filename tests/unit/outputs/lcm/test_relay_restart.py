@@ -74,13 +74,15 @@ async def test_requests_are_answered_again_after_the_relay_restarts(
 async def test_a_lost_relay_is_logged_with_the_key_to_check(
     relay: LcmRelay, output: LcmOutput, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(logging.INFO, "gateway.outputs.lcm.queries")
+    caplog.set_level(logging.DEBUG, "gateway.outputs.lcm.queries")
     await wait_until_async(lambda: output.health().connected and relay.subscribed)
     relay.close()
-    await wait_until_async(lambda: caplog.messages)
-    relay.open()
     await wait_until_async(lambda: len(caplog.messages) >= 2)
-    lost, found = caplog.messages
+    relay.open()
+    await wait_until_async(lambda: "after" in caplog.messages[-1])
+    failure, lost, *_, found = caplog.messages
+    assert failure.startswith("receiving LCM requests: ")
+    assert "None" not in failure
     assert lost.startswith(f"lcm: no requests can be received: LCM did not send to {relay.url}: ")
     assert lost.endswith("; check lcm.url (this is lcm.queries_url)")
     assert "None" not in lost

@@ -12,6 +12,7 @@ import zenoh
 
 from gateway.errors import ConfigError, OutputError
 from gateway.messages.topics import Topic
+from gateway.outputs.status import OutputHealth
 from gateway.outputs.zenoh.config import zenoh_config
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -317,6 +318,15 @@ def test_a_session_that_opens_only_after_close_is_closed() -> None:
         assert not output.health().connected
     finally:
         router.close()
+
+
+def test_health_says_how_to_open_a_session_before_and_after(lab: Lab) -> None:
+    remedy = "is the router running, are zenoh.config's endpoints right and free?"
+    assert lab.output.health().problem == f"the Zenoh session is not open yet; {remedy}"
+    lab.open()
+    assert lab.output.health() == OutputHealth(True, "")
+    lab.output.close()
+    assert lab.output.health().problem == "the Zenoh session is closed; start the gateway again"
 
 
 # Configuration -------------------------------------------------------------------------------

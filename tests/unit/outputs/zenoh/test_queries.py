@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import logging
 from collections.abc import AsyncIterator, Mapping, Sequence
 from typing import Any
 
@@ -70,6 +71,7 @@ class Lab:
         self.output.announce("lab")
         self.output.start()
         await wait_until_async(lambda: self.output.health().connected)
+        await asyncio.to_thread(self.output._opener.join)  # it declares the queryables last
         self.peer = open_zenoh("client", connect=self.endpoint)
 
     def subscribe(self, keys: str) -> None:
@@ -284,3 +286,21 @@ async def test_an_event_loop_that_has_ended_is_no_error(lab: Lab) -> None:
     queries = queries_module.ZenohQueries("mocap", lab.service, loop)  # type: ignore[arg-type]  # see Lab
     queries.open(lab.peer, [])
     await queries.close()
+
+
+async def test_what_a_closed_session_does_not_publish_is_logged_for_developers(
+    lab: Lab, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG, "gateway.outputs.zenoh.queries")
+    session = open_zenoh("client", connect=lab.endpoint)
+    loop = asyncio.get_running_loop()
+    queries = queries_module.ZenohQueries("mocap", lab.service, loop)  # type: ignore[arg-type]  # see Lab
+    queries.open(session, ["lab"])
+    session.close()
+    caplog.clear()
+    queries.publish_parameters("lab", ServerParameters(XML, 1, 1))
+    queries.announce_file("lab", {"name": "late.c3d"})
+    await wait_until_async(lambda: len(caplog.messages) >= 2)
+    await queries.close()
+    assert all(message.startswith("zenoh: not published: ") for message in caplog.messages)
+    assert "None" not in caplog.text

@@ -1,0 +1,71 @@
+"""The threads of the outputs: daemons, so that a program does not wait for them, with telling names."""
+
+import asyncio
+import socket
+import threading
+from collections.abc import Callable
+
+import lcm
+import pytest
+
+from gateway.outputs.lcm.output import LcmOutput
+from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lcm.subscriber import LcmSubscriber
+from gateway.outputs.zenoh.output import ZenohOutput
+from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.queries.service import SourceQueryService
+from tests.lcm_relay import LcmRelay
+from tests.networks import zenoh_keys
+from tests.waiting import wait_until_async
+
+
+@pytest.fixture
+def threads() -> Callable[[], dict[str, bool]]:
+    """Return a function that returns whether the threads started since then are daemons, by name."""
+    earlier = set(threading.enumerate())
+
+    def started() -> dict[str, bool]:
+        later = set(threading.enumerate()) - earlier
+        return {thread.name: thread.daemon for thread in later if not thread.name.startswith("Dummy-")}
+
+    return started
+
+
+async def test_zenoh_opens_and_replies_in_threads(threads: Callable[[], dict[str, bool]]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:  # zenoh.open waits for an answer
+        endpoint = f"tcp/127.0.0.1:{silent.getsockname()[1]}"
+        output = ZenohOutput(ZenohSettings(config=zenoh_keys("client", connect=endpoint)))
+        output.serve_queries(SourceQueryService(dict, dict))
+        output.start()
+        assert threads() == {"zenoh-open": True, "zenoh-send": True, "zenoh-send-long": True}
+        await output.stop_queries()
+        await wait_until_async(lambda: set(threads()) == {"zenoh-open"})
+    await asyncio.to_thread(output.close)
+
+
+async def test_lcm_sends_and_receives_in_threads(threads: Callable[[], dict[str, bool]]) -> None:
+    relay = LcmRelay()
+    output = LcmOutput(LcmSettings(url=relay.url))
+    output.serve_queries(SourceQueryService(dict, dict))
+    output.announce("lab")
+    output.start()
+    await wait_until_async(lambda: output.health().connected and relay.subscribed)
+    assert {"lcm-send": True, "lcm-requests": True}.items() <= threads().items()
+    await output.stop_queries()
+    output.close()
+    await wait_until_async(lambda: not {"lcm-send", "lcm-requests"} & set(threads()))
+    relay.close()
+
+
+def test_a_subscriber_of_lcm_receives_in_a_thread_until_it_is_closed(
+    threads: Callable[[], dict[str, bool]],
+) -> None:
+    received: list[tuple[str, bytes]] = []
+    shared = lcm.LCM("memq://")
+    subscriber = LcmSubscriber(shared, "A|B", lambda *each: received.append(each))
+    assert threads() == {"lcm-subscriber": True}
+    subscriber.close()
+    assert threads() == {}
+    shared.publish("A", b"late")
+    shared.handle_timeout(0)
+    assert received == []
