@@ -162,16 +162,16 @@ soak: build/compiled/complete
 	$(COMPILED) tests/with-netns $(BIN)/python -m tests.soak --minutes $(SOAK_MINUTES) --report docs/reliability.md
 
 # Mutation tests: thousands of small changes to the code, each of which some test should notice; hours for all
-# packages. PACKAGES="rtc3d stream publish outputs" are all there are. SAMPLE=300 runs 300 random mutants of each, and SEED=2
-# others. A table is printed at the end, and the changes that no test noticed are in mutants/survivors.diff. Not part of
-# the check.
+# packages. PACKAGES="rtc3d stream publish outputs" are all there are. SAMPLE=300 runs 300 random mutants of each, and
+# SEED=2 others. A table is printed at the end, and the changes that no test noticed are in mutants/survivors.diff. Not
+# part of the check.
 PACKAGES ?=
 SAMPLE ?=
 SEED ?=
 
 mutants: .venv/installed
 	$(BIN)/pip install --quiet --group mutants
-	tests/with-netns $(BIN)/python -P tests/mutants.py $(PACKAGES) $(if $(SAMPLE),--sample $(SAMPLE)) $(if $(SEED),--seed $(SEED))
+	tests/with-netns $(BIN)/python -P tests/mutants.py $(PACKAGES) $(SAMPLE:%=--sample %) $(SEED:%=--seed %)
 
 # Compare the gateway with a bare relay to Zenoh and LCM, and write benchmarks/results.json and docs/performance.md.
 # This takes half an hour and needs an idle machine. PARTS="ceiling loss" measures only these parts. bench-quick takes
