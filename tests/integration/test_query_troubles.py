@@ -16,6 +16,7 @@ from gateway.outputs.zenoh import queries as zenoh_queries
 from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.queries.service import SourceQueryService
 from gateway.queries.source_queries import SourceQueries
+from tests.losses import amounts
 from tests.networks import free_endpoint, open_zenoh
 from tests.queried_gateway import gateway_with_server, output_queries, query, run_gateway, zenoh_peer
 from tests.servers import packet
@@ -149,10 +150,12 @@ async def test_files_that_arrive_faster_than_the_disk_writes_are_dropped_and_log
 
     monkeypatch.setattr(Spool, "store", slow)
     try:
-        async with gateway_with_server(spool=tmp_path) as (server, _, _, _):
+        async with gateway_with_server(spool=tmp_path) as (server, _, gateway, _):
             for number in range(6):
                 server.send(packet(5, b"content %d" % number))
-            await wait_until_async(lambda: caplog.text.count("4 earlier files are still being written") == 2)
+            [status] = gateway.sources[0].statuses
+            await wait_until_async(lambda: amounts(status.losses.report()) == {"C3D file": (2, 0)})
+            assert caplog.text.count("4 earlier files are still being written") == 1
             disk.set()
             await wait_until_async(lambda: len(list(tmp_path.glob("*.c3d"))) == 4)
             server.send(packet(5, b"a later one"))
