@@ -160,6 +160,7 @@ class Source:
 
         return Callbacks(
             publish=self.fan_out.publish,
+            skip=self.fan_out.skip,
             on_parameters=on_parameters,
             on_connected=lambda: self._start_task(self.queries.parameters.fill()),
             on_restart=self._refresh_parameters_soon,

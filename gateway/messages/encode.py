@@ -41,6 +41,9 @@ CONTENT_OFFSET: Final = FINGERPRINT_BYTES + PREFIX.size
 ITEMS_OFFSET: Final = CONTENT_OFFSET + 16
 """The offset of the items in a message, after frame number, time stamp and count: 56."""
 
+_SEQUENCE_OFFSET: Final = FINGERPRINT_BYTES + 16
+_TIMESTAMP_OFFSET: Final = CONTENT_OFFSET + 4
+
 _FINGERPRINTS: Final[dict[ComponentType, bytes]] = {
     component: message_type._get_packed_fingerprint()  # noqa: SLF001 - lcm-gen offers no other way
     for component, message_type in MESSAGE_TYPES.items()
@@ -80,6 +83,11 @@ def lcm_content(component: Component) -> bytes:
     return header + events.tobytes()
 
 
-def content_timestamp_us(content: bytes) -> int:
-    """Return the server's time stamp, in µs, from a content in LCM form."""
-    return int.from_bytes(content[4:12], "big", signed=True)
+def with_sequence(message: bytes, sequence: int) -> bytes:
+    """Return a component's message with another sequence number."""
+    return message[:_SEQUENCE_OFFSET] + sequence.to_bytes(8, "big") + message[_SEQUENCE_OFFSET + 8 :]
+
+
+def message_timestamp_us(message: bytes) -> int:
+    """Return the server's time stamp, in µs, from a component's message."""
+    return int.from_bytes(message[_TIMESTAMP_OFFSET : _TIMESTAMP_OFFSET + 8], "big", signed=True)

@@ -203,7 +203,7 @@ class GatewayCollector(Collector):
     def _component_frames(self) -> Metric:
         return _counter(
             "component_frames",
-            "Frames with the component, including those that an output's max_rate_hz leaves out.",
+            "Frames with the component that have arrived, published or not.",
             ("source", "component"),
             [
                 ((source.name, component.key), count)

@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import Final
 
 from gateway.messages.encode import MESSAGE_TYPES, encode_content, has_lcm_form, lcm_content
-from gateway.messages.stamp import NOT_PUBLISHED, Stamp
+from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import Output
 from gateway.outputs.status import OutputStatus
 from gateway.publish.routes import ComponentRoute, FrameRoute, OutputRoute
@@ -21,36 +21,39 @@ _MAX_PLANS: Final = 256
 logger = logging.getLogger(__name__)
 
 
-class _ComponentRecord:
-    """The number of frames that contained one component, and its newest message."""
+class _Component:
+    """The numbering of one component's messages, and the newest message."""
 
-    def __init__(self) -> None:
-        self.frames = 0
+    def __init__(self, component_type: ComponentType) -> None:
+        self.type = component_type
+        self.sequence = 0
         self.newest: bytes | None = None
+
+    def next_message(self, content: bytes, stamp: Stamp) -> bytes:
+        """Return the message of a content in LCM form, under the next sequence number."""
+        self.newest = encode_content(self.type, content, stamp, self.sequence)
+        self.sequence += 1
+        return self.newest
 
 
 class _ComponentPlan:
     """How to publish one component of a layout: its index in the frame, and its routes."""
 
     def __init__(
-        self,
-        component_type: ComponentType,
-        record: _ComponentRecord,
-        index: int,
-        has_lcm_form: bool,
-        routes: list[ComponentRoute],
+        self, component: _Component, index: int, has_lcm_form: bool, routes: list[ComponentRoute]
     ) -> None:
-        self.type = component_type
-        self.record = record
         self.routes = routes
+        self._component = component
         self._index = index
         self._has_lcm_form = has_lcm_form
 
-    def content(self, frame: Frame) -> bytes:
-        """Return the component's content in LCM form."""
+    def next_message(self, frame: Frame, stamp: Stamp) -> bytes:
+        """Return the component's message, which uses up a sequence number even if it is not published."""
         if self._has_lcm_form:
-            return frame.content(self._index)
-        return lcm_content(frame.component(self._index))
+            content = frame.content(self._index)
+        else:
+            content = lcm_content(frame.component(self._index))
+        return self._component.next_message(content, stamp)
 
 
 class _Plan:
@@ -81,6 +84,10 @@ class _Plan:
 class FanOut:
     """Publishes the frames, status and clock of one source on every output.
 
+    It numbers the messages of each component, and the frames, when they arrive. A message that is not
+    published afterwards, whatever the reason, leaves a gap in the numbers. All outputs get the same message
+    under the same number, except for those with a maximum rate (ComponentRoute).
+
     It calls ``on_items_changed``, which may be assigned later, when the number of markers, tools, channels
     or plates changes.
     """
@@ -93,7 +100,8 @@ class FanOut:
     ) -> None:
         self.on_items_changed = on_items_changed
         self._source = source
-        self._records = {component: _ComponentRecord() for component in MESSAGE_TYPES}
+        self._components = {component: _Component(component) for component in MESSAGE_TYPES}
+        self._frame_sequence = 0
         self._routes: list[OutputRoute] = []
         self._frame_routes: list[FrameRoute] = []
         self._last_routes: dict[str, OutputRoute] = {}  # by the output's name, including closed ones
@@ -107,7 +115,7 @@ class FanOut:
     def set_outputs(self, outputs: Sequence[Output]) -> None:
         """Publish on these outputs from now on. Routes to outputs that stay are not touched.
 
-        An output that replaces another of the same name continues its sequence numbers and counters.
+        An output that replaces another of the same name continues its counters.
         """
         open_routes = {route.output: route for route in self._routes}
         for output, route in open_routes.items():
@@ -120,7 +128,7 @@ class FanOut:
         self._plan = None
 
     def _open_route(self, output: Output) -> OutputRoute:
-        route = OutputRoute(self._source, output, self._last_routes.get(output.name))
+        route = OutputRoute(self._source, output, self.frames, self._last_routes.get(output.name))
         self._last_routes[output.name] = route
         if self._is_streaming:
             output.show_streaming(self._source, True)
@@ -134,13 +142,13 @@ class FanOut:
 
     @property
     def frames(self) -> dict[ComponentType, int]:
-        """The number of frames with each component, including those that a pacer left out."""
-        return {component: record.frames for component, record in self._records.items()}
+        """The number of frames with each component that have arrived, published or not."""
+        return {component.type: component.sequence for component in self._components.values()}
 
     @property
     def newest(self) -> dict[ComponentType, bytes]:
         """The newest message of each component."""
-        newest = {component: record.newest for component, record in self._records.items()}
+        newest = {component.type: component.newest for component in self._components.values()}
         return {component: message for component, message in newest.items() if message is not None}
 
     @property
@@ -151,30 +159,47 @@ class FanOut:
     def publish(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
         """Publish the ``wanted`` components of a frame. Raises nothing if an output fails."""
         # This is the inner loop of the gateway; benchmarks/own_cost.py measures it.
+        plan = self._plan_of(frame, wanted)
+        if not plan.components:
+            return
+        for frame_route in self._frame_routes:
+            frame_route.publish(frame, stamp, self._frame_sequence, wanted)
+        self._frame_sequence += 1
+        for component in plan.components:
+            message = component.next_message(frame, stamp)
+            for route in component.routes:
+                route.publish(message, stamp)
+        for index in plan.tool_indices:
+            self._tool_poses.publish(frame, index, stamp)
+
+    def skip(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> int:
+        """Number the messages of these components like ``publish``, but publish nothing.
+
+        Returns how many messages are lost thereby. A message that pacing leaves out on every output is not.
+        """
+        plan = self._plan_of(frame, components)
+        if not plan.components:
+            return 0
+        self._frame_sequence += 1
+        num_lost = sum(self._tool_poses.skip(frame, index) for index in plan.tool_indices)
+        for component in plan.components:
+            message = component.next_message(frame, stamp)
+            is_lost = [route.skip(message, stamp) for route in component.routes]
+            num_lost += any(is_lost) or bool(self._frame_routes)
+        return num_lost
+
+    def _plan_of(self, frame: Frame, wanted: frozenset[ComponentType]) -> _Plan:
         plan = self._plan
         if plan is None or plan.layout is not frame.layout or plan.wanted is not wanted:
             self._plan = plan = self._plan_for(frame.layout, wanted)
             self._check_item_counts(plan)
-        for frame_route in self._frame_routes:
-            frame_route.publish(frame, stamp, wanted)
-        for planned in plan.components:
-            content = planned.content(frame)
-            planned.record.frames += 1
-            for route in planned.routes:
-                message = route.publish(content, stamp)
-                if message is not None:
-                    planned.record.newest = message
-            if not planned.routes:  # No output takes components, but queries need a message.
-                planned.record.newest = encode_content(planned.type, content, stamp, NOT_PUBLISHED)
-        for index in plan.tool_indices:
-            self._tool_poses.publish(frame, index, stamp)
+        return plan
 
     def _new_plan(self, layout: FrameLayout, wanted: frozenset[ComponentType]) -> _Plan:
         indexed = [pair for pair in enumerate(layout.components) if pair[1].type in wanted]
         plans = [
             _ComponentPlan(
-                component.type,
-                self._records[component.type],
+                self._components[component.type],
                 index,
                 has_lcm_form(component, layout.byte_order),
                 [route.components[component.type] for route in self._routes if route.frame_route is None],

@@ -1,14 +1,15 @@
-"""The route from one source to one output: publishers, sequence numbers, counters and failures."""
+"""The route from one source to one output: publishers, pacing, counters and failures."""
 
 import logging
 from collections import Counter
+from collections.abc import Mapping
 from typing import Any
 
 import rtc3d
 
 from gateway.errors import OutputError
 from gateway.losses import Losses
-from gateway.messages.encode import MESSAGE_TYPES, content_timestamp_us, encode_content, lcm_type_name
+from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name, message_timestamp_us, with_sequence
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import FramePublisher, Output
@@ -31,11 +32,17 @@ class SentCounter:
 class OutputRoute:
     """Everything that one source publishes on one output.
 
-    It continues the sequence numbers and counters of ``predecessor``, an earlier route to an output of the
-    same name.
+    ``sequences`` are the next sequence number of each component. The route continues the counters of
+    ``predecessor``, an earlier route to an output of the same name.
     """
 
-    def __init__(self, source: str, output: Output, predecessor: "OutputRoute | None" = None) -> None:
+    def __init__(
+        self,
+        source: str,
+        output: Output,
+        sequences: Mapping[ComponentType, int],
+        predecessor: "OutputRoute | None" = None,
+    ) -> None:
         self.source = source
         self.output = output
         self.sent: dict[str, SentCounter] = {} if predecessor is None else predecessor.sent
@@ -46,16 +53,13 @@ class OutputRoute:
         frame_publisher = output.frame_publisher(source)
         self.frame_route: FrameRoute | None = None
         """For whole frames. An output that takes them gets no single components."""
+        self.components: dict[ComponentType, ComponentRoute] = {}
         if frame_publisher is not None:
-            self.frame_route = FrameRoute(
-                self, frame_publisher, None if predecessor is None else predecessor.frame_route
-            )
-        self.components: dict[ComponentType, ComponentRoute] = {
-            component: ComponentRoute(
-                self, component, None if predecessor is None else predecessor.components.get(component)
-            )
-            for component in (MESSAGE_TYPES if frame_publisher is None else ())
-        }
+            self.frame_route = FrameRoute(self, frame_publisher)
+        else:
+            before = {} if predecessor is None else predecessor.components
+            for component, sequence in sequences.items():
+                self.components[component] = ComponentRoute(self, component, sequence, before.get(component))
         self.status_route = TopicRoute(self, ("status",), rtc3d.status_t, "status")
         self.clock_route = TopicRoute(self, ("clock",), rtc3d.clock_t, "clock")
         output.count_losses(source, self.losses)
@@ -119,51 +123,63 @@ class TopicRoute:
 
 
 class ComponentRoute(TopicRoute):
-    """The route of one component to one output, with pacing and its own sequence numbers."""
+    """The route of one component to one output.
+
+    A paced route leaves messages out and numbers the others itself, so that only loss is a gap. It continues
+    the numbers of ``predecessor`` if that was paced, too. Otherwise it begins with ``sequence``, the number
+    of the next message on routes that are not paced: no route ever goes back to smaller numbers.
+    """
 
     def __init__(
-        self, output_route: OutputRoute, component: ComponentType, predecessor: "ComponentRoute | None"
+        self,
+        output_route: OutputRoute,
+        component: ComponentType,
+        sequence: int,
+        predecessor: "ComponentRoute | None",
     ) -> None:
         super().__init__(output_route, (component.key,), MESSAGE_TYPES[component], component.key)
         max_rate_hz = output_route.output.max_rate_hz.get(component)
         if component is ComponentType.EVENT:  # events are never left out
             max_rate_hz = None
-        self._component = component
         self._pacer = None if max_rate_hz is None else Pacer(max_rate_hz)
-        self.sequence: int = 0 if predecessor is None else predecessor.sequence
-        """The sequence number of the next message."""
+        self._sequence = sequence  # of the next message; only used if the route is paced
+        if predecessor is not None and predecessor._pacer is not None:  # noqa: SLF001 - of the same class
+            self._sequence = predecessor._sequence  # noqa: SLF001
 
-    def publish(self, content: bytes, stamp: Stamp) -> bytes | None:
-        """Publish a content in LCM form and return the message; return None if the pacer leaves it out.
+    def publish(self, message: bytes, stamp: Stamp) -> None:
+        """Publish a message, unless the pacer leaves it out.
 
-        A message that the output does not accept uses up a sequence number, so that subscribers see the loss.
+        A message that the output does not accept uses up its number, so that subscribers see the loss.
         """
-        if self._pacer is not None:
-            timestamp_us = content_timestamp_us(content) if stamp.has_clock else None
-            if not self._pacer.due(timestamp_us, stamp.utime):
-                return None
-        message = encode_content(self._component, content, stamp, self.sequence)
-        self.sequence += 1
-        self.send(message, stamp)
-        return message
+        if self._pacer is None:
+            self.send(message, stamp)
+        elif self._is_due(self._pacer, message, stamp):
+            self.send(with_sequence(message, self._sequence), stamp)
+            self._sequence += 1
+
+    def skip(self, message: bytes, stamp: Stamp) -> bool:
+        """Use up the number of a message that is not published. Return False if the pacer leaves it out."""
+        if self._pacer is None:
+            return True
+        is_due = self._is_due(self._pacer, message, stamp)
+        if is_due:
+            self._sequence += 1
+        return is_due
+
+    def _is_due(self, pacer: Pacer, message: bytes, stamp: Stamp) -> bool:
+        return pacer.due(message_timestamp_us(message) if stamp.has_clock else None, stamp.utime)
 
 
 class FrameRoute:
-    """The route of whole frames to an output that takes them, with their own sequence numbers."""
+    """The route of whole frames to an output that takes them."""
 
-    def __init__(
-        self, output_route: OutputRoute, publisher: FramePublisher, predecessor: "FrameRoute | None"
-    ) -> None:
+    def __init__(self, output_route: OutputRoute, publisher: FramePublisher) -> None:
         self.publisher = publisher
-        self.sequence: int = 0 if predecessor is None else predecessor.sequence
-        """The sequence number of the next frame."""
         self._output_route = output_route
         self._sent = output_route.sent.setdefault("frame", SentCounter())
 
-    def publish(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
+    def publish(self, frame: Frame, stamp: Stamp, sequence: int, wanted: frozenset[ComponentType]) -> None:
         """Publish and count one frame; never raises, because outputs must not disturb each other."""
-        sequence = self.sequence
-        self.sequence += 1
         try:
             self.publisher.publish(frame, stamp, sequence, wanted)
         except Exception as error:  # noqa: BLE001 - a defect in one output must not stop the others

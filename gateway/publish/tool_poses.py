@@ -13,6 +13,9 @@ from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import Parameters
 
+_MAX_REMEMBERED_NAMES: Final = 1024
+"""How many names of tools keep their sequence numbers. The server determines the names."""
+
 _MAX_TOOLS: Final = 256
 """How many tools can have topics of their own. The server determines the number of tools in a frame."""
 
@@ -23,6 +26,11 @@ class _Tool:
     def __init__(self, name: str) -> None:
         self.name = name
         self.routes: dict[OutputRoute, TopicRoute] = {}
+
+    @property
+    def is_wanted(self) -> bool:
+        """Whether any output may have a subscriber to the topic."""
+        return any(route.publisher.wanted for route in self.routes.values())
 
     def set_routes(self, output_routes: Sequence[OutputRoute]) -> None:
         """Open the routes that are missing, and close those to other outputs."""
@@ -43,7 +51,7 @@ class ToolPoses:
         self._unit = ""
         self._unit_m: float | None = 1e-3  # the unit of length in metres; None if it is unknown
         self._tools: list[_Tool] = []
-        self._sequences: dict[str, int] = {}  # by the tools' names
+        self._sequences: dict[str, int] = {}  # by the tools' names, also former ones
 
     @property
     def is_used(self) -> bool:
@@ -76,6 +84,7 @@ class ToolPoses:
                 "set it to mm or m in the server",
                 num_tools,
             )
+            self.skip(frame, index)
             return
         if num_tools > _MAX_TOOLS:
             self._count_loss(
@@ -87,14 +96,24 @@ class ToolPoses:
         # Topics stay open when a frame has fewer tools: the number may go up and down.
         if num_tools > len(self._tools):
             self._open_topics(num_tools)
-        if any(route.publisher.wanted for tool in self._tools for route in tool.routes.values()):
+        if any(tool.is_wanted for tool in self._tools):
             self._send(frame.component(index), stamp, self._unit_m)
+
+    def skip(self, frame: Frame, index: int) -> int:
+        """Use up the numbers of the poses that ``publish`` would publish; return how many poses that are."""
+        num_tools = frame.layout.components[index].num_items
+        wanted = [tool.name for tool in self._tools[:num_tools] if tool.is_wanted]
+        for name in wanted:
+            self._sequences[name] += 1
+        return len(wanted)
 
     def _send(self, component: Component, stamp: Stamp, unit_m: float) -> None:
         tools = self._tools[: component.num_items]
         sequences = [self._sequences[tool.name] for tool in tools]
         messages = tool_poses(component, stamp, sequences, unit_m)
         for tool, message in zip(tools, messages, strict=True):
+            if not tool.is_wanted:  # not sent, but not lost either
+                continue
             for route in tool.routes.values():
                 if route.publisher.wanted:
                     route.send(message, stamp)
@@ -107,14 +126,17 @@ class ToolPoses:
     def _open_topics(self, num_tools: int) -> None:
         """Open topics for ``num_tools`` tools. A name that had a topic before continues counting."""
         self._close_topics()
-        before, self._sequences = self._sequences, {}
+        names: set[str] = set()
         for index in range(num_tools):
             label = self._labels[index].strip() if index < len(self._labels) else ""
-            name = unique_name(label or f"tool {index + 1}", self._sequences, MAX_LABEL_LENGTH)
-            self._sequences[name] = before.get(name, 0)
+            name = unique_name(label or f"tool {index + 1}", names, MAX_LABEL_LENGTH)
+            names.add(name)
+            self._sequences[name] = self._sequences.pop(name, 0)  # the newest names are at the end
             tool = _Tool(name)
             tool.set_routes(self._output_routes)
             self._tools.append(tool)
+        for name in list(self._sequences)[:-_MAX_REMEMBERED_NAMES]:
+            del self._sequences[name]
 
     def _close_topics(self) -> None:
         for tool in self._tools:

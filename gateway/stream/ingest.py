@@ -13,6 +13,9 @@ from gateway.stream.status import StreamStatus
 Publish = Callable[[Frame, Stamp, frozenset[ComponentType]], None]
 """Takes a frame, its stamp, and the types of the components to publish."""
 
+Skip = Callable[[Frame, Stamp, frozenset[ComponentType]], int]
+"""Takes the same for components that are not published; returns how many messages are lost thereby."""
+
 _EVENTS: Final = frozenset({ComponentType.EVENT})
 
 
@@ -29,14 +32,17 @@ class Ingest:
         stream: StreamSettings,
         status: StreamStatus,
         publish: Publish,
+        skip: Skip,
         on_lateness: Callable[[int], None],
         on_restart: Callable[[], None],
     ) -> None:
         self._wanted = frozenset(stream.components)
-        self._wanted_events = _EVENTS & self._wanted
+        self._wanted_events = self._wanted & _EVENTS
+        self._skippable = self._wanted - _EVENTS
         self._skips_when_behind = stream.backlog == "latest"
         self._status = status
         self._publish = publish
+        self._skip = skip
         self._on_lateness = on_lateness
         self._on_restart = on_restart
         self._clock = status.clock  # outlives the session: it detects a restart of the server by itself
@@ -44,7 +50,6 @@ class Ingest:
         self._frame_number = 0  # the newest of a component of _followed_type
         self._lag = LagControl(source.max_lag_ms / 1000, MAX_HALVINGS if stream.adapt_rate else 1)
         self._layout: FrameLayout | None = None  # of the newest frame
-        self._num_skippable = 0  # how many of its components are wanted and no events
         self._unwanted = ""  # its components, if none of them is wanted
 
     def receive(self, frames: list[Frame], utime: int, now_s: float) -> None:
@@ -68,9 +73,10 @@ class Ingest:
                 continue
             stamp = self._stamp(frame, utime, now_s)
             if self._lag.behind and self._skips_when_behind and frame is not newest:
-                if self._num_skippable:
-                    status.frame_skipped(self._num_skippable)
                 self._publish(frame, stamp, self._wanted_events)
+                num_lost = self._skip(frame, stamp, self._skippable)
+                if num_lost:
+                    status.frame_skipped(num_lost)
             else:
                 self._publish(frame, stamp, self._wanted)
         status.components_received("" if has_wanted else self._unwanted, utime)
@@ -78,7 +84,6 @@ class Ingest:
     def _set_layout(self, layout: FrameLayout) -> None:
         types = [component.type for component in layout.components]
         self._layout = layout
-        self._num_skippable = sum(each in self._wanted and each not in _EVENTS for each in types)
         if self._wanted.isdisjoint(types):
             self._unwanted = " ".join(each.key for each in types) or "no components"
         else:

@@ -11,7 +11,7 @@ from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSet
 from gateway.errors import LinkError
 from gateway.log import FailureLog, log_fields
 from gateway.stream.change_tasks import ChangeTasks
-from gateway.stream.ingest import Ingest, Publish
+from gateway.stream.ingest import Ingest, Publish, Skip
 from gateway.stream.session import OnFile, Session
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
@@ -26,6 +26,8 @@ class Callbacks(NamedTuple):
 
     publish: Publish
     """Takes a frame to publish."""
+    skip: Skip
+    """Takes a frame that is not published because frames are late."""
     on_parameters: OnParameters
     """Takes the parameters that the server sends in each handshake."""
     on_connected: Callable[[], None]
@@ -111,6 +113,7 @@ class Supervisor:
             self._stream,
             self._status,
             self._callbacks.publish,
+            self._callbacks.skip,
             lambda halvings: changes.lateness_changed(halvings),  # noqa: PLW0108 - assigned below
             self._callbacks.on_restart,
         )

@@ -33,7 +33,8 @@ class markers_t(object):
 
         self.sequence = 0
         """
-        Grows by one with each message of this key and channel. A gap means loss.
+        Assigned when the frame arrives; grows by one with each message of this key and channel. A gap means loss,
+        wherever it happened.
         LCM Type: int64_t
         """
 

@@ -116,7 +116,7 @@ def test_an_output_of_frames_can_replace_one_of_components() -> None:
     fan_out.publish(FULL, STAMP, ALL)
     fan_out.set_outputs([after])
     fan_out.publish(FULL, STAMP, ALL)
-    assert [sequence for _, _, sequence, _ in after.frames] == [0]
+    assert [sequence for _, _, sequence, _ in after.frames] == [1]
     fan_out.set_outputs([before])
     fan_out.publish(FULL, STAMP, MARKERS)
     assert len(before.messages) == 6

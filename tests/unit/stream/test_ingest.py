@@ -38,12 +38,13 @@ def frame_of(tick: int, *numbered: tuple[ComponentType, int]) -> Frame:
 
 
 class Lab:
-    """An ingest; ``published`` are the frame numbers and component keys that it passed on."""
+    """An ingest; ``published`` and ``skipped`` are the frame numbers and component keys it passed on."""
 
     def __init__(self, backlog: str, *, adapt_rate: bool = True) -> None:
         self.backlog = backlog
         self.status = StreamStatus("3d event", name="lab (3d event)")
         self.published: list[tuple[int, list[str]]] = []
+        self.skipped: list[tuple[int, list[str]]] = []
         self.stamps: list[Stamp] = []
         self.halvings: list[int] = []
         self.restarts = 0
@@ -52,7 +53,13 @@ class Lab:
         )
         source = SourceSettings(name="lab", host="127.0.0.1")
         self.ingest = Ingest(
-            source, stream, self.status, self._publish, self.halvings.append, self._on_restart
+            source,
+            stream,
+            self.status,
+            self._publish,
+            self._skip,
+            self.halvings.append,
+            self._on_restart,
         )
 
     def _on_restart(self) -> None:
@@ -60,9 +67,18 @@ class Lab:
 
     def _publish(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
         self.stamps.append(stamp)
-        keys = [component.type.key for component in frame.components if component.type in wanted]
+        self._add(self.published, frame, wanted)
+
+    def _skip(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> int:
+        assert stamp is self.stamps[-1]
+        return self._add(self.skipped, frame, components)
+
+    @staticmethod
+    def _add(numbers: list[tuple[int, list[str]]], frame: Frame, types: frozenset[ComponentType]) -> int:
+        keys = [component.type.key for component in frame.components if component.type in types]
         if keys:
-            self.published.append((frame.components[0].frame_number, keys))
+            numbers.append((frame.components[0].frame_number, keys))
+        return len(keys)
 
     def receive(self, *frames: Frame, late_us: int = 0) -> None:
         """Receive the frames together, ``late_us`` after the newest was captured."""

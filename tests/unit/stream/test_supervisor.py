@@ -44,6 +44,7 @@ class Lab:
             self.status,
             Callbacks(
                 publish=self._publish,
+                skip=lambda *_: 0,
                 on_parameters=lambda *_: None,
                 on_connected=self._on_connected,
                 on_restart=self._on_restart,

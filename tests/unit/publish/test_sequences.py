@@ -1,0 +1,235 @@
+"""Sequence numbers: assigned when a frame arrives, so that every gap is loss."""
+
+import numpy as np
+import pytest
+
+from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.errors import OutputError
+from gateway.messages.decode import decode
+from gateway.messages.encode import encode_message
+from gateway.messages.stamp import Stamp
+from gateway.publish.fan_out import FanOut
+from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, WIRE_ORDER, ComponentType, encode_component
+from gateway.rtc3d.frames import Frame, encode_frame, split_frame
+from gateway.stream.ingest import Ingest
+from gateway.stream.status import StreamStatus
+from tests.losses import amounts
+from tests.toy_output import ToyOutput
+from tests.unit.publish.test_whole_frames import FrameOutput
+
+MARKERS, TOOLS, EVENT = ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.EVENT
+ALL = frozenset(WIRE_ORDER)
+SKIPPABLE = ALL - {EVENT}
+EVENTS = frozenset({EVENT})
+PERIOD_US = 10_000
+UTIME = 1_700_000_000_000_000
+
+
+def frame(number: int, *types: ComponentType) -> Frame:
+    """Return frame ``number`` at 100 Hz, with one item of each of these types; by default of 3D and 6D."""
+    components = [
+        encode_component(
+            each, number, PERIOD_US * number, np.zeros(1, LONG_EVENT if each is EVENT else ITEM_DTYPES[each])
+        )
+        for each in types or (MARKERS, TOOLS)
+    ]
+    return split_frame(encode_frame(components), "big")
+
+
+def stamp(number: int) -> Stamp:
+    return Stamp(UTIME + PERIOD_US * number, UTIME + PERIOD_US * number, 1, 1)
+
+
+def publish(fan_out: FanOut, *numbers: int) -> None:
+    for number in numbers:
+        fan_out.publish(frame(number), stamp(number), ALL)
+
+
+def skip(fan_out: FanOut, *numbers: int) -> int:
+    return sum(fan_out.skip(frame(number), stamp(number), SKIPPABLE) for number in numbers)
+
+
+def numbered(output: ToyOutput, *path: str) -> list[tuple[int, int]]:
+    """Return (sequence, frame number) of each message of a topic."""
+    messages = [decode(data) for topic, data in output.messages if topic.path == path]
+    return [(message.sequence, message.frame_number) for message in messages]
+
+
+def num_missing(sequences: list[int]) -> int:
+    """Return the sum of the gaps."""
+    return sequences[-1] - sequences[0] + 1 - len(sequences)
+
+
+def test_all_outputs_get_the_same_message_object() -> None:
+    outputs = [ToyOutput("one"), ToyOutput("two")]
+    publish(FanOut("lab", outputs), 1)
+    [first, second] = [[message for _, message in output.messages] for output in outputs]
+    assert len(first) == 2
+    assert all(one is two for one, two in zip(first, second, strict=True))
+
+
+def test_an_output_that_is_added_joins_the_numbers_of_the_others() -> None:
+    one, two = ToyOutput("one"), ToyOutput("two")
+    fan_out = FanOut("lab", [one])
+    publish(fan_out, 1, 2)
+    fan_out.set_outputs([one, two])
+    publish(fan_out, 3)
+    assert numbered(one, "3d") == [(0, 1), (1, 2), (2, 3)]
+    assert numbered(two, "3d") == [(2, 3)]
+
+
+def test_skipped_frames_are_a_gap_on_every_output() -> None:
+    outputs = [ToyOutput("one"), ToyOutput("two")]
+    fan_out = FanOut("lab", outputs)
+    publish(fan_out, 1)
+    assert skip(fan_out, 2, 3) == 4
+    publish(fan_out, 4)
+    for output in outputs:
+        assert numbered(output, "3d") == numbered(output, "6d") == [(0, 1), (3, 4)]
+        assert output.messages[-1][1] == encode_message(frame(4).components[1], stamp(4), 3)
+
+
+def test_only_the_skipped_components_are_a_gap() -> None:
+    output = ToyOutput()
+    fan_out = FanOut("lab", [output])
+    both = frame(1, MARKERS, EVENT)
+    for _ in range(2):
+        fan_out.publish(both, stamp(1), EVENTS)
+        assert fan_out.skip(both, stamp(1), SKIPPABLE) == 1
+    fan_out.publish(both, stamp(1), ALL)
+    assert [sequence for sequence, _ in numbered(output, "event")] == [0, 1, 2]
+    assert [sequence for sequence, _ in numbered(output, "3d")] == [2]
+
+
+def test_skipping_a_frame_without_these_components_loses_nothing() -> None:
+    output = ToyOutput()
+    fan_out = FanOut("lab", [output])
+    assert fan_out.skip(frame(1, EVENT), stamp(1), SKIPPABLE) == 0
+    publish(fan_out, 2)
+    assert numbered(output, "3d") == [(0, 2)]
+
+
+def test_what_pacing_leaves_out_is_no_gap_and_what_is_skipped_beyond_that_is_one() -> None:
+    paced = ToyOutput("paced")
+    paced.max_rate_hz = {MARKERS: 50.0, TOOLS: 50.0}
+    fan_out = FanOut("lab", [paced])
+    publish(fan_out, *range(10))
+    assert skip(fan_out, *range(10, 20)) == 10  # of ten frames with two components, five were due
+    publish(fan_out, *range(20, 24))
+    expected = [(0, 0), (1, 2), (2, 4), (3, 6), (4, 8), (10, 20), (11, 22)]
+    assert numbered(paced, "3d") == numbered(paced, "6d") == expected
+
+
+def test_a_skipped_message_is_lost_if_one_output_would_have_got_it() -> None:
+    paced, unpaced = ToyOutput("paced"), ToyOutput("unpaced")
+    paced.max_rate_hz = {MARKERS: 0.001, TOOLS: 0.001}
+    fan_out = FanOut("lab", [paced])
+    publish(fan_out, 1)
+    assert skip(fan_out, 2) == 0
+    fan_out.set_outputs([paced, unpaced])
+    assert skip(fan_out, 3) == 2
+
+
+def test_paced_and_unpaced_routes_to_replaced_outputs_never_go_back() -> None:
+    unpaced, paced, again = ToyOutput(), ToyOutput(), ToyOutput()
+    paced.max_rate_hz = {MARKERS: 50.0}
+    sequences: list[int] = []
+    fan_out = FanOut("lab", [unpaced])
+    for first, output in ((0, unpaced), (10, paced), (20, again), (30, paced), (40, unpaced)):
+        output.messages.clear()
+        fan_out.set_outputs([output])
+        publish(fan_out, *range(first, first + 10))
+        sequences += [sequence for sequence, _ in numbered(output, "3d")]
+    assert sequences == [*range(10), *range(10, 15), *range(20, 30), *range(30, 35), *range(40, 50)]
+
+
+def test_a_paced_route_that_is_replaced_by_a_paced_one_continues_its_numbers() -> None:
+    before, after = ToyOutput(), ToyOutput()
+    before.max_rate_hz = after.max_rate_hz = {MARKERS: 50.0}
+    fan_out = FanOut("lab", [before])
+    publish(fan_out, *range(10))
+    fan_out.set_outputs([after])
+    publish(fan_out, 10)
+    assert numbered(after, "3d") == [(5, 10)]
+
+
+def test_a_refused_message_is_a_gap_only_on_the_output_that_refused_it() -> None:
+    refusing, accepting = ToyOutput("refusing"), ToyOutput("accepting")
+    fan_out = FanOut("lab", [refusing, accepting])
+    for number, error in ((1, None), (2, OutputError("no router", cause="no router")), (3, None)):
+        refusing.error = error
+        publish(fan_out, number)
+    assert numbered(refusing, "3d") == [(0, 1), (2, 3)]
+    assert numbered(accepting, "3d") == [(0, 1), (1, 2), (2, 3)]
+
+
+def test_whole_frames_have_one_number_each_and_skipped_ones_are_a_gap() -> None:
+    output = FrameOutput()
+    fan_out = FanOut("lab", [output])
+    publish(fan_out, 1)
+    assert skip(fan_out, 2) == 2
+    publish(fan_out, 3)
+    assert [sequence for _, _, sequence, _ in output.frames] == [0, 2]
+
+
+def test_a_frame_without_wanted_components_has_no_number() -> None:
+    output = FrameOutput()
+    fan_out = FanOut("lab", [output])
+    fan_out.publish(frame(1), stamp(1), EVENTS)
+    publish(fan_out, 2)
+    assert [sequence for _, _, sequence, _ in output.frames] == [0]
+
+
+def test_poses_without_a_subscriber_are_no_gap_and_skipped_ones_are() -> None:
+    output = ToyOutput("toy", "tool 1", has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
+    publish(fan_out, 1)
+    output.wanted = set()
+    publish(fan_out, 2)
+    skip(fan_out, 3)
+    output.wanted = {"tool 1"}
+    publish(fan_out, 4)
+    skip(fan_out, 5, 6)
+    publish(fan_out, 7)
+    assert numbered(output, "6d", "tool 1") == [(0, 1), (1, 4), (4, 7)]
+
+
+@pytest.mark.parametrize("rate_hz", [None, 40.0])
+def test_missing_frames_are_the_gaps_and_the_count_of_skipped_messages(rate_hz: float | None) -> None:
+    """Frames arrive in batches, some late: with ``backlog: latest``, all but the newest are skipped."""
+    whole, paced = ToyOutput("whole", "tool 1", has_tool_poses=True), ToyOutput("paced")
+    paced.max_rate_hz = {} if rate_hz is None else {MARKERS: rate_hz, TOOLS: rate_hz}
+    fan_out = FanOut("lab", [whole, paced])
+    status = StreamStatus("all", name="lab (all)")
+    ingest = Ingest(
+        SourceSettings(name="lab", host="192.0.2.20"),
+        StreamSettings(backlog="latest"),
+        status,
+        fan_out.publish,
+        fan_out.skip,
+        lambda _halvings: None,
+        lambda: None,
+    )
+    number = 0
+    for batch in range(200):
+        late_us = 150_000 if 60 <= batch < 160 and batch % 4 else 0
+        frames = [frame(number + index) for index in range(1 + 5 * (batch % 3))]
+        if batch % 7 == 0:
+            frames[0] = frame(number, MARKERS, TOOLS, EVENT)
+        number += len(frames)
+        utime = UTIME + PERIOD_US * (number - 1) + late_us
+        ingest.receive(frames, utime, (utime - UTIME) / 1e6)
+
+    (lost_messages, skipped_frames) = amounts(status.losses.report())["skipped while behind"]
+    assert lost_messages == 3 * skipped_frames > 100  # 3D, 6D and one pose
+    for path in (("3d",), ("6d",), ("6d", "tool 1")):
+        published = numbered(whole, *path)
+        assert published[0] == (0, 0)
+        assert (
+            number - len(published) == num_missing([sequence for sequence, _ in published]) == skipped_frames
+        )
+    events = numbered(whole, "event")
+    assert [sequence for sequence, _ in events] == list(range(len(events)))
+    assert len(events) == 29
+    gaps = num_missing([sequence for sequence, _ in numbered(paced, "3d")])
+    assert gaps == skipped_frames if rate_hz is None else 0 < gaps < skipped_frames
