@@ -1,46 +1,110 @@
-"""The health check: every stream receives frames and every output is connected."""
+"""The health check: every stream receives frames, every output is connected, and nothing is lost."""
 
 import json
+from collections.abc import Iterator, Sequence
 from http import HTTPStatus
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from gateway.config.settings import StreamSettings
 from gateway.gateway import Gateway
+from gateway.losses import Loss, last_minute_text
 from gateway.monitoring.http_pages import Page
 from gateway.outputs.contract import Output
 from gateway.rtc3d.components import ComponentType
 from gateway.source import Source
 from gateway.stream.running_time import running_clock
 from gateway.stream.state import StreamState
-from gateway.stream.status import StreamStatus
+from gateway.stream.status import FRAME_REJECTED, StreamStatus
 
 _ONLY_EVENTS: Final = {ComponentType.EVENT}
 
 
+class _Route(NamedTuple):
+    """What was lost of a source: in one stream, before any output, or on one output."""
+
+    source: str
+    stream: str | None
+    output: str | None
+    losses: Sequence[Loss]
+
+    @property
+    def name(self) -> str:
+        """The name in texts: "lab (3d 6d)" or "lab to zenoh"."""
+        return f"{self.source} to {self.output}" if self.output else f"{self.source} ({self.stream})"
+
+
 def health_page(gateway: Gateway) -> Page:
-    """Return the page /healthz: JSON with status 200, or 503 if a stream or an output has a problem."""
+    """Return the page /healthz: JSON with status 200, or 503 if a stream or an output has a problem.
+
+    If something was lost in the last minute, the gateway is degraded, which is still 200.
+    """
     now_s = running_clock().time()  # a stop of this process does not make the newest frames older
     streams = [
-        _stream_health(source, stream, status, now_s)
+        _stream_health(source, stream, status, rate_hz, now_s)
         for source in gateway.sources
-        for stream, status in zip(source.settings.streams, source.statuses, strict=True)
+        for stream, (status, rate_hz) in zip(source.settings.streams, source.streams, strict=True)
     ]
     outputs = [_output_health(output) for output in gateway.outputs]
-    healthy = not any(each["problem"] for each in (*streams, *outputs))
-    body = {"healthy": healthy, "streams": streams, "outputs": outputs}
-    status = HTTPStatus.OK if healthy else HTTPStatus.SERVICE_UNAVAILABLE
+    problems = [
+        *(f"{each['source']} ({each['stream']}): {each['problem']}" for each in streams if each["problem"]),
+        *(f"{each['output']}: {each['problem']}" for each in outputs if each["problem"]),
+    ]
+    routes = list(_losses(gateway))
+    losses = [f"{route.name}: {text}" for route in routes if (text := last_minute_text(route.losses))]
+    body = {
+        "status": "unhealthy" if problems else "degraded" if losses else "healthy",
+        "healthy": not problems,
+        "reasons": [*problems, *losses],
+        "streams": streams,
+        "outputs": outputs,
+        "losses": [loss for route in routes for loss in _losses_json(route)],
+    }
+    status = HTTPStatus.SERVICE_UNAVAILABLE if problems else HTTPStatus.OK
     return Page(status, "application/json", json.dumps(body, ensure_ascii=False, indent=2).encode() + b"\n")
 
 
+def unusable_frames(status: StreamStatus, max_age_s: float) -> str:
+    """Return why nothing is published although frames come; "" if frames are usable, or none come.
+
+    ``max_age_s`` is how long this must last, or how old the newest frame may be.
+    """
+    rejected = next((loss for loss in status.losses.report() if loss.cause == FRAME_REJECTED), None)
+    if rejected is not None and rejected.age_s < max_age_s and not _is_recent(status.last_frame_s, max_age_s):
+        reason = rejected.text.removeprefix(f"{FRAME_REJECTED}: ")
+        return f"frames come, and all are rejected: {reason}"
+    if (
+        status.unwanted_components
+        and status.components != ComponentType.EVENT.key  # events are sporadic
+        and _is_recent(status.last_frame_s, max_age_s)
+        and not _is_recent(status.unwanted_since_s, max_age_s)
+    ):
+        return (
+            f"frames come, and none has a component of this stream ({status.components}); the newest has "
+            f"{status.unwanted_components}: check the server's real-time output, and sources.streams"
+        )
+    return ""
+
+
+def _is_recent(time_s: float | None, max_age_s: float) -> bool:
+    """Return whether a time on the running clock is at most ``max_age_s`` ago."""
+    return time_s is not None and running_clock().time() - time_s <= max_age_s
+
+
 def _stream_health(
-    source: Source, stream: StreamSettings, status: StreamStatus, now_s: float
+    source: Source, stream: StreamSettings, status: StreamStatus, rate_hz: float, now_s: float
 ) -> dict[str, Any]:
     age_s = None if status.last_frame_s is None else now_s - status.last_frame_s
     return {
         "source": source.name,
         "stream": status.components,
+        "server": f"{source.settings.host}:{source.settings.port}",
         "state": status.state.value,
+        "session": status.session,
+        "frames": status.frames_in,
+        "frame_rate_hz": round(rate_hz, 3),
+        "lag_s": round(status.lag_s, 6),
         "last_frame_age_s": age_s,
+        "limitations": list(status.limitations),
         "problem": _stream_problem(source, stream, status, age_s),
     }
 
@@ -50,22 +114,45 @@ def _output_health(output: Output) -> dict[str, str]:
     return {"output": output.name, "problem": "" if health.connected else health.problem}
 
 
+def _losses(gateway: Gateway) -> Iterator[_Route]:
+    """Yield what each stream lost before any output, and what each source lost on each output."""
+    for source in gateway.sources:
+        for status in source.statuses:
+            yield _Route(source.name, status.components, None, status.losses.report())
+        for output, output_status in source.fan_out.outputs:
+            yield _Route(source.name, None, output.name, output_status.losses)
+
+
+def _losses_json(route: _Route) -> list[dict[str, Any]]:
+    names = {"source": route.source, "stream": route.stream, "output": route.output}
+    return [names | loss._asdict() | {"age_s": round(loss.age_s, 1)} for loss in route.losses]
+
+
 def _stream_problem(source: Source, stream: StreamSettings, status: StreamStatus, age_s: float | None) -> str:
     """Return what is wrong with a stream and what to check; "" if frames arrive or none are needed."""
     max_age_s = source.settings.stall_timeout_s
+    only_events = set(stream.components) == _ONLY_EVENTS  # events are sporadic
+    problem = unusable_frames(status, max_age_s)
+    if problem:
+        return problem
     if age_s is not None and age_s < max_age_s:
         return ""
     silence = "no frame so far" if age_s is None else f"no frame for {age_s:.1f} s (limit {max_age_s:g} s)"
-    match status.state:
-        case StreamState.NO_MEASUREMENT:
-            return ""
-        case StreamState.IDLE | StreamState.STREAMING if set(stream.components) == _ONLY_EVENTS:
-            return ""  # events are sporadic
-        case StreamState.IDLE if stream.on_demand and not source.fan_out.has_subscribers(stream.components):
-            return ""
-        case StreamState.IDLE:
-            return (
-                f"{silence}: {source.settings.host} is connected but sends nothing; is a measurement running?"
-            )
+    if _needs_no_frames(source, stream, status.state, only_events):
+        return ""
+    if status.state is StreamState.IDLE:
+        return f"{silence}: {source.settings.host} is connected but sends nothing; is a measurement running?"
     reason = status.last_error or f"connecting to {source.settings.host}:{source.settings.port}"
     return f"{silence}: {reason}"
+
+
+def _needs_no_frames(source: Source, stream: StreamSettings, state: StreamState, only_events: bool) -> bool:
+    match state:
+        case StreamState.NO_MEASUREMENT:
+            return True
+        case StreamState.IDLE | StreamState.STREAMING if only_events:
+            return True
+        case StreamState.IDLE:
+            return stream.on_demand and not source.fan_out.has_subscribers(stream.components)
+        case _:
+            return False

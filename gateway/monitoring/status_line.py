@@ -4,17 +4,25 @@ from collections.abc import Iterable, Sequence
 
 from gateway.config.settings import SourceSettings
 from gateway.gateway import Gateway
+from gateway.losses import Loss, last_minute_text
+from gateway.monitoring.health import unusable_frames
 from gateway.outputs.status import OutputHealth
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 
 
 def status_lines(gateway: Gateway) -> list[str]:
-    """Return a text for each source, and for each output that cannot send."""
+    """Return a text for each source, for each output that cannot send, and for what an output loses."""
     outputs = ((output.name, output.health()) for output in gateway.outputs)
+    losses = (
+        (f"{source.name} to {output.name}", status.losses)
+        for source in gateway.sources
+        for output, status in source.fan_out.outputs
+    )
     return [
         *(source_line(source.settings, source.streams) for source in gateway.sources),
         *output_lines(outputs),
+        *loss_lines(losses),
     ]
 
 
@@ -25,7 +33,10 @@ def source_line(source: SourceSettings, streams: Sequence[tuple[StreamStatus, fl
     stream precede its text.
     """
     server = f"{source.host}:{source.port}"
-    texts = [_stream_text(server, status, rate_hz) for status, rate_hz in streams]
+    texts = []
+    for status, rate_hz in streams:
+        text = unusable_frames(status, source.stall_timeout_s) or _stream_text(server, status, rate_hz)
+        texts.append(", ".join(filter(None, (text, last_minute_text(status.losses.report())))))
     if len(set(texts)) == 1:
         return f"{source.name}: {texts[0]}"
     named = (f"{status.components} {text}" for (status, _), text in zip(streams, texts, strict=True))
@@ -35,6 +46,14 @@ def source_line(source: SourceSettings, streams: Sequence[tuple[StreamStatus, fl
 def output_lines(outputs: Iterable[tuple[str, OutputHealth]]) -> list[str]:
     """Return a text for each output that cannot send; ``outputs`` are pairs of a name and its health."""
     return [f"{name}: {health.problem}" for name, health in outputs if not health.connected]
+
+
+def loss_lines(losses: Iterable[tuple[str, Sequence[Loss]]]) -> list[str]:
+    """Return a text for each output that lost something in the last minute.
+
+    ``losses`` are pairs of the route, such as "lab to zenoh", and what was lost on it.
+    """
+    return [f"{route}: {text}" for route, lost in losses if (text := last_minute_text(lost))]
 
 
 def _stream_text(server: str, status: StreamStatus, rate_hz: float) -> str:

@@ -79,13 +79,13 @@ class Ingest:
                     status.frame_skipped(num_lost)
             else:
                 self._publish(frame, stamp, self._wanted)
-        status.components_received("" if has_wanted else self._unwanted, utime)
+        status.components_received("" if has_wanted else self._unwanted)
 
     def _set_layout(self, layout: FrameLayout) -> None:
         types = [component.type for component in layout.components]
         self._layout = layout
         if self._wanted.isdisjoint(types):
-            self._unwanted = " ".join(each.key for each in types) or "no components"
+            self._unwanted = " ".join(each.key for each in types) or "nothing"
         else:
             self._unwanted = ""
 

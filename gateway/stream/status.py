@@ -50,8 +50,8 @@ class StreamStatus:
     counts how often the server's time or frame numbers started again within a connection. ``losses`` counts
     by cause what arrived and was not published. ``limitations`` lists what the current connection lacks.
 
-    ``last_wanted_utime`` is when the newest frame with a component of this stream arrived, and
-    ``unwanted_components`` what the newest frame had if it had none of them.
+    ``unwanted_components`` are the components of the newest frame if it had none of this stream's;
+    ``unwanted_since_s`` is since when all frames were like that, on the running clock.
     """
 
     components: str
@@ -71,8 +71,8 @@ class StreamStatus:
     restarts: int = 0
     lag_s: float = 0.0
     clock: ServerClock = field(default_factory=ServerClock)
-    last_wanted_utime: int = 0
     unwanted_components: str = ""
+    unwanted_since_s: float = 0.0
     losses: Losses = field(init=False)
     limitations: list[str] = field(default_factory=list)
     last_error: str = ""
@@ -132,14 +132,14 @@ class StreamStatus:
         self.frames_in += count
         self.last_frame_utime = utime
 
-    def components_received(self, unwanted: str, utime: int) -> None:
-        """Note whether frames that arrived at ``utime`` had a component of this stream.
+    def components_received(self, unwanted: str) -> None:
+        """Note whether the frames of one read had a component of this stream.
 
         If not, ``unwanted`` are the components of the newest one.
         """
+        if unwanted and not self.unwanted_components:
+            self.unwanted_since_s = self.last_frame_s or 0.0
         self.unwanted_components = unwanted
-        if not unwanted:
-            self.last_wanted_utime = utime
 
     def frames_read(self, now_s: float) -> None:
         """Note that frames were read from the socket at ``now_s`` on the running clock."""

@@ -1,9 +1,15 @@
+import logging
+
 import pytest
 import rtc3d
 
+from gateway.losses import Losses
 from gateway.messages.decode import decode
 from gateway.messages.summary import summarise
+from gateway.outputs.status import OutputHealth, OutputStatus
+from gateway.publish.status_messages import status_message
 from gateway.stream.state import StreamState
+from gateway.stream.status import StreamStatus
 from tests.unit.messages.samples import component_message, status_of, tool_pose_messages, unknown_clock
 from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS
 
@@ -58,6 +64,27 @@ from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS
 )
 def test_a_summary_shows_what_matters_first(message: bytes, line: str) -> None:
     assert summarise(decode(message)) == line
+
+
+def test_the_summary_of_a_status_says_what_was_lost_and_why() -> None:
+    status = StreamStatus("3d 6d")
+    for _ in range(436):
+        status.frame_skipped(2)
+    status.file_lost("the disk is full")
+    losses = Losses(logging.getLogger("tests"), "lab to zenoh")
+    losses.lost("no router", "start it", messages=5, frames=1)
+    message = status_message(
+        source="lab",
+        server="192.0.2.20:3020",
+        sequence=17,
+        streams=[(status, 0.0)],
+        outputs=[(OutputStatus("zenoh", losses=losses.report()), OutputHealth(True))],
+    )
+    assert summarise(decode(message.encode())) == (
+        "#17 lab at 192.0.2.20:3020: [3d 6d] waiting to reconnect 0.0 Hz, 0 frames, 0 reconnects, "
+        "lost 1 message (C3D file), 872 messages of 436 frames (skipped while behind); "
+        "outputs: zenoh ok, lost 5 messages of 1 frame (no router)"
+    )
 
 
 def test_a_summary_without_visible_markers_has_no_position() -> None:

@@ -1,13 +1,16 @@
 """/healthz for streams and outputs in every state."""
 
 import json
+import logging
 from typing import Any
 
 import pytest
 
 from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
 from gateway.gateway import Gateway
+from gateway.losses import Losses
 from gateway.monitoring.health import health_page
+from gateway.monitoring.status_line import status_lines
 from gateway.outputs.memory import MemoryOutput
 from gateway.rtc3d.components import ComponentType
 from gateway.stream.running_time import running_clock
@@ -41,6 +44,11 @@ class Lab:
         page = health_page(self.gateway)
         assert page.content_type == "application/json"
         return page.status, json.loads(page.body)
+
+    def line(self) -> str:
+        """Return the status line of the source."""
+        [line, *_] = status_lines(self.gateway)
+        return line
 
     def problem(self) -> str:
         """Return the problem of the only stream, and check that the HTTP status matches it."""
@@ -140,3 +148,110 @@ async def test_an_output_that_cannot_send_is_listed_with_its_problem() -> None:
     assert status == 503
     assert body["healthy"] is False
     assert body["outputs"] == [{"output": "memory", "problem": lab.output.health().problem}]
+
+
+# Loss ----------------------------------------------------------------------------------------
+
+
+async def test_loss_in_the_last_minute_degrades_the_gateway_which_is_still_200() -> None:
+    lab = Lab(StreamSettings(components=MARKERS))
+    set_state(lab.statuses[0], StreamState.STREAMING, 0.01)
+    status, body = lab.health()
+    assert (status, body["status"], body["reasons"], body["losses"]) == (200, "healthy", [], [])
+    for _ in range(436):
+        lab.statuses[0].frame_skipped(2)
+    lab.output.close()
+    lab.gateway.sources[0].fan_out.publish_status(b"status")
+    lab.output.start()
+    status, body = lab.health()
+    assert (status, body["status"], body["healthy"]) == (200, "degraded", True)
+    assert body["reasons"] == [
+        "lab (3d): lost in the last minute: 872 messages of 436 frames (skipped while behind)",
+        "lab to memory: lost in the last minute: 1 message (not open)",
+    ]
+    skipped, unsent = body["losses"]
+    assert skipped == {
+        "source": "lab",
+        "stream": "3d",
+        "output": None,
+        "cause": "skipped while behind",
+        "messages": 872,
+        "frames": 436,
+        "messages_last_minute": 872,
+        "frames_last_minute": 436,
+        "age_s": skipped["age_s"],
+        "text": "frames arrive late and are skipped, except for the newest one (backlog: latest)",
+    }
+    assert (unsent["source"], unsent["stream"], unsent["output"]) == ("lab", None, "memory")
+    assert (unsent["cause"], unsent["messages"], unsent["frames"]) == ("not open", 1, 0)
+
+
+async def test_older_loss_is_in_the_totals_but_does_not_degrade() -> None:
+    lab = Lab(StreamSettings(components=MARKERS))
+    set_state(lab.statuses[0], StreamState.STREAMING, 0.01)
+    now_s = 1000.0
+    lab.statuses[0].losses = Losses(logging.getLogger("tests"), "lab", lambda: now_s)
+    lab.statuses[0].frame_skipped(1)
+    now_s += 61
+    status, body = lab.health()
+    assert (status, body["status"], body["reasons"]) == (200, "healthy", [])
+    [loss] = body["losses"]
+    assert (loss["frames"], loss["frames_last_minute"], loss["age_s"]) == (1, 0, 61.0)
+
+
+async def test_a_problem_is_unhealthy_even_if_something_is_lost_and_comes_first() -> None:
+    lab = Lab(StreamSettings(components=MARKERS))
+    set_state(lab.statuses[0], StreamState.WAITING, None)
+    lab.statuses[0].frame_skipped(1)
+    status, body = lab.health()
+    assert (status, body["status"], body["healthy"]) == (503, "unhealthy", False)
+    assert [reason.partition(": ")[2][:8] for reason in body["reasons"]] == ["no frame", "lost in "]
+
+
+@pytest.mark.parametrize("age_s", [None, STALL_TIMEOUT_S + 1])
+async def test_frames_that_are_all_rejected_are_named(age_s: float | None) -> None:
+    lab = Lab(StreamSettings(components=MARKERS))
+    set_state(lab.statuses[0], StreamState.IDLE, age_s)
+    lab.statuses[0].frame_rejected("3d component of 40 bytes announces 4 items", 1)
+    text = "frames come, and all are rejected: 3d component of 40 bytes announces 4 items"
+    assert lab.problem() == text
+    assert lab.line().startswith(f"lab: {text}, lost in the last minute: 1 message of 1 frame")
+
+
+async def test_a_frame_that_is_rejected_among_others_is_only_loss() -> None:
+    lab = Lab(StreamSettings(components=MARKERS))
+    set_state(lab.statuses[0], StreamState.STREAMING, 0.01)
+    lab.statuses[0].frame_rejected("too short", 1)
+    assert lab.problem() == ""
+    assert lab.line() == (
+        "lab: streaming 0.0 Hz, lost in the last minute: 1 message of 1 frame (frame rejected)"
+    )
+
+
+@pytest.mark.parametrize(
+    ("since_s", "is_problem"), [(STALL_TIMEOUT_S - 1, False), (STALL_TIMEOUT_S + 1, True)]
+)
+async def test_frames_without_a_component_of_the_stream_are_named(since_s: float, is_problem: bool) -> None:
+    lab = Lab(StreamSettings(components=MARKERS))
+    [status] = lab.statuses
+    set_state(status, StreamState.STREAMING, since_s)
+    status.components_received("6d analog")
+    set_state(status, StreamState.STREAMING, 0.01)
+    status.components_received("6d analog")
+    text = (
+        "frames come, and none has a component of this stream (3d); the newest has 6d analog: "
+        "check the server's real-time output, and sources.streams"
+    )
+    assert lab.problem() == (text if is_problem else "")
+    assert lab.line() == f"lab: {text if is_problem else 'streaming 0.0 Hz'}"
+    status.components_received("")
+    assert lab.problem() == ""
+
+
+async def test_a_stream_of_events_needs_none_in_its_frames() -> None:
+    lab = Lab(StreamSettings(components=EVENT))
+    set_state(lab.statuses[0], StreamState.STREAMING, 41.5)
+    lab.statuses[0].components_received("3d")
+    set_state(lab.statuses[0], StreamState.STREAMING, 0.01)
+    assert lab.problem() == ""
+    assert lab.line() == "lab: streaming 0.0 Hz"

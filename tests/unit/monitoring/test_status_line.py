@@ -1,9 +1,12 @@
 """The texts of the status line for sources, streams and outputs with a problem."""
 
+import logging
+
 import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.monitoring.status_line import output_lines, source_line
+from gateway.losses import Losses
+from gateway.monitoring.status_line import loss_lines, output_lines, source_line
 from gateway.outputs.status import OutputHealth
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.protocol_state import ProtocolState
@@ -54,6 +57,23 @@ def test_streams_with_different_texts_are_listed_by_components() -> None:
 def test_only_outputs_that_cannot_send_have_a_line() -> None:
     health = {"zenoh": OutputHealth(False, "no router"), "lcm": OutputHealth(True)}
     assert output_lines(health.items()) == ["zenoh: no router"]
+
+
+def test_what_a_stream_lost_in_the_last_minute_follows_its_state() -> None:
+    status = StreamStatus("3d 6d", state=StreamState.STREAMING)
+    for _ in range(436):
+        status.frame_skipped(2)
+    assert source_line(LAB, [(status, 200.0)]) == (
+        "lab: streaming 200.0 Hz, lost in the last minute: 872 messages of 436 frames (skipped while behind)"
+    )
+
+
+def test_only_outputs_that_lose_something_have_a_line() -> None:
+    losses = Losses(logging.getLogger("tests"), "lab to zenoh")
+    losses.lost("no router", "start it", messages=5)
+    assert loss_lines({"lab to zenoh": losses.report(), "lab to lcm": []}.items()) == [
+        "lab to zenoh: lost in the last minute: 5 messages of 1 frame (no router)"
+    ]
 
 
 def test_tries_are_counted_since_the_last_handshake() -> None:
