@@ -15,6 +15,8 @@
     │   ├── ConnectError          it could not be opened
     │   ├── ReplyTimeoutError     a command was not answered in time
     │   ├── SilenceError          nothing arrived although something should have
+    │   ├── RequestError          the server accepts no request for frames
+    │   ├── DefectError           a defect in this program ended it
     │   └── ClosedError           it was closed by the server, by the gateway, or by the network
     ├── OutputError               an output did not open or did not accept a message
     ├── SpoolError                a C3D file from a server could not be stored
@@ -87,6 +89,24 @@ class ReplyTimeoutError(LinkError):
 
 class SilenceError(LinkError):
     """Nothing arrived from the server although something should have."""
+
+
+class RequestError(LinkError):
+    """The server accepts no request for frames."""
+
+
+class DefectError(LinkError):
+    """A defect in this program ended the connection; ``__cause__`` is the exception."""
+
+    @staticmethod
+    def of(defect: Exception) -> "DefectError":
+        """Return the error for an exception that nobody expected."""
+        error = DefectError(
+            f"defect in the gateway: {type(defect).__name__}: {defect}; connecting again; "
+            "report this with the log"
+        )
+        error.__cause__ = defect
+        return error
 
 
 class ClosedError(LinkError):

@@ -85,3 +85,31 @@ class FailureLog:
             self.recovered(text)
         else:
             self._logger.info("%s: %s", self._subject, text)
+
+
+class DefectLog:
+    """Logs each defect in this program once as ERROR, with its traceback, and repeats as DEBUG."""
+
+    def __init__(self, logger: logging.Logger, subject: str) -> None:
+        self._logger = logger
+        self._subject = subject
+        self._places: set[tuple[str, str, int]] = set()  # of defects, in the source code: there are few
+
+    def log(self, defect: BaseException) -> None:
+        """Log a defect. One that is raised at the same place as an earlier one is a repeat."""
+        place = _place(defect.__cause__ or defect)
+        if place in self._places:
+            self._logger.debug("%s: %s (again)", self._subject, defect)
+            return
+        self._places.add(place)
+        self._logger.error("%s: %s", self._subject, defect, exc_info=defect)
+
+
+def _place(error: BaseException) -> tuple[str, str, int]:
+    """Return the type of an exception, and the file and line that raised it."""
+    trace = error.__traceback__
+    if trace is None:
+        return type(error).__name__, "", 0
+    while trace.tb_next is not None:
+        trace = trace.tb_next
+    return type(error).__name__, trace.tb_frame.f_code.co_filename, trace.tb_lineno

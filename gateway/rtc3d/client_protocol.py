@@ -27,7 +27,7 @@ from gateway.rtc3d.packets import (
     encode_packet,
 )
 from gateway.rtc3d.protocol_state import ProtocolInput, ProtocolState, next_state
-from gateway.rtc3d.reply_matcher import ANSWERING_TYPES, ReplyMatcher
+from gateway.rtc3d.reply_matcher import Match, ReplyMatcher
 
 _MAX_ERROR_BYTES: Final = 300  # of a server's error text, which goes into logs and status messages
 _UNUSED_PARAMETER: Final = -1  # of an event (§7.7)
@@ -45,6 +45,16 @@ class Refused(NamedTuple):
 
     command: Command
     error: ServerError
+
+
+class PossibleReply(NamedTuple):
+    """A text that answers ``command``, or an earlier command that was not answered in time.
+
+    Call ``ClientProtocol.assume_reply`` if no other reply follows soon: the server has ignored the earlier
+    commands then (field note 20). A server that only was slow sends its replies one after the other.
+    """
+
+    command: Command
 
 
 class FrameRejected(NamedTuple):
@@ -82,7 +92,14 @@ class StreamCorrupted(NamedTuple):
 
 
 ProtocolEvent = (
-    Answered | Refused | FrameRejected | FileReceived | UnexpectedPacket | ByteOrderMismatch | StreamCorrupted
+    Answered
+    | Refused
+    | PossibleReply
+    | FrameRejected
+    | FileReceived
+    | UnexpectedPacket
+    | ByteOrderMismatch
+    | StreamCorrupted
 )
 
 
@@ -129,8 +146,6 @@ class ClientProtocol:
             raise LinkError(f"{command} not sent: {self.pending_command} has not been answered yet")
         elif isinstance(command, StreamFrames):
             self._apply(ProtocolInput.REQUEST_SENT)
-        elif isinstance(command, StopStreaming):
-            self._apply(ProtocolInput.STOP_SENT)
         self._replies.pending = command
         self._outgoing += encode_packet(PacketType.COMMAND, encode_command(command))
 
@@ -147,7 +162,17 @@ class ClientProtocol:
 
     def give_up(self) -> None:
         """Stop waiting for the pending command. A late reply to it answers no command."""
+        if isinstance(self.pending_command, StopStreaming):
+            self._apply(ProtocolInput.STOP_UNANSWERED)
         self._replies.give_up()
+
+    def assume_reply(self) -> list[ProtocolEvent]:
+        """Take the newest PossibleReply as the reply to the pending command; return the event, if any."""
+        events: list[ProtocolEvent] = []
+        packet = self._replies.possible
+        if packet is not None:
+            self._on_reply(packet, events)
+        return events
 
     def bytes_to_send(self) -> bytes:
         """Return the bytes to write to the server since the last call."""
@@ -243,20 +268,32 @@ class ClientProtocol:
                 events.append(UnexpectedPacket(packet))
 
     def _on_text(self, packet: Packet, events: list[ProtocolEvent]) -> None:
-        command = self._replies.match_text(packet)
-        if command is None:
+        match = self._replies.match_text(packet)
+        pending = self._replies.pending
+        if pending is None or match is Match.NO:
             events.append(UnexpectedPacket(packet))
-        elif packet.type == PacketType.ERROR:
-            self._replies.finish_by_reply()
+        elif match is Match.MAYBE:
+            events.append(PossibleReply(pending))
+        else:
+            self._on_reply(packet, events)
+
+    def _on_reply(self, packet: Packet, events: list[ProtocolEvent]) -> None:
+        """Process a text that answers the pending command."""
+        command = self._replies.pending
+        if command is None:
+            return
+        self._replies.finish_by_reply()
+        if packet.type == PacketType.ERROR:
             if isinstance(command, StreamFrames):
                 self._apply(ProtocolInput.REQUEST_REFUSED)
             text = decode_text(packet.body[:_MAX_ERROR_BYTES]) or "no reason given"
             events.append(Refused(command, ServerError(text)))
-        elif PacketType.COMMAND in ANSWERING_TYPES[type(command)]:
-            self._replies.finish_by_reply()
-            if isinstance(command, SetByteOrder):
-                self._agreed_byte_order = command.byte_order
-            events.append(Answered(command, packet))
+            return
+        if isinstance(command, SetByteOrder):
+            self._agreed_byte_order = command.byte_order
+        elif isinstance(command, StopStreaming):
+            self._apply(ProtocolInput.STOP_ACCEPTED)
+        events.append(Answered(command, packet))
 
     def _on_xml(self, packet: Packet, events: list[ProtocolEvent]) -> None:
         command = self._replies.match_xml(packet)
@@ -267,8 +304,9 @@ class ClientProtocol:
             events.append(Answered(command, packet))
 
     def _on_no_data(self, packet: Packet, events: list[ProtocolEvent]) -> None:
-        self._apply(ProtocolInput.NO_DATA_RECEIVED)
         pending = self._replies.pending
+        if not isinstance(pending, SendCurrentFrame) or self.state is not ProtocolState.IDLE:
+            self._apply(ProtocolInput.NO_DATA_RECEIVED)
         if isinstance(pending, StreamFrames | SendCurrentFrame):
             self._replies.finish_by_data()
             events.append(Answered(pending, packet))

@@ -5,14 +5,17 @@ and the matcher remembers earlier commands whose replies may still arrive. The r
 
 - Only a packet of the right type answers a command: see ``ANSWERING_TYPES``. An acknowledgement that
   precedes XML or a frame (field note 3) is ignored.
-- A text that names another command than the pending one is a duplicate or late reply and answers no
-  command. A text that names no command replies to the oldest command whose reply is outstanding.
+- A text that names a command, with its parameters or without, replies to that command, or it is a duplicate.
+- A text that names none may be the late reply to the oldest command whose reply is outstanding, or it
+  answers the pending command, and the server has ignored the earlier ones (field note 20). It counts as the
+  late reply first. If no further reply comes soon, ``assume`` gives it to the pending command.
 - After the client gives up on a command, its reply stays outstanding until a later command has been
   answered, because servers answer in order.
 """
 
 import re
 from collections import deque
+from enum import Enum
 from typing import Final
 
 from gateway.errors import ParametersError
@@ -42,13 +45,22 @@ ANSWERING_TYPES: Final[dict[type[Command], frozenset[PacketType]]] = {
 }
 """The packet types that answer each command; an error packet answers any command."""
 
-_ACKNOWLEDGED: Final = re.compile(
-    r"(?:ok\W*)?(version|setbyteorder|sendparameters|sendcurrentframe|streamframes|bye)\b"
-)
+_VERBS: Final = r"(version|setbyteorder|sendparameters|sendcurrentframe|streamframes|bye)\b"
+_ACKNOWLEDGED: Final = re.compile(rf"(?:ok\W*)?{_VERBS}")
 """The command at the start of an acknowledgement's text, as all known servers write it (field note 1)."""
+_REFUSED: Final = re.compile(rf"\b{_VERBS}")
+"""A command anywhere in the text of an error."""
 
 _MAX_REMEMBERED: Final = 8
 """The maximum number of outstanding commands, and of answered commands, that are remembered."""
+
+
+class Match(Enum):
+    """Whether a reply answers the pending command."""
+
+    YES = "yes"
+    MAYBE = "maybe"  # or it is the late reply to an earlier command
+    NO = "no"
 
 
 class ReplyMatcher:
@@ -57,6 +69,8 @@ class ReplyMatcher:
     def __init__(self) -> None:
         self.pending: Command | None = None
         """The command whose answer the client is waiting for."""
+        self.possible: Packet | None = None
+        """The newest reply that may answer the pending command (``Match.MAYBE``)."""
         self._outstanding: deque[Command] = deque(maxlen=_MAX_REMEMBERED)
         """Earlier commands whose replies may still arrive, oldest first."""
         self._answered: deque[Command] = deque(maxlen=_MAX_REMEMBERED)
@@ -66,11 +80,21 @@ class ReplyMatcher:
         """Stop waiting for the pending command. A late reply to it answers no command."""
         if self.pending is not None:
             self._outstanding.append(self.pending)
-            self.pending = None
+            self.pending = self.possible = None
 
-    def match_text(self, packet: Packet) -> Command | None:
-        """Return the pending command if a type 0 or 1 packet replies to it, otherwise None."""
-        return self._settle(self._command_of_text(packet))
+    def match_text(self, packet: Packet) -> Match:
+        """Return whether a type 0 or 1 packet answers the pending command."""
+        candidates = self._candidates(packet)
+        if not candidates:
+            return Match.NO
+        oldest = candidates[0]
+        if oldest == self.pending:
+            return Match.YES
+        self._outstanding.remove(oldest)
+        if self.pending not in candidates:
+            return Match.NO
+        self.possible = packet
+        return Match.MAYBE
 
     def match_xml(self, packet: Packet) -> Command | None:
         """Return the pending command if a type 2 packet answers it, otherwise None."""
@@ -81,6 +105,7 @@ class ReplyMatcher:
         # Servers answer in order, so replies to earlier commands do not follow any more. But if an equal
         # command is outstanding, this may be the late reply to that one, and another reply may follow.
         if self.pending not in self._outstanding:
+            self._answered.extend(self._outstanding)  # if a reply that names one follows, it is a duplicate
             self._outstanding.clear()
         self._finish()
 
@@ -93,7 +118,7 @@ class ReplyMatcher:
     def _finish(self) -> None:
         if self.pending is not None:
             self._answered.append(self.pending)
-            self.pending = None
+            self.pending = self.possible = None
 
     def _settle(self, command: Command | None) -> Command | None:
         """Return ``command`` if it is pending; otherwise note that its late reply arrived, return None."""
@@ -103,25 +128,24 @@ class ReplyMatcher:
             self._outstanding.remove(command)
         return None
 
-    def _command_of_text(self, packet: Packet) -> Command | None:
-        """Return the command to which a text replies: the pending, an outstanding or an answered one."""
+    def _candidates(self, packet: Packet) -> list[Command]:
+        """Return the unanswered commands that a text may answer, oldest first."""
         text = decode_text(packet.body).lower()
-        pending = [] if self.pending is None else [self.pending]
-        echoed = [
-            command
-            for command in (*pending, *self._outstanding, *self._answered)
-            if str(command).lower() in text
-        ]
+        unanswered = [*self._outstanding, *([] if self.pending is None else [self.pending])]
+        echoed = [command for command in (*unanswered, *self._answered) if str(command).lower() in text]
         if echoed:
             # One command's text may be the beginning of another's, so the longest echo counts.
-            return max(echoed, key=lambda command: len(str(command)))
-        acknowledged = _ACKNOWLEDGED.match(text) if packet.type == PacketType.COMMAND else None
-        for command in (*self._outstanding, *pending):
-            if acknowledged and acknowledged[1] != str(command).split()[0].lower():
-                continue
-            if packet.type == PacketType.ERROR or packet.type in ANSWERING_TYPES[type(command)]:
-                return command
-        return None
+            named = max(echoed, key=lambda command: len(str(command)))
+            unanswered = [command for command in unanswered if command == named]
+        if packet.type == PacketType.ERROR:
+            # The text may mention other commands as well ("Version must be sent first").
+            refused = set(_REFUSED.findall(text))
+            return [command for command in unanswered if _verb(command) in refused] or unanswered
+        unanswered = [command for command in unanswered if packet.type in ANSWERING_TYPES[type(command)]]
+        acknowledged = _ACKNOWLEDGED.match(text)
+        if acknowledged is None:
+            return unanswered
+        return [command for command in unanswered if _verb(command) == acknowledged[1]]
 
     def _command_of_xml(self, packet: Packet) -> Command | None:
         """Return the SendParameters that the XML answers: the pending or an outstanding one."""
@@ -136,6 +160,10 @@ class ReplyMatcher:
             return pending[0] if pending else None
         sections = _sections_in(packet.body)
         return max((*outstanding, *pending), key=lambda command: _similarity(sections, command))
+
+
+def _verb(command: Command) -> str:
+    return str(command).split()[0].lower()
 
 
 def _sections_in(xml: bytes) -> frozenset[str]:

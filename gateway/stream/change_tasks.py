@@ -6,21 +6,32 @@ from collections.abc import Callable, Coroutine
 from typing import Any, Final
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.errors import LinkError
+from gateway.errors import DefectError, LinkError, RequestError
 from gateway.log import FailureLog
+from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
 
 DEMAND_POLL_S: Final = 0.05
 """How often an on-demand stream checks for subscribers. It polls because a notification could be missed."""
 
+FIRST_RETRY_S: Final = 1.0
+"""How long to wait before a refused stop or resume is repeated. Each wait is twice as long as the last."""
+
+MAX_RESUMES: Final = 4
+"""How often a resume may be refused, in a row, before the connection ends."""
+
+_MAX_RETRY_S: Final = 30.0
+
 logger = logging.getLogger(__name__)
 
 
 class ChangeTasks:
-    """The tasks that change the stream of one session, until ``cancel``.
+    """Decides what the server of one session should send, and asks for it, until ``cancel``.
 
-    ``has_subscribers`` returns whether the stream's components may have subscribers.
+    Two facts decide: whether frames are wanted, and how often their rate is to be halved. One task brings the
+    server to what they say now, so changes of both never meet. ``has_subscribers`` returns whether the
+    stream's components may have subscribers.
     """
 
     def __init__(
@@ -28,19 +39,26 @@ class ChangeTasks:
         source: SourceSettings,
         stream: StreamSettings,
         status: StreamStatus,
+        session: Session,
         control: StreamControl,
         has_subscribers: Callable[[], bool],
     ) -> None:
         self._source = source
         self._stream = stream
         self._status = status
+        self._session = session
         self._control = control
         self._has_subscribers = has_subscribers
         self._lateness = FailureLog(logger, status.name)
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._is_wanted = True
+        self._halvings = 0  # as wanted
+        self._requested_halvings = 0  # in the newest request for another rate
+        self._changed = asyncio.Event()  # _is_wanted or _halvings
+        self._tasks: list[asyncio.Task[None]] = []
 
     def start(self) -> None:
-        """Start to follow the demand if the stream is on demand. Call it after the handshake."""
+        """Start to change the stream as needed. Call it after the handshake."""
+        self._start_task(self._apply_changes())
         if self._stream.on_demand:
             self._start_task(self._follow_demand())
 
@@ -50,7 +68,8 @@ class ChangeTasks:
         Without it, only log that frames are late, or in time again if ``halvings`` is 0. Returns at once.
         """
         if self._stream.adapt_rate:
-            self._start_task(self._change_rate(halvings))
+            self._halvings = halvings
+            self._changed.set()
         elif halvings:
             self._lateness.failed(f"frames arrive {1000 * self._status.lag_s:.0f} ms late")
         else:
@@ -62,41 +81,81 @@ class ChangeTasks:
             task.cancel()
 
     def _start_task(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.create_task(self._run_until_link_error(work))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        self._tasks.append(asyncio.create_task(self._run_until_error(work)))
 
-    async def _run_until_link_error(self, work: Coroutine[Any, Any, None]) -> None:
+    async def _run_until_error(self, work: Coroutine[Any, Any, None]) -> None:
+        """Run a task; end the session if it fails, because then nothing changes the stream any more."""
         try:
             await work
         except LinkError as error:
-            logger.debug("%s: %s", self._status.name, error)  # the session ends and reports the reason
+            logger.debug("%s: %s", self._status.name, error)  # the supervisor reports it
+            self._session.fail(error)
+        except Exception as defect:  # noqa: BLE001 - the supervisor logs it and connects again
+            self._session.fail(DefectError.of(defect))
 
-    async def _change_rate(self, halvings: int) -> None:
+    async def _apply_changes(self) -> None:
+        refusals = 0
+        while True:
+            await self._changed.wait()
+            self._changed.clear()
+            if await self._apply():
+                refusals = 0
+                continue
+            refusals += 1
+            if self._is_wanted and refusals >= MAX_RESUMES:
+                raise RequestError(
+                    f"{self._session.server} refuses to send frames again after they were stopped; "
+                    "connecting again"
+                )
+            try:
+                async with asyncio.timeout(min(FIRST_RETRY_S * 2 ** (refusals - 1), _MAX_RETRY_S)):
+                    await self._changed.wait()  # what is wanted may change while waiting
+            except TimeoutError:
+                self._changed.set()
+
+    async def _apply(self) -> bool:
+        """Request what is wanted now; return False if that must be repeated."""
+        control = self._control
+        if not self._is_wanted:
+            return control.is_stopped or await self._stop()
+        if control.is_stopped:
+            logger.info("%s: a subscriber appeared; frames are requested again", self._status.name)
+            return await self._request_rate()
+        if self._halvings != self._requested_halvings:
+            await self._change_rate()
+        return True
+
+    async def _stop(self) -> bool:
+        is_stopped = await self._control.stop()
+        if is_stopped:
+            logger.info("%s: no subscribers; the stream is stopped", self._status.name)
+        return is_stopped
+
+    async def _request_rate(self) -> bool:
+        self._requested_halvings = self._halvings
+        return await self._control.request(self._halvings)
+
+    async def _change_rate(self) -> None:
+        """Request another rate. If the server refuses, it keeps the rate, and another one may be accepted."""
         lag_ms = 1000 * self._status.lag_s
-        await self._control.change_rate(halvings)
+        await self._request_rate()
         request = f"asked the server for {self._status.rate or 'its default rate'}"
         if lag_ms > self._source.max_lag_ms:
             self._lateness.failed(f"frames arrive {lag_ms:.0f} ms late; {request}")
-        elif halvings:
+        elif self._halvings:
             logger.debug("%s: frames arrive in time; %s", self._status.name, request)
         else:
             self._lateness.recovered(f"frames arrive in time; {request}")
 
     async def _follow_demand(self) -> None:
-        """Stop the stream while it has no subscribers, and resume it within DEMAND_POLL_S of the first."""
+        """Want no frames while there are no subscribers, and frames within DEMAND_POLL_S of the first one."""
         loop = asyncio.get_running_loop()
         last_subscribed_s = loop.time()
-        running = True
         while True:
             if self._has_subscribers():
                 last_subscribed_s = loop.time()
-                if not running:
-                    logger.info("%s: a subscriber appeared; streaming", self._status.name)
-                    await self._control.resume()
-                    running = True
-            elif running and loop.time() - last_subscribed_s >= self._stream.idle_after_s:
-                logger.info("%s: no subscribers; the stream is stopped", self._status.name)
-                await self._control.pause()
-                running = False
+            is_wanted = loop.time() - last_subscribed_s < self._stream.idle_after_s
+            if is_wanted is not self._is_wanted:
+                self._is_wanted = is_wanted
+                self._changed.set()
             await asyncio.sleep(DEMAND_POLL_S)

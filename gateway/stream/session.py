@@ -5,11 +5,19 @@ import contextlib
 import logging
 import socket
 import time
-from collections.abc import Callable
-from typing import Final
+from collections.abc import Awaitable, Callable
+from typing import Final, NoReturn
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.errors import ClosedError, LinkError, ReplyTimeoutError, ServerError, SilenceError
+from gateway.errors import (
+    ClosedError,
+    DefectError,
+    GatewayError,
+    LinkError,
+    ReplyTimeoutError,
+    ServerError,
+    SilenceError,
+)
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.client_protocol import (
     Answered,
@@ -17,12 +25,13 @@ from gateway.rtc3d.client_protocol import (
     ClientProtocol,
     FileReceived,
     FrameRejected,
+    PossibleReply,
     ProtocolEvent,
     Refused,
     StreamCorrupted,
     UnexpectedPacket,
 )
-from gateway.rtc3d.commands import Bye, Command, Version
+from gateway.rtc3d.commands import Bye, Command, StopStreaming
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.packets import Packet, decode_text
@@ -33,6 +42,9 @@ from gateway.stream.tcp import Connect, open_connection
 
 _BYE_S: Final = 0.5
 """How long a server may take to close after Bye; some never do (field note 10)."""
+
+_FURTHER_REPLY_S: Final = 0.3
+"""How soon a slow server's next reply follows a late one. The replies that it owes leave it together."""
 
 OnFrames = Callable[[list[Frame], int, float], None]
 """Takes frames that arrived together, oldest first, and when: in µs since the Unix epoch, in monotonic s."""
@@ -82,6 +94,9 @@ class Session:
         self._lost = asyncio.Event()  # the transport is closed
         self._ask_lock = asyncio.Lock()  # held while a command is pending
         self._reply: asyncio.Future[Packet] | None = None  # to the command that ``ask`` has sent
+        self._assume_timer: asyncio.TimerHandle | None = None  # runs after a PossibleReply
+        self._answered: dict[type[Command], Command] = {}  # the newest that was answered, by type
+        self._state_changed = asyncio.Event()  # set when the protocol's state changes
         self._quiet_since_s = 0.0  # when the stall time-out last started, on the running clock
 
     @property
@@ -93,6 +108,11 @@ class Session:
     def protocol_state(self) -> ProtocolState:
         """What the gateway has requested, and what the server sends."""
         return self._protocol.state
+
+    @property
+    def has_data(self) -> bool:
+        """Whether the server sends frames, or reports that no measurement runs."""
+        return self.protocol_state in {ProtocolState.STREAMING, ProtocolState.NO_MEASUREMENT}
 
     async def connect(self) -> None:
         """Connect to the server. Raises ConnectError with the reason and what to check."""
@@ -111,20 +131,45 @@ class Session:
             self._check_open()
             state_before = self._protocol.state
             self._protocol.send(command)
-            if self._protocol.state is not state_before:
-                self._report_protocol()
+            self._report_change(state_before)
             self._reply = self._loop.create_future()
             self._flush()
             try:
                 async with running_timeout(self._source.reply_timeout_s):
-                    return await self._reply
+                    packet = await self._reply
             except TimeoutError:
                 raise ReplyTimeoutError(
                     f"{self.server} did not answer {command} within {self._source.reply_timeout_s:g} s"
                 ) from None
+            except ServerError:
+                self._answered[type(command)] = command
+                raise
             finally:
+                state_before = self._protocol.state
                 self._protocol.give_up()
+                self._report_change(state_before)
                 self._reply = None
+            self._answered[type(command)] = command
+            return packet
+
+    def answered(self, *kinds: type[Command]) -> Command | None:
+        """Return a command of the first of ``kinds`` that the server has answered or refused."""
+        return next((self._answered[kind] for kind in kinds if kind in self._answered), None)
+
+    @property
+    def has_answered(self) -> bool:
+        """Whether the server has answered, or refused, any command."""
+        return bool(self._answered)
+
+    async def wait_for_data(self, timeout_s: float) -> bool:
+        """Wait for frames or No Data; return whether the server sends either."""
+        with contextlib.suppress(TimeoutError):
+            async with running_timeout(timeout_s):
+                while not self.has_data and self._error is None:
+                    self._state_changed.clear()
+                    await self._state_changed.wait()
+        self._check_open()
+        return self.has_data
 
     def control_recording(self, *, start: bool) -> None:
         """Start or stop the server's recording (field note 16). Raises LinkError if the session has ended."""
@@ -132,35 +177,41 @@ class Session:
         self._protocol.send_recording(start=start)
         self._flush()
 
-    async def monitor(self) -> None:
-        """Wait until the session ends or the server is silent; then raise LinkError with the reason."""
+    async def monitor(self, check_silence: Callable[[], Awaitable[None]]) -> NoReturn:
+        """Wait until the session ends or the server is silent; then raise LinkError with the reason.
+
+        After each ``stall_timeout_s`` without a frame, call ``check_silence`` if silence may be normal. It
+        raises LinkError if it is not.
+        """
         while True:
             self._check_open()
             wait_s = self._source.stall_timeout_s - (self._running.time() - self._quiet_since_s)
             if wait_s <= 0:
-                await self._check_silence()
+                self._check_stall()
+                await check_silence()
+                self._quiet_since_s = self._running.time()
                 continue
             with contextlib.suppress(TimeoutError):
                 async with running_timeout(wait_s):
                     await self._ended.wait()
 
-    async def _check_silence(self) -> None:
-        """Check the server after stall_timeout_s without a frame; raise SilenceError if it is at fault.
+    def _check_stall(self) -> None:
+        """Raise SilenceError if frames have stopped although a measurement runs.
 
-        While a measurement runs, silence is a fault, unless the stream has only events, which are rare.
-        Otherwise send a harmless command: any reply shows that the server is alive.
+        Events are rare, so a stream that has only events may be silent.
         """
-        if self._protocol.state is ProtocolState.STREAMING and not self._only_events:
+        is_stopping = isinstance(self._protocol.pending_command, StopStreaming)
+        if self._protocol.state is ProtocolState.STREAMING and not self._only_events and not is_stopping:
             text = f"no frame from {self.server} for {self._source.stall_timeout_s:g} s"
             self._status.silent(text)
             raise SilenceError(f"{text} although a measurement runs; connecting again")
-        try:
-            await self.ask(Version())
-        except ServerError:
-            pass
-        except ReplyTimeoutError as error:
-            raise SilenceError(f"{error}, and sends no frames; connecting again") from None
-        self._quiet_since_s = self._running.time()
+
+    def fail(self, error: LinkError) -> None:
+        """End the session with ``error`` and drop the connection, unless it has ended already."""
+        if self._error is None:
+            self._end(error)
+            if self._transport is not None:
+                self._transport.abort()
 
     async def close(self) -> None:
         """Send Bye, and close the connection when the server does, or after 0.5 s.
@@ -194,14 +245,19 @@ class Session:
 
     def data_received(self, data: bytes) -> None:
         """Process the bytes of one read. From here to the outputs there are only plain calls, no tasks."""
+        try:
+            self._receive(data)
+        except Exception as defect:  # noqa: BLE001 - the supervisor logs it and connects again
+            self.fail(DefectError.of(defect))
+
+    def _receive(self, data: bytes) -> None:
         utime = now_utime()
         self._status.bytes_received(len(data))
         state_before = self._protocol.state
         frames, events = self._protocol.receive(data)
         for event in events:
             self._on_event(event)
-        if self._protocol.state is not state_before and self._error is None:
-            self._report_protocol()
+        self._report_change(state_before)
         if frames:
             self._quiet_since_s = self._running.time()
             self._status.frames_read(self._quiet_since_s)
@@ -211,17 +267,17 @@ class Session:
         """End the session, unless it has ended already: the connection is closed, by either side."""
         self._protocol.end()
         reason = f"broke: {exc}" if exc else "was closed by the server"
-        self._fail(ClosedError(f"the connection to {self.server} {reason}"))
+        self.fail(ClosedError(f"the connection to {self.server} {reason}"))
         self._lost.set()
 
     def _on_event(self, event: ProtocolEvent) -> None:
         match event:
             case Answered(_, packet):
-                if self._reply is not None and not self._reply.done():
-                    self._reply.set_result(packet)
+                self._end_ask(packet)
             case Refused(_, error):
-                if self._reply is not None and not self._reply.done():
-                    self._reply.set_exception(error)
+                self._end_ask(error)
+            case PossibleReply():
+                self._assume_reply_soon()
             case FrameRejected(frame_error, num_components):
                 self._status.frame_rejected(str(frame_error), self._num_lost(num_components))
             case FileReceived(content):
@@ -233,7 +289,7 @@ class Session:
             case StreamCorrupted(packet_error):
                 closed = ClosedError(f"{self.server}: {packet_error}")
                 closed.__cause__ = packet_error
-                self._fail(closed)
+                self.fail(closed)
             case UnexpectedPacket(packet):
                 logger.debug(
                     "%s: unexpected packet of type %d: %.200s",
@@ -244,9 +300,33 @@ class Session:
         """Return how many messages a rejected frame would have had, as far as its component count tells."""
         return min(announced, self._num_wanted) if 0 < announced <= len(ComponentType) else 1
 
-    def _report_protocol(self) -> None:
-        """Report the protocol's new state, and restart the stall time-out."""
+    def _end_ask(self, result: Packet | GatewayError) -> None:
+        if self._reply is None or self._reply.done():
+            return
+        if isinstance(result, Packet):
+            self._reply.set_result(result)
+        else:
+            self._reply.set_exception(result)
+
+    def _assume_reply_soon(self) -> None:
+        if self._assume_timer is not None:
+            self._assume_timer.cancel()
+        self._assume_timer = self._loop.call_later(_FURTHER_REPLY_S, self._assume_reply)
+
+    def _assume_reply(self) -> None:
+        """No further reply has followed: the newest one answers the pending command."""
+        if self._error is None:
+            state_before = self._protocol.state
+            for event in self._protocol.assume_reply():
+                self._on_event(event)
+            self._report_change(state_before)
+
+    def _report_change(self, state_before: ProtocolState) -> None:
+        """Report the protocol's state if it has changed, and restart the stall time-out."""
+        if self._protocol.state is state_before or self._error is not None:
+            return
         self._quiet_since_s = self._running.time()
+        self._state_changed.set()
         self._status.protocol_changed(self._protocol.state, self._protocol.byte_order or "", self.server)
 
     def _check_open(self) -> None:
@@ -256,19 +336,12 @@ class Session:
         if self._transport is None:
             raise ClosedError(f"{self.server}: not connected")
 
-    def _fail(self, error: LinkError) -> None:
-        """End the session with ``error`` and drop the connection, unless it has ended already."""
-        if self._error is None:
-            self._end(error)
-            if self._transport is not None:
-                self._transport.abort()
-
     def _end(self, error: LinkError) -> None:
         """End the session. Calls that are waiting, and later calls, raise ``error``."""
         self._error = error
         self._ended.set()
-        if self._reply is not None and not self._reply.done():
-            self._reply.set_exception(error)
+        self._state_changed.set()
+        self._end_ask(error)
 
     def _flush(self) -> None:
         if self._transport is not None:

@@ -7,6 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
+from gateway.errors import DefectError, LinkError
+from gateway.log import DefectLog, FailureLog
 from gateway.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.protocol_state import ProtocolState
@@ -22,12 +24,14 @@ MAX_LIMITATIONS: Final = 20
 FRAME_REJECTED: Final = "frame rejected"
 """The cause of loss of frames that contradict themselves."""
 
-_RECONNECTING: Final = (StreamState.CONNECTING, StreamState.HANDSHAKING, StreamState.WAITING)
+_CONNECTING: Final = (StreamState.CONNECTING, StreamState.HANDSHAKING)
+_RECEIVING: Final = (StreamState.STREAMING, StreamState.NO_MEASUREMENT)
 
 _PROTOCOL_EVENTS: Final = {
     ProtocolState.STREAMING: "a frame arrived",
     ProtocolState.NO_MEASUREMENT: "the server reports that no measurement runs",
-    ProtocolState.IDLE: "the gateway stopped the frames",
+    ProtocolState.IDLE: "the server does not answer StreamFrames Stop, or refuses StreamFrames",
+    ProtocolState.STOPPED: "the gateway stopped the frames",
 }
 """Why the protocol entered a state, for the log."""
 
@@ -78,9 +82,14 @@ class StreamStatus:
     last_error: str = ""
     last_error_utime: int = 0
     _phase: Phase = field(default=Phase.WAITING, init=False)
+    _failures: FailureLog = field(init=False)
+    _defects: DefectLog = field(init=False)
     _logged_limitations: deque[str] = field(default_factory=lambda: deque(maxlen=MAX_LIMITATIONS), init=False)
 
     def __post_init__(self) -> None:
+        """Create the logs of losses, lost connections and defects."""
+        self._failures = FailureLog(logger, self.name)
+        self._defects = DefectLog(logger, self.name)
         self.losses = Losses(logger, self.name)
 
     # Reports of session and supervisor about the connection.
@@ -97,9 +106,10 @@ class StreamStatus:
         self.byte_order = self.rate = ""
         self._enter(Phase.HANDSHAKING, "connected", server)
 
-    def handshake_done(self, protocol_state: ProtocolState, server: str) -> None:
-        """Note that the server agreed to stream; frames may have arrived already."""
+    def handshake_done(self, protocol_state: ProtocolState, server: str, request: str) -> None:
+        """Note that the server accepted ``request``, a StreamFrames; frames may have arrived already."""
         self.tries = 0
+        logger.info("%s: connected to %s, which accepted %s", self.name, server, request)
         self._phase = Phase.READY
         self._update_state(protocol_state, "handshake done", server)
 
@@ -112,10 +122,14 @@ class StreamStatus:
         """Note that no frames arrive although a measurement runs."""
         self._enter(Phase.SILENT, "silence", text)
 
-    def disconnected(self, error: str) -> None:
-        """Note why the connection ended or could not be opened."""
-        self.record_error(error)
-        self._enter(Phase.WAITING, "the connection ended", error)
+    def disconnected(self, error: LinkError) -> None:
+        """Note and log why the connection ended or could not be opened."""
+        self.record_error(str(error))
+        if isinstance(error, DefectError):
+            self._defects.log(error)
+        else:
+            self._failures.failed(str(error))
+        self._enter(Phase.WAITING, "the connection ended", str(error))
 
     def reconnecting(self) -> None:
         """Count an attempt to connect after the first."""
@@ -222,9 +236,12 @@ class StreamStatus:
         before, self.state = self.state, stream_state(self._phase, protocol_state)
         if self.state is before:
             return
-        # While a server is away, these states alternate. The supervisor logs this as one failure.
-        level = logging.DEBUG if self.state in _RECONNECTING else logging.INFO
+        # Up to the end of the handshake, these states alternate while a server is away.
+        is_attempt = self.state in _CONNECTING or (before in _CONNECTING and self.state not in _RECEIVING)
+        level = logging.DEBUG if is_attempt else logging.INFO
         logger.log(level, "%s: %s → %s: %s (%s)", self.name, before.value, self.state.value, event, cause)
+        if self.state in _RECEIVING:
+            self._failures.recovered(f"{self.state.value} again")
         self.on_state(self.state)
 
 

@@ -1,11 +1,12 @@
-"""Requests to the server about its stream: handshake, rate, pause."""
+"""Requests to the server about its stream: handshake, rate, pause, checks of a silent server."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from enum import Enum
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.errors import LinkError, ParametersError, ReplyTimeoutError, ServerError
+from gateway.errors import ParametersError, ReplyTimeoutError, RequestError, ServerError, SilenceError
 from gateway.rtc3d.commands import (
     Command,
     SendParameters,
@@ -14,6 +15,7 @@ from gateway.rtc3d.commands import (
     StreamFrames,
     Version,
 )
+from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
@@ -27,11 +29,21 @@ OnParameters = Callable[[bytes, ParsedParameters], None]
 logger = logging.getLogger(__name__)
 
 
+class _Outcome(Enum):
+    """How the server reacts to a request for frames."""
+
+    ACCEPTED = "accepted"
+    REFUSED = "refused"
+    NO_ANSWER = "no answer"  # not accepted, as far as the gateway knows (field note 20)
+
+
 class StreamControl:
     """Controls the stream of one connected session. Use once, like the session.
 
-    If the server refuses or does not answer a command, the status shows a limitation, and the gateway
-    continues without it (field note 2). Every method raises LinkError if the connection ends.
+    It is the only sender of StreamFrames, so it knows what the server was asked for last. A command that the
+    server does not answer counts as refused (field note 20). If the server refuses or does not answer a
+    command, the status shows a limitation, and the gateway continues without it (field note 2). Every method
+    raises LinkError if the connection ends.
     """
 
     def __init__(
@@ -43,16 +55,25 @@ class StreamControl:
         on_parameters: OnParameters,
     ) -> None:
         self._source = source
+        self._only_events = set(stream.components) == {ComponentType.EVENT}
         self._stream = stream
         self._status = status
         self._session = session
         self._on_parameters = on_parameters
-        self._request = StreamFrames()  # as the server accepted it, at the full rate
+        self._accepted = StreamFrames()  # the form that the server accepted, at the full rate
+        self._requested: StreamFrames | None = None  # what the server streams now; None if it is stopped
+        self._is_slow = False  # whether the server has left a command unanswered
+        self._asked_again = False  # since the last request, because neither a frame nor No Data arrived
+
+    @property
+    def is_stopped(self) -> bool:
+        """Whether the server accepted to stop the frames, or to send none yet."""
+        return self._requested is None
 
     async def start(self) -> None:
         """Do the handshake (§5.3.1 to §5.3.3) and request frames (§5.3.5).
 
-        Also raises LinkError if the server refuses all forms of StreamFrames (see ``stream_requests``).
+        Also raises RequestError if the server accepts no form of StreamFrames (see ``stream_requests``).
         """
         await self._ask_optional(Version())
         if self._source.byte_order == "little":
@@ -61,40 +82,120 @@ class StreamControl:
         frequency_hz = None
         if parameters is not None and parameters.markers is not None:
             frequency_hz = parameters.markers.frequency_hz
-        for request in stream_requests(self._stream.rate, self._stream.components, frequency_hz):
-            if await self._request_frames(request):
-                self._request = request
-                self._status.handshake_done(self._session.protocol_state, self._session.server)
-                return
-        raise LinkError(
-            f"{self._session.server} refuses to stream in every form that the protocol has; "
+        await self._request_any(stream_requests(self._stream.rate, self._stream.components, frequency_hz))
+        self._status.handshake_done(self._session.protocol_state, self._session.server, str(self._accepted))
+
+    async def request(self, halvings: int) -> bool:
+        """Request frames as agreed, the rate halved ``halvings`` times; return whether the server accepts."""
+        request = replace(self._accepted, rate=halved(self._accepted.rate, halvings))
+        return await self._request(request) is _Outcome.ACCEPTED
+
+    async def stop(self) -> bool:
+        """Stop the frames (§5.3.5) and keep the connection; return whether the server has stopped them."""
+        try:
+            await self._session.ask(StopStreaming())
+        except ServerError as error:
+            self._status.add_limitation(f"the server refused {StopStreaming()}: {error}")
+            return False
+        except ReplyTimeoutError:
+            self._status.add_limitation(f"the server did not answer {StopStreaming()}")
+            if self._session.has_data:
+                return False
+        self._requested = None
+        self._status.rate_agreed("")
+        return True
+
+    async def check_silence(self) -> None:
+        """Check a server that sends no frames, which may be normal; raise SilenceError if it is not.
+
+        Frames were requested, and neither a frame nor No Data has arrived: request them again. If that
+        changes nothing, the connection is at fault. Otherwise no measurement is running: any reply to a
+        harmless command, even a refusal, shows that the server is alive.
+        """
+        if self._requested is not None and not self._session.has_data and not self._only_events:
+            await self._ask_again(self._requested)
+            return
+        probe = self._session.answered(Version, SendParameters, SetByteOrder, StopStreaming)
+        if self._requested is not None and (probe is None or isinstance(probe, StopStreaming)):
+            probe = self._requested  # the server accepted it, so it answers it again
+        if probe is None:
+            return  # The server answers nothing, and nothing is requested of it.
+        try:
+            await self._session.ask(probe)
+        except ServerError:
+            pass
+        except ReplyTimeoutError as error:
+            raise SilenceError(f"{error}, and sends no frames; connecting again") from None
+
+    async def _ask_again(self, requested: StreamFrames) -> None:
+        text = f"{self._session.server} accepted {requested} and sends neither frames nor No Data"
+        if self._asked_again:
+            raise SilenceError(f"{text}, although the gateway asked again; connecting again")
+        logger.info("%s: %s; asking again", self._status.name, text)
+        if await self._request(requested) is not _Outcome.ACCEPTED:
+            raise RequestError(f"{self._session.server} no longer accepts {requested}; connecting again")
+        self._asked_again = True
+
+    async def _request_any(self, forms: Sequence[StreamFrames]) -> None:
+        """Request frames in one form after the other, until the server accepts one or sends frames."""
+        has_answered = self._session.has_answered
+        ignored: list[StreamFrames] = []
+        for form in forms:
+            outcome = await self._request(form)
+            if outcome is _Outcome.ACCEPTED:
+                self._accepted = form
+                break
+            if outcome is _Outcome.NO_ANSWER:
+                ignored.append(form)
+        else:
+            # A late refusal need not say what it refuses, so the server may have accepted a form after all.
+            if not (self._is_slow and await self._session.wait_for_data(self._source.reply_timeout_s)):
+                raise self._request_error()
+            self._accepted = self._requested = forms[-1]
+        if ignored and not has_answered:
+            # The server was not answering at all, so it may know the form that it seemed to ignore.
+            await self._prefer(ignored[0])
+
+    async def _prefer(self, form: StreamFrames) -> None:
+        """Request a better form than the accepted one; return to that if the server does not accept it."""
+        if await self._request(form) is _Outcome.ACCEPTED:
+            self._accepted = form
+        else:
+            await self._request(self._accepted)
+
+    def _request_error(self) -> RequestError:
+        if not self._session.has_answered:
+            return RequestError(
+                f"{self._session.server} accepts connections and answers no command; restart its application"
+            )
+        verb = "refuses or ignores" if self._is_slow else "refuses"
+        return RequestError(
+            f"{self._session.server} {verb} StreamFrames in every form that the protocol has; "
             "check its real-time output settings"
         )
 
-    async def change_rate(self, halvings: int) -> None:
-        """Request the agreed rate, halved ``halvings`` times. If the server refuses, the rate stays."""
-        await self._request_frames(replace(self._request, rate=halved(self._request.rate, halvings)))
+    async def _request(self, request: StreamFrames) -> _Outcome:
+        """Request frames, and keep the request if the server accepts it.
 
-    async def pause(self) -> None:
-        """Stop the frames (§5.3.5); keep the connection."""
-        await self._ask_optional(StopStreaming())
-        self._status.rate_agreed("")
-
-    async def resume(self) -> None:
-        """Request frames again, as agreed in the handshake."""
-        await self._request_frames(self._request)
-
-    async def _request_frames(self, request: StreamFrames) -> bool:
-        """Request frames; return whether the server accepted. No answer counts as acceptance."""
+        If the server sends data without having sent any before, it has accepted the request.
+        """
+        self._asked_again = False
+        had_data = self._session.has_data
+        outcome = _Outcome.ACCEPTED
         try:
             await self._session.ask(request)
         except ServerError as error:
             self._status.add_limitation(f"the server refused {request}: {error}")
-            return False
+            outcome = _Outcome.REFUSED
         except ReplyTimeoutError:
+            self._is_slow = True
             self._status.add_limitation(f"the server did not acknowledge {request}")
-        self._status.rate_agreed("" if request.rate is None else str(request.rate))
-        return True
+            if had_data or not self._session.has_data:
+                outcome = _Outcome.NO_ANSWER
+        if outcome is _Outcome.ACCEPTED:
+            self._requested = request
+            self._status.rate_agreed("" if request.rate is None else str(request.rate))
+        return outcome
 
     async def _fetch_parameters(self) -> Parameters | None:
         """Return the server's parameters and pass them on; None if there are none."""
@@ -118,5 +219,6 @@ class StreamControl:
         except ServerError as error:
             self._status.add_limitation(f"the server refused {command}: {error}")
         except ReplyTimeoutError:
+            self._is_slow = True
             self._status.add_limitation(f"the server did not answer {command}")
         return None

@@ -5,11 +5,11 @@ import logging
 import random
 import time
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import NamedTuple, NoReturn
 
 from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
-from gateway.errors import LinkError
-from gateway.log import FailureLog, log_fields
+from gateway.errors import DefectError, LinkError
+from gateway.log import log_fields
 from gateway.stream.change_tasks import ChangeTasks
 from gateway.stream.ingest import Ingest, Publish, Skip
 from gateway.stream.session import OnFile, Session
@@ -72,7 +72,6 @@ class Supervisor:
         self._callbacks = callbacks
         self._connect = connect
         self._monotonic = monotonic
-        self._failures = FailureLog(logger, status.name)
         self._ready_session: Session | None = None  # the newest session with a completed handshake
 
     @property
@@ -86,28 +85,43 @@ class Supervisor:
 
         The rule for errors: after any failure of a connection (LinkError), reconnect, without a limit,
         because a motion-capture computer that is off today is on tomorrow. Any other exception is a defect
-        in this program and is raised.
+        in this program. It is logged as an error, and also ends only the connection: other streams and
+        sources continue.
         """
         server = f"{self._source.host}:{self._source.port}"
         with log_fields(source=self._source.name, stream=self._status.components, peer=server):
             await self._run_sessions()
 
     async def _run_sessions(self) -> None:
-        delays_s = backoff_delays_s(self._source.reconnect)
+        reconnect = self._source.reconnect
+        delays_s = backoff_delays_s(reconnect)
         while True:
             frames_before = self._status.frames_in
-            try:
-                await self._run_session()
-            except LinkError as error:
-                self._failures.failed(str(error))
-                if self._status.state is StreamState.NO_MEASUREMENT or self._status.frames_in > frames_before:
-                    delays_s = backoff_delays_s(self._source.reconnect)
-                self._status.disconnected(str(error))
-            await asyncio.sleep(next(delays_s))
+            began_s = self._monotonic()
+            error = await self._run_session_to_its_end()
+            had_data = self._status.frames_in > frames_before or (
+                self._status.state is StreamState.NO_MEASUREMENT
+            )
+            if had_data and not isinstance(error, DefectError):
+                delays_s = backoff_delays_s(reconnect)
+            self._status.disconnected(error)
+            # An attempt that took long need not be followed by a long wait as well: a server that hangs, and
+            # is well again, would stay without a client.
+            lasted_s = self._monotonic() - began_s
+            await asyncio.sleep(max(next(delays_s) - lasted_s, next(backoff_delays_s(reconnect))))
             self._status.reconnecting()
 
-    async def _run_session(self) -> None:
-        """Run one session until it ends, which always raises LinkError."""
+    async def _run_session_to_its_end(self) -> LinkError:
+        """Run one session; return why it ended."""
+        try:
+            await self._run_session()
+        except LinkError as error:
+            return error
+        except Exception as defect:  # noqa: BLE001 - a defect in one stream must not stop the others
+            return DefectError.of(defect)
+
+    async def _run_session(self) -> NoReturn:
+        """Run one session until it ends; raise LinkError with the reason."""
         ingest = Ingest(
             self._source,
             self._stream,
@@ -130,16 +144,15 @@ class Supervisor:
             self._source, self._stream, self._status, session, self._callbacks.on_parameters
         )
         changes = ChangeTasks(
-            self._source, self._stream, self._status, control, self._callbacks.has_subscribers
+            self._source, self._stream, self._status, session, control, self._callbacks.has_subscribers
         )
         try:
             await session.connect()
             await control.start()
-            self._failures.succeeded(f"streaming from {session.server}")
             self._ready_session = session
             self._callbacks.on_connected()
             changes.start()
-            await session.monitor()
+            await session.monitor(control.check_silence)
         finally:
             changes.cancel()
             await session.close()

@@ -396,6 +396,6 @@ async def test_a_failure_is_logged_once_and_so_is_its_end(caplog: pytest.LogCapt
             await gateway.wait_for("3d")
     refused = [record for record in caplog.records if "refused by" in record.message]
     assert [record.levelname for record in refused[:3]] == ["WARNING", "DEBUG", "DEBUG"]
-    [recovered] = [record for record in caplog.records if "streaming from" in record.message]
+    [recovered] = [record for record in caplog.records if "streaming again" in record.message]
     assert recovered.levelname == "INFO"
     assert "failures" in recovered.message

@@ -268,7 +268,7 @@ async def test_the_journal_entries_have_fields(service: Service) -> None:
         service.configure({"lab": server.port})
         await service.start()
         await service.wait_for_status("lab: streaming")
-    entries = [entry for entry in await service.machine.journal() if "streaming from" in entry["MESSAGE"]]
+    entries = [entry for entry in await service.machine.journal() if "connected to" in entry["MESSAGE"]]
     assert [(entry["SOURCE"], entry["PEER"]) for entry in entries] == [("lab", f"127.0.0.1:{server.port}")]
     assert entries[0]["STREAM"] == "3d 6d analog force event"
     assert entries[0]["PRIORITY"] == "6"

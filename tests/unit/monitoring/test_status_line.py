@@ -5,6 +5,7 @@ import logging
 import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.errors import LinkError
 from gateway.losses import Losses
 from gateway.monitoring.status_line import loss_lines, output_lines, source_line
 from gateway.outputs.status import OutputHealth
@@ -79,10 +80,10 @@ def test_only_outputs_that_lose_something_have_a_line() -> None:
 def test_tries_are_counted_since_the_last_handshake() -> None:
     status = StreamStatus("3d")
     status.connecting("server")
-    status.disconnected("connection refused")
+    status.disconnected(LinkError("connection refused"))
     status.connecting("server")
     assert status.tries == 2
     status.connected("server")
     assert status.tries == 2
-    status.handshake_done(ProtocolState.REQUESTED, "server")
+    status.handshake_done(ProtocolState.REQUESTED, "server", "StreamFrames")
     assert status.tries == 0

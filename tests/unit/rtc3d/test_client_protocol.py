@@ -56,7 +56,7 @@ def test_the_states_of_a_connection_through_a_measurement() -> None:
         ProtocolState.NO_MEASUREMENT,
         ProtocolState.STREAMING,
         ProtocolState.NO_MEASUREMENT,
-        ProtocolState.IDLE,
+        ProtocolState.STOPPED,
         ProtocolState.CLOSING,
         ProtocolState.CLOSED,
     ]

@@ -31,6 +31,11 @@ def refusing(*refused: str, by: Answer = obliging) -> Answer:
     return answer
 
 
+def refusing_without_name(*refused: str, by: Answer = obliging) -> Answer:
+    """Return an answer that refuses as ``refusing`` does, and does not say what (field note 20)."""
+    return lambda command: packet(0, "what?") if command.startswith(refused) else by(command)
+
+
 def silent_to(*ignored: str, by: Answer = obliging) -> Answer:
     """Return an answer that ignores the commands that begin with one of these texts."""
     return lambda command: None if command.startswith(ignored) else by(command)

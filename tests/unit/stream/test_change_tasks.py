@@ -31,7 +31,7 @@ class Lab:
         )
         self._control = StreamControl(source, settings, self.status, self.session, lambda *_: None)
         self.adaptation = ChangeTasks(
-            source, settings, self.status, self._control, lambda: self.has_subscribers
+            source, settings, self.status, self.session, self._control, lambda: self.has_subscribers
         )
 
     async def start(self) -> None:
@@ -78,7 +78,7 @@ async def test_each_stop_and_each_start_on_demand_happens_once_and_is_logged(
     assert lab.requests == [STOP, START, STOP]
     assert caplog.messages == [
         "lab (3d): no subscribers; the stream is stopped",
-        "lab (3d): a subscriber appeared; streaming",
+        "lab (3d): a subscriber appeared; frames are requested again",
         "lab (3d): no subscribers; the stream is stopped",
     ]
     lab.adaptation.cancel()
@@ -139,14 +139,14 @@ async def test_a_lag_of_exactly_the_maximum_is_in_time(caplog: pytest.LogCapture
     caplog.set_level(logging.DEBUG, "gateway.stream.change_tasks")
     lab = Lab(adapt_rate=True)
     await lab.start()
-    for lag_s in (0.05, 0.051, 2.0):
+    for halvings, lag_s in ((1, 0.05), (2, 0.051), (3, 2.0)):
         lab.status.lag_measured(lag_s)
-        lab.adaptation.lateness_changed(1)
+        lab.adaptation.lateness_changed(halvings)
         await settle()
     assert caplog.messages == [
         "lab (3d): frames arrive in time; asked the server for FrequencyDivisor:2",
-        "lab (3d): frames arrive 51 ms late; asked the server for FrequencyDivisor:2",
-        "lab (3d): frames arrive 2000 ms late; asked the server for FrequencyDivisor:2 (failure 2 in a row)",
+        "lab (3d): frames arrive 51 ms late; asked the server for FrequencyDivisor:4",
+        "lab (3d): frames arrive 2000 ms late; asked the server for FrequencyDivisor:8 (failure 2 in a row)",
     ]
 
 

@@ -10,7 +10,7 @@ from unittest.mock import Mock
 import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.errors import ClosedError, LinkError, ReplyTimeoutError, ServerError, SilenceError
+from gateway.errors import ClosedError, DefectError, LinkError, ReplyTimeoutError, ServerError, SilenceError
 from gateway.rtc3d.commands import SendParameters, StopStreaming, StreamFrames, Version
 from gateway.rtc3d.frames import Frame
 from gateway.stream.session import Session
@@ -18,7 +18,14 @@ from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from tests.losses import amounts
 from tests.servers import markers_frame, ok, packet
-from tests.unit.stream.scripted_server import Connection, ScriptedServer, obliging, refusing, silent_to
+from tests.unit.stream.scripted_server import (
+    Connection,
+    ScriptedServer,
+    obliging,
+    refusing,
+    refusing_without_name,
+    silent_to,
+)
 from tests.unit.stream.virtual_time import settle, stop_process
 from tests.vectors import STOP_RECORDING
 
@@ -26,13 +33,17 @@ NO_DATA = packet(4)
 
 
 class Lab:
-    """A session and its server. ``frames`` and ``files`` are those that the session passed on."""
+    """A session and its server. ``frames`` and ``files`` are those that the session passed on.
+
+    ``checks_s`` is when it asked for a check of the silence.
+    """
 
     def __init__(self, components: tuple[str, ...] = ("3d",), **settings: Any) -> None:
         self.server = ScriptedServer()
         self.status = StreamStatus("3d", name="lab (3d)")
         self.frames: list[tuple[int, float]] = []
         self.files: list[bytes] = []
+        self.checks_s: list[float] = []
         self.session = Session(
             SourceSettings(name="lab", host="192.0.2.20", **settings),
             StreamSettings.model_validate({"components": components}),
@@ -46,6 +57,9 @@ class Lab:
     def _on_frames(self, frames: list[Frame], utime: int, now_s: float) -> None:
         assert utime > 0
         self.frames += [(frame.components[0].frame_number, now_s) for frame in frames]
+
+    async def check_silence(self) -> None:
+        self.checks_s.append(now_s())
 
     @property
     def connection(self) -> Connection:
@@ -145,17 +159,40 @@ async def test_the_control_of_a_recording_goes_out_at_once(lab: Lab, monkeypatch
     assert start == STOP_RECORDING[:-24] + b"\0\0\0\1" + STOP_RECORDING[-20:]  # the event's id
 
 
-async def test_a_stopped_stream_is_idle_before_the_server_answers(lab: Lab) -> None:
+async def test_a_stopped_stream_is_idle_once_the_server_has_answered(lab: Lab) -> None:
     await lab.streaming()
     lab.connection.send_frames(1)
-    lab.status.handshake_done(lab.session.protocol_state, lab.session.server)
+    lab.status.handshake_done(lab.session.protocol_state, lab.session.server, "StreamFrames")
     lab.server.answer = silent_to("StreamFrames Stop")
     stopping = asyncio.create_task(lab.session.ask(StopStreaming()))
     await settle()
+    assert lab.status.state.value == "streaming"
+    lab.connection.send(obliging("StreamFrames Stop"))
+    await stopping
     assert lab.status.state is StreamState.IDLE
     lab.connection.send_frames(2)  # was under way
     assert lab.status.state is StreamState.IDLE
-    stopping.cancel()
+
+
+async def test_a_refused_stop_leaves_the_stream_streaming(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    lab.server.answer = refusing("StreamFrames Stop")
+    with pytest.raises(ServerError):
+        await lab.session.ask(StopStreaming())
+    assert lab.status.state is StreamState.STREAMING
+
+
+async def test_a_stop_without_an_answer_is_believed_until_the_next_frame(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    lab.status.handshake_done(lab.session.protocol_state, lab.session.server, "StreamFrames")
+    lab.server.answer = silent_to("StreamFrames Stop")
+    with pytest.raises(ReplyTimeoutError):
+        await lab.session.ask(StopStreaming())
+    assert lab.status.state.value == "idle"
+    lab.connection.send_frames(2)
+    assert lab.status.state is StreamState.STREAMING
 
 
 async def test_a_rejected_frame_is_counted_and_the_next_is_passed_on(
@@ -198,7 +235,7 @@ async def test_packets_above_the_configured_limits_end_the_session(packet_type: 
     assert lab.session.is_open
     lab.connection.send(struct.pack(">II", limit + 1, packet_type))
     with pytest.raises(ClosedError, match=rf"packet size {limit + 1} \(limit {limit}\), type {packet_type}"):
-        await lab.session.monitor()
+        await lab.session.monitor(lab.check_silence)
 
 
 async def test_the_byte_order_is_unknown_before_the_first_frame(lab: Lab) -> None:
@@ -219,7 +256,7 @@ async def test_silence_while_a_measurement_runs_ends_the_session(
     lab.connection.send_frames(1)
     since_s = now_s()
     with pytest.raises(SilenceError, match=r"no frame from 192\.0\.2\.20:3020 for 3 s although"):
-        await lab.session.monitor()
+        await lab.session.monitor(lab.check_silence)
     assert now_s() - since_s == pytest.approx(3)
     assert lab.status.state is StreamState.STALLED
     assert (
@@ -231,7 +268,7 @@ async def test_silence_while_a_measurement_runs_ends_the_session(
 async def test_each_frame_restarts_the_stall_timeout(lab: Lab) -> None:
     await lab.streaming()
     lab.connection.send_frames(1)
-    monitoring = asyncio.create_task(lab.session.monitor())
+    monitoring = asyncio.create_task(lab.session.monitor(lab.check_silence))
     for number in range(2, 8):
         await asyncio.sleep(2.5)
         lab.connection.send_frames(number)
@@ -245,7 +282,7 @@ async def test_silence_is_measured_from_the_last_frame_however_soon_it_came(lab:
     await lab.streaming()
     lab.connection.send_frames(1)
     since_s = now_s()
-    monitoring = asyncio.create_task(lab.session.monitor())
+    monitoring = asyncio.create_task(lab.session.monitor(lab.check_silence))
     await asyncio.sleep(0.4)
     lab.connection.send_frames(2)
     with pytest.raises(SilenceError):
@@ -257,7 +294,7 @@ async def test_packets_that_are_no_frames_do_not_end_the_silence(lab: Lab) -> No
     await lab.streaming()
     lab.connection.send_frames(1)
     since_s = now_s()
-    monitoring = asyncio.create_task(lab.session.monitor())
+    monitoring = asyncio.create_task(lab.session.monitor(lab.check_silence))
     for _ in range(2):
         await asyncio.sleep(1)
         lab.connection.send(packet(77))
@@ -266,39 +303,36 @@ async def test_packets_that_are_no_frames_do_not_end_the_silence(lab: Lab) -> No
     assert now_s() - since_s == pytest.approx(3)
 
 
-async def test_silence_without_a_measurement_is_checked_by_a_command(lab: Lab) -> None:
+async def test_silence_without_a_measurement_is_checked_every_stall_timeout(lab: Lab) -> None:
     await lab.streaming()
     lab.connection.send(NO_DATA)
-    monitoring = asyncio.create_task(lab.session.monitor())
+    began_s = now_s()
+    monitoring = asyncio.create_task(lab.session.monitor(lab.check_silence))
     await asyncio.sleep(10)
-    assert lab.connection.commands[1:] == ["Version 1.0"] * 3
+    assert lab.checks_s == pytest.approx([began_s + 3, began_s + 6, began_s + 9])
     assert not monitoring.done()
-    lab.server.answer = silent_to("Version")
-    with pytest.raises(SilenceError, match=r"did not answer Version 1\.0 within 2 s, and sends no frames"):
-        await monitoring
+    monitoring.cancel()
+
+
+async def test_a_failed_check_of_the_silence_ends_monitoring(lab: Lab) -> None:
+    async def fail() -> None:
+        raise SilenceError("no answer")
+
+    await lab.streaming()
+    with pytest.raises(SilenceError, match="no answer"):
+        await lab.session.monitor(fail)
 
 
 async def test_the_stall_timeout_begins_again_when_a_measurement_ends(lab: Lab) -> None:
     await lab.streaming()
     lab.connection.send_frames(1)
-    monitoring = asyncio.create_task(lab.session.monitor())
+    monitoring = asyncio.create_task(lab.session.monitor(lab.check_silence))
     await asyncio.sleep(2.9)
     lab.connection.send(NO_DATA)
     await asyncio.sleep(2.9)
-    assert "Version 1.0" not in lab.connection.commands
+    assert lab.checks_s == []
     await asyncio.sleep(0.2)
-    assert lab.connection.commands[-1] == "Version 1.0"
-    monitoring.cancel()
-
-
-async def test_a_refusal_shows_that_the_server_is_alive(lab: Lab) -> None:
-    await lab.streaming()
-    lab.server.answer = refusing("Version")
-    lab.connection.send(NO_DATA)
-    monitoring = asyncio.create_task(lab.session.monitor())
-    await asyncio.sleep(10)
-    assert lab.connection.commands.count("Version 1.0") == 3
-    assert not monitoring.done()
+    assert len(lab.checks_s) == 1
     monitoring.cancel()
 
 
@@ -307,11 +341,80 @@ async def test_a_stream_of_events_alone_may_be_silent_during_a_measurement() -> 
     await lab.streaming()
     lab.connection.send_frames(1)
     assert lab.status.state is StreamState.STREAMING
-    monitoring = asyncio.create_task(lab.session.monitor())
-    await asyncio.sleep(60)
+    monitoring = asyncio.create_task(lab.session.monitor(lab.check_silence))
+    await asyncio.sleep(61)
     assert not monitoring.done()
-    assert lab.connection.commands.count("Version 1.0") == 19
+    assert len(lab.checks_s) == 20
     monitoring.cancel()
+
+
+async def test_frames_may_stop_before_a_slow_server_answers_the_stop() -> None:
+    lab = Lab(reply_timeout_s=10)
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    lab.server.answer = silent_to("StreamFrames Stop")
+    stopping = asyncio.create_task(lab.session.ask(StopStreaming()))
+    monitoring = asyncio.create_task(lab.session.monitor(lab.check_silence))
+    await asyncio.sleep(5)
+    assert not monitoring.done()
+    lab.connection.send(obliging("StreamFrames Stop"))
+    await stopping
+    monitoring.cancel()
+
+
+async def test_a_defect_in_what_takes_frames_ends_the_session(
+    lab: Lab, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await lab.streaming()
+    monkeypatch.setattr(lab, "frames", None)
+    lab.connection.send_frames(1)
+    with pytest.raises(DefectError, match="defect in the gateway: TypeError: ") as caught:
+        await lab.session.monitor(lab.check_silence)
+    assert isinstance(caught.value.__cause__, TypeError)
+    assert not lab.connection.is_open
+
+
+# --- replies that name no command
+
+
+async def test_a_refusal_without_a_name_refuses_the_command_under_way_if_no_other_follows(lab: Lab) -> None:
+    lab.server.answer = silent_to("Version", by=refusing_without_name("SendParameters"))
+    await lab.session.connect()
+    with pytest.raises(ReplyTimeoutError):
+        await lab.session.ask(Version())
+    asked_s = now_s()
+    with pytest.raises(ServerError, match="what"):
+        await lab.session.ask(SendParameters())
+    assert now_s() - asked_s < 0.5
+
+
+async def test_late_refusals_that_come_together_refuse_each_its_own_command(lab: Lab) -> None:
+    lab.server.answer = silent_to("")
+    await lab.session.connect()
+    with pytest.raises(ReplyTimeoutError):
+        await lab.session.ask(Version())
+    asking = asyncio.create_task(lab.session.ask(StreamFrames()))
+    await settle()
+    lab.connection.send(packet(0, "what?"))  # the late refusal of Version
+    await asyncio.sleep(0.1)
+    lab.connection.send(packet(1, "fine"))
+    assert (await asking).body == b"fine"
+
+
+async def test_a_refusal_without_a_name_after_the_command_timed_out_changes_nothing() -> None:
+    lab = Lab(reply_timeout_s=0.1)
+    lab.server.answer = silent_to("")
+    await lab.session.connect()
+    for _ in range(2):
+        with pytest.raises(ReplyTimeoutError):
+            await lab.session.ask(Version())
+    asking = asyncio.create_task(lab.session.ask(StreamFrames()))
+    await settle()
+    lab.connection.send(packet(0, "what?"))
+    with pytest.raises(ReplyTimeoutError):
+        await asking
+    await asyncio.sleep(1)
+    assert lab.session.is_open
 
 
 # --- a stop of this process
@@ -321,7 +424,7 @@ async def test_a_stream_of_events_alone_may_be_silent_during_a_measurement() -> 
 async def test_a_stop_of_this_process_is_not_the_servers_silence(lab: Lab, stop_s: float) -> None:
     await lab.streaming()
     lab.connection.send_frames(1)
-    monitoring = asyncio.create_task(lab.session.monitor())
+    monitoring = asyncio.create_task(lab.session.monitor(lab.check_silence))
     await asyncio.sleep(2.7)
     stop_process(stop_s)
     asyncio.get_running_loop().call_later(0.05, lab.connection.send_frames, 2, 3)
@@ -349,7 +452,7 @@ async def test_the_end_is_raised_by_every_waiting_call(lab: Lab) -> None:
     lab.server.answer = silent_to("Version")
     await lab.session.connect()
     asking = asyncio.create_task(lab.session.ask(Version()))
-    monitoring = asyncio.create_task(lab.session.monitor())
+    monitoring = asyncio.create_task(lab.session.monitor(lab.check_silence))
     await settle()
     lab.connection.end()
     errors = await asyncio.gather(asking, monitoring, return_exceptions=True)
@@ -364,7 +467,7 @@ async def test_the_first_error_wins(lab: Lab) -> None:
     lab.connection.send(b"HTTP/1.1 400 Bad Request\r\n\r\n")
     await settle()  # the session has aborted the connection, which ended after that
     lab.session.connection_lost(OSError("Connection reset by peer"))
-    for late_call in (lab.session.monitor(), lab.session.ask(Version())):
+    for late_call in (lab.session.monitor(lab.check_silence), lab.session.ask(Version())):
         with pytest.raises(ClosedError, match="this is not an RTC3D server"):
             await late_call
     with pytest.raises(ClosedError, match="this is not an RTC3D server"):
@@ -376,7 +479,7 @@ async def test_a_broken_connection_names_its_reason(lab: Lab) -> None:
     await lab.session.connect()
     lab.connection.end(OSError("Connection reset by peer"))
     with pytest.raises(ClosedError, match=r"192\.0\.2\.20:3020 broke: Connection reset by peer"):
-        await lab.session.monitor()
+        await lab.session.monitor(lab.check_silence)
 
 
 async def test_closing_sends_bye_and_waits_for_the_server_to_close(lab: Lab) -> None:
@@ -408,7 +511,7 @@ async def test_closing_ends_every_waiting_call_at_once(lab: Lab) -> None:
     lab.server.answer = silent_to("Version")
     await lab.session.connect()
     asking = asyncio.create_task(lab.session.ask(Version()))
-    monitoring = asyncio.create_task(lab.session.monitor())
+    monitoring = asyncio.create_task(lab.session.monitor(lab.check_silence))
     await settle()
     closing = asyncio.create_task(lab.session.close())
     await settle()

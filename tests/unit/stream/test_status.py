@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import pytest
 
+from gateway.errors import ClosedError
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.stream.state import StreamState
@@ -44,21 +45,23 @@ def test_a_change_of_state_is_logged_with_source_states_and_cause(caplog: pytest
     status = StreamStatus("3d", name="lab (3d)", on_state=states.append)
     status.connecting(SERVER)
     status.connected(SERVER)
-    status.handshake_done(ProtocolState.REQUESTED, SERVER)
+    status.handshake_done(ProtocolState.REQUESTED, SERVER, "StreamFrames")
     status.protocol_changed(ProtocolState.STREAMING, "big", SERVER)
     status.protocol_changed(ProtocolState.NO_MEASUREMENT, "big", SERVER)
-    status.protocol_changed(ProtocolState.IDLE, "big", SERVER)
+    status.protocol_changed(ProtocolState.STOPPED, "big", SERVER)
     status.protocol_changed(ProtocolState.REQUESTED, "big", SERVER)  # still idle: logged once
     status.silent("no frame for 3 s")
-    status.disconnected("closed by the server")
+    status.disconnected(ClosedError("closed by the server"))
     assert caplog.messages == [
         f"lab (3d): waiting to reconnect → connecting: connecting ({SERVER})",
         f"lab (3d): connecting → handshaking: connected ({SERVER})",
+        f"lab (3d): connected to {SERVER}, which accepted StreamFrames",
         f"lab (3d): handshaking → idle: handshake done ({SERVER})",
         f"lab (3d): idle → streaming: a frame arrived ({SERVER})",
         f"lab (3d): streaming → no measurement: the server reports that no measurement runs ({SERVER})",
         f"lab (3d): no measurement → idle: the gateway stopped the frames ({SERVER})",
         "lab (3d): idle → stalled: silence (no frame for 3 s)",
+        "lab (3d): closed by the server",
         "lab (3d): stalled → waiting to reconnect: the connection ended (closed by the server)",
     ]
     assert len(states) == 8
@@ -70,8 +73,8 @@ def test_attempts_to_connect_are_logged_as_debug(caplog: pytest.LogCaptureFixtur
     status = StreamStatus("3d", name="lab (3d)")
     status.connecting(SERVER)
     status.connected(SERVER)
-    status.disconnected("closed by the server")
-    assert not caplog.messages
+    status.disconnected(ClosedError("closed by the server"))
+    assert caplog.messages == ["lab (3d): closed by the server"]
     assert status.last_error == "closed by the server"
 
 
@@ -80,7 +83,7 @@ def test_a_frame_may_arrive_before_the_handshake_is_done() -> None:
     status.connecting(SERVER)
     status.connected(SERVER)
     status.protocol_changed(ProtocolState.STREAMING, "little", SERVER)
-    status.handshake_done(ProtocolState.STREAMING, SERVER)
+    status.handshake_done(ProtocolState.STREAMING, SERVER, "StreamFrames")
     assert status.state is StreamState.STREAMING
     assert status.byte_order == "little"
 
@@ -166,7 +169,7 @@ def test_repeated_events_are_added_up() -> None:
         status.bytes_received(100 * count)
         status.frames_received(count, 1_000 * count)
         status.server_restarted()
-        status.disconnected("closed by the server")
+        status.disconnected(ClosedError("closed by the server"))
         status.reconnecting()
     assert (status.tries, status.session, status.restarts, status.reconnects) == (2, 2, 2, 2)
     assert (status.bytes_in, status.frames_in, status.last_frame_utime) == (700, 7, 4_000)

@@ -90,7 +90,7 @@ async def test_a_frame_before_the_acknowledgement_is_streaming_after_the_handsha
 async def test_the_handshake_continues_after_refused_and_ignored_commands(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    lab = Lab(refusing("Version", by=silent_to("SendParameters", "StreamFrames")))
+    lab = Lab(refusing("Version", by=silent_to("SendParameters", "StreamFrames AllFrames 3D")))
     await lab.start()
     assert lab.status.limitations == [
         "the server refused Version 1.0: Error-Version 1.0",
@@ -101,6 +101,7 @@ async def test_the_handshake_continues_after_refused_and_ignored_commands(
         logging.WARNING
     ] * 3
     assert lab.parameters == []
+    assert lab.commands[2:] == ["StreamFrames AllFrames 3D", "StreamFrames AllFrames"]
     assert lab.status.rate == "AllFrames"
 
 
@@ -124,7 +125,7 @@ async def test_a_refused_request_is_repeated_in_simpler_forms() -> None:
 
 async def test_a_server_that_refuses_every_form_ends_the_handshake() -> None:
     lab = Lab(refusing("StreamFrames"))
-    with pytest.raises(LinkError, match="refuses to stream in every form"):
+    with pytest.raises(LinkError, match="refuses StreamFrames in every form"):
         await lab.start()
     assert lab.status.state is StreamState.HANDSHAKING
     assert lab.status.tries == 1
@@ -141,10 +142,10 @@ async def test_parameters_that_cannot_be_read_are_a_limitation() -> None:
 async def test_a_changed_rate_is_a_fraction_of_the_agreed_one() -> None:
     lab = Lab(rate={"frequency_hz": 200})
     await lab.start()
-    await lab.control.change_rate(2)
+    await lab.control.request(2)
     assert lab.commands[-1] == "StreamFrames Frequency:50 3D"
     assert lab.status.rate == "Frequency:50"
-    await lab.control.change_rate(0)
+    await lab.control.request(0)
     assert lab.commands[-1] == "StreamFrames Frequency:200 3D"
 
 
@@ -152,7 +153,7 @@ async def test_a_refused_change_of_rate_leaves_the_rate() -> None:
     lab = Lab(rate={"frequency_hz": 200})
     await lab.start()
     lab.server.answer = refusing("StreamFrames")
-    await lab.control.change_rate(1)
+    await lab.control.request(1)
     assert lab.status.rate == "Frequency:200"
     assert lab.status.limitations == [
         "the server refused StreamFrames Frequency:100 3D: Error-StreamFrames Frequency:100 3D"
@@ -162,10 +163,10 @@ async def test_a_refused_change_of_rate_leaves_the_rate() -> None:
 async def test_a_paused_stream_has_no_rate_until_it_is_resumed() -> None:
     lab = Lab()
     await lab.start()
-    await lab.control.pause()
+    await lab.control.stop()
     assert lab.commands[-1] == "StreamFrames Stop"
     assert lab.status.rate == ""
-    await lab.control.resume()
+    await lab.control.request(0)
     assert lab.commands[-1] == "StreamFrames AllFrames 3D"
     assert lab.status.rate == "AllFrames"
 

@@ -41,11 +41,12 @@ async def test_each_state_from_connecting_to_streaming(caplog: pytest.LogCapture
     await lab.start()
     lab.server.connection.send_frames(1)
     lab.server.connection.send(packet(4))
-    await lab.control.pause()
+    await lab.control.stop()
     assert logged(caplog, "status") == [
         f"DEBUG lab (3d): waiting to reconnect → connecting: connecting ({SERVER})",
         f"DEBUG lab (3d): connecting → handshaking: connected ({SERVER})",
-        f"INFO lab (3d): handshaking → idle: handshake done ({SERVER})",
+        f"INFO lab (3d): connected to {SERVER}, which accepted StreamFrames AllFrames 3D",
+        f"DEBUG lab (3d): handshaking → idle: handshake done ({SERVER})",
         f"INFO lab (3d): idle → streaming: a frame arrived ({SERVER})",
         f"INFO lab (3d): streaming → no measurement: the server reports that no measurement runs ({SERVER})",
         f"INFO lab (3d): no measurement → idle: the gateway stopped the frames ({SERVER})",
@@ -93,7 +94,7 @@ async def test_a_corrupt_stream_ends_the_session_with_its_cause() -> None:
     lab = await session_with_frames()
     lab.connection.send(b"HTTP/1.1 400 Bad Request\r\n")
     with pytest.raises(ClosedError) as caught:
-        await lab.session.monitor()
+        await lab.session.monitor(lab.check_silence)
     assert str(caught.value).startswith(f"{SERVER}: packet size 1213486160 (limit ")
     assert isinstance(caught.value.__cause__, PacketError)
 
@@ -102,7 +103,7 @@ async def test_bytes_after_the_end_change_no_state() -> None:
     lab = await session_with_frames()
     lab.connection.end()
     await settle()
-    lab.status.disconnected("the test")
+    lab.status.disconnected(LinkError("the test"))
     state = lab.status.state
     lab.session.data_received(packet(4))
     assert lab.status.state is state
@@ -126,5 +127,6 @@ async def test_a_server_that_refuses_every_form_is_named_with_what_to_check() ->
     with pytest.raises(LinkError) as caught:
         await lab.start()
     assert str(caught.value) == (
-        f"{SERVER} refuses to stream in every form that the protocol has; check its real-time output settings"
+        f"{SERVER} refuses StreamFrames in every form that the protocol has; "
+        "check its real-time output settings"
     )

@@ -33,6 +33,7 @@ class Lab:
         self.published: list[tuple[Frame, Stamp]] = []
         self.files: list[bytes] = []
         self.has_subscribers = True
+        self.has_defect = False
         self.restarts = self.connected = 0
         self._stream = StreamSettings(**stream)
         self.supervisor = self.new_supervisor()
@@ -49,7 +50,7 @@ class Lab:
                 on_connected=self._on_connected,
                 on_restart=self._on_restart,
                 on_file=self.files.append,
-                has_subscribers=lambda: self.has_subscribers,
+                has_subscribers=self._has_subscribers,
             ),
             self.server.connect,
             asyncio.get_running_loop().time,
@@ -61,6 +62,11 @@ class Lab:
     def _on_connected(self) -> None:
         self.connected += 1
         assert self.supervisor.session is not None  # commands can be sent
+
+    def _has_subscribers(self) -> bool:
+        if self.has_defect:
+            _raise_defect()
+        return self.has_subscribers
 
     def _on_restart(self) -> None:
         self.restarts += 1
@@ -106,7 +112,7 @@ def test_delays_double_up_to_the_maximum_and_are_shortened_at_random() -> None:
 
 
 async def test_delays_grow_while_the_server_is_away(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.DEBUG, "gateway.stream.supervisor")
+    caplog.set_level(logging.DEBUG, "gateway.stream")
     lab = Lab()
     lab.server.refuses = True
     async with running(lab):
@@ -116,7 +122,7 @@ async def test_delays_grow_while_the_server_is_away(caplog: pytest.LogCaptureFix
     assert lab.status.last_error == "connection refused by the test"
     assert lab.status.tries == 9
     levels = [record.levelno for record in caplog.records]
-    assert levels == [logging.WARNING] + [logging.DEBUG] * (len(levels) - 1)
+    assert [level for level in levels if level > logging.DEBUG] == [logging.WARNING]
 
 
 async def test_delays_start_again_after_a_connection_that_brought_frames() -> None:
@@ -160,16 +166,19 @@ async def test_delays_continue_to_grow_if_connections_bring_nothing() -> None:
 
 
 async def test_recovery_is_logged_once_with_its_duration(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "gateway.stream.supervisor")
+    caplog.set_level(logging.INFO, "gateway.stream")
     lab = Lab()
     lab.server.refuses = True
     async with running(lab):
         await lab.tried(3)
         lab.server.refuses = False
         await lab.ready()
-    assert caplog.messages[0] == "lab (3d): connection refused by the test"
-    assert caplog.messages[1].startswith("lab (3d): streaming from 192.0.2.20:3020, after ")
-    assert len(caplog.messages) == 2
+        lab.server.connection.send_frames(1)
+    refused, connected, state, recovered = caplog.messages
+    assert refused == "lab (3d): connection refused by the test"
+    assert connected == "lab (3d): connected to 192.0.2.20:3020, which accepted StreamFrames AllFrames"
+    assert state == "lab (3d): idle → streaming: a frame arrived (192.0.2.20:3020)"
+    assert recovered.startswith("lab (3d): streaming again, after ")
 
 
 async def test_a_silent_measurement_leads_to_a_new_connection() -> None:
@@ -185,17 +194,54 @@ async def test_a_silent_measurement_leads_to_a_new_connection() -> None:
     assert "although a measurement runs" in lab.status.last_error
 
 
-async def test_a_defect_is_raised_and_not_retried() -> None:
+async def test_a_defect_is_an_error_with_its_traceback_once_and_is_retried_ever_later(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lab = Lab()
-    lab.server.answer = _raise_defect
-    async with running(lab) as task:
-        with pytest.raises(ZeroDivisionError):
-            await task
-    assert len(lab.server.tried_s) == 1
+    monkeypatch.setattr(lab, "_on_connected", _raise_defect)
+    lab.supervisor = lab.new_supervisor()
+    async with running(lab):
+        await lab.tried(7)
+    assert_delays(lab.delays_s[:6], [0.2, 0.4, 0.8, 1.6, 3.2, 6.4])
+    [error] = [record for record in caplog.records if record.levelno >= logging.WARNING]
+    text = "defect in the gateway: ZeroDivisionError: by the test; connecting again; report this with the log"
+    assert (error.levelname, error.message) == ("ERROR", f"lab (3d): {text}")
+    assert error.exc_info is not None
+    assert lab.status.last_error == text
 
 
-def _raise_defect(_command: str) -> bytes:
-    raise ZeroDivisionError
+async def test_a_defect_in_what_takes_frames_delays_the_next_connection_more_each_time(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    lab = Lab()
+    monkeypatch.setattr(lab, "_publish", _raise_defect)
+    lab.supervisor = lab.new_supervisor()
+    async with running(lab):
+        for connection in range(1, 6):
+            await lab.ready(connection)
+            lab.server.connection.send_frames(connection)
+    assert lab.delays_s[-1] > 0.7
+    assert len([record for record in caplog.records if record.levelno >= logging.ERROR]) == 1
+
+
+async def test_a_defect_in_a_task_ends_the_session_with_the_reason(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab(on_demand=True)
+    async with running(lab):
+        await lab.ready()
+        lab.server.connection.send_frames(1)
+        lab.has_defect = True
+        await until(lambda: lab.supervisor.session is None)
+        lab.has_defect = False
+        await lab.ready(2)
+        lab.server.connection.send_frames(2)
+        assert lab.status.state is StreamState.STREAMING
+    [error] = [record for record in caplog.records if record.levelno >= logging.ERROR]
+    assert "defect in the gateway: ZeroDivisionError" in error.message
+    assert error.exc_info is not None
+
+
+def _raise_defect(*_: object) -> None:
+    raise ZeroDivisionError("by the test")
 
 
 # --- the session that can be asked
@@ -285,9 +331,10 @@ async def test_a_stream_on_demand_follows_its_subscribers() -> None:
     lab = Lab(on_demand=True, idle_after_s=5.0)
     async with running(lab):
         await lab.ready()
+        lab.server.connection.send(packet(4))
         lab.has_subscribers = False
         await asyncio.sleep(10)
         lab.has_subscribers = True
-        await asyncio.sleep(10)
+        await asyncio.sleep(1)
         streamed = [text for text in lab.server.connection.commands if text.startswith("StreamFrames")]
         assert streamed[-2:] == ["StreamFrames Stop", "StreamFrames AllFrames"]
