@@ -190,6 +190,8 @@ def test_zenohs_reasons_keep_what_helps() -> None:
         " --> 2:7\n  |\n2 |  mode: 'geheim',,\n  |       ^---\n  |\n  = expected identifier\n at src/a.rs:1."
     )
     assert zenoh_reason(ValueError(drawing)) == "line 2, column 7: expected identifier"
+    message = r'Message { msg: "no field `a\"b`", location: Some(Location { line: 2, column: 7 }) }'
+    assert zenoh_reason(ValueError(message)) == 'line 2, column 7: no field `a"b`'
     text = 'invalid type: string "ge\\"heim", expected a boolean at /x/y.rs:615.'
     assert zenoh_reason(ValueError(text)) == "invalid type: string, expected a boolean"
 

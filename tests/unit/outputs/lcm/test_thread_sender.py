@@ -234,6 +234,7 @@ def test_opening_is_tried_again_until_it_succeeds(lcm: FakeLcm, caplog: pytest.L
     send(sender, b"message")
     sender.close()
     assert messages(lcm) == [b"message"]
+    assert caplog.messages[0] == "lcm: nobody listens; start the relay"
     levels = [record.levelno for record in caplog.records]
     assert (levels[0], levels[-1], set(levels[1:-1])) == (logging.WARNING, logging.INFO, {logging.DEBUG})
 

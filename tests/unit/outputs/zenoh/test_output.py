@@ -177,6 +177,20 @@ def test_a_client_that_has_lost_its_router_refuses_messages() -> None:
     output.close()
 
 
+def test_a_message_that_zenoh_refuses_is_an_error_with_its_key_and_reason(lab: Lab) -> None:
+    publisher = lab.output.publisher(MARKERS)
+    lab.open()
+    lab.output._opener.join()  # it still declares on the session
+    assert lab.output.session is not None
+    lab.output.session.close()
+    with pytest.raises(OutputError) as caught:
+        publisher.publish(b"message")
+    text = "Zenoh did not take a message for mocap/lab/3d: "
+    assert str(caught.value).startswith(text)
+    assert str(caught.value) != text
+    assert caught.value.cause == "put failed"
+
+
 # Liveliness ----------------------------------------------------------------------------------
 
 
@@ -282,7 +296,7 @@ def test_a_router_lost_and_found_is_told_once_each(caplog: pytest.LogCaptureFixt
         router.close()
     assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.INFO]
     assert "no Zenoh router is connected: start zenohd" in caplog.messages[0]
-    assert "connected to the router" in caplog.messages[1]
+    assert caplog.messages[1].startswith("zenoh: connected to the router, after ")
 
 
 def test_a_process_ends_although_the_router_never_answers() -> None:

@@ -115,6 +115,8 @@ async def test_a_selector_with_wildcards_gets_one_reply_for_each_key(lab: Lab) -
         ("mocap/lab/status", b"status", {}),
     ]
     assert lab.service.received == [("lab", [STATUS, ("parameters", "3d")], {"format": "json"})]
+    replies = await query_all(lab.peer, "mocap/lab/parameters/*")
+    assert [reply.key for reply in replies] == ["mocap/lab/parameters/3d"]
     replies = await query_all(lab.peer, "mocap/*/c3d")
     assert [(reply.key, reply.payload) for reply in replies] == [("mocap/lab/c3d", b"c3d")]
 
