@@ -20,7 +20,13 @@ from gateway.outputs.zenoh.kind import ZENOH
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import key_pattern
-from tests.networks import free_endpoint, lcm_url, zenoh_keys
+from tests.networks import (
+    add_multicast_route,
+    free_endpoint,
+    lcm_url,
+    remove_multicast_route,
+    zenoh_keys,
+)
 from tests.waiting import wait_until
 
 MARKERS = Topic("lab", ("3d",), "rtc3d.markers_t")
@@ -91,6 +97,21 @@ def test_the_demo_on_the_network_uses_the_default_of_lcm(received: list[tuple[st
     send_until_received(side.output, received)
     subscription.close()
     side.output.close()
+    assert set(received) == {(NAMES["lcm"], b"message")}
+
+
+@pytest.mark.netns
+def test_the_demo_in_memory_needs_no_network(received: list[tuple[str, bytes]]) -> None:
+    assert LCM.demo is not None
+    remove_multicast_route()
+    try:
+        side = LCM.demo(False)
+        side.output.start()
+        subscription = side.subscribe("lab", lambda *each: received.append(each))
+        send_until_received(side.output, received)
+        subscription.close()
+    finally:
+        add_multicast_route()
     assert set(received) == {(NAMES["lcm"], b"message")}
 
 
