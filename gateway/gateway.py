@@ -35,13 +35,12 @@ class Gateway:
         self._spool = _new_spool(settings.spool)
         self._sources: dict[str, Source] = {}
         self._source_tasks: dict[str, asyncio.Task[None]] = {}
-        self._query_service = SourceQueryService(self._queries, self._commands)
         self._tasks = asyncio.TaskGroup()
         self._reload_lock = asyncio.Lock()
         self.opened = asyncio.Event()
         """Set once the outputs are open, but at most 2 s after the start: one may be unavailable for long."""
         for output in self._outputs:
-            output.serve_queries(self._query_service)
+            self._serve_queries(output)
         for source in settings.sources:
             self._add_source(source)
 
@@ -54,6 +53,9 @@ class Gateway:
     def outputs(self) -> Sequence[Output]:
         """The outputs."""
         return self._outputs
+
+    def _serve_queries(self, output: Output) -> None:
+        output.serve_queries(SourceQueryService(self._queries, self._commands, output.name))
 
     def _queries(self) -> Mapping[str, SourceQueries]:
         return {name: source.queries for name, source in self._sources.items()}
@@ -134,7 +136,7 @@ class Gateway:
         new = [output for output in outputs if output not in self._outputs]
         self._outputs = outputs
         for output in new:
-            output.serve_queries(self._query_service)
+            self._serve_queries(output)
         for source in self._sources.values():
             source.fan_out.set_outputs(outputs)
         await asyncio.gather(*map(_close, removed))  # first, because a new output may use the same address

@@ -77,7 +77,7 @@ class Source:
                 StreamAccess(stream.components, status, _session_ask(supervisor))
                 for stream, status, supervisor in streams
             ],
-            newest_messages=lambda: self.fan_out.newest,
+            newest_message=self.fan_out.newest,
             status_message=lambda: self._newest_status,
             last_c3d=self._last_c3d,
             record=self._record,

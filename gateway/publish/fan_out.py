@@ -145,11 +145,18 @@ class FanOut:
         """The number of frames with each component that have arrived, published or not."""
         return {component.type: component.sequence for component in self._components.values()}
 
-    @property
-    def newest(self) -> dict[ComponentType, bytes]:
-        """The newest message of each component."""
-        newest = {component.type: component.newest for component in self._components.values()}
-        return {component: message for component, message in newest.items() if message is not None}
+    def newest(self, component: ComponentType, output: str) -> bytes | None:
+        """Return the message of the newest frame with a component that has arrived, published or not.
+
+        It has the number under which it is published on the output named ``output``. If pacing leaves it out
+        there, it has the number of the last message before it. None if no such frame has arrived.
+        """
+        message = self._components[component].newest
+        for route in self._routes:
+            component_route = route.components.get(component)
+            if message is not None and route.output.name == output and component_route is not None:
+                return component_route.numbered(message)
+        return message
 
     @property
     def outputs(self) -> list[tuple[Output, OutputStatus]]:

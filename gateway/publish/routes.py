@@ -166,6 +166,10 @@ class ComponentRoute(TopicRoute):
             self._sequence += 1
         return is_due
 
+    def numbered(self, message: bytes) -> bytes:
+        """Return the newest message with the number of the newest one that this route has let through."""
+        return message if self._pacer is None else with_sequence(message, self._sequence - 1)
+
     def _is_due(self, pacer: Pacer, message: bytes, stamp: Stamp) -> bool:
         return pacer.due(message_timestamp_us(message) if stamp.has_clock else None, stamp.utime)
 

@@ -21,15 +21,18 @@ class SourceQueryService:
     """Implements QueryService (outputs/contract.py) for the sources of one gateway.
 
     ``sources`` returns the queries of each source, ``commands`` the outputs' own commands, both by name.
+    ``output`` is the name of the output whose queries it answers.
     """
 
     def __init__(
         self,
         sources: Callable[[], Mapping[str, SourceQueries]],
         commands: Callable[[], Mapping[str, Command]],
+        output: str,
     ) -> None:
         self._sources = sources
         self._commands = commands
+        self._output = output
 
     def serves(self, source: str) -> bool:
         """See QueryService."""
@@ -49,7 +52,7 @@ class SourceQueryService:
         if command is not None:
             return await command(source, options)
         queries = self._sources()[source]
-        return await queries.answer(parse_question(path, options, queries.components))
+        return await queries.answer(parse_question(path, options, queries.components), self._output)
 
     async def answer_all(
         self, source: str, paths: Sequence[KeyPath], options: Mapping[str, str]
@@ -57,7 +60,10 @@ class SourceQueryService:
         """See QueryService. Exceptions other than QueryError are raised in any case."""
         queries = self._sources()[source]
         questions = parse_questions(paths, options, queries.components)
-        results = await asyncio.gather(*map(queries.answer, questions.values()), return_exceptions=True)
+        results = await asyncio.gather(
+            *(queries.answer(question, self._output) for question in questions.values()),
+            return_exceptions=True,
+        )
         answers: dict[KeyPath, Answer] = {}
         errors: list[QueryError] = []
         for path, result in zip(questions, results, strict=True):

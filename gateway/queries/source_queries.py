@@ -3,7 +3,7 @@
 The server gets one request at a time, and equal questions at the same time share its answer.
 """
 
-from collections.abc import Callable, Coroutine, Mapping, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from typing import Any
 
 from gateway.config.settings import SourceSettings
@@ -29,16 +29,17 @@ from gateway.stream.state import StreamState
 class SourceQueries:
     """Answers questions about one source; ``parameters`` has those of its server.
 
-    ``newest_messages`` returns the newest message of each component. ``last_c3d`` raises QueryError if there
-    is no file. ``record`` starts (True) or stops a recording, and returns False if there is no connection.
-    ``on_change`` is called with all parameters when the server's parameters change.
+    ``newest_message`` returns the newest message of a component as the output of a name numbers it.
+    ``last_c3d`` raises QueryError if there is no file. ``record`` starts (True) or stops a recording, and
+    returns False if there is no connection. ``on_change`` is called with all parameters when the server's
+    parameters change.
     """
 
     def __init__(
         self,
         settings: SourceSettings,
         streams: Sequence[StreamAccess],
-        newest_messages: Callable[[], Mapping[ComponentType, bytes]],
+        newest_message: Callable[[ComponentType, str], bytes | None],
         status_message: Callable[[], bytes],
         last_c3d: Callable[[], Coroutine[Any, Any, Answer]],
         record: Callable[[bool], bool],
@@ -47,7 +48,7 @@ class SourceQueries:
         self._settings = settings
         self.components = frozenset(component for stream in streams for component in stream.components)
         self._streams = streams
-        self._newest_messages = newest_messages
+        self._newest_message = newest_message
         self._status_message = status_message
         self._last_c3d = last_c3d
         self._record = record
@@ -64,13 +65,16 @@ class SourceQueries:
         """The version of the server's parameters; 0 before the first."""
         return self._requests.parameters_version
 
-    async def answer(self, question: Question) -> Answer:
-        """Return the answer; raises QueryError at the latest after query_timeout_s."""
+    async def answer(self, question: Question, output: str = "") -> Answer:
+        """Return the answer to a query on the output of this name; "" stands for any output.
+
+        Raises QueryError, at the latest after query_timeout_s.
+        """
         match question.kind:
             case "parameters":
                 return await self._parameters(question)
             case "component":
-                return await self._component(question)
+                return await self._component(question, output)
             case "status":
                 return message_answer(self._status_message(), question, {})
             case "schema":
@@ -101,7 +105,7 @@ class SourceQueries:
             raise QueryError(f"the server's answer has no section {question.name}", code="nothing-yet")
         return Answer(cached.json, JSON, attachment | {"recovered": list(cached.parsed.recovered)})
 
-    async def _component(self, question: Question) -> Answer:
+    async def _component(self, question: Question, output: str) -> Answer:
         """Return the newest message of the stream; while it does not run, ask for the current frame."""
         component = COMPONENTS_BY_KEY[question.name]
         stream = next(stream for stream in self._streams if component in stream.components)
@@ -109,7 +113,7 @@ class SourceQueries:
         if stream.sender() is None:
             raise self._requests.no_connection_error()
         if stream.status.state is StreamState.STREAMING:
-            message = self._newest_messages().get(component)
+            message = self._newest_message(component, output)
             if message is None or prefix_of(message).session != session:
                 raise QueryError(
                     f"no {component.key} has arrived from source {self._settings.name!r} in this session",

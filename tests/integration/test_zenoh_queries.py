@@ -7,6 +7,7 @@ import pytest
 import zenoh
 
 from gateway.messages.decode import to_json
+from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
 from tests.networks import free_endpoint
 from tests.queried_gateway import (
@@ -176,7 +177,7 @@ async def test_the_refusal_of_send_parameters_is_reported_and_cached() -> None:
         ScriptedServer(server.script) as listening,
         run_gateway(listening.port, listen=endpoint) as gateway,
     ):
-        await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
+        await wait_until_async(lambda: gateway.sources[0].fan_out.newest(ComponentType.MARKERS, "zenoh"))
         with zenoh_peer(endpoint) as peer:
             reply = await query(peer, "mocap/lab/parameters")
             assert reply.code == "refused"

@@ -25,9 +25,9 @@ from tests.waiting import wait_until_async
 
 async def test_a_streaming_component_is_answered_with_its_newest_message() -> None:
     async with gateway_with_server() as (server, _, gateway, peer):
-        await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
+        await wait_until_async(lambda: gateway.sources[0].fan_out.newest(ComponentType.MARKERS, "zenoh"))
         reply = await query(peer, "mocap/lab/3d")
-        assert reply.payload == gateway.sources[0].fan_out.newest[ComponentType.MARKERS]
+        assert reply.payload == gateway.sources[0].fan_out.newest(ComponentType.MARKERS, "zenoh")
         assert reply.encoding == "application/x-lcm;rtc3d.markers_t"
         message = rtc3d.markers_t.decode(reply.payload)
         assert (message.frame_number, message.num_markers) == (7, 1)
@@ -65,7 +65,7 @@ async def test_without_a_measurement_there_is_no_current_frame() -> None:
 
 async def test_a_component_that_has_not_arrived_is_an_error() -> None:
     async with gateway_with_server() as (_, _, gateway, peer):
-        await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
+        await wait_until_async(lambda: gateway.sources[0].fan_out.newest(ComponentType.MARKERS, "zenoh"))
         reply = await query(peer, "mocap/lab/event")
         assert reply.code == "nothing-yet"
         assert reply.error == "no event has arrived from source 'lab' in this session"
@@ -73,7 +73,7 @@ async def test_a_component_that_has_not_arrived_is_an_error() -> None:
 
 async def test_frames_of_an_earlier_connection_are_not_current() -> None:
     async with gateway_with_server() as (server, _, gateway, peer):
-        await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
+        await wait_until_async(lambda: gateway.sources[0].fan_out.newest(ComponentType.MARKERS, "zenoh"))
         server.has_measurement = False
         assert server.client is not None
         server.client.cut()
@@ -125,7 +125,7 @@ async def test_lcm_gen_makes_a_decoder_from_a_schema_alone(name: str, tmp_path: 
 
 async def test_a_decoder_from_a_queried_schema_reads_a_queried_frame(tmp_path: Path) -> None:
     async with gateway_with_server() as (_, _, gateway, peer):
-        await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
+        await wait_until_async(lambda: gateway.sources[0].fan_out.newest(ComponentType.MARKERS, "zenoh"))
         frame = await query(peer, "mocap/lab/3d")
         schema = await query(peer, f"mocap/lab/schema/{frame.encoding.partition(';')[2]}")
     code = (

@@ -67,7 +67,7 @@ async def test_options_of_zenoh_itself_are_ignored() -> None:
 
 async def test_a_wildcard_is_answered_by_every_key_that_has_an_answer() -> None:
     async with gateway_with_server() as (server, _, gateway, peer):
-        await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
+        await wait_until_async(lambda: gateway.sources[0].fan_out.newest(ComponentType.MARKERS, "zenoh"))
         replies = {reply.key: reply for reply in await query_all(peer, "mocap/lab/*?format=json")}
         assert set(replies) == {"mocap/lab/parameters", "mocap/lab/3d", "mocap/lab/status"}
         assert {reply.encoding for reply in replies.values()} == {"application/json"}
@@ -77,7 +77,7 @@ async def test_a_wildcard_is_answered_by_every_key_that_has_an_answer() -> None:
 
 async def test_a_wildcard_does_not_select_files_and_recording(tmp_path: Path) -> None:
     async with gateway_with_server(spool=tmp_path, remote_control=True) as (server, _, gateway, peer):
-        await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
+        await wait_until_async(lambda: gateway.sources[0].fan_out.newest(ComponentType.MARKERS, "zenoh"))
         server.send(packet(5, b"a file"))
         await wait_until_async(lambda: list(tmp_path.glob("*.c3d")))
         keys = [reply.key for reply in await query_all(peer, "mocap/**")]
@@ -123,7 +123,7 @@ async def test_queries_work_through_a_router() -> None:
             run_gateway(listening.port, router=router) as gateway,
         ):
             await wait_until_cached(gateway, server)
-            await wait_until_async(lambda: gateway.sources[0].fan_out.newest)
+            await wait_until_async(lambda: gateway.sources[0].fan_out.newest(ComponentType.MARKERS, "zenoh"))
             with zenoh_peer(router) as peer:
                 assert (await query(peer, "mocap/lab/parameters")).payload == server.xml
                 fresh = await query(peer, "mocap/lab/parameters/3d?fresh=true;format=json")

@@ -35,7 +35,7 @@ async def test_zenoh_opens_and_replies_in_threads(threads: Callable[[], dict[str
     with socket.create_server(("127.0.0.1", 0)) as silent:  # zenoh.open waits for an answer
         endpoint = f"tcp/127.0.0.1:{silent.getsockname()[1]}"
         output = ZenohOutput(ZenohSettings(config=zenoh_keys("client", connect=endpoint)))
-        output.serve_queries(SourceQueryService(dict, dict))
+        output.serve_queries(SourceQueryService(dict, dict, "zenoh"))
         output.start()
         assert threads() == {"zenoh-open": True, "zenoh-send": True, "zenoh-send-long": True}
         await output.stop_queries()
@@ -46,7 +46,7 @@ async def test_zenoh_opens_and_replies_in_threads(threads: Callable[[], dict[str
 async def test_lcm_sends_and_receives_in_threads(threads: Callable[[], dict[str, bool]]) -> None:
     relay = LcmRelay()
     output = LcmOutput(LcmSettings(url=relay.url))
-    output.serve_queries(SourceQueryService(dict, dict))
+    output.serve_queries(SourceQueryService(dict, dict, "zenoh"))
     output.announce("lab")
     output.start()
     await wait_until_async(lambda: output.health().connected and relay.subscribed)

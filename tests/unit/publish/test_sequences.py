@@ -194,6 +194,29 @@ def test_poses_without_a_subscriber_are_no_gap_and_skipped_ones_are() -> None:
     assert numbered(output, "6d", "tool 1") == [(0, 1), (1, 4), (4, 7)]
 
 
+def newest(fan_out: FanOut, output: str) -> tuple[int, int]:
+    """Return (sequence, frame number) of the newest 3D message."""
+    message = decode(fan_out.newest(MARKERS, output) or b"")
+    return message.sequence, message.frame_number
+
+
+def test_the_newest_message_is_the_newest_that_arrived_with_the_number_of_the_asked_output() -> None:
+    unpaced, paced, whole = ToyOutput("unpaced"), ToyOutput("paced"), FrameOutput("whole")
+    paced.max_rate_hz = {MARKERS: 50.0}
+    fan_out = FanOut("lab", [unpaced, paced, whole])
+    assert fan_out.newest(MARKERS, "unpaced") is None
+    for number, of_paced in ((0, 0), (1, 0), (2, 1), (3, 1), (4, 2)):
+        publish(fan_out, number)
+        assert newest(fan_out, "paced") == (of_paced, number)
+        assert newest(fan_out, "unpaced") == newest(fan_out, "whole") == (number, number)
+    assert (
+        fan_out.newest(MARKERS, "paced")
+        == [data for topic, data in paced.messages if topic.path == ("3d",)][-1]
+    )
+    skip(fan_out, 5)
+    assert newest(fan_out, "unpaced") == (5, 5)
+
+
 @pytest.mark.parametrize("rate_hz", [None, 40.0])
 def test_missing_frames_are_the_gaps_and_the_count_of_skipped_messages(rate_hz: float | None) -> None:
     """Frames arrive in batches, some late: with ``backlog: latest``, all but the newest are skipped."""

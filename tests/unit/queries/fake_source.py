@@ -84,7 +84,7 @@ class FakeSource:
         self.queries = SourceQueries(
             source_settings,
             [self.stream],
-            lambda: self.newest_messages,
+            lambda component, _output: self.newest_messages.get(component),
             rtc3d.status_t().encode,
             self._last_c3d,
             self._record,
@@ -115,4 +115,4 @@ class FakeSource:
         return caught.value
 
     async def answer(self, kind: Any, name: str = "", **question: Any) -> Answer:
-        return await self.queries.answer(Question(kind, name, **question))
+        return await self.queries.answer(Question(kind, name, **question), "zenoh")

@@ -14,7 +14,7 @@ async def trim(source: str, options: Mapping[str, str]) -> Answer:
 
 
 def service_of(source: FakeSource) -> SourceQueryService:
-    return SourceQueryService(lambda: {"lab": source.queries}, lambda: {"record/trim": trim})
+    return SourceQueryService(lambda: {"lab": source.queries}, lambda: {"record/trim": trim}, "zenoh")
 
 
 async def test_a_command_of_an_output_gets_the_source_and_the_options() -> None:
