@@ -25,6 +25,7 @@ from gateway.config.values import (
     Seconds,
     ServerByteOrder,
     SourceName,
+    Speed,
     SpoolDirectory,
     StreamRate,
     Switch,
@@ -47,6 +48,9 @@ class StreamSettings(Section):
 
     backlog: Backlog = "all"
     """While frames are late: publish all frames, or only the newest one. Events are never skipped."""
+
+    backlog_speed: Speed = 2.0
+    """How fast a backlog is published with `backlog: all`, as a multiple of the stream's own rate."""
 
     adapt_rate: Switch = False
     """Whether to request a lower rate from the server while frames are late."""

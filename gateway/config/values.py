@@ -51,6 +51,11 @@ Hertz = Annotated[
     Field(strict=True, gt=0, le=1_000_000, allow_inf_nan=False),
     expects("a number of frames per second above 0, up to 1000000"),
 ]
+Speed = Annotated[
+    float,
+    Field(strict=True, ge=1.5, le=1000, allow_inf_nan=False),
+    expects("a number from 1.5 to 1000"),
+]
 Divisor = Annotated[int, Field(strict=True, ge=1, le=1_000_000), expects("a whole number from 1 to 1000000")]
 ByteLimit = Annotated[
     int,

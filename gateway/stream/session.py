@@ -36,9 +36,13 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.packets import Packet, decode_text
 from gateway.rtc3d.protocol_state import ProtocolState
+from gateway.stream.backlog import MAX_TOGETHER, Backlog
 from gateway.stream.running_time import running_clock, running_timeout
 from gateway.stream.status import StreamStatus
 from gateway.stream.tcp import Connect, open_connection
+
+_MIN_WAIT_S: Final = 0.001
+"""The shortest timer. uvloop has whole milliseconds, and would run shorter ones without waiting."""
 
 _BYE_S: Final = 0.5
 """How long a server may take to close after Bye; some never do (field note 10)."""
@@ -82,6 +86,11 @@ class Session:
         self._only_events = set(stream.components) == {ComponentType.EVENT}
         self._status = status
         self._on_frames = on_frames
+        self._publishes_all = stream.backlog == "all"
+        self._backlog = Backlog(on_frames, status.clock, stream.backlog_speed, monotonic)
+        self._backlog_timer: asyncio.Handle | None = None  # set while frames wait
+        self._is_reading_paused = False
+        self._caught_up_s = 0.0  # when a backlog was last published, on the running clock
         self._on_file = on_file
         self._connect = connect
         self._monotonic = monotonic
@@ -135,8 +144,7 @@ class Session:
             self._reply = self._loop.create_future()
             self._flush()
             try:
-                async with running_timeout(self._source.reply_timeout_s):
-                    packet = await self._reply
+                packet = await self._wait_for_reply(self._reply)
             except TimeoutError:
                 raise ReplyTimeoutError(
                     f"{self.server} did not answer {command} within {self._source.reply_timeout_s:g} s"
@@ -170,6 +178,22 @@ class Session:
                     await self._state_changed.wait()
         self._check_open()
         return self.has_data
+
+    async def _wait_for_reply(self, reply: "asyncio.Future[Packet]") -> Packet:
+        """Wait for ``reply``; raise TimeoutError if the server does not answer within reply_timeout_s.
+
+        The time-out starts again when a backlog ends, because the reply may be behind it.
+        """
+        since_s = self._running.time()
+        while not reply.done():
+            since_s = max(since_s, self._caught_up_s)
+            wait_s = self._source.reply_timeout_s - (self._running.time() - since_s)
+            if wait_s <= 0:
+                raise TimeoutError
+            with contextlib.suppress(TimeoutError):
+                async with running_timeout(wait_s):
+                    await asyncio.wait({reply})
+        return reply.result()
 
     def control_recording(self, *, start: bool) -> None:
         """Start or stop the server's recording (field note 16). Raises LinkError if the session has ended."""
@@ -261,7 +285,13 @@ class Session:
         if frames:
             self._quiet_since_s = self._running.time()
             self._status.frames_read(self._quiet_since_s)
-            self._on_frames(frames, utime, self._monotonic())
+            is_backlog = len(frames) > MAX_TOGETHER and self._publishes_all and self._error is None
+            if is_backlog or not self._backlog.is_empty:
+                self._backlog.add(frames, utime, self._monotonic())
+                if self._backlog_timer is None:
+                    self._publish_backlog()
+            else:
+                self._on_frames(frames, utime, self._monotonic())
 
     def connection_lost(self, exc: Exception | None) -> None:
         """End the session, unless it has ended already: the connection is closed, by either side."""
@@ -269,6 +299,39 @@ class Session:
         reason = f"broke: {exc}" if exc else "was closed by the server"
         self.fail(ClosedError(f"the connection to {self.server} {reason}"))
         self._lost.set()
+
+    def _publish_backlog(self) -> None:
+        """Publish the part of the backlog that is due; read from the server again when nothing is left.
+
+        Meanwhile the data stays in the kernel, and TCP makes the server wait when the kernel's buffer is
+        full. So memory is limited, and the other sources get their turn.
+        """
+        self._backlog_timer = None
+        try:
+            wait_s = self._backlog.publish_due()
+        except Exception as defect:  # noqa: BLE001 - the supervisor logs it and connects again
+            self.fail(DefectError.of(defect))
+            return
+        # What follows has not been read yet, so silence and unanswered commands mean nothing.
+        self._caught_up_s = self._quiet_since_s = self._running.time()
+        if wait_s is None:
+            self._set_reading(True)
+        else:
+            self._set_reading(False)
+            self._backlog_timer = self._loop.call_later(
+                max(wait_s, _MIN_WAIT_S) if wait_s else 0.0, self._publish_backlog
+            )
+
+    def _set_reading(self, is_reading: bool) -> None:
+        """Read from the server, or let the data wait in the kernel."""
+        transport = self._transport
+        if transport is None or transport.is_closing() or self._is_reading_paused is not is_reading:
+            return
+        self._is_reading_paused = not is_reading
+        if is_reading:
+            transport.resume_reading()
+        else:
+            transport.pause_reading()
 
     def _on_event(self, event: ProtocolEvent) -> None:
         match event:
@@ -342,6 +405,9 @@ class Session:
         self._ended.set()
         self._state_changed.set()
         self._end_ask(error)
+        if not isinstance(error, DefectError):  # which may be one in publishing
+            self._backlog.publish_all()
+        self._set_reading(True)
 
     def _flush(self) -> None:
         if self._transport is not None:

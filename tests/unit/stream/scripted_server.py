@@ -50,6 +50,8 @@ class Connection(asyncio.Transport):
         self._session = session
         self.commands: list[str] = []
         self.is_open = True
+        self.is_read = True
+        """Whether the client reads from the connection."""
         self.got_eof = False
         self.num_recording_packets = 0
 
@@ -75,6 +77,17 @@ class Connection(asyncio.Transport):
 
     def abort(self) -> None:
         self.end()
+
+    def is_closing(self) -> bool:
+        return not self.is_open
+
+    def pause_reading(self) -> None:
+        assert self.is_read
+        self.is_read = False
+
+    def resume_reading(self) -> None:
+        assert not self.is_read
+        self.is_read = True
 
     # The server's side.
 

@@ -1,0 +1,127 @@
+"""The pace of a backlog: many frames that arrived together because something stood still.
+
+The cause can be this process, the network or the server. If all of these frames were published at once, the
+loss would only move: subscribers with small buffers, such as those of LCM over UDP, could not take them.
+So a backlog is published like a recording that is played at a multiple of its speed. Each subscriber then has
+to take that multiple of its usual load, whatever the rate and the size of the frames are.
+"""
+
+from collections.abc import Callable
+from typing import Final
+
+from gateway.rtc3d.frames import Frame
+from gateway.stream.clock import ServerClock
+
+MAX_TOGETHER: Final = 4
+"""As many frames may be published together without being a backlog."""
+
+_MAX_WAIT_S: Final = 0.005
+"""The longest time between two frames, so that gaps and low rates do not delay a backlog."""
+
+_MAX_LATE_S: Final = 0.015
+"""How much of the time that the event loop was late is made up for by publishing frames together."""
+
+_IDLE_S: Final = 0.5
+"""After this time, a backlog does not continue an earlier one. A stream that comes in batches has many."""
+
+_TURN_S: Final = 0.005
+"""How long one call may publish, except for what its last frames take."""
+
+_MAX_CHUNK: Final = 16
+"""How many frames are published between two looks at the time."""
+
+
+class Backlog:
+    """The frames of one session that wait to be published, and when each is due.
+
+    ``publish`` takes frames and when they arrived, as Ingest.receive does. ``speed`` is the pace as a
+    multiple of the stream's own, according to the server's time stamps while they are those of a ``clock``.
+    Without a clock, every frame is due at once.
+
+    The session stops reading while frames wait, so the number of frames is limited by the size of one read.
+    """
+
+    def __init__(
+        self,
+        publish: Callable[[list[Frame], int, float], None],
+        clock: ServerClock,
+        speed: float,
+        monotonic: Callable[[], float],
+    ) -> None:
+        self._publish = publish
+        self._clock = clock
+        self._speed = speed
+        self._monotonic = monotonic
+        self._frames: list[Frame] = []  # waiting, without those before _next
+        self._next = 0
+        self._utime = 0  # when they arrived
+        self._arrival_s = 0.0
+        self._due_s = 0.0  # when the next frame is due, on the monotonic clock
+        self._timestamp_us: int | None = None  # of the newest frame published at a pace
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no frames wait."""
+        return not self._frames
+
+    def add(self, frames: list[Frame], utime: int, now_s: float) -> None:
+        """Take frames that arrived together, oldest first; see Ingest.receive. Publishes nothing yet."""
+        if self._frames:
+            self._frames = self._frames[self._next :] + frames
+        else:
+            self._frames = frames
+            if now_s - self._due_s > _IDLE_S:
+                self._due_s = now_s
+                self._timestamp_us = None
+        self._next = 0
+        self._utime = utime
+        self._arrival_s = now_s
+
+    def publish_due(self) -> float | None:
+        """Publish what is due. Return in how many s to call again, or None if nothing waits any more."""
+        now_s = self._monotonic()
+        end_s = now_s + _TURN_S
+        self._due_s = max(self._due_s, now_s - _MAX_LATE_S)
+        while self._frames and now_s < end_s:
+            end = self._end_of_due(now_s)
+            if end == self._next:
+                return self._due_s - now_s
+            self._publish_until(end)
+            now_s = self._monotonic()
+        return 0.0 if self._frames else None
+
+    def publish_all(self) -> None:
+        """Publish everything that waits, at once."""
+        if self._frames:
+            self._publish_until(len(self._frames))
+
+    def _end_of_due(self, now_s: float) -> int:
+        """Return the index after the last of the next frames that is due; plan when the one after it is."""
+        at = self._next
+        last = min(len(self._frames), at + _MAX_CHUNK)
+        if not self._clock.has_clock:
+            return last
+        while at < last and self._due_s <= now_s:
+            self._due_s += self._wait_s(self._frames[at])
+            at += 1
+        return at
+
+    def _wait_s(self, frame: Frame) -> float:
+        """Return how long to wait after ``frame`` was due: as long as after the one before it."""
+        if frame.layout.first_component_type is None:
+            return 0.0
+        _, timestamp_us = frame.number_and_timestamp
+        before_us = self._timestamp_us
+        self._timestamp_us = timestamp_us
+        if before_us is None or timestamp_us <= before_us:
+            return 0.0
+        return min((timestamp_us - before_us) / (1e6 * self._speed), _MAX_WAIT_S)
+
+    def _publish_until(self, end: int) -> None:
+        frames = self._frames[self._next : end]
+        if end == len(self._frames):
+            self._frames = []
+            self._next = 0
+        else:
+            self._next = end
+        self._publish(frames, self._utime, self._arrival_s)

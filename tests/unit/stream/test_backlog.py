@@ -1,0 +1,192 @@
+"""The pace of a backlog, on a clock that only the tests advance."""
+
+import pytest
+
+from gateway.rtc3d.frames import Frame, split_frame
+from gateway.stream.backlog import Backlog
+from gateway.stream.clock import ServerClock
+from tests.servers import markers_frame
+
+UTIME = 1_700_000_000_000_000
+MS = 0.001
+
+
+def frame(timestamp_ms: int) -> Frame:
+    return split_frame(markers_frame(timestamp_ms, (0.0, 0.0, 0.0))[8:], "big")
+
+
+def frames(count: int, first_ms: int = 0, step_ms: int = 1) -> list[Frame]:
+    return [frame(first_ms + step_ms * number) for number in range(count)]
+
+
+class Subscriber:
+    """A backlog and its clock. ``published`` has each frame's number, and when it was published, in s."""
+
+    def __init__(self, speed: float = 2.0) -> None:
+        self.now_s = 100.0
+        self.costs_s = 0.0
+        """How long it takes to publish one frame."""
+        self.published: list[tuple[int, float]] = []
+        self.clock = ServerClock()
+        self.clock.has_clock = True
+        self.backlog = Backlog(self._publish, self.clock, speed, lambda: self.now_s)
+
+    def _publish(self, published: list[Frame], utime: int, now_s: float) -> None:
+        assert utime == UTIME
+        assert now_s <= self.now_s
+        for each in published:
+            self.published.append((each.number_and_timestamp[0], self.now_s - 100.0))
+            self.now_s += self.costs_s
+
+    def arrive(self, arrived: list[Frame]) -> None:
+        self.backlog.add(arrived, UTIME, self.now_s)
+
+    def run(self, late_s: float = 0.0) -> None:
+        """Publish everything that waits, with every call ``late_s`` later than asked for."""
+        while (wait_s := self.backlog.publish_due()) is not None:
+            self.now_s += wait_s + late_s
+
+    @property
+    def numbers(self) -> list[int]:
+        return [number for number, _ in self.published]
+
+    @property
+    def times_ms(self) -> list[float]:
+        return [round(1000 * time_s, 3) for _, time_s in self.published]
+
+
+@pytest.mark.parametrize("speed", [1.5, 2.0, 10.0])
+def test_a_backlog_is_published_at_a_multiple_of_the_streams_rate(speed: float) -> None:
+    subscriber = Subscriber(speed)
+    subscriber.arrive(frames(1000))
+    subscriber.run()
+    assert subscriber.numbers == list(range(1000))
+    assert subscriber.times_ms[-1] == pytest.approx(998 / speed)
+    steps = [
+        after - before
+        for before, after in zip(subscriber.times_ms[1:], subscriber.times_ms[2:], strict=False)
+    ]
+    assert steps == pytest.approx([1 / speed] * 998, abs=0.002)
+
+
+def test_the_pace_continues_from_one_read_to_the_next() -> None:
+    subscriber = Subscriber()
+    for first in range(0, 1000, 100):
+        subscriber.arrive(frames(100, first))
+        subscriber.run()
+    assert subscriber.numbers == list(range(1000))
+    assert subscriber.times_ms[-1] == pytest.approx(500, abs=2)
+
+
+def test_frames_that_arrive_while_others_wait_follow_them() -> None:
+    subscriber = Subscriber()
+    subscriber.arrive(frames(20))
+    subscriber.backlog.publish_due()
+    subscriber.arrive(frames(20, 20))
+    subscriber.run()
+    assert subscriber.numbers == list(range(40))
+
+
+def test_a_stream_that_arrives_in_batches_is_not_delayed() -> None:
+    """After the first batch, the time since the last one pays for the next."""
+    subscriber = Subscriber()
+    for first in range(0, 100, 10):
+        arrived_s = subscriber.now_s
+        subscriber.arrive(frames(10, first))
+        subscriber.run()
+        if first:
+            assert subscriber.now_s == arrived_s
+        subscriber.now_s = arrived_s + 10 * MS
+
+
+def test_a_stream_as_fast_as_the_gateway_is_never_throttled() -> None:
+    """Every read has more frames than one publishes at once, and publishing takes as long as measuring."""
+    subscriber = Subscriber()
+    subscriber.costs_s = 1 * MS
+    for first in range(0, 1000, 100):
+        subscriber.arrive(frames(100, first))
+        subscriber.run()
+    assert subscriber.times_ms[-1] == pytest.approx(999, abs=2)
+
+
+@pytest.mark.parametrize("late_ms", [1, 5, 20])
+def test_an_event_loop_whose_timers_are_late_keeps_the_pace(late_ms: int) -> None:
+    subscriber = Subscriber()
+    subscriber.arrive(frames(1000))
+    subscriber.run(late_ms * MS)
+    expected_ms = 500 if late_ms <= 15 else 500 * late_ms / 15
+    assert subscriber.times_ms[-1] == pytest.approx(expected_ms, rel=0.1)
+    assert subscriber.times_ms[-1] < 1000, "slower than the stream itself"
+
+
+def test_a_second_stop_does_not_lead_to_a_burst() -> None:
+    subscriber = Subscriber()
+    subscriber.arrive(frames(1000))
+    subscriber.backlog.publish_due()
+    subscriber.now_s += 5.0
+    before = len(subscriber.published)
+    subscriber.backlog.publish_due()
+    assert len(subscriber.published) - before <= 32
+
+
+@pytest.mark.parametrize(
+    "timestamps_ms",
+    [
+        pytest.param([0, 1, 2, 3_600_000, 3_600_001], id="gap"),
+        pytest.param([1000 * number for number in range(5)], id="slow"),
+        pytest.param([5000, 5001, 0, 1, 2], id="back"),
+        pytest.param([7] * 5, id="constant"),
+    ],
+)
+def test_unusual_time_stamps_never_cost_more_than_5_ms(timestamps_ms: list[int]) -> None:
+    subscriber = Subscriber()
+    subscriber.arrive([frame(timestamp_ms) for timestamp_ms in timestamps_ms])
+    subscriber.run()
+    assert subscriber.numbers == timestamps_ms
+    steps = [
+        after - before for before, after in zip(subscriber.times_ms, subscriber.times_ms[1:], strict=False)
+    ]
+    assert max(steps) <= 5.001
+
+
+def test_frames_without_components_have_no_time() -> None:
+    subscriber = Subscriber()
+    empty = split_frame(bytes(4), "big")
+    subscriber.backlog = Backlog(
+        lambda published, _utime, _now_s: subscriber.published.extend((-1, 0.0) for _ in published),
+        subscriber.clock,
+        2.0,
+        lambda: subscriber.now_s,
+    )
+    subscriber.arrive([empty] * 10)
+    subscriber.run()
+    assert len(subscriber.published) == 10
+    assert subscriber.now_s == 100.0
+
+
+def test_without_a_clock_nothing_waits() -> None:
+    subscriber = Subscriber()
+    subscriber.clock.has_clock = False
+    subscriber.arrive(frames(1000))
+    subscriber.run()
+    assert subscriber.times_ms == [0.0] * 1000
+
+
+def test_one_call_publishes_only_for_a_while() -> None:
+    subscriber = Subscriber()
+    subscriber.clock.has_clock = False
+    subscriber.costs_s = 0.1 * MS
+    subscriber.arrive(frames(1000))
+    assert subscriber.backlog.publish_due() == 0.0
+    assert 50 <= len(subscriber.published) <= 50 + 16
+
+
+def test_everything_can_be_published_at_once() -> None:
+    subscriber = Subscriber()
+    subscriber.arrive(frames(1000))
+    subscriber.backlog.publish_due()
+    assert 0 < len(subscriber.published) < 1000
+    subscriber.backlog.publish_all()
+    assert subscriber.numbers == list(range(1000))
+    subscriber.backlog.publish_all()
+    assert subscriber.backlog.publish_due() is None
