@@ -2,7 +2,8 @@
 
 No data leaves the machine: Zenoh uses loopback TCP without scouting, LCM stays in memory (or uses
 multicast with ``udpm``). The measurement starts after all subscribers have received the gateway's status,
-and stops before they close, so every component that was sent must arrive.
+and stops before they close, so every component that was sent must arrive. Messages that the gateway skipped
+on purpose and messages that arrived late are counted apart from lost ones.
 """
 
 import asyncio
@@ -20,17 +21,20 @@ from rich.table import Table
 from gateway.config.settings import MetricsSettings, Settings, SourceSettings, StreamSettings
 from gateway.errors import OutputError
 from gateway.gateway import Gateway
-from gateway.messages.decode import decode
+from gateway.messages.decode import decode, prefix_of
+from gateway.messages.host_time import now_utime
 from gateway.messages.summary import summarise
 from gateway.outputs.kind import DemoSide
 from gateway.outputs.registry import OUTPUTS, settings_type
-from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ComponentType
 from gateway.rtc3d_server.scene import Scene
 from gateway.simulator.simulator import Simulator
 
 SOURCE: Final = "demo"
 _START_TIMEOUT_S: Final = 10.0
-_DRAIN_TIMEOUT_S: Final = 3.0
+_QUIET_S: Final = 3.0
+"""If nothing arrives for this long after the end, what is missing then is lost."""
+
 _REFRESH_S: Final = 0.5
 _MESSAGE_WIDTH: Final = 60
 
@@ -39,7 +43,10 @@ _MESSAGE_WIDTH: Final = 60
 class _Received:
     """What one subscriber received, by component. Its thread writes, the event loop reads."""
 
+    max_lag_s: float
+    """Messages that arrive later than this after their capture are late."""
     count: Counter[str] = field(default_factory=Counter)
+    late: Counter[str] = field(default_factory=Counter)
     newest: dict[str, bytes] = field(default_factory=dict)
 
     def add(self, name: str, message: bytes) -> None:
@@ -47,6 +54,8 @@ class _Received:
         component = name.replace("_", "/").rsplit("/", 1)[-1].lower()
         self.count[component] += 1
         self.newest[component] = message
+        if component in COMPONENTS_BY_KEY:
+            self.late[component] += now_utime() - prefix_of(message).capture_utime > 1e6 * self.max_lag_s
 
 
 async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool) -> bool:
@@ -55,13 +64,13 @@ async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool
     Raises OutputError if Zenoh or LCM does not open on this machine.
     """
     sides = {name: kind.demo(udpm) for name, kind in OUTPUTS.items() if kind.demo is not None}
-    received = {name: _Received() for name in sides}
     async with contextlib.AsyncExitStack() as stack:
         simulator = await stack.enter_async_context(Simulator(scene))
         simulator.stop_measurement()
         settings = _settings(simulator.port, sides)
-        outputs = [side.output for side in sides.values()]
-        await stack.enter_async_context(_running(Gateway(settings, outputs)))
+        received = {name: _Received(settings.sources[0].max_lag_ms / 1000) for name in sides}
+        gateway = Gateway(settings, [side.output for side in sides.values()])
+        await stack.enter_async_context(_running(gateway))
         for name, side in sides.items():
             await _until_open(name, side)
             stack.callback(side.subscribe(SOURCE, received[name].add).close)
@@ -73,9 +82,20 @@ async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool
         simulator.start_measurement()
         await _show(received, seconds, console)
         simulator.stop_measurement()
-        lost = await _count_missing(simulator, received)
+        await _wait_for_missing(simulator, received)
+        skipped = _num_skipped(gateway)
     console.print(_report(simulator.components_sent, received))
+    lost = sum(max(0, _num_missing(simulator.components_sent, each) - skipped) for each in received.values())
+    late = sum(each.late.total() for each in received.values())
     console.print("[green]Nothing was lost.[/]" if not lost else f"[red]{lost} messages were lost.[/]")
+    console.print(
+        f"{skipped} messages were skipped, and {late} arrived late "
+        f"(more than {settings.sources[0].max_lag_ms:g} ms after their capture)."
+    )
+    if simulator.frames_dropped:
+        console.print(
+            f"The simulator left out {simulator.frames_dropped} frames that were more than 1 s late."
+        )
     return not lost
 
 
@@ -136,19 +156,29 @@ async def _show(received: dict[str, _Received], seconds: float, console: Console
                 live.update(_table(received, rates, now_s, seconds), refresh=True)
 
 
-async def _count_missing(simulator: Simulator, received: dict[str, _Received]) -> int:
-    """Wait for messages that are in transit; return how many are missing after that."""
+async def _wait_for_missing(simulator: Simulator, received: dict[str, _Received]) -> None:
+    """Wait until every message that was sent has arrived, or none arrives for _QUIET_S."""
+    while missing := sum(_num_missing(simulator.components_sent, each) for each in received.values()):
+        try:
+            await _until(
+                lambda: (
+                    sum(_num_missing(simulator.components_sent, each) for each in received.values()) < missing
+                ),
+                _QUIET_S,
+                "messages are missing",
+            )
+        except OutputError:
+            return
 
-    def missing() -> int:
-        return sum(
-            max(0, sent - each.count[component])
-            for component, sent in simulator.components_sent.items()
-            for each in received.values()
-        )
 
-    with contextlib.suppress(OutputError):
-        await _until(lambda: not missing(), _DRAIN_TIMEOUT_S, "messages are missing")
-    return missing()
+def _num_missing(sent: Counter[str], received: _Received) -> int:
+    return sum(max(0, count - received.count[component]) for component, count in sent.items())
+
+
+def _num_skipped(gateway: Gateway) -> int:
+    """Return how many messages the gateway skipped before any output."""
+    statuses = [status for source in gateway.sources for status in source.statuses]
+    return sum(loss.messages for status in statuses for loss in status.losses.report())
 
 
 def _table(
@@ -171,17 +201,17 @@ def _table(
 
 
 def _report(sent: Counter[str], received: dict[str, _Received]) -> Table:
-    table = Table(title="Messages sent, received and lost")
+    table = Table(title="Messages sent, received, late and missing")
     for heading in (
         "component",
         "sent",
-        *(f"{output} {what}" for output in received for what in ("received", "lost")),
+        *(f"{output}\n{what}" for output in received for what in ("received", "late", "missing")),
     ):
         table.add_column(heading, justify="left" if heading == "component" else "right")
     for component in WIRE_ORDER:
         cells = []
-        for output in received:
-            count = received[output].count[component.key]
-            cells += [str(count), str(sent[component.key] - count)]
+        for each in received.values():
+            count = each.count[component.key]
+            cells += [str(count), str(each.late[component.key]), str(sent[component.key] - count)]
         table.add_row(component.key, str(sent[component.key]), *cells)
     return table

@@ -2,6 +2,7 @@
 
 import ipaddress
 import socket
+from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
 
@@ -14,6 +15,9 @@ DEFAULT_PORT: Final = 7667
 """LCM's own defaults for multicast."""
 
 MULTICAST_SCHEMES: Final = ("udpm", "mpudpm")
+_RECEIVE_BUFFER_BYTES: Final = 4 * 1024 * 1024
+_RMEM_MAX: Final = Path("/proc/sys/net/core/rmem_max")
+
 BLOCKING_SCHEMES: Final = ("tcpq", "file")
 """Schemes that open and publish synchronously: a peer or disk that stalls blocks the caller."""
 
@@ -44,6 +48,21 @@ def multicast_problem(url: str) -> str:
             "ip route add 224.0.0.0/4 dev INTERFACE"
         )
     return ""
+
+
+def receiving_url(url: str) -> str:
+    """Return ``url`` with a receive buffer for bursts, unless it sets one or its scheme has none.
+
+    LCM's default takes what the kernel gives, which holds about 100 messages. Larger than what the kernel
+    allows, the buffer would be a warning on stderr.
+    """
+    if scheme_of(url) not in MULTICAST_SCHEMES or "recv_buf_size" in url:
+        return url
+    try:
+        largest = int(_RMEM_MAX.read_text())
+    except (OSError, ValueError):
+        return url  # not Linux, or a sandbox that hides it
+    return f"{url}{'&' if '?' in url else '?'}recv_buf_size={min(_RECEIVE_BUFFER_BYTES, largest)}"
 
 
 def open_lcm(url: str) -> lcm.LCM:

@@ -4,7 +4,7 @@ from typing import Final
 
 from gateway.outputs.kind import DemoSide, OutputKind, Receive, Subscription
 from gateway.outputs.lcm.checks import CHECKS, check_lcm
-from gateway.outputs.lcm.connection import open_lcm
+from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.subscriber import LcmSubscriber, channel_pattern, subscribe
@@ -13,7 +13,7 @@ from gateway.outputs.lcm.subscriber import LcmSubscriber, channel_pattern, subsc
 def _demo(use_network: bool) -> DemoSide:
     """Return LCM for the demo: in memory, or on multicast with ``use_network``."""
     settings = LcmSettings(url=None if use_network else "memq://")
-    subscriber_lcm = open_lcm(settings.effective_url)
+    subscriber_lcm = open_lcm(receiving_url(settings.effective_url))
 
     def subscribe_here(source: str, receive: Receive) -> Subscription:
         return LcmSubscriber(subscriber_lcm, channel_pattern(settings.prefix, source, None), receive)

@@ -9,7 +9,7 @@ import lcm
 
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.kind import Receive, SubscriptionRequest
-from gateway.outputs.lcm.connection import open_lcm
+from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url
 
 QUEUE_MESSAGES: Final = 10_000
@@ -61,4 +61,4 @@ class LcmSubscriber:
 def subscribe(request: SubscriptionRequest, receive: Receive) -> LcmSubscriber:
     """Subscribe with a new LCM object; ``request.address`` is its URL. Raises OutputError."""
     channels = channel_pattern(request.prefix or DEFAULT_LCM_PREFIX, request.source, request.component)
-    return LcmSubscriber(open_lcm(effective_lcm_url(request.address)), channels, receive)
+    return LcmSubscriber(open_lcm(receiving_url(effective_lcm_url(request.address))), channels, receive)

@@ -1,0 +1,111 @@
+"""The demo on a busy machine, and how it tells lost, skipped and late messages apart."""
+
+import asyncio
+import io
+import os
+import re
+import signal
+import sys
+import time
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import pytest
+from rich.console import Console
+
+from gateway import demo
+from gateway.config.settings import StreamSettings
+from gateway.outputs.kind import DemoSide, Receive, Subscription
+from gateway.outputs.lcm.kind import LCM
+from gateway.outputs.registry import OUTPUTS
+from gateway.rtc3d.components import ComponentType
+from gateway.simulator.synthetic import SyntheticScene
+
+
+class StallingScene(SyntheticScene):
+    """Stops the whole process for a moment after two seconds, like a busy machine."""
+
+    def __init__(self) -> None:
+        super().__init__(markers=2, tools=1, analog=0, plates=0, rate_hz=200)
+        self._has_stalled = False
+
+    def items(self, component: ComponentType, samples: Any) -> Any:
+        if samples[-1] >= 400 and not self._has_stalled:
+            self._has_stalled = True
+            time.sleep(0.4)
+        return super().items(component, samples)
+
+
+async def report(scene: SyntheticScene, seconds: float) -> tuple[bool, str]:
+    """Run the demo; return its verdict and what it prints."""
+    out = io.StringIO()
+    verdict = await demo.run_demo(scene, seconds, Console(file=out, width=200), udpm=False)
+    return verdict, out.getvalue()
+
+
+def number_of(what: str, text: str) -> int:
+    """Return the number before ``what``."""
+    found = re.search(rf"(\d+) (?:messages )?(?:were |arrived ){what}", text)
+    assert found, text
+    return int(found[1])
+
+
+async def test_the_demo_loses_nothing_on_a_busy_machine_and_says_what_is_late() -> None:
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "gateway", "demo", "--seconds", "3"),
+        stdout=asyncio.subprocess.PIPE,
+        env=os.environ | {"COLUMNS": "200"},
+    )
+    output = asyncio.create_task(process.communicate())
+    while not output.done():  # a busy machine: the process runs for some time, then others do
+        process.send_signal(signal.SIGSTOP)
+        await asyncio.sleep(0.3)
+        process.send_signal(signal.SIGCONT)
+        await asyncio.wait([output], timeout=0.7)
+    out = output.result()[0].decode()
+    assert process.returncode == 0, out
+    assert "Nothing was lost." in out
+    assert number_of("late", out) > 100
+    assert number_of("skipped", out) == 0
+
+
+async def test_what_the_gateway_skips_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demo, "StreamSettings", partial(StreamSettings, backlog="latest"))
+    is_complete, text = await report(StallingScene(), 3.0)
+    assert is_complete, text
+    assert "Nothing was lost." in text
+    assert number_of("skipped", text) > 50
+
+
+async def test_what_a_subscriber_misses_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(OUTPUTS, "lcm", _with_deaf_subscriber(every=10))
+    is_complete, text = await report(SyntheticScene(markers=2, tools=0, analog=0, plates=0, rate_hz=100), 1.0)
+    assert not is_complete
+    lost = number_of("lost", text)
+    assert 9 <= lost <= 12
+    assert number_of("skipped", text) == 0
+
+
+def _with_deaf_subscriber(every: int) -> Any:
+    kind = LCM
+    assert kind.demo is not None
+    build = kind.demo
+
+    def demo_side(use_network: bool) -> DemoSide:
+        side = build(use_network)
+
+        def subscribe(source: str, receive: Receive) -> Subscription:
+            count = 0
+
+            def receive_most(name: str, message: bytes) -> None:
+                nonlocal count
+                count += name.endswith("_3D")
+                if not (name.endswith("_3D") and count % every == 0):
+                    receive(name, message)
+
+            return side.subscribe(source, receive_most)
+
+        return side._replace(subscribe=subscribe)
+
+    return replace(kind, demo=demo_side)
