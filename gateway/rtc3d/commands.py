@@ -124,7 +124,28 @@ class Bye:
         return "Bye"
 
 
-Command = Version | SetByteOrder | SendParameters | SendCurrentFrame | StreamFrames | StopStreaming | Bye
+@dataclass(frozen=True, slots=True)
+class ControlRecording:
+    """Start or stop a recording, as one WaveFront client does (field note 18); not in the specification."""
+
+    start: bool
+    options: str = ""
+    """What follows Start, for example ",file=take.c3d"."""
+
+    def __str__(self) -> str:
+        return f"Recording Start{self.options}" if self.start else "Recording Stop"
+
+
+Command = (
+    Version
+    | SetByteOrder
+    | SendParameters
+    | SendCurrentFrame
+    | StreamFrames
+    | StopStreaming
+    | Bye
+    | ControlRecording
+)
 
 
 def _component_words(components: Iterable[ComponentType]) -> list[str]:
@@ -148,23 +169,25 @@ def parse_command(body: bytes) -> Command:
     if not words:
         raise CommandError(f"Empty command; {_KNOWN_COMMANDS}")
     verb, parameters = words[0].lower(), [word.lower() for word in words[1:]]
+    command: Command
     match verb:
         case "version":
-            return _parse_version(parameters)
+            command = _parse_version(parameters)
         case "setbyteorder":
-            return _parse_byte_order(parameters)
+            command = _parse_byte_order(parameters)
         case "sendparameters":
-            return SendParameters(_parse_names(parameters, _SECTION_BY_WORD, "section"))
+            command = SendParameters(_parse_names(parameters, _SECTION_BY_WORD, "section"))
         case "sendcurrentframe":
-            return SendCurrentFrame(_parse_names(parameters, _COMPONENT_BY_WORD, "component"))
+            command = SendCurrentFrame(_parse_names(parameters, _COMPONENT_BY_WORD, "component"))
         case "streamframes":
-            return _parse_stream_frames(parameters)
-        case "bye" if not parameters:
-            return Bye()
+            command = _parse_stream_frames(parameters)
         case "bye":
-            raise CommandError("Bye takes no parameter")
+            command = _parse_bye(parameters)
+        case "recording":
+            command = _parse_recording(decode_text(body)[len(verb) :].strip())
         case _:
             raise CommandError(f"Unknown command {_quote(words[0])}; {_KNOWN_COMMANDS}")
+    return command
 
 
 def _parse_version(parameters: Sequence[str]) -> Version:
@@ -180,6 +203,22 @@ def _parse_byte_order(parameters: Sequence[str]) -> SetByteOrder:
         case ["littleendian"]:
             return SetByteOrder("little")
     raise CommandError("SetByteOrder takes one parameter, BigEndian or LittleEndian")
+
+
+def _parse_bye(parameters: Sequence[str]) -> Bye:
+    if parameters:
+        raise CommandError("Bye takes no parameter")
+    return Bye()
+
+
+def _parse_recording(parameter: str) -> ControlRecording:
+    """Return the command with this parameter, which may contain a file name with spaces."""
+    action = parameter[:5].lower()
+    if action == "start" and parameter[5:6] in {"", ",", " "}:
+        return ControlRecording(start=True, options=parameter[5:])
+    if action.startswith("stop") and parameter[4:5] in {"", ",", " "}:
+        return ControlRecording(start=False)
+    raise CommandError("Recording takes Start or Stop, as in: Recording Start,file=take.c3d")
 
 
 def _parse_stream_frames(parameters: Sequence[str]) -> StreamFrames | StopStreaming:

@@ -56,6 +56,8 @@ class _Template:
                 rest = f"{size - COMPONENT_HEADER_BYTES}x"
                 constants += f"Q12xI{rest}"
                 example += struct.pack(f"{order}II12xI{rest}", size, type_number, component.num_items)
+        constants += f"{layout.num_extra_bytes}x"
+        example += bytes(layout.num_extra_bytes)
         self.layout = layout
         self._unpack_constants: _Unpack = struct.Struct(constants).unpack
         self._expected = self._unpack_constants(example)

@@ -48,12 +48,16 @@ class FrameLayout:
     """What all frames with the same components and item counts have in common.
 
     ``components`` are the components of known type in the order of the frame, ``unknown_types`` the types
-    of the others, which are skipped. Callers may compare layouts with ``is`` for speed: ``split_frame``
-    returns the same object for equal layouts while it is cached.
+    of the others, which are skipped. ``num_extra_bytes`` bytes follow the last component. Callers may
+    compare layouts with ``is`` for speed: ``split_frame`` returns the same object for equal layouts while
+    it is cached.
     """
 
-    def __init__(self, byte_order: ByteOrder, fields: tuple[LayoutField, ...]) -> None:
+    def __init__(
+        self, byte_order: ByteOrder, fields: tuple[LayoutField, ...], num_extra_bytes: int = 0
+    ) -> None:
         self.byte_order: ByteOrder = byte_order
+        self.num_extra_bytes = num_extra_bytes
         self.fields = fields
         """All components, including those of unknown type."""
         self.components = tuple(field.component for field in fields if field.component is not None)
@@ -136,7 +140,8 @@ class Frame:
 def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
     """Split a type-3 packet's body into components (§7.1).
 
-    Components of unknown type are skipped by their size. Raises FrameError if sizes and counts
+    Components of unknown type are skipped by their size. Bytes behind the last component are ignored, as by
+    NDI's own code: some programs end every body in LF (field note 17). Raises FrameError if sizes and counts
     contradict each other or the body's length: then no part of the frame can be trusted.
     """
     total = len(body)
@@ -163,9 +168,7 @@ def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
             )
         fields.append(LayoutField(size, type_number, _component_layout(type_number, size, count)))
         start = end
-    if start != total:
-        raise FrameError(f"{total - start} bytes follow the last of the frame's {component_count} components")
-    return Frame(_layout(byte_order, tuple(fields)), body)
+    return Frame(_layout(byte_order, tuple(fields), total - start), body)
 
 
 def _component_layout(type_number: int, size: int, count: int) -> ComponentLayout | None:

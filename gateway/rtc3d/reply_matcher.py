@@ -22,6 +22,7 @@ from gateway.errors import ParametersError
 from gateway.rtc3d.commands import (
     Bye,
     Command,
+    ControlRecording,
     SendCurrentFrame,
     SendParameters,
     SetByteOrder,
@@ -42,6 +43,7 @@ ANSWERING_TYPES: Final[dict[type[Command], frozenset[PacketType]]] = {
     StreamFrames: frozenset({PacketType.COMMAND, PacketType.DATA, PacketType.NO_DATA}),
     StopStreaming: frozenset({PacketType.COMMAND}),
     Bye: frozenset({PacketType.COMMAND}),
+    ControlRecording: frozenset({PacketType.COMMAND}),
 }
 """The packet types that answer each command; an error packet answers any command."""
 

@@ -10,7 +10,7 @@ from typing import Final, Protocol, cast
 
 import gateway
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.packets import Packet, PacketReader
+from gateway.rtc3d.packets import Packet, PacketReader, PacketType
 from gateway.rtc3d.parameters import General, Parameters
 from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks, error_packet
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
@@ -24,6 +24,7 @@ MAX_COMMAND_BYTES: Final = 64 * 1024
 MAX_UNREAD_BYTES: Final = 4 * 1024 * 1024
 """How many bytes are kept for a client that does not read; beyond this, its frames are dropped."""
 
+_MAX_LOGGED_BYTES: Final = 200  # of a command
 _log = logging.getLogger(__name__)
 
 
@@ -212,7 +213,9 @@ class ClientConnection(asyncio.Protocol):
         if not self._can_send():
             return
         if self._inbox:
-            for reply in self.filter.answer(self._inbox.popleft()):
+            packet = self._inbox.popleft()
+            _log.debug("%s: received %s", self.name, _described(packet))
+            for reply in self.filter.answer(packet):
                 self.send(reply)
             if self.session.said_bye:
                 self.close()
@@ -243,3 +246,10 @@ class ClientConnection(asyncio.Protocol):
             frames_per_s=round((frames - 1) / streaming_s, 2) if streaming_s > 0 else 0.0,
         )
         return replace(self._owner.scene.parameters, general=general)
+
+
+def _described(packet: Packet) -> str:
+    """Return a client's packet as text for the log: a command as it was sent, bytes behind it included."""
+    if packet.type == PacketType.COMMAND:
+        return ascii(packet.body[:_MAX_LOGGED_BYTES].decode("latin-1"))
+    return f"a packet of type {packet.type} with {len(packet.body)} bytes"

@@ -10,6 +10,7 @@ from gateway.errors import CommandError, FrameError
 from gateway.rtc3d.commands import (
     Bye,
     Command,
+    ControlRecording,
     SendCurrentFrame,
     SendParameters,
     SetByteOrder,
@@ -71,7 +72,7 @@ class ClientSession:
         self.frames_dropped = 0
         """The number of stream frames that were dropped because the client or the server was late."""
         self.is_recording = False
-        """Whether the client started a recording, as WaveFront's clients do (field note 16)."""
+        """Whether the client started a recording, as WaveFront's clients do (field notes 16 and 18)."""
         self.said_bye = False
         """Whether the client sent Bye: close the connection once the replies are sent."""
 
@@ -159,6 +160,8 @@ class ClientSession:
                 self._stream_command = self._schedule = None
                 if not self._frame_requests:
                     self._events_from_us = None
+            case ControlRecording(start):
+                self._set_recording(start=start)
             case Bye():
                 self.said_bye = True
                 return [encode_packet(PacketType.COMMAND, b"bye")]  # exactly these bytes: field note 14
@@ -204,6 +207,10 @@ class ClientSession:
         self._events_from_us = max(start_us, time_us + 1)
         return builder.packet(self.byte_order, tick, events)
 
+    def _set_recording(self, *, start: bool) -> None:
+        self.is_recording = start
+        _log.info("%s: recording %s", self.name, "started" if start else "stopped")
+
     def _switch_recording(self, body: bytes) -> list[bytes]:
         try:
             components = split_frame(body, detect_byte_order(body, self.byte_order)).components
@@ -212,8 +219,7 @@ class ClientSession:
         if len(components) == 1 and components[0].type is ComponentType.EVENT:
             events = components[0].items()
             if components[0].frame_number == -1 and events["id"].tolist() in ([0], [1]):
-                self.is_recording = bool(events["id"][0])
-                _log.info("%s: recording %s", self.name, "started" if self.is_recording else "stopped")
+                self._set_recording(start=bool(events["id"][0]))
                 return []
         return [
             error_packet(

@@ -88,6 +88,8 @@ class Ingest:
             self._unwanted = " ".join(each.key for each in types) or "nothing"
         else:
             self._unwanted = ""
+        if layout.num_extra_bytes:
+            self._status.add_limitation("bytes behind the last component of a frame are ignored")
 
     def _stamp(self, frame: Frame, utime: int, now_s: float) -> Stamp:
         frame_number, timestamp_us = frame.number_and_timestamp

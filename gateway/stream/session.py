@@ -374,7 +374,8 @@ class Session:
     def _assume_reply_soon(self) -> None:
         if self._assume_timer is not None:
             self._assume_timer.cancel()
-        self._assume_timer = self._loop.call_later(_FURTHER_REPLY_S, self._assume_reply)
+        wait_s = min(_FURTHER_REPLY_S, self._source.reply_timeout_s / 4)
+        self._assume_timer = self._loop.call_later(wait_s, self._assume_reply)
 
     def _assume_reply(self) -> None:
         """No further reply has followed: the newest one answers the pending command."""

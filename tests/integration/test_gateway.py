@@ -52,6 +52,33 @@ async def test_every_component_of_the_simulator_is_published() -> None:
         assert gateway.status.rate == "AllFrames"
 
 
+async def test_bytes_behind_every_body_change_nothing_that_is_published() -> None:
+    """Field note 17. The frames alternate between two layouts."""
+
+    def extended(whole: bytes, extra: bytes) -> bytes:
+        return packet(int.from_bytes(whole[4:8], "big"), whole[8:] + extra)
+
+    frames = [markers_frame(number, *((float(number), 2.0, 3.0),) * (1 + number % 2)) for number in range(20)]
+
+    def answer(command: str) -> bytes:
+        if command.startswith("SendParameters"):
+            return extended(XML, b"\n\0")
+        reply = extended(ok(f"OK-{command}"), b"\n")
+        if command.startswith("StreamFrames"):
+            reply += b"".join(extended(each, extra) for each in frames for extra in (b"\n", b"", b"\0\0"))
+        return reply
+
+    async with (
+        ScriptedServer(lambda client: client.commands(answer)) as server,
+        run_gateway(server.port) as gateway,
+    ):
+        await gateway.wait_for("3d", 60)
+        contents = [data[40:] for topic, data in gateway.output.messages if topic.path == ("3d",)]
+        assert contents == [each[20:] for each in frames for _ in range(3)]
+        assert gateway.status.limitations == ["bytes behind the last component of a frame are ignored"]
+        assert gateway.source.queries.parameters.xml is not None
+
+
 async def test_each_stream_has_its_own_connection() -> None:
     scene = SyntheticScene(markers=2, tools=0, analog=2, plates=0, rate_hz=100, analog_rate_hz=1000)
     streams = (

@@ -167,6 +167,42 @@ async def test_the_recording_packet_gets_no_reply() -> None:
         assert connection.session.is_recording
 
 
+async def test_packets_in_three_sends_with_a_line_feed_behind_the_body_are_accepted() -> None:
+    """As the MATLAB toolbox for the Wave writes them (field note 17)."""
+    event = struct.pack("<IIIiqI", 1, 48, EVENT, -1, 0, 1) + struct.pack("<iqiii", 1, 0, -1, -1, -1)
+    async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
+
+        async def send(packet_type: int, body: bytes) -> None:
+            for part in (struct.pack(">I", 8 + len(body)), struct.pack(">I", packet_type), body):
+                client.send(part)
+                await asyncio.sleep(0.01)  # so that each part is a segment of its own
+
+        await send(COMMAND, b"SetByteOrder LittleEndian\n")
+        assert await client.read() == (COMMAND, b"OK-SetByteOrder LittleEndian")
+        await send(DATA, event + b"\n")
+        await send(COMMAND, b"Recording Stop\n")
+        [connection] = simulator.connections
+        assert await client.read() == (COMMAND, b"OK-Recording Stop")
+        await send(DATA, event + b"\n")
+        await send(COMMAND, b"StreamFrames AllFrames\n")
+        assert await client.read() == (COMMAND, b"OK-StreamFrames AllFrames")
+        assert connection.session.is_recording
+        await client.frames(3, "little")
+
+
+async def test_commands_are_logged_as_debug(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level("DEBUG", "gateway.rtc3d_server")
+    async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
+        await client.ask("Version 1.0\0")
+        await client.ask("x" * 1000)
+        client.send(packet(DATA, b"\0\0\0\0"))
+        await client.read()
+    received = [
+        record.message.split(" received ")[1] for record in caplog.records if " received " in record.message
+    ]
+    assert received == [r"'Version 1.0\x00'", repr("x" * 200), "a packet of type 3 with 4 bytes"]
+
+
 async def test_each_packet_is_sent_with_one_send() -> None:
     async with Simulator(SyntheticScene(markers=50)) as simulator, connected(simulator) as client:
         client.send(command("StreamFrames"), command("SendParameters"))

@@ -233,9 +233,9 @@ def test_any_bytes_are_a_consistent_frame_or_raise_frame_error(body: bytes, orde
         assert_consistent(component, order)
     known_bytes = 4 + sum(8 + len(component.content) for component in split.components)
     if split.unknown_types:
-        assert known_bytes + 8 * len(split.unknown_types) <= len(body)
+        assert known_bytes + 8 * len(split.unknown_types) + split.layout.num_extra_bytes <= len(body)
     else:
-        assert known_bytes == len(body)
+        assert known_bytes + split.layout.num_extra_bytes == len(body)
 
 
 @settings(max_examples=300)

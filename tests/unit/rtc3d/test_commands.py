@@ -5,6 +5,7 @@ from gateway.rtc3d.commands import (
     AllFrames,
     Bye,
     Command,
+    ControlRecording,
     Frequency,
     FrequencyDivisor,
     SendCurrentFrame,
@@ -39,6 +40,8 @@ TEXTS: list[tuple[Command, str]] = [
         SendParameters(("general", "3d", "analog", "force", "6d", "events")),
         "SendParameters General 3D Analog Force 6D Events",
     ),
+    (ControlRecording(start=True), "Recording Start"),  # field note 18
+    (ControlRecording(start=False), "Recording Stop"),
     (SendCurrentFrame((MARKERS, ANALOG)), "SendCurrentFrame 3D Analog"),  # § 5.3.4
     (SendCurrentFrame(), "SendCurrentFrame"),
     (SendCurrentFrame((TOOLS,)), "SendCurrentFrame 6D"),
@@ -267,3 +270,8 @@ def test_a_binary_body_is_an_error(body: bytes) -> None:
 
 def test_repeated_components_are_parsed_once_each() -> None:
     assert parse_command(b"StreamFrames" + b" 3D 6D" * 200_000) == StreamFrames(None, (MARKERS, TOOLS))
+
+
+def test_a_file_name_is_kept_as_it_was_sent() -> None:
+    command = parse_command(b"RECORDING START,file=C:\\My  takes\\A b.c3d\n")
+    assert command == ControlRecording(start=True, options=",file=C:\\My  takes\\A b.c3d")

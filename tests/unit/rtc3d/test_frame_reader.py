@@ -52,6 +52,22 @@ def test_a_frame_that_differs_in_anything_else_does_not_have_the_layout(offset: 
         reader_after(MARKERS_FRAME).read(bytes(body))
 
 
+@pytest.mark.parametrize("order", ["big", "little"])
+def test_frames_with_and_without_extra_bytes_are_read_alike(order: ByteOrder) -> None:
+    bodies = [FULL_FRAME[order], FULL_FRAME[order] + b"\n", FULL_FRAME[order] + b"\0\0"]
+    reader = FrameReader(order)
+    for body in [*bodies, *bodies, *reversed(bodies)]:
+        read = reader.read(bytes(bytearray(body)))
+        assert read.layout is split_frame(body, order).layout
+        assert read.components == split_frame(FULL_FRAME[order], order).components
+        assert read.layout.num_extra_bytes == len(body) - len(FULL_FRAME[order])
+
+
+def test_the_extra_bytes_of_frames_with_one_layout_may_differ() -> None:
+    read = reader_after(MARKERS_FRAME + b"\n").read(MARKERS_FRAME + b"\0")
+    assert read.layout is split_frame(MARKERS_FRAME + b"\n", "big").layout
+
+
 def test_two_layouts_of_the_same_size_are_distinguished() -> None:
     bodies = [
         frame("big", encode_component(kind, 1, 1, np.zeros(count, ITEM_DTYPES[kind])))

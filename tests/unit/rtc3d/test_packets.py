@@ -312,6 +312,7 @@ def test_a_long_read_after_an_incomplete_packet_is_not_copied_as_a_whole() -> No
         (b"StreamFrames\n", "StreamFrames"),
         (b"StreamFrames 3D \r\n\0\0", "StreamFrames 3D"),
         (b"\0\0\0", ""),
+        (b"Version 1.0 \0what the buffer held before", "Version 1.0"),
         (b"d\xe9j\xe0 vu\xff\0", "d\xe9j\xe0 vu\xff"),
     ],
 )

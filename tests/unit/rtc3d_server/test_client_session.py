@@ -118,6 +118,36 @@ def test_the_recording_control_of_wavefront_gets_no_reply(
     assert not client.session.is_recording
 
 
+@pytest.mark.parametrize("extra", [b"\n", b"\0", b"\r\n\0"])
+def test_bytes_behind_the_recording_control_are_ignored(client: ScriptedClient, extra: bytes) -> None:
+    assert client.send(START_BIG + extra, DATA) == []
+    assert client.session.is_recording
+    assert client.send(START_LITTLE[:28] + bytes(4) + START_LITTLE[32:] + extra, DATA) == []
+    assert not client.session.is_recording
+
+
+@pytest.mark.parametrize("end", [b"", b"\n", b"\0"])
+@pytest.mark.parametrize("start", [b"Recording Start,file=C:\\My takes\\A b.c3d", b"recording start"])
+def test_a_recording_is_started_and_stopped_by_commands(
+    client: ScriptedClient, start: bytes, end: bytes
+) -> None:
+    """Field note 18."""
+    assert client.send(start + end) == [(COMMAND, b"OK-" + start)]
+    assert client.session.is_recording
+    assert client.send(b"Recording Stop" + end) == [(COMMAND, b"OK-Recording Stop")]
+    assert not client.session.is_recording
+
+
+@pytest.mark.parametrize(
+    "sent", [b"Recording", b"Recording Pause", b"Recording Started", b"Recording Stopped"]
+)
+def test_other_recording_commands_are_refused(client: ScriptedClient, sent: bytes) -> None:
+    [(packet_type, text)] = client.send(sent)
+    assert packet_type == ERROR
+    assert text.startswith(b"Error-Recording takes Start or Stop")
+    assert not client.session.is_recording
+
+
 @pytest.mark.parametrize(
     "body",
     [

@@ -222,3 +222,12 @@ def test_unknown_components_are_counted_and_the_others_published(
     assert amounts(lab.status.losses.report()) == {"unknown component": (3, 3)}
     assert lab.status.limitations == ["components of unknown type [99] are skipped"]
     assert caplog.messages == ["lab (3d event): components of unknown type [99] are skipped"]
+
+
+def test_bytes_behind_the_last_component_are_a_limitation_once() -> None:
+    lab = Lab("all")
+    extended = split_frame(frame(1).body + b"\n", "big")
+    for each in (extended, frame(2), extended):
+        lab.ingest.receive([each], BOOT_UTIME, 0.0)
+    assert len(lab.published) == 3
+    assert lab.status.limitations == ["bytes behind the last component of a frame are ignored"]
