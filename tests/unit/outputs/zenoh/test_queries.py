@@ -265,6 +265,7 @@ async def test_parameters_published_before_opening_follow_when_the_session_opens
 async def test_a_source_that_returns_does_not_publish_its_old_parameters(lab: Lab) -> None:
     lab.output.announce("hall")
     lab.output.publish_parameters("hall", ServerParameters(b"<old/>", 1, 4))
+    await lab.query("mocap/hall/status")  # the thread sends the reply after the parameters
     lab.output.withdraw("hall")
     lab.output.announce("hall")
     lab.subscribe("mocap/**")
