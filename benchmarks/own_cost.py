@@ -106,7 +106,7 @@ class _FedGateway:
         self._running = self._loop.create_task(gateway.run(self._stop))
         [source_gateway] = gateway.sources
         await wait_until_async(lambda: source_gateway.statuses[0].state is StreamState.NO_MEASUREMENT)
-        session = source_gateway.supervisors[0].session
+        session = source_gateway.streams[0].session
         assert session is not None  # noqa: S101 - a stream in this state has a session
         return session
 

@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.live import Live
 from rich.table import Table
 
-from gateway.config.settings import MetricsSettings, Settings, SourceSettings, StreamSettings
+from gateway.config.settings import MetricsSettings, Settings, SourceSettings
 from gateway.errors import OutputError
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode, prefix_of
@@ -26,9 +26,10 @@ from gateway.messages.host_time import now_utime
 from gateway.messages.summary import summarise
 from gateway.outputs.kind import DemoSide
 from gateway.outputs.registry import OUTPUTS, settings_type
-from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ComponentType
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER
 from gateway.rtc3d_server.scene import Scene
 from gateway.simulator.simulator import Simulator
+from gateway.stream.state import StreamState
 
 SOURCE: Final = "demo"
 _START_TIMEOUT_S: Final = 10.0
@@ -79,6 +80,12 @@ async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool
             _START_TIMEOUT_S,
             "the gateway's status did not arrive on every output",
         )
+        [source] = gateway.sources
+        await _until(
+            lambda: all(status.state is StreamState.NO_MEASUREMENT for status in source.statuses),
+            _START_TIMEOUT_S,
+            "the gateway did not request every component",
+        )
         simulator.start_measurement()
         await _show(received, seconds, console)
         simulator.stop_measurement()
@@ -111,13 +118,8 @@ async def _running(gateway: Gateway) -> AsyncIterator[None]:
 
 
 def _settings(port: int, sides: dict[str, DemoSide]) -> Settings:
-    # Analog has a higher rate than the other components, which needs a separate stream (§5.3.5).
-    analog = StreamSettings(components=(ComponentType.ANALOG,))
-    others = StreamSettings(
-        components=tuple(component for component in WIRE_ORDER if component is not ComponentType.ANALOG)
-    )
     sections = {name: side.settings for name, side in sides.items()}
-    source = SourceSettings(name=SOURCE, host="127.0.0.1", port=port, streams=(others, analog))
+    source = SourceSettings(name=SOURCE, host="127.0.0.1", port=port)
     return settings_type().model_validate(
         {"sources": (source,), "metrics": MetricsSettings(enabled=False), **sections}
     )

@@ -17,15 +17,17 @@ _fields: ContextVar[Mapping[str, str]] = ContextVar("log fields")
 
 
 @contextmanager
-def log_fields(**fields: str) -> Iterator[None]:
+def log_fields(**fields: str) -> Iterator[dict[str, str]]:
     """Add ``fields`` (names from FIELDS) to the records of the block and of tasks and callbacks it starts.
 
     The event loop runs a callback in the context in which it was registered. So all records of a
-    connection have the fields, without naming them in each call.
+    connection have the fields, without naming them in each call. The block gets all fields as a dict and may
+    change them, for its tasks and callbacks too.
     """
-    token = _fields.set({**current_log_fields(), **fields})
+    all_fields = {**current_log_fields(), **fields}
+    token = _fields.set(all_fields)
     try:
-        yield
+        yield all_fields
     finally:
         _fields.reset(token)
 
@@ -38,11 +40,12 @@ def current_log_fields() -> Mapping[str, str]:
 class FailureLog:
     """Logs the first of several failures in a row as WARNING, repeats as DEBUG, and recovery as INFO.
 
-    ``subject`` begins every message, for example "lab" or "lcm". Successes within ``hold_s`` after a failure
+    ``subject`` begins every message, for example "lab" or "lcm"; any object whose str
+    may change. Successes within ``hold_s`` after a failure
     do not count as recovery, so intermittent failures are logged as one.
     """
 
-    def __init__(self, logger: logging.Logger, subject: str, hold_s: float = 0.0) -> None:
+    def __init__(self, logger: logging.Logger, subject: object, hold_s: float = 0.0) -> None:
         self._logger = logger
         self._subject = subject
         self._hold_s = hold_s
@@ -90,7 +93,7 @@ class FailureLog:
 class DefectLog:
     """Logs each defect in this program once as ERROR, with its traceback, and repeats as DEBUG."""
 
-    def __init__(self, logger: logging.Logger, subject: str) -> None:
+    def __init__(self, logger: logging.Logger, subject: object) -> None:
         self._logger = logger
         self._subject = subject
         self._places: set[tuple[str, str, int]] = set()  # of defects, in the source code: there are few

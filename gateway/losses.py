@@ -81,7 +81,7 @@ class Losses:
     """
 
     def __init__(
-        self, logger: logging.Logger, subject: str, monotonic: Callable[[], float] = time.monotonic
+        self, logger: logging.Logger, subject: object, monotonic: Callable[[], float] = time.monotonic
     ) -> None:
         self._logger = logger
         self._subject = subject

@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, Final
 
 from gateway.c3d_spool import Spool
@@ -19,8 +19,9 @@ from gateway.queries.source_queries import SourceQueries
 from gateway.rtc3d.parameters import Parameters, without_statistics
 from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.stream.state import StreamState
-from gateway.stream.status import FrameRate, StreamStatus
-from gateway.stream.supervisor import Callbacks, Supervisor
+from gateway.stream.status import SessionNumbers, StreamStatus
+from gateway.stream.streams import AutomaticStreams, ConfiguredStreams
+from gateway.stream.supervisor import Callbacks, Listener, Supervisor, component_keys, stream_name
 
 _MAX_UNSTORED_FILES: Final = 4
 """How many C3D files may wait in memory to be stored; further ones are dropped and logged."""
@@ -50,16 +51,18 @@ class Source:
         self.spool = spool
         self.fan_out = fan_out
         self.fan_out.on_items_changed = self._refresh_parameters_soon
-        self.statuses: list[StreamStatus] = [self._new_status(stream, before) for stream in settings.streams]
-        self.supervisors = [
-            Supervisor(settings, stream, status, self._callbacks(stream, status))
-            for stream, status in zip(settings.streams, self.statuses, strict=True)
-        ]
+        self.sessions: SessionNumbers = SessionNumbers() if before is None else before.sessions
+        """The numbers of the connections."""
+        self.parameters_version: int = 0 if before is None else before.parameters_version
+        """The version of the server's parameters; 0 before the first."""
+        self._streams: ConfiguredStreams | AutomaticStreams = (
+            AutomaticStreams(settings.stall_timeout_s, self._new_stream)
+            if settings.streams == "auto"
+            else ConfiguredStreams(settings.streams, self._new_stream)
+        )
         self.queries = self._new_queries()
         self._publish_parameters = publish_parameters
         self._announce_file = announce_file
-        self._frame_rates = [FrameRate() for _ in settings.streams]
-        self._frame_rates_hz = [0.0 for _ in settings.streams]
         self._tasks: set[asyncio.Task[None]] = set()
         self.parameters: Parameters | None = None if before is None else before.parameters
         """The newest parameters, without the server's statistics; None before the first."""
@@ -70,12 +73,11 @@ class Source:
         self._newest_status: bytes = self._encoded_status()
 
     def _new_queries(self) -> SourceQueries:
-        streams = zip(self.settings.streams, self.statuses, self.supervisors, strict=True)
         return SourceQueries(
             self.settings,
-            [
-                StreamAccess(stream.components, status, _session_ask(supervisor))
-                for stream, status, supervisor in streams
+            lambda: [
+                StreamAccess(stream.settings.components, stream.status, _session_ask(stream))
+                for stream in self.streams
             ],
             newest_message=self.fan_out.newest,
             status_message=lambda: self._newest_status,
@@ -90,38 +92,45 @@ class Source:
         return self.settings.name
 
     @property
-    def streams(self) -> list[tuple[StreamStatus, float]]:
+    def streams(self) -> Sequence[Supervisor]:
+        """The streams: those of the configuration, or the present ones with ``streams: auto``."""
+        return self._streams.streams
+
+    @property
+    def statuses(self) -> list[StreamStatus]:
+        """The status of each stream."""
+        return [stream.status for stream in self.streams]
+
+    @property
+    def rated_statuses(self) -> list[tuple[StreamStatus, float]]:
         """The status of each stream, with its frame rate in Hz at the last ``publish_status``."""
-        return list(zip(self.statuses, self._frame_rates_hz, strict=True))
+        return [(stream.status, stream.frame_rate.rate_hz) for stream in self.streams]
 
     async def run(self) -> None:
         """Run every stream until cancelled; then send Bye to the server."""
         try:
-            async with asyncio.TaskGroup() as tasks:
-                for supervisor in self.supervisors:
-                    tasks.create_task(supervisor.run())
+            await self._streams.run()
         finally:
             for task in self._tasks:
                 task.cancel()
-            for status in self.statuses:
-                status.losses.close()
+            for stream in self._streams.known:
+                stream.status.losses.close()
 
     # Status.
 
     def publish_status(self) -> None:
-        """Publish the status and the clock of this source. Called once a second."""
+        """Check the streams, and publish the status and the clock of this source. Called once a second."""
         self.sequence += 1
-        self._frame_rates_hz = [
-            rate.update(status.frames_in)
-            for rate, status in zip(self._frame_rates, self.statuses, strict=True)
-        ]
+        self._streams.check()
+        for stream in self.streams:
+            stream.frame_rate.update(stream.status.frames_in)
         self._newest_status = self._encoded_status()
         # One server has one clock: publish the best estimate of all streams.
         best = min(self.statuses, key=_uncertainty_us)
         clock = clock_message(self.queries.session, self.sequence, best)
         with log_fields(source=self.name):
-            for status in self.statuses:
-                status.losses.check()
+            for stream in self._streams.known:
+                stream.status.losses.check()
             self.fan_out.check_losses()
             self.fan_out.publish_status(self._newest_status)
             self.fan_out.publish_clock(clock.encode())
@@ -131,19 +140,22 @@ class Source:
             source=self.name,
             server=f"{self.settings.host}:{self.settings.port}",
             sequence=self.sequence,
-            streams=self.streams,
+            streams=self.rated_statuses,
             outputs=[(status, output.health()) for output, status in self.fan_out.outputs],
         )
         encoded: bytes = message.encode()
         return encoded
 
-    def _new_status(self, stream: StreamSettings, before: "Source | None") -> StreamStatus:
-        components = " ".join(component.key for component in stream.components)
-        status = StreamStatus(components, name=f"{self.name} ({components})", on_state=self._on_state)
-        if before is not None:
-            status.session = max(each.session for each in before.statuses)
-            status.parameters_version = before.queries.parameters_version
-        return status
+    def _new_stream(self, stream: StreamSettings, listener: Listener) -> Supervisor:
+        status = StreamStatus(
+            component_keys(stream.components),
+            name=stream_name(self.settings, stream.components),
+            on_state=self._on_state,
+            session=self.sessions.newest,
+            sessions=self.sessions,
+            parameters_version=self.parameters_version,
+        )
+        return Supervisor(self.settings, stream, status, self._callbacks(status), listener)
 
     def _on_state(self, _state: StreamState) -> None:
         is_streaming = any(status.state is StreamState.STREAMING for status in self.statuses)
@@ -151,9 +163,7 @@ class Source:
 
     # Parameters.
 
-    def _callbacks(self, stream: StreamSettings, status: StreamStatus) -> Callbacks:
-        components = frozenset(stream.components)
-
+    def _callbacks(self, status: StreamStatus) -> Callbacks:
         def on_parameters(xml: bytes, parsed: ParsedParameters) -> None:
             self.queries.parameters.store(xml, parsed)
             self._publish_new_parameters(xml, parsed)
@@ -165,7 +175,7 @@ class Source:
             on_connected=lambda: self._start_task(self.queries.parameters.fill()),
             on_restart=self._refresh_parameters_soon,
             on_file=lambda content: self._on_file(status, content),
-            has_subscribers=lambda: self.fan_out.has_subscribers(components),
+            has_subscribers=self.fan_out.has_subscribers,
         )
 
     def _on_changed_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
@@ -178,11 +188,14 @@ class Source:
         parameters = without_statistics(parsed.parameters)
         if parameters != self.parameters:
             self.parameters = parameters
-            for status in self.statuses:
-                status.parameters_changed(status.parameters_version + 1)
+            self.parameters_version += 1
+            for stream in self._streams.known:
+                stream.status.parameters_changed(self.parameters_version)
+        self._streams.parameters_changed(parameters)
         self.fan_out.set_parameters(parameters)
-        version = self.queries.parameters_version
-        self._publish_parameters(self.name, ServerParameters(xml, self.queries.session, version))
+        self._publish_parameters(
+            self.name, ServerParameters(xml, self.queries.session, self.parameters_version)
+        )
 
     def _refresh_parameters_soon(self) -> None:
         """Request the parameters again after ``fresh_interval_s``: the scene may have changed."""
@@ -238,10 +251,10 @@ class Source:
         return Answer(content, C3D, {"name": path.name, "bytes": len(content)})
 
     def _record(self, start: bool) -> bool:
-        for supervisor in self.supervisors:
-            if supervisor.session is not None:
+        for stream in self.streams:
+            if stream.session is not None:
                 try:
-                    supervisor.session.control_recording(start=start)
+                    stream.session.control_recording(start=start)
                 except LinkError:
                     continue
                 return True

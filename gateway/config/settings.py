@@ -9,9 +9,18 @@ import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, Self
 
-from pydantic import AfterValidator, Field, create_model, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    PlainSerializer,
+    PlainValidator,
+    TypeAdapter,
+    create_model,
+    field_validator,
+    model_validator,
+)
 
 from gateway.config.section import Effective, Section, expects, join_or, validation_error
 from gateway.config.values import (
@@ -62,6 +71,31 @@ class StreamSettings(Section):
     """How long an on-demand stream continues without subscribers before it stops."""
 
 
+_StreamList = Annotated[
+    tuple[StreamSettings, ...],
+    AfterValidator(not_empty),
+    expects("auto, or a list of streams, one or more"),
+    Field(json_schema_extra={"minItems": 1}),
+]
+_STREAM_LIST: Final[TypeAdapter[tuple[StreamSettings, ...]]] = TypeAdapter(_StreamList)
+
+
+def _streams(value: object) -> Literal["auto"] | tuple[StreamSettings, ...]:
+    return "auto" if value == "auto" else _STREAM_LIST.validate_python(value)
+
+
+def _streams_to_yaml(streams: Literal["auto"] | tuple[StreamSettings, ...]) -> str | list[dict[str, Any]]:
+    return "auto" if streams == "auto" else [stream.model_dump(mode="json") for stream in streams]
+
+
+Streams = Annotated[
+    Literal["auto"] | tuple[StreamSettings, ...],
+    PlainValidator(_streams, json_schema_input_type=Literal["auto"] | _StreamList),
+    PlainSerializer(_streams_to_yaml),
+]
+"""In YAML: auto, or a list of streams."""
+
+
 class ReconnectSettings(Section):
     """The delays between connection attempts: each about twice the previous one, up to a maximum."""
 
@@ -96,13 +130,8 @@ class SourceSettings(Section):
     byte_order: ServerByteOrder = "big"
     """The byte order to request. The published messages are the same in both."""
 
-    streams: Annotated[
-        tuple[StreamSettings, ...],
-        AfterValidator(not_empty),
-        expects("a list of streams, one or more"),
-        Field(json_schema_extra={"minItems": 1}),
-    ] = (StreamSettings(),)
-    """The TCP sessions with the server, each with its components and rate."""
+    streams: Streams = "auto"
+    """The TCP sessions with the server: auto for one per rate, or a list with components and rates."""
 
     reconnect: ReconnectSettings = ReconnectSettings()
     """The delays between connection attempts."""
@@ -137,10 +166,10 @@ class SourceSettings(Section):
     @field_validator("streams")
     @classmethod
     def _check_components_are_in_one_stream(
-        cls, streams: tuple[StreamSettings, ...]
-    ) -> tuple[StreamSettings, ...]:
+        cls, streams: Literal["auto"] | tuple[StreamSettings, ...]
+    ) -> Literal["auto"] | tuple[StreamSettings, ...]:
         owners: dict[ComponentType, int] = {}
-        for index, stream in enumerate(streams):
+        for index, stream in enumerate(() if streams == "auto" else streams):
             for component in stream.components:
                 if component in owners:
                     raise validation_error(
@@ -153,7 +182,7 @@ class SourceSettings(Section):
 
     @model_validator(mode="after")
     def _check_rates_against_stall_timeout(self) -> Self:
-        for index, stream in enumerate(self.streams):
+        for index, stream in enumerate(() if self.streams == "auto" else self.streams):
             if isinstance(stream.rate, Frequency) and stream.rate.hz * self.stall_timeout_s <= 1:
                 raise validation_error(
                     f"found {stream.rate.hz:g}, one frame in {1 / stream.rate.hz:g} s, which counts as "

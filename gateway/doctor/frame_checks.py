@@ -3,10 +3,10 @@
 from typing import Final
 
 from gateway.doctor.observation import COMPONENTS_WITH_VISIBILITY, ObservedComponent, ObservedStream
-from gateway.doctor.server_description import described_labels, num_described_items
 from gateway.findings import Finding, Subject
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.server_description import described_labels, num_described_items
 from gateway.stream.state import StreamState
 from gateway.stream.status import FRAME_REJECTED
 

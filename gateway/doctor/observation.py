@@ -1,5 +1,6 @@
 """Observation of one stream: rates, message sizes, and which markers and tools are in view."""
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
@@ -10,10 +11,13 @@ from gateway.findings import MessageLoad
 from gateway.messages.encode import ITEMS_OFFSET
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import ParsedParameters
+from gateway.stream.plan import StreamPlan, plan_streams
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
+from gateway.stream.supervisor import component_keys, stream_name
 
 COMPONENTS_WITH_VISIBILITY: Final = (ComponentType.MARKERS, ComponentType.TOOLS)
 """The components whose items can be out of view."""
@@ -88,16 +92,41 @@ class ObservedComponent:
 
 
 class ObservedStream:
-    """One stream of a source, on its own connection. Create it in a running event loop."""
+    """One stream of a source, on its own connection. Create it in a running event loop.
 
-    def __init__(self, source: SourceSettings, stream: StreamSettings) -> None:
+    If it ``plans``, it requests what the gateway requests on the first connection of ``streams: auto``.
+    """
+
+    def __init__(self, source: SourceSettings, stream: StreamSettings, *, plans: bool = False) -> None:
         self.settings = stream
-        self.component_keys = " ".join(component.key for component in stream.components)
-        self.status = StreamStatus(self.component_keys, name=f"{source.name} ({self.component_keys})")
+        self.component_keys = component_keys(stream.components)
+        self.status = StreamStatus(self.component_keys, name=stream_name(source, stream.components))
         self.parsed: ParsedParameters | None = None
         self.observed: dict[ComponentType, ObservedComponent] = {}
         self.session = Session(source, stream, self.status, self._on_frames, lambda _content: None)
-        self.control = StreamControl(source, stream, self.status, self.session, self._on_parameters)
+        self.control = StreamControl(
+            source, stream, self.status, self.session, self._on_parameters, self._planned_components
+        )
+        self._plans = plans
+        self.plan = StreamPlan()
+        """What the server's rates need, with ``streams: auto``."""
+
+    def _planned_components(self, parameters: Parameters | None) -> Sequence[ComponentType]:
+        if self._plans:
+            self.plan = plan_streams(parameters)
+            self._set_components(self.plan.groups[0])
+        return self.settings.components
+
+    def _set_components(self, components: tuple[ComponentType, ...]) -> None:
+        self.settings = self.settings.model_copy(update={"components": components})
+        self.component_keys = component_keys(components)
+
+    async def use_one_connection(self, reason: str) -> None:
+        """Request all components on this connection, as the gateway does if a further one fails."""
+        plan = self.plan.on_one_connection(reason)
+        self.status.add_limitation(plan.limitation)
+        self._set_components(plan.groups[0])
+        await self.control.request_components(plan.groups[0])
 
     def _on_parameters(self, _xml: bytes, parsed: ParsedParameters) -> None:
         self.parsed = parsed

@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 from typing import Final
 
 from gateway.doctor.observation import ObservedStream
-from gateway.doctor.server_description import described_rate_hz
 from gateway.findings import Finding, Subject
 from gateway.rtc3d.commands import Frequency, FrequencyDivisor
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.server_description import described_rate_hz
 
 _MIN_SHARE: Final = 0.9
 """The check fails if a component arrives at a smaller share of its expected rate."""

@@ -6,7 +6,7 @@ import socket
 from collections.abc import AsyncIterator
 from typing import Final
 
-from gateway.config.settings import SourceSettings
+from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.doctor.frame_checks import check_frames, check_visibility
 from gateway.doctor.observation import COMPONENTS_WITH_VISIBILITY, ObservedStream
 from gateway.doctor.rate_check import check_rate
@@ -86,7 +86,10 @@ class SourceChecks:
         return self._subject.passing("name", f"{host} resolves to {', '.join(addresses)}")
 
     async def _check_tcp(self) -> Finding:
-        self._streams = [ObservedStream(self._source, stream) for stream in self._source.streams]
+        if self._source.streams == "auto":
+            self._streams = [ObservedStream(self._source, StreamSettings(), plans=True)]
+        else:
+            self._streams = [ObservedStream(self._source, stream) for stream in self._source.streams]
         try:
             for stream in self._streams:
                 await stream.session.connect()
@@ -110,6 +113,8 @@ class SourceChecks:
                     f"Correct the source's host and port ({_PORTS}). If they are correct, restart the RT "
                     "server.",
                 )
+        if self._source.streams == "auto":
+            await self._open_further_streams(self._streams[0])
         limitations = dict.fromkeys(text for stream in self._streams for text in stream.status.limitations)
         if not limitations:
             return self._subject.passing("protocol", "the server accepts every command")
@@ -117,6 +122,21 @@ class SourceChecks:
             "protocol",
             f"the server is an RT server; the gateway works around this: {'; '.join(limitations)}",
         )
+
+    async def _open_further_streams(self, first: ObservedStream) -> None:
+        """Open a connection for each faster rate, as the gateway does."""
+        for group in first.plan.groups[1:]:
+            stream = ObservedStream(self._source, StreamSettings(components=group))
+            try:
+                await stream.session.connect()
+                await stream.control.start()
+            except LinkError as error:
+                await stream.session.close()
+                await first.use_one_connection(
+                    f"the server accepts one connection only ({str(error).partition('; ')[0]})"
+                )
+                return
+            self._streams.append(stream)
 
     def _protocol_failure(self, stream: ObservedStream, error: LinkError) -> Finding:
         if isinstance(error.__cause__, PacketError):

@@ -40,9 +40,9 @@ def health_page(gateway: Gateway) -> Page:
     """
     now_s = running_clock().time()  # a stop of this process does not make the newest frames older
     streams = [
-        _stream_health(source, stream, status, rate_hz, now_s)
+        _stream_health(source, stream.settings, stream.status, stream.frame_rate.rate_hz, now_s)
         for source in gateway.sources
-        for stream, (status, rate_hz) in zip(source.settings.streams, source.streams, strict=True)
+        for stream in source.streams
     ]
     outputs = [_output_health(output) for output in gateway.outputs]
     problems = [

@@ -20,7 +20,7 @@ def status_lines(gateway: Gateway) -> list[str]:
         for output, status in source.fan_out.outputs
     )
     return [
-        *(source_line(source.settings, source.streams) for source in gateway.sources),
+        *(source_line(source.settings, source.rated_statuses) for source in gateway.sources),
         *output_lines(outputs),
         *loss_lines(losses),
     ]

@@ -43,7 +43,7 @@ def status_message(
     message = rtc3d.status_t()
     message.utime = message.capture_utime = now_utime()
     message.sequence = sequence
-    message.session = sum(stream.session for stream, _ in streams)
+    message.session = max((stream.session for stream, _ in streams), default=0)
     message.parameters_version = max((stream.parameters_version for stream, _ in streams), default=0)
     message.source = source
     message.server = server
@@ -56,7 +56,7 @@ def status_message(
 
 
 def clock_message(session: int, sequence: int, stream: StreamStatus) -> rtc3d.clock_t:
-    """Return the clock of one stream; ``session`` is the number of connections of all streams so far."""
+    """Return the clock of one stream; ``session`` is that of the newest connection of the source."""
     message = rtc3d.clock_t()
     message.utime = message.capture_utime = now_utime()
     message.sequence = sequence

@@ -30,7 +30,7 @@ class StreamAccess(NamedTuple):
 class ServerRequests:
     """Sends commands to the server of one source over the connections of its streams."""
 
-    def __init__(self, settings: SourceSettings, streams: Sequence[StreamAccess]) -> None:
+    def __init__(self, settings: SourceSettings, streams: Callable[[], Sequence[StreamAccess]]) -> None:
         self._settings = settings
         self._streams = streams
         self._pending: dict[Hashable, asyncio.Task[Any]] = {}
@@ -39,21 +39,23 @@ class ServerRequests:
     @property
     def session(self) -> int:
         """A number that grows with every connection of any stream."""
-        return sum(stream.status.session for stream in self._streams)
+        return max(stream.status.session for stream in self._streams())
 
     @property
     def parameters_version(self) -> int:
         """The version of the server's parameters; 0 before the first."""
-        return self._streams[0].status.parameters_version
+        return self._streams()[0].status.parameters_version
 
     @property
     def is_connected(self) -> bool:
         """Whether any stream has a connection."""
-        return any(stream.sender() is not None for stream in self._streams)
+        return any(stream.sender() is not None for stream in self._streams())
 
     def no_connection_error(self) -> QueryError:
         """Return the error that says why there is no connection, since when, and what to do about it."""
-        newest = max((stream.status for stream in self._streams), key=lambda status: status.last_error_utime)
+        newest = max(
+            (stream.status for stream in self._streams()), key=lambda status: status.last_error_utime
+        )
         text = f"source {self._settings.name!r} has no connection"
         if newest.last_error:
             problem, separator, remedy = newest.last_error.partition("; ")
@@ -72,7 +74,7 @@ class ServerRequests:
         at the latest after query_timeout_s, which includes the wait for earlier requests.
         """
         name, timeout_s = f"source {self._settings.name!r}", self._settings.query_timeout_s
-        streams = self._streams if stream is None else [stream]
+        streams = self._streams() if stream is None else [stream]
         try:
             async with running_timeout(timeout_s), self._lock:
                 try:

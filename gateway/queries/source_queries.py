@@ -38,7 +38,7 @@ class SourceQueries:
     def __init__(
         self,
         settings: SourceSettings,
-        streams: Sequence[StreamAccess],
+        streams: Callable[[], Sequence[StreamAccess]],
         newest_message: Callable[[ComponentType, str], bytes | None],
         status_message: Callable[[], bytes],
         last_c3d: Callable[[], Coroutine[Any, Any, Answer]],
@@ -46,7 +46,6 @@ class SourceQueries:
         on_change: Callable[[bytes, ParsedParameters], None],
     ) -> None:
         self._settings = settings
-        self.components = frozenset(component for stream in streams for component in stream.components)
         self._streams = streams
         self._newest_message = newest_message
         self._status_message = status_message
@@ -54,6 +53,11 @@ class SourceQueries:
         self._record = record
         self._requests = ServerRequests(settings, streams)
         self.parameters = ParameterCache(settings, self._requests, on_change)
+
+    @property
+    def components(self) -> frozenset[ComponentType]:
+        """The components of all streams."""
+        return frozenset(component for stream in self._streams() for component in stream.components)
 
     @property
     def session(self) -> int:
@@ -108,7 +112,7 @@ class SourceQueries:
     async def _component(self, question: Question, output: str) -> Answer:
         """Return the newest message of the stream; while it does not run, ask for the current frame."""
         component = COMPONENTS_BY_KEY[question.name]
-        stream = next(stream for stream in self._streams if component in stream.components)
+        stream = next(stream for stream in self._streams() if component in stream.components)
         session = stream.status.session
         if stream.sender() is None:
             raise self._requests.no_connection_error()

@@ -2,12 +2,13 @@
 
 import asyncio
 import logging
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, Final
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import DefectError, LinkError, RequestError
 from gateway.log import FailureLog
+from gateway.rtc3d.components import ComponentType
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
@@ -29,9 +30,9 @@ logger = logging.getLogger(__name__)
 class ChangeTasks:
     """Decides what the server of one session should send, and asks for it, until ``cancel``.
 
-    Two facts decide: whether frames are wanted, and how often their rate is to be halved. One task brings the
-    server to what they say now, so changes of both never meet. ``has_subscribers`` returns whether the
-    stream's components may have subscribers.
+    Three facts decide: whether frames are wanted, how often their rate is to be halved, and which components
+    are wanted. One task brings the server to what they say now, so changes never meet. ``has_subscribers``
+    returns whether the stream's components may have subscribers.
     """
 
     def __init__(
@@ -49,11 +50,12 @@ class ChangeTasks:
         self._session = session
         self._control = control
         self._has_subscribers = has_subscribers
-        self._lateness = FailureLog(logger, status.name)
+        self._lateness = FailureLog(logger, status)
         self._is_wanted = True
         self._halvings = 0  # as wanted
         self._requested_halvings = 0  # in the newest request for another rate
-        self._changed = asyncio.Event()  # _is_wanted or _halvings
+        self._components: Sequence[ComponentType] | None = None  # to request instead of the former ones
+        self._changed = asyncio.Event()  # _is_wanted, _halvings or _components
         self._tasks: list[asyncio.Task[None]] = []
 
     def start(self) -> None:
@@ -74,6 +76,11 @@ class ChangeTasks:
             self._lateness.failed(f"frames arrive {1000 * self._status.lag_s:.0f} ms late")
         else:
             self._lateness.recovered("frames arrive in time")
+
+    def request_components(self, components: Sequence[ComponentType]) -> None:
+        """Start to request these components instead of the former ones; return at once."""
+        self._components = components
+        self._changed.set()
 
     def cancel(self) -> None:
         """Cancel all tasks."""
@@ -121,6 +128,10 @@ class ChangeTasks:
         if control.is_stopped:
             logger.info("%s: a subscriber appeared; frames are requested again", self._status.name)
             return await self._request_rate()
+        if self._components is not None:
+            components, self._components = self._components, None
+            self._requested_halvings = 0
+            await self._control.request_components(components)
         if self._halvings != self._requested_halvings:
             await self._change_rate()
         return True

@@ -1,6 +1,6 @@
 """From the session to the fan-out: when each frame was captured, how late it is, whether it is skipped."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Final
 
 from gateway.config.settings import SourceSettings, StreamSettings
@@ -36,9 +36,6 @@ class Ingest:
         on_lateness: Callable[[int], None],
         on_restart: Callable[[], None],
     ) -> None:
-        self._wanted = frozenset(stream.components)
-        self._wanted_events = self._wanted & _EVENTS
-        self._skippable = self._wanted - _EVENTS
         self._skips_when_behind = stream.backlog == "latest"
         self._status = status
         self._publish = publish
@@ -49,8 +46,15 @@ class Ingest:
         self._followed_type: ComponentType | None = None
         self._frame_number = 0  # the newest of a component of _followed_type
         self._lag = LagControl(source.max_lag_ms / 1000, MAX_HALVINGS if stream.adapt_rate else 1)
+        self._unwanted = ""  # the components of the newest frame, if none of them is wanted
+        self.want(stream.components)
+
+    def want(self, components: Collection[ComponentType]) -> None:
+        """Publish these components from now on."""
+        self._wanted = frozenset(components)
+        self._wanted_events = self._wanted & _EVENTS
+        self._skippable = self._wanted - _EVENTS
         self._layout: FrameLayout | None = None  # of the newest frame
-        self._unwanted = ""  # its components, if none of them is wanted
 
     def receive(self, frames: list[Frame], utime: int, now_s: float) -> None:
         """Take frames that arrived together, oldest first.

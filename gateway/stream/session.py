@@ -82,7 +82,6 @@ class Session:
     ) -> None:
         self.server = f"{source.host}:{source.port}"
         self._source = source
-        self._num_wanted = len(stream.components)
         self._only_events = set(stream.components) == {ComponentType.EVENT}
         self._status = status
         self._on_frames = on_frames
@@ -361,7 +360,8 @@ class Session:
 
     def _num_lost(self, announced: int) -> int:
         """Return how many messages a rejected frame would have had, as far as its component count tells."""
-        return min(announced, self._num_wanted) if 0 < announced <= len(ComponentType) else 1
+        num_wanted = len(self._status.components.split())
+        return min(announced, num_wanted) if 0 < announced <= len(ComponentType) else 1
 
     def _end_ask(self, result: Packet | GatewayError) -> None:
         if self._reply is None or self._reply.done():

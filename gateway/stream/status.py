@@ -38,6 +38,18 @@ _PROTOCOL_EVENTS: Final = {
 logger = logging.getLogger(__name__)
 
 
+class SessionNumbers:
+    """Numbers the connections of a source. All of its streams share it, so that no number occurs twice."""
+
+    def __init__(self, newest: int = 0) -> None:
+        self.newest = newest
+
+    def next_after(self, session: int) -> int:
+        """Return a number larger than ``session`` and than all numbers so far."""
+        self.newest = max(self.newest, session) + 1
+        return self.newest
+
+
 @dataclass
 class StreamStatus:
     """The status of one stream, over all its connections.
@@ -45,7 +57,7 @@ class StreamStatus:
     Only the methods of this class change it, except for ``clock``, which Ingest updates with every frame.
     Most methods are named after the event that they report.
 
-    ``components`` are the configured components, separated by spaces. ``name`` begins the stream's log
+    ``components`` are the stream's components, separated by spaces. ``name`` begins the stream's log
     lines. ``on_state`` is called with each new state. ``parameters_version`` is that of the server's
     parameters, 0 before the first; all streams of a source have the same. ``last_frame_utime`` is when the
     newest frame arrived, in µs since the Unix epoch, 0 before the first; ``last_frame_s`` is the same on the
@@ -66,6 +78,7 @@ class StreamStatus:
     rate: str = ""
     session: int = 0
     parameters_version: int = 0
+    sessions: SessionNumbers = field(default_factory=SessionNumbers)
     frames_in: int = 0
     last_frame_utime: int = 0
     last_frame_s: float | None = None
@@ -88,9 +101,13 @@ class StreamStatus:
 
     def __post_init__(self) -> None:
         """Create the logs of losses, lost connections and defects."""
-        self._failures = FailureLog(logger, self.name)
-        self._defects = DefectLog(logger, self.name)
-        self.losses = Losses(logger, self.name)
+        self._failures = FailureLog(logger, self)
+        self._defects = DefectLog(logger, self)
+        self.losses = Losses(logger, self)
+
+    def __str__(self) -> str:
+        """Return the name, which begins log messages."""
+        return self.name
 
     # Reports of session and supervisor about the connection.
 
@@ -99,9 +116,18 @@ class StreamStatus:
         self.tries += 1
         self._enter(Phase.CONNECTING, "connecting", server)
 
+    def components_changed(self, components: str, name: str, *, on_open_connection: bool) -> None:
+        """Note the components that the stream has from now on, and the name that follows from them.
+
+        Components that move to an open connection get a new session number there.
+        """
+        self.components, self.name = components, name
+        if on_open_connection:
+            self.session = self.sessions.next_after(self.session)
+
     def connected(self, server: str) -> None:
         """Count a new session, and forget what was agreed in the previous one."""
-        self.session += 1
+        self.session = self.sessions.next_after(self.session)
         self.limitations.clear()
         self.byte_order = self.rate = ""
         self._enter(Phase.HANDSHAKING, "connected", server)
@@ -221,6 +247,13 @@ class StreamStatus:
         self.limitations.append(text)
         return True
 
+    def replace_limitation(self, former: str, text: str) -> None:
+        """Remove the limitation ``former`` and add ``text``; "" means none."""
+        if former != text and former in self.limitations:
+            self.limitations.remove(former)
+        if text:
+            self.add_limitation(text)
+
     def record_error(self, text: str) -> None:
         """Keep ``text``, cut to MAX_ERROR_LENGTH, as the last error, with the time."""
         self.last_error = text[:MAX_ERROR_LENGTH]
@@ -251,11 +284,13 @@ class FrameRate:
     def __init__(self) -> None:
         self._frames = 0
         self._time_s = time.monotonic()
+        self.rate_hz = 0.0
+        """The rate at the last call of ``update``."""
 
     def update(self, frames: int) -> float:
         """Return the mean rate in Hz since the last call; ``frames`` is the number of frames so far."""
         now_s = time.monotonic()
         elapsed_s = now_s - self._time_s
-        rate_hz = (frames - self._frames) / elapsed_s if elapsed_s > 0 else 0.0
+        self.rate_hz = (frames - self._frames) / elapsed_s if elapsed_s > 0 else 0.0
         self._frames, self._time_s = frames, now_s
-        return rate_hz
+        return self.rate_hz

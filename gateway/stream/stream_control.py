@@ -53,6 +53,7 @@ class StreamControl:
         status: StreamStatus,
         session: Session,
         on_parameters: OnParameters,
+        choose_components: Callable[[Parameters | None], Sequence[ComponentType]] | None = None,
     ) -> None:
         self._source = source
         self._only_events = set(stream.components) == {ComponentType.EVENT}
@@ -60,7 +61,10 @@ class StreamControl:
         self._status = status
         self._session = session
         self._on_parameters = on_parameters
-        self._accepted = StreamFrames()  # the form that the server accepted, at the full rate
+        self._choose_components = choose_components or (lambda _parameters: stream.components)
+        self._frequency_hz: float | None = None  # of the markers, as the server announces it
+        self.accepted = StreamFrames()
+        """The form of StreamFrames that the server accepted, at the full rate."""
         self._requested: StreamFrames | None = None  # what the server streams now; None if it is stopped
         self._is_slow = False  # whether the server has left a command unanswered
         self._asked_again = False  # since the last request, because neither a frame nor No Data arrived
@@ -79,15 +83,18 @@ class StreamControl:
         if self._source.byte_order == "little":
             await self._ask_optional(SetByteOrder("little"))
         parameters = await self._fetch_parameters()
-        frequency_hz = None
         if parameters is not None and parameters.markers is not None:
-            frequency_hz = parameters.markers.frequency_hz
-        await self._request_any(stream_requests(self._stream.rate, self._stream.components, frequency_hz))
-        self._status.handshake_done(self._session.protocol_state, self._session.server, str(self._accepted))
+            self._frequency_hz = parameters.markers.frequency_hz
+        await self.request_components(self._choose_components(parameters))
+        self._status.handshake_done(self._session.protocol_state, self._session.server, str(self.accepted))
+
+    async def request_components(self, components: Sequence[ComponentType]) -> None:
+        """Request frames with these components, at the full rate. Raises RequestError as ``start`` does."""
+        await self._request_any(stream_requests(self._stream.rate, components, self._frequency_hz))
 
     async def request(self, halvings: int) -> bool:
         """Request frames as agreed, the rate halved ``halvings`` times; return whether the server accepts."""
-        request = replace(self._accepted, rate=halved(self._accepted.rate, halvings))
+        request = replace(self.accepted, rate=halved(self.accepted.rate, halvings))
         return await self._request(request) is _Outcome.ACCEPTED
 
     async def stop(self) -> bool:
@@ -143,7 +150,7 @@ class StreamControl:
         for form in forms:
             outcome = await self._request(form)
             if outcome is _Outcome.ACCEPTED:
-                self._accepted = form
+                self.accepted = form
                 break
             if outcome is _Outcome.NO_ANSWER:
                 ignored.append(form)
@@ -151,7 +158,7 @@ class StreamControl:
             # A late refusal need not say what it refuses, so the server may have accepted a form after all.
             if not (self._is_slow and await self._session.wait_for_data(self._source.reply_timeout_s)):
                 raise self._request_error()
-            self._accepted = self._requested = forms[-1]
+            self.accepted = self._requested = forms[-1]
         if ignored and not has_answered:
             # The server was not answering at all, so it may know the form that it seemed to ignore.
             await self._prefer(ignored[0])
@@ -159,9 +166,9 @@ class StreamControl:
     async def _prefer(self, form: StreamFrames) -> None:
         """Request a better form than the accepted one; return to that if the server does not accept it."""
         if await self._request(form) is _Outcome.ACCEPTED:
-            self._accepted = form
+            self.accepted = form
         else:
-            await self._request(self._accepted)
+            await self._request(self.accepted)
 
     def _request_error(self) -> RequestError:
         if not self._session.has_answered:

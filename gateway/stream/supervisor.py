@@ -4,17 +4,20 @@ import asyncio
 import logging
 import random
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import NamedTuple, NoReturn
 
 from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
 from gateway.errors import DefectError, LinkError
 from gateway.log import log_fields
+from gateway.rtc3d.commands import StreamFrames
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import Parameters
 from gateway.stream.change_tasks import ChangeTasks
 from gateway.stream.ingest import Ingest, Publish, Skip
 from gateway.stream.session import OnFile, Session
 from gateway.stream.state import StreamState
-from gateway.stream.status import StreamStatus
+from gateway.stream.status import FrameRate, StreamStatus
 from gateway.stream.stream_control import OnParameters, StreamControl
 from gateway.stream.tcp import Connect, open_connection
 
@@ -36,8 +39,21 @@ class Callbacks(NamedTuple):
     """Called when the server's frame numbers or time stamps start again within a connection."""
     on_file: OnFile
     """Takes a complete C3D file."""
-    has_subscribers: Callable[[], bool]
-    """Returns whether the stream's components may have subscribers."""
+    has_subscribers: Callable[[Collection[ComponentType]], bool]
+    """Returns whether any of these components may have subscribers."""
+
+
+class Listener:
+    """Follows the connections of streams, and may change their components. This one does nothing."""
+
+    def planning(self, stream: "Supervisor", parameters: Parameters | None) -> None:
+        """Called in each handshake before frames are requested; ``parameters`` is None if there are none."""
+
+    def connected(self, stream: "Supervisor", request: StreamFrames) -> None:
+        """Called when the server has accepted ``request``, one of the forms of the request for frames."""
+
+    def ended(self, stream: "Supervisor", error: LinkError) -> None:
+        """Called when a connection ended, or could not be made."""
 
 
 def backoff_delays_s(reconnect: ReconnectSettings) -> Iterator[float]:
@@ -54,7 +70,7 @@ def backoff_delays_s(reconnect: ReconnectSettings) -> Iterator[float]:
 class Supervisor:
     """Runs the sessions of one stream, one after the other.
 
-    ``connect`` and ``monotonic`` are passed on to each Session.
+    ``connect`` and ``monotonic`` are passed on to each Session. ``listener`` is told of each connection.
     """
 
     def __init__(
@@ -63,22 +79,44 @@ class Supervisor:
         stream: StreamSettings,
         status: StreamStatus,
         callbacks: Callbacks,
+        listener: Listener | None = None,
         connect: Connect = open_connection,
         monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         self._source = source
-        self._stream = stream
-        self._status = status
+        self.settings = stream
+        """The settings of the stream, with its present components."""
+        self.status = status
+        self.frame_rate = FrameRate()
         self._callbacks = callbacks
         self._connect = connect
         self._monotonic = monotonic
+        self._listener = listener or Listener()
         self._ready_session: Session | None = None  # the newest session with a completed handshake
+        self._ingest: Ingest | None = None  # of the newest session, like _changes
+        self._changes: ChangeTasks | None = None
+        self._log_fields: dict[str, str] = {}
 
     @property
     def session(self) -> Session | None:
         """The open session with a completed handshake, for further commands; None if there is none."""
         session = self._ready_session
         return session if session is not None and session.is_open else None
+
+    def change_components(self, components: tuple[ComponentType, ...]) -> None:
+        """Stream these components from now on; an open connection requests them at once."""
+        if components == self.settings.components:
+            return
+        self.settings = self.settings.model_copy(update={"components": components})
+        keys = component_keys(components)
+        self.status.components_changed(
+            keys, stream_name(self._source, components), on_open_connection=self.session is not None
+        )
+        self._log_fields["stream"] = keys
+        if self._ingest is not None:
+            self._ingest.want(components)
+        if self.session is not None and self._changes is not None:
+            self._changes.request_components(components)
 
     async def run(self) -> None:
         """Keep the stream running until cancelled; then send Bye.
@@ -89,27 +127,29 @@ class Supervisor:
         sources continue.
         """
         server = f"{self._source.host}:{self._source.port}"
-        with log_fields(source=self._source.name, stream=self._status.components, peer=server):
+        with log_fields(source=self._source.name, stream=self.status.components, peer=server) as fields:
+            self._log_fields = fields
             await self._run_sessions()
 
     async def _run_sessions(self) -> None:
         reconnect = self._source.reconnect
         delays_s = backoff_delays_s(reconnect)
         while True:
-            frames_before = self._status.frames_in
+            frames_before = self.status.frames_in
             began_s = self._monotonic()
             error = await self._run_session_to_its_end()
-            had_data = self._status.frames_in > frames_before or (
-                self._status.state is StreamState.NO_MEASUREMENT
+            had_data = self.status.frames_in > frames_before or (
+                self.status.state is StreamState.NO_MEASUREMENT
             )
             if had_data and not isinstance(error, DefectError):
                 delays_s = backoff_delays_s(reconnect)
-            self._status.disconnected(error)
+            self.status.disconnected(error)
+            self._listener.ended(self, error)
             # An attempt that took long need not be followed by a long wait as well: a server that hangs, and
             # is well again, would stay without a client.
             lasted_s = self._monotonic() - began_s
             await asyncio.sleep(max(next(delays_s) - lasted_s, next(backoff_delays_s(reconnect))))
-            self._status.reconnecting()
+            self.status.reconnecting()
 
     async def _run_session_to_its_end(self) -> LinkError:
         """Run one session; return why it ended."""
@@ -122,10 +162,10 @@ class Supervisor:
 
     async def _run_session(self) -> NoReturn:
         """Run one session until it ends; raise LinkError with the reason."""
-        ingest = Ingest(
+        ingest = self._ingest = Ingest(
             self._source,
-            self._stream,
-            self._status,
+            self.settings,
+            self.status,
             self._callbacks.publish,
             self._callbacks.skip,
             lambda halvings: changes.lateness_changed(halvings),  # noqa: PLW0108 - assigned below
@@ -133,26 +173,54 @@ class Supervisor:
         )
         session = Session(
             self._source,
-            self._stream,
-            self._status,
+            self.settings,
+            self.status,
             ingest.receive,
             self._callbacks.on_file,
             self._connect,
             self._monotonic,
         )
         control = StreamControl(
-            self._source, self._stream, self._status, session, self._callbacks.on_parameters
+            self._source,
+            self.settings,
+            self.status,
+            session,
+            self._callbacks.on_parameters,
+            self._planned_components,
         )
-        changes = ChangeTasks(
-            self._source, self._stream, self._status, session, control, self._callbacks.has_subscribers
+        changes = self._changes = ChangeTasks(
+            self._source,
+            self.settings,
+            self.status,
+            session,
+            control,
+            lambda: self._callbacks.has_subscribers(self.settings.components),
         )
         try:
             await session.connect()
             await control.start()
+            self._listener.connected(self, control.accepted)
             self._ready_session = session
+            if set(control.accepted.components) not in (set(), set(self.settings.components)):
+                changes.request_components(self.settings.components)  # they changed in the meantime
             self._callbacks.on_connected()
             changes.start()
             await session.monitor(control.check_silence)
         finally:
             changes.cancel()
             await session.close()
+
+    def _planned_components(self, parameters: Parameters | None) -> tuple[ComponentType, ...]:
+        """Return the components to request from a server with these parameters."""
+        self._listener.planning(self, parameters)
+        return self.settings.components
+
+
+def component_keys(components: Sequence[ComponentType]) -> str:
+    """Return for example "3d 6d"."""
+    return " ".join(component.key for component in components)
+
+
+def stream_name(source: SourceSettings, components: Sequence[ComponentType]) -> str:
+    """Return the name of a stream in log messages, for example "lab (3d 6d)"."""
+    return f"{source.name} ({component_keys(components)})"

@@ -180,7 +180,7 @@ async def test_a_limitation_is_logged_as_warning_only_for_the_first_connection(
 
     async with ScriptedServer(script) as server, run_gateway(server.port) as gateway:
         await gateway.wait_for("3d")
-        assert gateway.status.limitations == ["the server refused Version 1.0: err-unknown command"]
+        assert "the server refused Version 1.0: err-unknown command" in gateway.status.limitations
     refusals = [record for record in caplog.records if "refused Version" in record.message]
     assert [record.levelname for record in refusals[:3]] == ["WARNING", "DEBUG", "DEBUG"]
 

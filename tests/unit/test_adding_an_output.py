@@ -295,7 +295,7 @@ async def test_its_subscribers_keep_an_on_demand_stream_running(tmp_path: Path, 
     stream = {"on_demand": True, "idle_after_s": 0.1}
     async with running(tmp_path, source={"streams": [stream]}, whole_frames=whole_frames) as lab:
         [status] = lab.source.statuses
-        await wait_until_async(lambda: status.state is StreamState.IDLE and lab.source.supervisors[0].session)
+        await wait_until_async(lambda: status.state is StreamState.IDLE and lab.source.streams[0].session)
         with closing(lab.subscribe()):
             await lab.messages("frame" if whole_frames else "3d", 30)  # more than fit into idle_after_s
         await wait_until_async(lambda: status.state is StreamState.IDLE)
@@ -340,7 +340,7 @@ async def test_it_receives_parameters_and_announcements_of_files(tmp_path: Path)
 
 async def test_it_answers_queries_about_sources(tmp_path: Path) -> None:
     async with running(tmp_path) as lab:
-        await wait_until_async(lambda: lab.source.supervisors[0].session)
+        await wait_until_async(lambda: lab.source.streams[0].session)
         assert b"<The_3D>" in (await lab.output.query("lab/parameters")).payload
         assert decode((await lab.output.query("lab/status")).payload).source == "lab"
         assert lab.metric("queries_total", output="example", result="ok") == 2
@@ -350,7 +350,7 @@ async def test_it_answers_queries_about_sources(tmp_path: Path) -> None:
 async def test_it_answers_queries_about_the_newest_components(tmp_path: Path, whole_frames: bool) -> None:
     async with running(tmp_path, whole_frames=whole_frames) as lab:
         await wait_until_async(lambda: lab.source.fan_out.frames[ComponentType.MARKERS])
-        await wait_until_async(lambda: lab.source.supervisors[0].session)
+        await wait_until_async(lambda: lab.source.streams[0].session)
         answer = await lab.output.query("lab/3d")
         assert len(decode(answer.payload).markers) == 3
 

@@ -100,7 +100,7 @@ async def running(
 
 
 async def connected(gateway: Gateway) -> None:
-    await until(lambda: all(each.session for source in gateway.sources for each in source.supervisors))
+    await until(lambda: all(each.session for source in gateway.sources for each in source.streams))
     await settle()
 
 

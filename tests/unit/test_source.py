@@ -78,7 +78,7 @@ class Lab:
         return [decode(message) for topic, message in self.output.messages if topic.path == (component,)]
 
     async def connected(self, sessions: int = 1) -> None:
-        await until(lambda: sum(1 for each in self.source.supervisors if each.session) == sessions)
+        await until(lambda: sum(1 for each in self.source.streams if each.session) == sessions)
         await settle()
 
     def count(self, command: str) -> int:
@@ -193,9 +193,8 @@ async def test_the_source_shows_streaming_while_any_stream_has_frames(servers: S
 
 async def test_a_source_that_replaces_another_continues_its_numbers(servers: Servers, spool: Spool) -> None:
     before = Lab(servers, spool, streams=TWO_STREAMS)
-    before.source.statuses[0].session, before.source.statuses[1].session = 3, 5
-    for status in before.source.statuses:
-        status.parameters_changed(7)
+    before.source.sessions.newest = 5
+    before.source.parameters_version = 7
     before.source.publish_status()
     after = Lab(servers, spool, before.source)
     assert [(each.session, each.parameters_version) for each in after.source.statuses] == [(5, 7)]

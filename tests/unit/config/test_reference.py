@@ -88,7 +88,8 @@ def test_the_reference_has_every_section() -> None:
                     found |= sections_in(type(value))
         return found
 
-    assert sections_in(MODEL) | sections_in(SourceSettings) == {MODEL, *SECTIONS.values()}
+    found = sections_in(MODEL) | sections_in(SourceSettings) | {StreamSettings}  # the default is auto
+    assert found == {MODEL, *SECTIONS.values()}
 
 
 @pytest.mark.parametrize("block", re.findall(r"```yaml\n(.*?)```", REFERENCE, re.DOTALL))

@@ -5,12 +5,11 @@ import pytest
 from pydantic import TypeAdapter, ValidationError
 
 from gateway.config.section import describe
-from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
+from gateway.config.settings import ReconnectSettings, SourceSettings
 from gateway.config.values import SourceName
 from gateway.messages import topics
 from gateway.outputs.lcm.settings import ChannelPrefix, LcmSettings, lcm_queries_url
 from gateway.outputs.zenoh.settings import ZenohSettings
-from gateway.rtc3d.commands import AllFrames
 from gateway.rtc3d.components import ComponentType
 from tests.configurations import MODEL, make_settings
 from tests.settings import mistakes, source
@@ -27,7 +26,7 @@ def test_a_configuration_needs_only_one_server() -> None:
         host="192.0.2.20",
         port=3020,
         byte_order="big",
-        streams=(StreamSettings(components=(MARKERS, TOOLS, ANALOG, FORCE, EVENT), rate=AllFrames()),),
+        streams="auto",
         reconnect=ReconnectSettings(first_delay_s=0.2, max_delay_s=10.0),
         connect_timeout_s=5.0,
         reply_timeout_s=2.0,
@@ -97,7 +96,7 @@ def test_sources_and_streams_must_be_lists_with_at_least_one_item(value: object,
         ("sources", f"found {found}; expected a list of sources, one or more, each with name and host")
     ]
     assert mistakes(SourceSettings, source(streams=value)) == [
-        ("streams", f"found {found}; expected a list of streams, one or more")
+        ("streams", f"found {found}; expected auto, or a list of streams, one or more")
     ]
 
 

@@ -68,7 +68,7 @@ def test_the_status_message_has_every_field() -> None:
         "utime": message["utime"],
         "capture_utime": message["utime"],
         "sequence": 17,
-        "session": 4,
+        "session": 3,
         "parameters_version": 5,
         "source": "lab",
         "server": "192.0.2.20:3020",

@@ -83,7 +83,7 @@ class FakeSource:
         )
         self.queries = SourceQueries(
             source_settings,
-            [self.stream],
+            lambda: [self.stream],
             lambda component, _output: self.newest_messages.get(component),
             rtc3d.status_t().encode,
             self._last_c3d,

@@ -108,7 +108,7 @@ async def test_a_signal_stops_the_gateway_and_all_tasks(
     systemd: Notifications, servers: Servers, number: signal.Signals
 ) -> None:
     async with running(Configuration()) as (gateway, task):
-        await until(lambda: gateway.sources[0].supervisors[0].session)
+        await until(lambda: gateway.sources[0].streams[0].session)
         await settle()
         os.kill(os.getpid(), number)
         await asyncio.wait([task], timeout=5)

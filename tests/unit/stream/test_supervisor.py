@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Collection, Mapping
 from contextlib import asynccontextmanager
 from itertools import pairwise
 from typing import Any
@@ -52,8 +52,8 @@ class Lab:
                 on_file=self.files.append,
                 has_subscribers=self._has_subscribers,
             ),
-            self.server.connect,
-            asyncio.get_running_loop().time,
+            connect=self.server.connect,
+            monotonic=asyncio.get_running_loop().time,
         )
 
     def _publish(self, frame: Frame, stamp: Stamp, _wanted: frozenset[ComponentType]) -> None:
@@ -63,7 +63,7 @@ class Lab:
         self.connected += 1
         assert self.supervisor.session is not None  # commands can be sent
 
-    def _has_subscribers(self) -> bool:
+    def _has_subscribers(self, _components: Collection[ComponentType]) -> bool:
         if self.has_defect:
             _raise_defect()
         return self.has_subscribers
