@@ -30,7 +30,9 @@ class Publisher(Protocol):
         """Whether there may be a subscriber; always True if the output cannot know."""
 
     def publish(self, message: bytes) -> None:
-        """Send one message without blocking, whatever the peers do.
+        """Send one message. Wait for a peer that is behind for at most some milliseconds, whatever it does.
+
+        This wait is how back-pressure reaches the server: the session reads on only after ``publish``.
 
         Raises OutputError if the output does not accept it. Then this message is lost, but the next one may
         be sent as usual.

@@ -17,8 +17,14 @@ _ZENOH_MESSAGE: Final = re.compile(
 """The Rust debug text by which Zenoh reports a value in a file that it cannot use."""
 
 _DEFAULTS: Final = {
-    # 16 MB of /dev/shm, and files left behind after a kill, for messages of a few kB.
-    "transport": {"shared_memory": {"enabled": False}},
+    "transport": {
+        # 16 MB of /dev/shm, and files left behind after a kill, for messages of a few kB.
+        "shared_memory": {"enabled": False},
+        # How long, in µs, a put waits for a subscriber that is behind before Zenoh drops messages for it. The
+        # scheduler alone delays a subscriber by more than Zenoh's 1 ms. Once Zenoh drops, it does not wait
+        # again until that subscriber has read something.
+        "link": {"tx": {"queue": {"congestion_control": {"drop": {"wait_before_drop": 20_000}}}}},
+    },
     # Caches for late subscribers need samples with time stamps.
     "timestamping": {"enabled": True},
     # Reconnects to a lost router within 0.5 s instead of up to 4 s.
