@@ -12,7 +12,7 @@ from gateway.monitoring.http_pages import Page
 from gateway.outputs.contract import Output
 from gateway.rtc3d.components import ComponentType
 from gateway.source import Source
-from gateway.stream.running_time import running_clock
+from gateway.stream.running_clock import running_clock
 from gateway.stream.state import StreamState
 from gateway.stream.status import FRAME_REJECTED, StreamStatus
 

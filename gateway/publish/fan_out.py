@@ -29,31 +29,30 @@ class _Component:
         self.sequence = 0
         self.newest: bytes | None = None
 
-    def next_message(self, content: bytes, stamp: Stamp) -> bytes:
-        """Return the message of a content in LCM form, under the next sequence number."""
-        self.newest = encode_content(self.type, content, stamp, self.sequence)
-        self.sequence += 1
-        return self.newest
-
 
 class _ComponentPlan:
-    """How to publish one component of a layout: its index in the frame, and its routes."""
+    """How to publish one component of a layout: its index and place in the frame, and its routes."""
 
     def __init__(
-        self, component: _Component, index: int, has_lcm_form: bool, routes: list[ComponentRoute]
+        self, component: _Component, layout: FrameLayout, index: int, routes: list[ComponentRoute]
     ) -> None:
         self.routes = routes
         self._component = component
         self._index = index
-        self._has_lcm_form = has_lcm_form
+        self._start, self._end = layout.content_spans[index]
+        self._has_lcm_form = has_lcm_form(layout.components[index], layout.byte_order)
 
     def next_message(self, frame: Frame, stamp: Stamp) -> bytes:
         """Return the component's message, which uses up a sequence number even if it is not published."""
+        component = self._component
         if self._has_lcm_form:
-            content = frame.content(self._index)
+            content = frame.body[self._start : self._end]
         else:
             content = lcm_content(frame.component(self._index))
-        return self._component.next_message(content, stamp)
+        message = encode_content(component.type, content, stamp, component.sequence)
+        component.sequence += 1
+        component.newest = message
+        return message
 
 
 class _Plan:
@@ -207,8 +206,8 @@ class FanOut:
         plans = [
             _ComponentPlan(
                 self._components[component.type],
+                layout,
                 index,
-                has_lcm_form(component, layout.byte_order),
                 [route.components[component.type] for route in self._routes if route.frame_route is None],
             )
             for index, component in indexed

@@ -37,7 +37,8 @@ from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.packets import Packet, decode_text
 from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.stream.backlog import MAX_TOGETHER, Backlog
-from gateway.stream.running_time import running_clock, running_timeout
+from gateway.stream.running_clock import running_clock
+from gateway.stream.running_time import running_timeout
 from gateway.stream.status import StreamStatus
 from gateway.stream.tcp import Connect, open_connection
 

@@ -61,7 +61,7 @@ class StreamStatus:
     lines. ``on_state`` is called with each new state. ``parameters_version`` is that of the server's
     parameters, 0 before the first; all streams of a source have the same. ``last_frame_utime`` is when the
     newest frame arrived, in µs since the Unix epoch, 0 before the first; ``last_frame_s`` is the same on the
-    running clock (see ``gateway.stream.running_time``), None before the first. ``tries`` counts the attempts
+    running clock (see ``gateway.stream.running_clock``), None before the first. ``tries`` counts the attempts
     to connect since the last completed handshake, ``reconnects`` all attempts except the first. ``restarts``
     counts how often the server's time or frame numbers started again within a connection. ``losses`` counts
     by cause what arrived and was not published. ``limitations`` lists what the current connection lacks.

@@ -13,7 +13,7 @@ from gateway.monitoring.health import health_page
 from gateway.monitoring.status_line import status_lines
 from gateway.outputs.memory import MemoryOutput
 from gateway.rtc3d.components import ComponentType
-from gateway.stream.running_time import running_clock
+from gateway.stream.running_clock import running_clock
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from tests.configurations import make_settings

@@ -4,7 +4,8 @@ import asyncio
 
 import pytest
 
-from gateway.stream.running_time import running_clock, running_timeout
+from gateway.stream.running_clock import running_clock
+from gateway.stream.running_time import running_timeout
 from tests.unit.stream.virtual_time import stop_process
 
 
