@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from gateway.c3d_spool import Spool
 from gateway.config.settings import Settings, SourceSettings, SpoolSettings
+from gateway.messages.host_time import host_clock
 from gateway.outputs.contract import Command, Output, ServerParameters
 from gateway.outputs.registry import build_outputs
 from gateway.publish.fan_out import FanOut
@@ -98,6 +99,7 @@ class Gateway:
         """Maintain the outputs and publish the status of each source."""
         while True:
             await asyncio.sleep(_STATUS_PERIOD_S)
+            host_clock.read()  # detects a step of the wall clock even if no frame arrives
             for output in self._outputs:
                 output.maintain()
             for source in self._sources.values():

@@ -33,12 +33,12 @@ class ObservedComponent:
         self._num_visible_items = 0
         self._was_visible: npt.NDArray[np.bool_] = np.zeros(0, np.bool_)
         self._timestamps_us: list[int] = []
-        self._first_utime = self._last_utime = 0
+        self._first_us = self._last_us = 0
 
-    def add(self, component: Component, utime: int) -> None:
-        """Count one frame with this component, which arrived at ``utime`` (µs since the Unix epoch)."""
-        self._first_utime = self._first_utime or utime
-        self._last_utime = utime
+    def add(self, component: Component, steady_us: int) -> None:
+        """Count one frame with this component, which arrived at ``steady_us`` on the steady clock."""
+        self._first_us = self._first_us or steady_us
+        self._last_us = steady_us
         self._num_frames += 1
         self._timestamps_us.append(component.timestamp_us)
         message_bytes = ITEMS_OFFSET + component.num_items * component.item_bytes
@@ -66,7 +66,7 @@ class ObservedComponent:
         note 11).
         """
         intervals = self._num_frames - 1
-        span_s = (self._last_utime - self._first_utime) / 1e6
+        span_s = (self._last_us - self._first_us) / 1e6
         arrival_hz = intervals / span_s if intervals > 0 and span_s > 0 else 0.0
         steps_us = np.diff(np.array(self._timestamps_us, np.int64))
         if intervals < 1 or bool(np.any(steps_us <= 0)):
@@ -131,9 +131,9 @@ class ObservedStream:
     def _on_parameters(self, _xml: bytes, parsed: ParsedParameters) -> None:
         self.parsed = parsed
 
-    def _on_frames(self, frames: list[Frame], utime: int, _now_s: float) -> None:
+    def _on_frames(self, frames: list[Frame], utime: int, steady_us: int) -> None:
         self.status.frames_received(len(frames), utime)
         for frame in frames:
             for component in frame.components:
                 if component.type in self.settings.components:
-                    self.observed.setdefault(component.type, ObservedComponent()).add(component, utime)
+                    self.observed.setdefault(component.type, ObservedComponent()).add(component, steady_us)

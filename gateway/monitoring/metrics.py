@@ -22,6 +22,7 @@ from prometheus_client.registry import Collector
 from gateway import __version__
 from gateway.gateway import Gateway
 from gateway.losses import Loss
+from gateway.messages.host_time import host_clock
 from gateway.monitoring.http_pages import Page
 from gateway.monitoring.loop_delay import LoopDelay
 from gateway.outputs.status import OutputStatus
@@ -80,7 +81,9 @@ _STREAM_GAUGES: Final = (
         lambda status: status.clock.has_clock,
     ),
     _StreamMetric(
-        "clock_offset_seconds", "Host time minus server time.", _if_valid(lambda clock: clock.offset_us / 1e6)
+        "clock_offset_seconds",
+        "Host time minus server time.",
+        _if_valid(lambda clock: (clock.offset_us + host_clock.offset_us) / 1e6),
     ),
     _StreamMetric(
         "clock_drift_ratio",
@@ -276,6 +279,12 @@ class GatewayCollector(Collector):
             "Largest of these delays in the last one to two minutes.",
             (),
             [((), self._loop_delay.max_s)],
+        )
+        yield _counter(
+            "host_clock_steps",
+            "How often the wall clock of this computer was set by 1 ms or more since the gateway started.",
+            (),
+            [((), host_clock.steps)],
         )
         yield InfoMetricFamily(f"{METRIC_PREFIX}build", "Versions; always 1.", self._build)
         # prometheus_client's own collector reads /proc/stat, which the service's sandbox hides.

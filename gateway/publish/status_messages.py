@@ -8,7 +8,7 @@ import rtc3d
 
 from gateway import __version__
 from gateway.losses import Loss
-from gateway.messages.host_time import now_utime
+from gateway.messages.host_time import host_clock, now_utime
 from gateway.outputs.status import OutputHealth, OutputStatus
 from gateway.stream.clock import ServerClock
 from gateway.stream.status import StreamStatus
@@ -26,6 +26,9 @@ _COPIED_FIELDS: Final = (
     "last_error_utime",
 )
 """Fields of ``stream_status_t`` with the same name and value in StreamStatus."""
+
+_MIN_INT64: Final = -(1 << 63)
+_MAX_INT64: Final = (1 << 63) - 1
 
 
 def status_message(
@@ -72,7 +75,8 @@ def clock_model(clock: ServerClock) -> rtc3d.clock_model_t:
     model = rtc3d.clock_model_t()
     model.has_clock = clock.has_clock
     if clock.has_clock:
-        model.offset_us = round(clock.offset_us)
+        offset_us = clock.offset_us + host_clock.offset_us
+        model.offset_us = max(_MIN_INT64, min(offset_us, _MAX_INT64))  # a server may count from any number
         model.drift_ppm = clock.drift_ppm
         model.uncertainty_us = clock.uncertainty_us
     model.samples = clock.samples

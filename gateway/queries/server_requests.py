@@ -1,12 +1,12 @@
 """Commands that peers' queries send to the server of one source: one at a time, and shared where equal."""
 
 import asyncio
+import time
 from collections.abc import Awaitable, Callable, Coroutine, Hashable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import LinkError, QueryError, ReplyTimeoutError, ServerError
-from gateway.messages.host_time import now_utime
 from gateway.rtc3d.commands import Command
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet
@@ -53,13 +53,11 @@ class ServerRequests:
 
     def no_connection_error(self) -> QueryError:
         """Return the error that says why there is no connection, since when, and what to do about it."""
-        newest = max(
-            (stream.status for stream in self._streams()), key=lambda status: status.last_error_utime
-        )
+        newest = max((stream.status for stream in self._streams()), key=lambda status: status.last_error_s)
         text = f"source {self._settings.name!r} has no connection"
         if newest.last_error:
             problem, separator, remedy = newest.last_error.partition("; ")
-            age_s = (now_utime() - newest.last_error_utime) / 1e6
+            age_s = time.monotonic() - newest.last_error_s
             text += f": {problem.removeprefix('connection ')}, tried {age_s:.1f} s ago{separator}{remedy}"
         else:
             text += f" yet: connecting to {self._settings.host}:{self._settings.port}"

@@ -36,27 +36,27 @@ class Backlog:
 
     ``publish`` takes frames and when they arrived, as Ingest.receive does. ``speed`` is the pace as a
     multiple of the stream's own, according to the server's time stamps while they are those of a ``clock``.
-    Without a clock, every frame is due at once.
+    Without a clock, every frame is due at once. ``read_clocks`` does the same as HostClock.read.
 
     The session stops reading while frames wait, so the number of frames is limited by the size of one read.
     """
 
     def __init__(
         self,
-        publish: Callable[[list[Frame], int, float], None],
+        publish: Callable[[list[Frame], int, int], None],
         clock: ServerClock,
         speed: float,
-        monotonic: Callable[[], float],
+        read_clocks: Callable[[], tuple[int, int]],
     ) -> None:
         self._publish = publish
         self._clock = clock
         self._speed = speed
-        self._monotonic = monotonic
+        self._read_clocks = read_clocks
         self._frames: list[Frame] = []  # waiting, without those before _next
         self._next = 0
         self._utime = 0  # when they arrived
-        self._arrival_s = 0.0
-        self._due_s = 0.0  # when the next frame is due, on the monotonic clock
+        self._arrival_us = 0  # the same on the steady clock
+        self._due_s = 0.0  # when the next frame is due, on the steady clock
         self._timestamp_us: int | None = None  # of the newest frame published at a pace
 
     @property
@@ -64,22 +64,23 @@ class Backlog:
         """Whether no frames wait."""
         return not self._frames
 
-    def add(self, frames: list[Frame], utime: int, now_s: float) -> None:
+    def add(self, frames: list[Frame], utime: int, steady_us: int) -> None:
         """Take frames that arrived together, oldest first; see Ingest.receive. Publishes nothing yet."""
         if self._frames:
             self._frames = self._frames[self._next :] + frames
         else:
             self._frames = frames
+            now_s = steady_us * 1e-6
             if now_s - self._due_s > _IDLE_S:
                 self._due_s = now_s
                 self._timestamp_us = None
         self._next = 0
         self._utime = utime
-        self._arrival_s = now_s
+        self._arrival_us = steady_us
 
     def publish_due(self) -> float | None:
         """Publish what is due. Return in how many s to call again, or None if nothing waits any more."""
-        now_s = self._monotonic()
+        now_s = self._now_s()
         end_s = now_s + _TURN_S
         self._due_s = max(self._due_s, now_s - _MAX_LATE_S)
         while self._frames and now_s < end_s:
@@ -87,13 +88,16 @@ class Backlog:
             if end == self._next:
                 return self._due_s - now_s
             self._publish_until(end)
-            now_s = self._monotonic()
+            now_s = self._now_s()
         return 0.0 if self._frames else None
 
     def publish_all(self) -> None:
         """Publish everything that waits, at once."""
         if self._frames:
             self._publish_until(len(self._frames))
+
+    def _now_s(self) -> float:
+        return self._read_clocks()[1] * 1e-6
 
     def _end_of_due(self, now_s: float) -> int:
         """Return the index after the last of the next frames that is due; plan when the one after it is."""
@@ -124,4 +128,4 @@ class Backlog:
             self._next = 0
         else:
             self._next = end
-        self._publish(frames, self._utime, self._arrival_s)
+        self._publish(frames, self._utime, self._arrival_us)

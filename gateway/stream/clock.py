@@ -13,16 +13,21 @@ show only that they were late.
    sensors by Olson, "A passive solution to the sensor synchronization problem", IROS 2010). Over less than
    5 s, drift cannot be distinguished from jitter; until then the drift keeps its last value.
 3. A frame that arrives before the line disproves the line, so the line moves down to that frame at once. If
-   the frame arrives far before the line, somebody has set a clock, and all samples become invalid. The drift
-   stays, because setting a clock does not change the rate of its crystal.
+   the frame arrives far before the line, the server's clock was set, and all samples become invalid. The
+   drift stays, because setting a clock does not change the rate of its crystal.
 4. A late frame proves nothing: the cause can be a pause, congestion, or a clock that was set. Samples of
    windows in which every frame was late are kept apart. They replace the other samples once they have been
    equally late for two seconds, which rules out congestion that grows or clears, or late for 30 s.
 5. If a time stamp or frame number goes back, the server has a new time base, and a new line starts at that
    frame. A time stamp that goes back by almost 2^32 µs has wrapped around, and the line continues (field
    note 11). Time stamps that do not change, or whose rate no crystal has, are not a clock.
+6. A time stamp that means "no time" (field note 25) says nothing about the clock. Such a frame has the time
+   of its arrival.
 
 The least delay itself cannot be measured from one side: every time computed here includes it.
+
+All times of the host are on its steady clock (``HostClock``), so setting the host's wall clock changes
+nothing here.
 """
 
 import math
@@ -63,6 +68,9 @@ _WRAP_US: Final = 1 << 32  # 32-bit time stamps start again at 0
 _WRAP_TOLERANCE_US: Final = 1_000_000  # between the arrival times and the time stamps around a wrap
 _NO_TIMESTAMP_US: Final = 1 << 63  # larger than any time stamp: those are signed 64-bit integers
 
+_NO_TIMES_US: Final = (0, -1, -(1 << 63))
+"""What servers send if they have no time: 0, all bits set, the smallest integer (field note 25)."""
+
 
 class Sample(NamedTuple):
     """The frame with the least delay in its window: its time stamp, and its arrival time minus that."""
@@ -75,7 +83,7 @@ class ServerClock:
     """The clock of one server, learned from its frames as the module's docstring describes.
 
     While ``has_clock`` is False (in the first 1.5 s, and whenever time stamps are unusable),
-    ``capture_utime`` is the time of arrival. Within one time base, ``capture_utime`` never decreases from
+    ``capture_us`` is the time of arrival. Within one time base, ``capture_us`` never decreases from
     frame to frame unless the arrival times do; it may stay equal.
     """
 
@@ -85,18 +93,19 @@ class ServerClock:
         self._late_samples: deque[Sample] = deque(maxlen=_KEPT_WINDOWS)
         self._scatter_us = math.inf
         # The line: one time stamp, its host time, and the slope minus 1.
-        self._line_timestamp_us = self._line_utime = 0
+        self._line_timestamp_us = self._line_host_us = 0
         self._drift = 0.0
         # The previous frame.
         self._timestamp_us = _NO_TIMESTAMP_US
-        self._frame_number = self._arrival_utime = self._capture_utime = 0
+        self._frame_number = self._arrival_us = self._capture_us = 0
         # The total, in µs, that 32-bit time stamps have lost by wrapping around. Line and samples include it.
         self._wrapped_us = 0
+        self._is_interrupted = False  # by a frame without a time; before it, there was a clock
         # The time stamp that was repeated last, and when it first arrived.
         self._repeated_us = _NO_TIMESTAMP_US
-        self._repeated_utime = 0
+        self._repeated_since_us = 0
         # The current window, and the frame with the least delay in it.
-        self._window_end_utime = 0
+        self._window_end_us = 0
         self._least_lag_us: float = math.inf
         self._least_timestamp_us = self._least_offset_us = 0
 
@@ -106,8 +115,8 @@ class ServerClock:
         if not self.has_clock:
             return 0
         elapsed_us = self._timestamp_us + self._wrapped_us - self._line_timestamp_us
-        capture_utime = self._line_utime + elapsed_us + int(self._drift * elapsed_us)
-        return capture_utime - self._timestamp_us
+        capture_us = self._line_host_us + elapsed_us + int(self._drift * elapsed_us)
+        return capture_us - self._timestamp_us
 
     @property
     def drift_ppm(self) -> float:
@@ -128,96 +137,120 @@ class ServerClock:
         """The number of samples that determine the line, at most 60."""
         return len(self._samples)
 
-    def observe(self, timestamp_us: int, frame_number: int, arrival_utime: int) -> tuple[int, float, bool]:
-        """Learn from one frame; return its (capture_utime, lag_s, restarted).
+    def observe(self, timestamp_us: int, frame_number: int, arrival_us: int) -> tuple[int, float, bool]:
+        """Learn from one frame; return its (capture_us, lag_s, restarted).
 
-        Call it once per frame, in the order of arrival. ``arrival_utime`` is in µs since the Unix epoch.
+        Call it once per frame, in the order of arrival. ``arrival_us`` is in µs on the host's steady clock.
         ``timestamp_us`` and ``frame_number`` are those of one of the frame's components (§7.1). The frame
         numbers must be of one type of component, because servers may number each type separately, and a
         number that goes back is a restart.
 
-        ``capture_utime`` is when the frame was captured, in µs since the Unix epoch, never after its arrival.
+        ``capture_us`` is when the frame was captured, on the same clock, never after its arrival.
         ``lag_s`` is how much later it arrived than a frame with the least delay would have; it is 0 without a
         clock. ``restarted`` is True if the server's time or frame numbers started again with this frame.
         """
         restarted = False
-        if timestamp_us <= self._timestamp_us or frame_number < self._frame_number:
-            restarted = self._handle_irregular(timestamp_us, frame_number, arrival_utime)
-        elif arrival_utime >= self._window_end_utime:
-            self._close_window(arrival_utime)
+        is_irregular = timestamp_us <= self._timestamp_us or frame_number < self._frame_number
+        if is_irregular and self._is_without_time(timestamp_us, frame_number):
+            return self._observe_without_time(frame_number, arrival_us)
+        if self._is_interrupted:
+            self._is_interrupted = False
+            self.has_clock = True
+        if is_irregular:
+            restarted = self._handle_irregular(timestamp_us, frame_number, arrival_us)
+        elif arrival_us >= self._window_end_us:
+            self._close_window(arrival_us)
         self._timestamp_us = timestamp_us
         self._frame_number = frame_number
-        self._arrival_utime = arrival_utime
+        self._arrival_us = arrival_us
 
         server_us = timestamp_us + self._wrapped_us
         elapsed_us = server_us - self._line_timestamp_us
-        capture_utime = self._line_utime + elapsed_us + int(self._drift * elapsed_us)
-        lag_us = arrival_utime - capture_utime
+        capture_us = self._line_host_us + elapsed_us + int(self._drift * elapsed_us)
+        lag_us = arrival_us - capture_us
         if lag_us < self._least_lag_us:
             if lag_us < 0:
                 if lag_us < -_STEP_US:
-                    self._clear_samples(arrival_utime)
-                self._line_timestamp_us, self._line_utime = server_us, arrival_utime
-                capture_utime = arrival_utime
+                    self._clear_samples(arrival_us)
+                self._line_timestamp_us, self._line_host_us = server_us, arrival_us
+                capture_us = arrival_us
                 lag_us = 0
             self._least_lag_us = float(lag_us)
-            self._least_timestamp_us, self._least_offset_us = server_us, arrival_utime - server_us
+            self._least_timestamp_us, self._least_offset_us = server_us, arrival_us - server_us
 
         if not self.has_clock:
-            self._capture_utime = arrival_utime
-            return arrival_utime, 0.0, restarted
+            self._capture_us = arrival_us
+            return arrival_us, 0.0, restarted
         # A new line may be below the previous one. Subscribers must not see time go back because of that.
-        if capture_utime < self._capture_utime:
-            capture_utime = min(self._capture_utime, arrival_utime)
-        self._capture_utime = capture_utime
-        return capture_utime, lag_us * 1e-6, restarted
+        if capture_us < self._capture_us:
+            capture_us = min(self._capture_us, arrival_us)
+        self._capture_us = capture_us
+        return capture_us, lag_us * 1e-6, restarted
 
-    def _handle_irregular(self, timestamp_us: int, frame_number: int, arrival_utime: int) -> bool:
+    def _is_without_time(self, timestamp_us: int, frame_number: int) -> bool:
+        """Return whether a frame that does not follow the last has a time stamp that means "no time".
+
+        After a restart, which frame numbers show, such a value may be a real time.
+        """
+        is_first = self._timestamp_us == _NO_TIMESTAMP_US
+        return timestamp_us in _NO_TIMES_US and not is_first and frame_number >= self._frame_number
+
+    def _observe_without_time(self, frame_number: int, arrival_us: int) -> tuple[int, float, bool]:
+        """Return the reading for a frame without a time; ``has_clock`` is False until one has a time."""
+        if self.has_clock:
+            self._is_interrupted = True
+            self.has_clock = False
+        self._frame_number = frame_number
+        self._capture_us = arrival_us
+        return arrival_us, 0.0, False
+
+    def _handle_irregular(self, timestamp_us: int, frame_number: int, arrival_us: int) -> bool:
         """Handle the first frame, or one that does not follow the last; return whether it is a restart."""
         if self._timestamp_us == _NO_TIMESTAMP_US:
-            self._start(timestamp_us, arrival_utime, has_clock=False)
+            self._start(timestamp_us, arrival_us, has_clock=False)
             return False
         if frame_number >= self._frame_number:
             if timestamp_us == self._timestamp_us:
-                self._handle_repeated(timestamp_us, arrival_utime)
+                self._handle_repeated(timestamp_us, arrival_us)
                 return False
             advance_us = timestamp_us + _WRAP_US - self._timestamp_us
-            elapsed_us = arrival_utime - self._arrival_utime
+            elapsed_us = arrival_us - self._arrival_us
             if advance_us > 0 and abs(advance_us - elapsed_us) < _WRAP_TOLERANCE_US:
                 self._wrapped_us += _WRAP_US
                 return False
         # A server that had a clock probably still has one, unless it restarts again within its first window.
-        self._start(timestamp_us, arrival_utime, has_clock=self.has_clock and len(self._samples) > 0)
+        self._start(timestamp_us, arrival_us, has_clock=self.has_clock and len(self._samples) > 0)
         return True
 
-    def _start(self, timestamp_us: int, arrival_utime: int, *, has_clock: bool) -> None:
+    def _start(self, timestamp_us: int, arrival_us: int, *, has_clock: bool) -> None:
         """Start a new line through this frame."""
         self.has_clock = has_clock
         self._wrapped_us = 0
-        self._line_timestamp_us, self._line_utime = timestamp_us, arrival_utime
-        self._clear_samples(arrival_utime)
+        self._line_timestamp_us, self._line_host_us = timestamp_us, arrival_us
+        self._clear_samples(arrival_us)
 
-    def _clear_samples(self, arrival_utime: int) -> None:
+    def _clear_samples(self, arrival_us: int) -> None:
         self._samples.clear()
+        self._late_samples.clear()
         self._scatter_us = math.inf
-        self._begin_window(arrival_utime)
+        self._begin_window(arrival_us)
 
-    def _begin_window(self, arrival_utime: int) -> None:
-        self._window_end_utime = arrival_utime + _WINDOW_US
+    def _begin_window(self, arrival_us: int) -> None:
+        self._window_end_us = arrival_us + _WINDOW_US
         self._least_lag_us = math.inf
 
-    def _handle_repeated(self, timestamp_us: int, arrival_utime: int) -> None:
+    def _handle_repeated(self, timestamp_us: int, arrival_us: int) -> None:
         # Duplicate frames and coarse time stamps still come from a clock; a frozen time stamp does not.
         if timestamp_us != self._repeated_us:
-            self._repeated_us, self._repeated_utime = timestamp_us, self._arrival_utime
-        if arrival_utime - self._repeated_utime > _FROZEN_US:
-            self._start(timestamp_us, arrival_utime, has_clock=False)
+            self._repeated_us, self._repeated_since_us = timestamp_us, self._arrival_us
+        if arrival_us - self._repeated_since_us > _FROZEN_US:
+            self._start(timestamp_us, arrival_us, has_clock=False)
 
-    def _close_window(self, arrival_utime: int) -> None:
+    def _close_window(self, arrival_us: int) -> None:
         """End the current window: add its sample to the others or to the late ones, and fit the line."""
         lag_us = self._least_lag_us
         least = Sample(self._least_timestamp_us, self._least_offset_us)
-        self._begin_window(arrival_utime)
+        self._begin_window(arrival_us)
         late_us = _STEP_US + 4 * self._scatter_us
         if lag_us < late_us:
             self._samples.append(least)
@@ -255,7 +288,7 @@ class ServerClock:
         ]
         least_us = min(heights_us)
         self._line_timestamp_us = last.timestamp_us
-        self._line_utime = last.timestamp_us + last.offset_us + math.floor(least_us)
+        self._line_host_us = last.timestamp_us + last.offset_us + math.floor(least_us)
         if enough:
             # The line touches two of the samples by construction, so they do not count.
             scatter_us = sum(height_us - least_us for height_us in heights_us) / (len(samples) - 2)

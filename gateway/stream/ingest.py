@@ -56,12 +56,13 @@ class Ingest:
         self._skippable = self._wanted - _EVENTS
         self._layout: FrameLayout | None = None  # of the newest frame
 
-    def receive(self, frames: list[Frame], utime: int, now_s: float) -> None:
+    def receive(self, frames: list[Frame], utime: int, steady_us: int) -> None:
         """Take frames that arrived together, oldest first.
 
-        ``utime`` is when they arrived, in µs since the Unix epoch; ``now_s`` is the same moment on the
-        monotonic clock. While frames are late, ``backlog: latest`` publishes only the newest frame whole. Of
-        the other frames it publishes the events, which are never skipped, and counts the frames as skipped.
+        ``utime`` is when they arrived, in µs since the Unix epoch; ``steady_us`` is the same moment on the
+        steady clock (see HostClock). While frames are late, ``backlog: latest`` publishes only the newest
+        frame whole. Of the other frames it publishes the events, which are never skipped, and counts the
+        frames as skipped.
         """
         status = self._status
         status.frames_received(len(frames), utime)
@@ -75,7 +76,7 @@ class Ingest:
                 status.unknown_components_skipped(frame.layout.unknown_types)
             if not frame.layout.components:
                 continue
-            stamp = self._stamp(frame, utime, now_s)
+            stamp = self._stamp(frame, utime, steady_us)
             if self._lag.behind and self._skips_when_behind and frame is not newest:
                 self._publish(frame, stamp, self._wanted_events)
                 num_lost = self._skip(frame, stamp, self._skippable)
@@ -95,21 +96,25 @@ class Ingest:
         if layout.num_extra_bytes:
             self._status.add_limitation("bytes behind the last component of a frame are ignored")
 
-    def _stamp(self, frame: Frame, utime: int, now_s: float) -> Stamp:
+    def _stamp(self, frame: Frame, utime: int, steady_us: int) -> Stamp:
         frame_number, timestamp_us = frame.number_and_timestamp
         self._follow_frame_number(frame.layout.first_component_type, frame_number)
         clock = self._clock
-        capture_utime, lag_s, restarted = clock.observe(timestamp_us, self._frame_number, utime)
+        capture_us, lag_s, restarted = clock.observe(timestamp_us, self._frame_number, steady_us)
         if restarted:
             self._status.server_restarted()
             self._lag.restart()
             self._on_restart()
         elif clock.has_clock:
             self._status.lag_measured(lag_s)
-            if self._lag.observe(now_s, lag_s):
+            if self._lag.observe(steady_us * 1e-6, lag_s):
                 self._on_lateness(self._lag.halvings)
         return Stamp(
-            utime, capture_utime, self._status.session, self._status.parameters_version, clock.has_clock
+            utime,
+            capture_us + (utime - steady_us),
+            self._status.session,
+            self._status.parameters_version,
+            clock.has_clock,
         )
 
     def _follow_frame_number(self, first_component_type: ComponentType | None, frame_number: int) -> None:

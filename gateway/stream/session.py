@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import logging
 import socket
-import time
 from collections.abc import Awaitable, Callable
 from typing import Final, NoReturn
 
@@ -18,7 +17,7 @@ from gateway.errors import (
     ServerError,
     SilenceError,
 )
-from gateway.messages.host_time import now_utime
+from gateway.messages.host_time import host_clock
 from gateway.rtc3d.client_protocol import (
     Answered,
     ByteOrderMismatch,
@@ -51,8 +50,11 @@ _BYE_S: Final = 0.5
 _FURTHER_REPLY_S: Final = 0.3
 """How soon a slow server's next reply follows a late one. The replies that it owes leave it together."""
 
-OnFrames = Callable[[list[Frame], int, float], None]
-"""Takes frames that arrived together, oldest first, and when: in µs since the Unix epoch, in monotonic s."""
+OnFrames = Callable[[list[Frame], int, int], None]
+"""Takes frames that arrived together, oldest first, and when, as ``HostClock.read`` returns it."""
+
+ReadClocks = Callable[[], tuple[int, int]]
+"""Returns the time in µs since the Unix epoch and on a steady clock, as ``HostClock.read`` does."""
 
 OnFile = Callable[[bytes], None]
 """Takes a complete C3D file."""
@@ -64,8 +66,8 @@ class Session:
     """One connection of one stream: ``connect``, then ``ask`` and ``monitor``, then ``close``.
 
     The event loop calls ``on_frames`` and ``on_file``, which must not block. ``connect`` opens the
-    connection, ``monotonic`` is the clock for the times of arrival. Time-outs count only the time during
-    which this process runs, so a stop of the process is not the server's silence.
+    connection, ``read_clocks`` dates what arrives. Time-outs count only the time during which this process
+    runs, so a stop of the process is not the server's silence.
 
     The first error ends the session, and so does ``close``. Every call that is waiting then, and every later
     call, raises that first error; later errors change nothing.
@@ -79,7 +81,7 @@ class Session:
         on_frames: OnFrames,
         on_file: OnFile,
         connect: Connect = open_connection,
-        monotonic: Callable[[], float] = time.monotonic,
+        read_clocks: ReadClocks = host_clock.read,
     ) -> None:
         self.server = f"{source.host}:{source.port}"
         self._source = source
@@ -87,13 +89,13 @@ class Session:
         self._status = status
         self._on_frames = on_frames
         self._publishes_all = stream.backlog == "all"
-        self._backlog = Backlog(on_frames, status.clock, stream.backlog_speed, monotonic)
+        self._backlog = Backlog(on_frames, status.clock, stream.backlog_speed, read_clocks)
         self._backlog_timer: asyncio.Handle | None = None  # set while frames wait
         self._is_reading_paused = False
         self._caught_up_s = 0.0  # when a backlog was last published, on the running clock
         self._on_file = on_file
         self._connect = connect
-        self._monotonic = monotonic
+        self._read_clocks = read_clocks
         self._running = running_clock()
         self._protocol = ClientProtocol(source.max_packet_bytes, source.max_c3d_bytes)
         self._loop = asyncio.get_running_loop()
@@ -275,7 +277,7 @@ class Session:
             self.fail(DefectError.of(defect))
 
     def _receive(self, data: bytes) -> None:
-        utime = now_utime()
+        utime, steady_us = self._read_clocks()
         self._status.bytes_received(len(data))
         state_before = self._protocol.state
         frames, events = self._protocol.receive(data)
@@ -287,11 +289,11 @@ class Session:
             self._status.frames_read(self._quiet_since_s)
             is_backlog = len(frames) > MAX_TOGETHER and self._publishes_all and self._error is None
             if is_backlog or not self._backlog.is_empty:
-                self._backlog.add(frames, utime, self._monotonic())
+                self._backlog.add(frames, utime, steady_us)
                 if self._backlog_timer is None:
                     self._publish_backlog()
             else:
-                self._on_frames(frames, utime, self._monotonic())
+                self._on_frames(frames, utime, steady_us)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """End the session, unless it has ended already: the connection is closed, by either side."""

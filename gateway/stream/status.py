@@ -1,6 +1,7 @@
 """The status of one stream: its state, its counters, and what went wrong."""
 
 import logging
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -94,6 +95,7 @@ class StreamStatus:
     limitations: list[str] = field(default_factory=list)
     last_error: str = ""
     last_error_utime: int = 0
+    last_error_s: float = -math.inf
     _phase: Phase = field(default=Phase.WAITING, init=False)
     _failures: FailureLog = field(init=False)
     _defects: DefectLog = field(init=False)
@@ -258,6 +260,7 @@ class StreamStatus:
         """Keep ``text``, cut to MAX_ERROR_LENGTH, as the last error, with the time."""
         self.last_error = text[:MAX_ERROR_LENGTH]
         self.last_error_utime = now_utime()
+        self.last_error_s = time.monotonic()
 
     def _enter(self, phase: Phase, event: str, cause: str) -> None:
         """Enter a phase in which earlier frames or No Data from the server do not matter."""

@@ -3,19 +3,19 @@
 import asyncio
 import logging
 import random
-import time
 from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import NamedTuple, NoReturn
 
 from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
 from gateway.errors import DefectError, LinkError
 from gateway.log import log_fields
+from gateway.messages.host_time import host_clock
 from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.stream.change_tasks import ChangeTasks
 from gateway.stream.ingest import Ingest, Publish, Skip
-from gateway.stream.session import OnFile, Session
+from gateway.stream.session import OnFile, ReadClocks, Session
 from gateway.stream.state import StreamState
 from gateway.stream.status import FrameRate, StreamStatus
 from gateway.stream.stream_control import OnParameters, StreamControl
@@ -70,7 +70,7 @@ def backoff_delays_s(reconnect: ReconnectSettings) -> Iterator[float]:
 class Supervisor:
     """Runs the sessions of one stream, one after the other.
 
-    ``connect`` and ``monotonic`` are passed on to each Session. ``listener`` is told of each connection.
+    ``connect`` and ``read_clocks`` are passed on to each Session. ``listener`` is told of each connection.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Supervisor:
         callbacks: Callbacks,
         listener: Listener | None = None,
         connect: Connect = open_connection,
-        monotonic: Callable[[], float] = time.monotonic,
+        read_clocks: ReadClocks = host_clock.read,
     ) -> None:
         self._source = source
         self.settings = stream
@@ -90,7 +90,7 @@ class Supervisor:
         self.frame_rate = FrameRate()
         self._callbacks = callbacks
         self._connect = connect
-        self._monotonic = monotonic
+        self._read_clocks = read_clocks
         self._listener = listener or Listener()
         self._ready_session: Session | None = None  # the newest session with a completed handshake
         self._ingest: Ingest | None = None  # of the newest session, like _changes
@@ -132,11 +132,12 @@ class Supervisor:
             await self._run_sessions()
 
     async def _run_sessions(self) -> None:
+        loop = asyncio.get_running_loop()
         reconnect = self._source.reconnect
         delays_s = backoff_delays_s(reconnect)
         while True:
             frames_before = self.status.frames_in
-            began_s = self._monotonic()
+            began_s = loop.time()
             error = await self._run_session_to_its_end()
             had_data = self.status.frames_in > frames_before or (
                 self.status.state is StreamState.NO_MEASUREMENT
@@ -147,7 +148,7 @@ class Supervisor:
             self._listener.ended(self, error)
             # An attempt that took long need not be followed by a long wait as well: a server that hangs, and
             # is well again, would stay without a client.
-            lasted_s = self._monotonic() - began_s
+            lasted_s = loop.time() - began_s
             await asyncio.sleep(max(next(delays_s) - lasted_s, next(backoff_delays_s(reconnect))))
             self.status.reconnecting()
 
@@ -178,7 +179,7 @@ class Supervisor:
             ingest.receive,
             self._callbacks.on_file,
             self._connect,
-            self._monotonic,
+            self._read_clocks,
         )
         control = StreamControl(
             self._source,

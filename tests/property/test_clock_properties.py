@@ -6,7 +6,8 @@ from hypothesis import strategies as st
 from gateway.stream.clock import Sample, ServerClock, envelope_slope
 from tests.clock_simulation import EPOCH_UTIME, observe, percentile_95_us, simulate
 
-timestamps_us = st.integers(-(2**63), 2**63 - 1)
+EXTREMES_US = (0, -1, 1, -(2**63), 2**63 - 1, 2**32 - 1, 2**32, -(2**32))
+timestamps_us = st.integers(-(2**63), 2**63 - 1) | st.sampled_from(EXTREMES_US)
 arrivals_utime = st.integers(EPOCH_UTIME, EPOCH_UTIME + 10**8)
 frame_numbers = st.integers(-(2**31), 2**31 - 1)
 

@@ -11,6 +11,7 @@ import pytest
 from gateway.config.settings import SourceSettings
 from gateway.stream.supervisor import Supervisor
 from tests.unit.stream.scripted_server import ScriptedServer
+from tests.unit.stream.virtual_time import read_clocks
 
 
 class Servers:
@@ -29,9 +30,7 @@ class Servers:
 def use_scripted_servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
     """Connect the supervisors of all sources to scripted servers from now on, in the loop's time."""
     servers = Servers()
-    supervisor = functools.partial(
-        Supervisor, connect=servers.connect, monotonic=asyncio.get_running_loop().time
-    )
+    supervisor = functools.partial(Supervisor, connect=servers.connect, read_clocks=read_clocks)
     monkeypatch.setattr("gateway.source.Supervisor", supervisor)
     return servers
 

@@ -1,9 +1,98 @@
+import logging
 import time
 
-from gateway.messages.host_time import now_utime
+import pytest
+
+from gateway.messages.host_time import HostClock, now_steady_us, now_utime
+
+DAY_S = 86_400.0
+
+
+class SetClock:
+    """Sets the wall clock that this process sees."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._offset_ns = 0
+        real = time.time_ns
+        monkeypatch.setattr(time, "time_ns", lambda: real() + self._offset_ns)
+
+    def by(self, seconds: float) -> None:
+        self._offset_ns += round(1e9 * seconds)
+
+
+@pytest.fixture
+def set_clock(monkeypatch: pytest.MonkeyPatch) -> SetClock:
+    return SetClock(monkeypatch)
 
 
 def test_the_hosts_time_is_in_microseconds_since_the_unix_epoch() -> None:
     before_ns = time.time_ns()
     utime = now_utime()
     assert before_ns // 1000 <= utime <= time.time_ns() // 1000
+
+
+def test_a_reading_has_both_clocks() -> None:
+    clock = HostClock()
+    before_utime, before_us = now_utime(), now_steady_us()
+    utime, steady_us = clock.read()
+    assert before_us <= steady_us <= now_steady_us()
+    assert before_utime - 1000 <= utime <= now_utime() + 1000
+
+
+def test_the_clocks_do_not_drift_apart_while_nobody_sets_the_wall_clock() -> None:
+    clock = HostClock()
+    offsets_us = {utime - steady_us for utime, steady_us in (clock.read() for _ in range(10_000))}
+    # One value; another one if the process was interrupted during the first measurement.
+    assert len(offsets_us) <= 2
+    assert clock.steps == 0
+
+
+@pytest.mark.parametrize(
+    ("by_s", "text"),
+    [
+        (0.5, "forward by 0.500 s"),
+        (-0.5, "back by 0.500 s"),
+        (DAY_S, "forward by 86400.000 s"),
+        (-DAY_S, "back by 86400.000 s"),
+        (200 * DAY_S, "forward by 17280000.000 s"),
+    ],
+)
+def test_a_step_is_followed_at_once_and_logged_once(
+    by_s: float, text: str, set_clock: SetClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    clock = HostClock()
+    utime, steady_us = clock.read()
+    set_clock.by(by_s)
+    for _ in range(100):
+        utime_after, steady_after_us = clock.read()
+        assert utime_after - steady_after_us == pytest.approx(utime - steady_us + 1e6 * by_s, abs=1000)
+        assert 0 <= steady_after_us - steady_us < 10_000_000
+    assert clock.steps == 1
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    [message] = caplog.messages
+    assert message.startswith("the clock of this computer was set ")
+    assert text[:-6] in message
+
+
+def test_slow_corrections_are_followed_in_silence(
+    set_clock: SetClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    clock = HostClock()
+    before_us = clock.offset_us
+    for _ in range(1000):
+        set_clock.by(0.0005)
+        clock.read()
+    assert clock.offset_us - before_us == pytest.approx(500_000, abs=1000)
+    assert (clock.steps, caplog.messages) == (0, [])
+
+
+def test_the_log_of_a_clock_that_is_set_all_the_time_is_bounded(
+    set_clock: SetClock, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG, "gateway.messages.host_time")
+    clock = HostClock()
+    for _ in range(25):
+        set_clock.by(1.0)
+        clock.read()
+    assert clock.steps == 25
+    assert [record.levelname for record in caplog.records] == 10 * ["WARNING"] + 15 * ["DEBUG"]

@@ -12,6 +12,7 @@ from gateway import __version__
 from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
 from gateway.errors import OutputError
 from gateway.gateway import Gateway
+from gateway.messages.host_time import HostClock, host_clock
 from gateway.messages.stamp import Stamp
 from gateway.monitoring.loop_delay import LoopDelay
 from gateway.monitoring.metrics import metrics_page, metrics_registry
@@ -157,17 +158,27 @@ async def test_frames_are_counted_by_configured_component(lab: Lab) -> None:
 
 
 async def test_clock_metrics_appear_once_the_clock_is_valid(lab: Lab) -> None:
-    boot_utime = 1_700_000_000_000_000
+    boot_us = 3_600_000_000
     assert lab.value("clock_valid", **MARKERS) == 0
     for name in ("clock_offset_seconds", "clock_drift_ratio", "clock_uncertainty_seconds"):
         assert not list(lab.samples(name))
     for number in range(400):  # 4 s at 100 Hz, without jitter
-        lab.markers.clock.observe(10_000 * number, number, boot_utime + 10_000 * number)
+        lab.markers.clock.observe(10_000 * number, number, boot_us + 10_000 * number)
     assert lab.value("clock_valid", **MARKERS) == 1
-    assert lab.value("clock_offset_seconds", **MARKERS) == boot_utime / 1e6
+    assert lab.value("clock_offset_seconds", **MARKERS) == (boot_us + host_clock.offset_us) / 1e6
     assert lab.value("clock_drift_ratio", **MARKERS) == lab.markers.clock.drift_ppm / 1e6
     assert lab.value("clock_uncertainty_seconds", **MARKERS) == lab.markers.clock.uncertainty_us / 1e6
     assert math.isfinite(lab.value("clock_uncertainty_seconds", **MARKERS))
+
+
+@pytest.mark.interpreted
+async def test_steps_of_the_wall_clock_are_counted(lab: Lab, monkeypatch: pytest.MonkeyPatch) -> None:
+    clock = HostClock()
+    monkeypatch.setattr("gateway.monitoring.metrics.host_clock", clock)
+    assert lab.value("host_clock_steps_total") == 0
+    clock.offset_us += 500_000
+    clock.read()
+    assert lab.value("host_clock_steps_total") == 1
 
 
 async def test_outputs_loop_delay_and_versions_are_reported(lab: Lab) -> None:

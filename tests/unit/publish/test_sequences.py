@@ -241,7 +241,7 @@ def test_missing_frames_are_the_gaps_and_the_count_of_skipped_messages(rate_hz: 
             frames[0] = frame(number, MARKERS, TOOLS, EVENT)
         number += len(frames)
         utime = UTIME + PERIOD_US * (number - 1) + late_us
-        ingest.receive(frames, utime, (utime - UTIME) / 1e6)
+        ingest.receive(frames, utime, utime - UTIME)
 
     (lost_messages, skipped_frames) = amounts(status.losses.report())["skipped while behind"]
     assert lost_messages == 3 * skipped_frames > 100  # 3D, 6D and one pose

@@ -7,7 +7,7 @@ import rtc3d
 
 from gateway import __version__
 from gateway.losses import Losses
-from gateway.messages.host_time import now_utime
+from gateway.messages.host_time import host_clock, now_utime
 from gateway.outputs.status import OutputHealth, OutputStatus
 from gateway.publish.status_messages import clock_message, clock_model, status_message
 from gateway.stream.clock import ServerClock
@@ -167,12 +167,23 @@ def test_the_clock_model_has_every_field_of_a_known_clock() -> None:
     assert clock.has_clock
     assert fields_of(clock_model(clock)) == {
         "has_clock": True,
-        "offset_us": round(clock.offset_us),
+        "offset_us": clock.offset_us + host_clock.offset_us,
         "drift_ppm": clock.drift_ppm,
         "uncertainty_us": clock.uncertainty_us,
         "samples": clock.samples,
     }
     assert clock.drift_ppm == pytest.approx(50, abs=1)
+
+
+@pytest.mark.parametrize("first_us", [-(2**63), 2**63 - 10**8])
+def test_the_offset_of_a_server_that_counts_from_any_number_fits_its_field(first_us: int) -> None:
+    clock = ServerClock()
+    for number in range(2_000):
+        clock.observe(first_us + 2_500 * number, number, 2_500 * number)
+    assert clock.has_clock
+    message = clock_model(clock)
+    encoded = rtc3d.clock_model_t.decode(message.encode())
+    assert encoded.offset_us == min(host_clock.offset_us - first_us, 2**63 - 1)
 
 
 def test_counts_are_sorted_by_name() -> None:

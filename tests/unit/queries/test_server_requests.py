@@ -106,7 +106,7 @@ async def test_without_a_connection_the_error_has_reason_age_and_remedy() -> Non
     source = FakeSource()
     source.server.is_connected = False
     source.status.record_error("connection refused by 192.0.2.1:3020; is the RT server running?")
-    source.status.last_error_utime -= 300_000_000
+    source.status.last_error_s -= 300
     problem, _, remedy = str(await source.parameters_error(stale_ok=True)).partition("; ")
     assert re.fullmatch(
         r"source 'lab' has no connection: refused by 192.0.2.1:3020, tried 3..\.. s ago", problem

@@ -211,6 +211,58 @@ def test_a_server_that_restarts_at_nearly_every_frame_has_no_clock() -> None:
     assert not observe(clock, nonsense).has_clock[10:].any()
 
 
+# --- time stamps that mean "no time"
+
+NO_TIMES_US = (0, -1, -(2**63))
+
+
+@pytest.mark.parametrize("no_time_us", NO_TIMES_US)
+def test_a_frame_without_a_time_does_not_disturb_the_clock(no_time_us: int) -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ)
+    stamps = frames.timestamps_us.copy()
+    without = np.arange(len(frames)) % 7 == 3
+    stamps[without] = no_time_us
+    observed = observe(ServerClock(), frames.with_timestamps(stamps))
+    assert not observed.restarted.any()
+    assert not observed.has_clock[without].any()
+    assert (observed.captures_utime == frames.arrivals_utime)[without].all()
+    assert observed.has_clock[2 * SECOND :][~without[2 * SECOND :]].all()
+    # After a frame that has the time of its arrival, capture times may not go back.
+    assert (np.diff(observed.captures_utime) >= 0).all()
+    before_next = ~without & ~np.roll(without, 1)
+    assert percentile_95_us(observed.errors_us[LEARNED:][before_next[LEARNED:]]) < 10_000
+
+
+@pytest.mark.parametrize("no_time_us", NO_TIMES_US)
+def test_a_server_that_has_a_time_only_later_gets_a_clock_then(no_time_us: int) -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ)
+    stamps = frames.timestamps_us.copy()
+    stamps[: 10 * SECOND] = no_time_us
+    observed = observe(ServerClock(), frames.with_timestamps(stamps))
+    assert not observed.restarted.any()
+    assert not observed.has_clock[: 10 * SECOND].any()
+    assert observed.has_clock[12 * SECOND :].all()
+    assert percentile_95_us(observed.errors_us[13 * SECOND :]) < 500
+
+
+@pytest.mark.parametrize("no_time_us", NO_TIMES_US)
+def test_a_server_that_loses_its_time_for_a_while_has_the_same_clock_after_it(no_time_us: int) -> None:
+    frames = simulate(seconds=40, rate_hz=RATE_HZ, drift_ppm=50)
+    stamps = frames.timestamps_us.copy()
+    stamps[LEARNED : LEARNED + 5 * SECOND] = no_time_us
+    observed = observe(ServerClock(), frames.with_timestamps(stamps))
+    assert not observed.restarted.any()
+    assert not observed.has_clock[LEARNED : LEARNED + 5 * SECOND].any()
+    assert observed.has_clock[LEARNED + 5 * SECOND :].all()
+    assert percentile_95_us(observed.errors_us[LEARNED + 5 * SECOND + 10 :]) < 200
+
+
+def test_after_a_restart_0_is_a_time() -> None:
+    clock = learned(simulate(seconds=40, rate_hz=RATE_HZ))
+    assert clock.observe(0, 0, EPOCH_UTIME + 60_000_000) == (EPOCH_UTIME + 60_000_000, 0.0, True)
+    assert clock.has_clock
+
+
 # --- without jitter, to the frame
 
 

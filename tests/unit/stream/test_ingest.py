@@ -48,6 +48,8 @@ class Lab:
         self.stamps: list[Stamp] = []
         self.halvings: list[int] = []
         self.restarts = 0
+        self.set_by_us = 0
+        """How far somebody has set the wall clock forward."""
         stream = StreamSettings.model_validate(
             {"components": ["all"], "backlog": backlog, "adapt_rate": adapt_rate}
         )
@@ -85,7 +87,7 @@ class Lab:
         self.receive_at(BOOT_UTIME + frames[-1].components[0].timestamp_us + late_us, *frames)
 
     def receive_at(self, utime: int, *frames: Frame) -> None:
-        self.ingest.receive(list(frames), utime, (utime - BOOT_UTIME) / 1e6)
+        self.ingest.receive(list(frames), utime + self.set_by_us, utime - BOOT_UTIME)
 
 
 @pytest.fixture(params=["latest", "all"])
@@ -138,6 +140,22 @@ def test_without_adapt_rate_lateness_is_reported_once() -> None:
     for number in range(600 + 5 * RATE_HZ, 600 + 16 * RATE_HZ):
         lab.receive(frame(number))
     assert lab.halvings == [1, 0]
+
+
+@pytest.mark.parametrize("by_s", [0.5, -0.5, 86_400, -86_400, 200 * 86_400])
+def test_a_step_of_the_hosts_clock_changes_time_stamps_and_nothing_else(lab: Lab, by_s: float) -> None:
+    lab.set_by_us = round(1e6 * by_s)
+    for number in range(600, 600 + 5 * RATE_HZ, 4):
+        lab.receive(*(frame(each) for each in range(number, number + 4)))
+    assert [number for number, _ in lab.published] == list(range(600, 600 + 5 * RATE_HZ))
+    assert not amounts(lab.status.losses.report())
+    assert (lab.halvings, lab.restarts) == ([], 0)
+    assert lab.status.lag_s < 0.03
+    for stamp, number in zip(lab.stamps, range(600, 600 + 5 * RATE_HZ), strict=True):
+        captured_utime = BOOT_UTIME + lab.set_by_us + number * PERIOD_US
+        assert stamp.has_clock
+        assert stamp.capture_utime == pytest.approx(captured_utime, abs=500)
+        assert stamp.capture_utime <= stamp.utime
 
 
 def test_a_restart_of_the_server_is_reported_and_does_not_count_as_lateness(lab: Lab) -> None:
@@ -228,6 +246,6 @@ def test_bytes_behind_the_last_component_are_a_limitation_once() -> None:
     lab = Lab("all")
     extended = split_frame(frame(1).body + b"\n", "big")
     for each in (extended, frame(2), extended):
-        lab.ingest.receive([each], BOOT_UTIME, 0.0)
+        lab.ingest.receive([each], BOOT_UTIME, 0)
     assert len(lab.published) == 3
     assert lab.status.limitations == ["bytes behind the last component of a frame are ignored"]

@@ -26,7 +26,7 @@ from tests.unit.stream.scripted_server import (
     refusing_without_name,
     silent_to,
 )
-from tests.unit.stream.virtual_time import settle, stop_process
+from tests.unit.stream.virtual_time import EPOCH_UTIME, read_clocks, settle, stop_process
 from tests.vectors import STOP_RECORDING
 
 NO_DATA = packet(4)
@@ -51,12 +51,12 @@ class Lab:
             self._on_frames,
             self.files.append,
             self.server.connect,
-            asyncio.get_running_loop().time,
+            read_clocks,
         )
 
-    def _on_frames(self, frames: list[Frame], utime: int, now_s: float) -> None:
-        assert utime > 0
-        self.frames += [(frame.components[0].frame_number, now_s) for frame in frames]
+    def _on_frames(self, frames: list[Frame], utime: int, steady_us: int) -> None:
+        assert utime == EPOCH_UTIME + steady_us
+        self.frames += [(frame.components[0].frame_number, steady_us / 1e6) for frame in frames]
 
     async def check_silence(self) -> None:
         self.checks_s.append(now_s())

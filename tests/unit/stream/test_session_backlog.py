@@ -13,7 +13,7 @@ from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from tests.servers import packet
 from tests.unit.stream.scripted_server import Connection, ScriptedServer, silent_to
-from tests.unit.stream.virtual_time import settle, until
+from tests.unit.stream.virtual_time import read_clocks, settle, until
 
 
 class Lab:
@@ -30,11 +30,11 @@ class Lab:
             self._on_frames,
             lambda _content: None,
             self.server.connect,
-            asyncio.get_running_loop().time,
+            read_clocks,
         )
 
-    def _on_frames(self, frames: list[Frame], _utime: int, now_s: float) -> None:
-        self.frames += [(frame.components[0].frame_number, now_s) for frame in frames]
+    def _on_frames(self, frames: list[Frame], _utime: int, steady_us: int) -> None:
+        self.frames += [(frame.components[0].frame_number, steady_us / 1e6) for frame in frames]
 
     @property
     def connection(self) -> Connection:

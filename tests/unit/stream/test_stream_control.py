@@ -15,7 +15,7 @@ from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
 from tests.servers import markers_frame, ok, packet
 from tests.unit.stream.scripted_server import XML, Answer, ScriptedServer, obliging, refusing, silent_to
-from tests.unit.stream.virtual_time import settle
+from tests.unit.stream.virtual_time import read_clocks, settle
 
 RATE_XML = packet(2, "<RT_Parameters Ver='1.00'><The_3D><Frequency>200</Frequency></The_3D></RT_Parameters>")
 
@@ -39,7 +39,7 @@ class Lab:
             lambda *_: None,
             lambda _: None,
             self.server.connect,
-            asyncio.get_running_loop().time,
+            read_clocks,
         )
         self.control = StreamControl(source, settings, self.status, self.session, self._on_parameters)
 

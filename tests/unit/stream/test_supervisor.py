@@ -19,7 +19,7 @@ from gateway.stream.status import StreamStatus
 from gateway.stream.supervisor import Callbacks, Supervisor, backoff_delays_s
 from tests.servers import packet
 from tests.unit.stream.scripted_server import ScriptedServer, refusing, silent_to
-from tests.unit.stream.virtual_time import settle, until
+from tests.unit.stream.virtual_time import read_clocks, settle, until
 
 FIRST_DELAY_S, MAX_DELAY_S = 0.2, 10.0
 
@@ -53,7 +53,7 @@ class Lab:
                 has_subscribers=self._has_subscribers,
             ),
             connect=self.server.connect,
-            monotonic=asyncio.get_running_loop().time,
+            read_clocks=read_clocks,
         )
 
     def _publish(self, frame: Frame, stamp: Stamp, _wanted: frozenset[ComponentType]) -> None:
@@ -310,12 +310,7 @@ async def test_files_and_restarts_of_the_server_are_passed_on() -> None:
     assert (lab.restarts, lab.files) == (1, [b"C3D"])
 
 
-@pytest.mark.interpreted
-async def test_frames_that_stay_late_halve_the_rate(monkeypatch: pytest.MonkeyPatch) -> None:
-    loop = asyncio.get_running_loop()
-    monkeypatch.setattr(
-        "gateway.stream.session.now_utime", lambda: 1_700_000_000_000_000 + int(1e6 * loop.time())
-    )
+async def test_frames_that_stay_late_halve_the_rate() -> None:
     lab = Lab(adapt_rate=True)
     async with running(lab):
         await lab.ready()

@@ -5,6 +5,8 @@ import selectors
 from collections.abc import Callable
 from typing import Any
 
+EPOCH_UTIME = 1_700_000_000_000_000
+
 _MAX_STEPS = 10_000
 
 
@@ -44,6 +46,12 @@ def stop_process(seconds: float) -> None:
     loop = asyncio.get_running_loop()
     assert isinstance(loop, VirtualTimeLoop)
     loop.stop_process(seconds)
+
+
+def read_clocks() -> tuple[int, int]:
+    """Return the virtual time as HostClock.read does; the steady clock began at EPOCH_UTIME."""
+    steady_us = round(1e6 * asyncio.get_running_loop().time())
+    return EPOCH_UTIME + steady_us, steady_us
 
 
 async def settle() -> None:
