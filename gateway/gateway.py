@@ -111,16 +111,22 @@ class Gateway:
         """Apply ``settings`` and return a text for each change. Call it after ``opened`` is set.
 
         Sources and outputs with unchanged settings keep running. A source that differs sends Bye and connects
-        again; an output that differs is closed and opened again. Session and sequence numbers continue.
+        again; an output that differs is closed and opened again, unless only the poses per tool are switched
+        on or off. Session and sequence numbers continue.
         Raises ConfigError, and changes nothing, if an output refuses its configuration.
         """
         async with self._reload_lock:
+            built = self._build_outputs(settings)
             outputs = [
                 next((running for running in self._outputs if running.is_configured_like(output)), output)
-                for output in self._build_outputs(settings)
+                for output in built
             ]
             before, self.settings = self.settings, settings
-            changes = [*await self._change_outputs(outputs), *await self._change_sources(settings.sources)]
+            changes = [
+                *_switch_tool_poses(outputs, built),
+                *await self._change_outputs(outputs),
+                *await self._change_sources(settings.sources),
+            ]
             if settings.spool != before.spool:
                 self._spool = _new_spool(settings.spool)
                 for source in self._sources.values():
@@ -193,6 +199,18 @@ class Gateway:
 async def _close(output: Output) -> None:
     await output.stop_queries()
     await asyncio.to_thread(output.close)
+
+
+def _switch_tool_poses(outputs: Sequence[Output], wanted: Sequence[Output]) -> list[str]:
+    """Let each output publish poses per tool as the wanted one does; return a text for each change."""
+    switched = [
+        (output, like)
+        for output, like in zip(outputs, wanted, strict=True)
+        if output.has_tool_poses is not like.has_tool_poses
+    ]
+    for output, like in switched:
+        output.has_tool_poses = like.has_tool_poses
+    return [f"output {output.name} changed" for output, _ in switched]
 
 
 def _changes(what: str, removed: Collection[str], new: Collection[str]) -> list[str]:

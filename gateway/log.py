@@ -98,14 +98,15 @@ class DefectLog:
         self._subject = subject
         self._places: set[tuple[str, str, int]] = set()  # of defects, in the source code: there are few
 
-    def log(self, defect: BaseException) -> None:
+    def log(self, defect: BaseException, text: str = "") -> None:
         """Log a defect. One that is raised at the same place as an earlier one is a repeat."""
-        place = _place(defect.__cause__ or defect)
+        text = text or f"defect in the gateway: {type(defect).__name__}: {defect}; report this with the log"
+        place = _place(defect)
         if place in self._places:
-            self._logger.debug("%s: %s (again)", self._subject, defect)
+            self._logger.debug("%s: %s (again)", self._subject, text)
             return
         self._places.add(place)
-        self._logger.error("%s: %s", self._subject, defect, exc_info=defect)
+        self._logger.error("%s: %s", self._subject, text, exc_info=defect)
 
 
 def _place(error: BaseException) -> tuple[str, str, int]:

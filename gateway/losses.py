@@ -41,6 +41,7 @@ class _Cause:
     def __init__(self) -> None:
         self.messages = self.frames = 0
         self.period_messages = self.period_frames = 0  # in the current period of loss
+        self.logged_level = 0  # the highest level at which it was logged in the current period
         self.newest_s = 0.0
         self.text = ""
         self.frame: object | None = None  # the newest frame that lost a message
@@ -76,8 +77,8 @@ class Losses:
     """Counts what is lost on one route, for example from a source to an output, and logs it.
 
     In each period of loss, the first loss for each cause is logged, as WARNING unless ``lost`` says another
-    level. The end of the period is logged as INFO with the total. ``subject`` begins every log message. Any
-    thread may call the methods.
+    level, and again if a later one has a higher level. The end of the period is logged as INFO with the
+    total. ``subject`` begins every log message. Any thread may call the methods.
     """
 
     def __init__(
@@ -107,23 +108,27 @@ class Losses:
         self.check()
         with self._lock:
             counted = self._causes.setdefault(cause, _Cause())
-            is_first = not counted.period_messages
+            is_news = counted.logged_level < level
+            if is_news:
+                counted.logged_level = level
             counted.add(now_s, messages, frames)
             counted.text = text
             self._newest_s = now_s
             if self._began_s is None:
                 self._begin(now_s)
-        if is_first:
+        if is_news:
             self._logger.log(level, "%s: %s", self._subject, text)
 
-    def message_lost(self, cause: str, text: str, frame: object | None) -> None:
+    def message_lost(
+        self, cause: str, text: str, frame: object | None, *, level: int = logging.WARNING
+    ) -> None:
         """Count one message of ``frame``; None if the message belongs to no frame.
 
         The messages of one frame come one after the other, so a frame counts once for each cause.
         """
         counted = self._causes.get(cause)
         is_new = frame is not None and (counted is None or counted.frame is not frame)
-        self.lost(cause, text, frames=1 if is_new else 0)
+        self.lost(cause, text, frames=1 if is_new else 0, level=level)
         self._causes[cause].frame = frame
 
     def check(self) -> None:
@@ -163,7 +168,7 @@ class Losses:
             for cause, counted in sorted(self._causes.items()):
                 if counted.period_messages:
                     counts.append((cause, counted.period_messages, counted.period_frames))
-                    counted.period_messages = counted.period_frames = 0
+                    counted.period_messages = counted.period_frames = counted.logged_level = 0
         self._logger.info(
             "%s: lost within %.1f s: %s%s", self._subject, duration_s, counts_text(counts), ending
         )

@@ -9,7 +9,7 @@ from typing import Any, Final
 from gateway.c3d_spool import Spool
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import LinkError, QueryError, SpoolError
-from gateway.log import log_fields
+from gateway.log import DefectLog, log_fields
 from gateway.outputs.contract import Answer, ServerParameters
 from gateway.outputs.encodings import C3D
 from gateway.publish.fan_out import FanOut
@@ -64,6 +64,7 @@ class Source:
         self._publish_parameters = publish_parameters
         self._announce_file = announce_file
         self._tasks: set[asyncio.Task[None]] = set()
+        self._defects = DefectLog(logger, self.name)
         self.parameters: Parameters | None = None if before is None else before.parameters
         """The newest parameters, without the server's statistics; None before the first."""
         self._num_unstored_files = 0
@@ -215,7 +216,15 @@ class Source:
     def _start_task(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)
         self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+        task.add_done_callback(self._end_task)
+
+    def _end_task(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        if task.cancelled():
+            return
+        defect = task.exception()
+        if defect is not None:
+            self._defects.log(defect)
 
     # C3D files and recordings.
 

@@ -7,7 +7,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
-_LOGGERS: Final = {"logger", "_log"}
+_LOGGERS: Final = {"logger", "_log", "_logger"}
 _LOUD_METHODS: Final = {"warning", "error", "exception", "critical"}
 """Methods of loggers that log at WARNING and above; ``log`` can do so, too."""
 
@@ -65,7 +65,9 @@ def _scopes(module: ast.Module) -> Iterator[ast.AST]:
 def _logging_calls(scope: ast.AST) -> Iterator[ast.Call]:
     for node in ast.walk(scope):
         match node:
-            case ast.Call(func=ast.Attribute(value=ast.Name(owner), attr=name)) if owner in _LOGGERS:
+            case ast.Call(
+                func=ast.Attribute(value=ast.Name(owner) | ast.Attribute(attr=owner), attr=name)
+            ) if owner in _LOGGERS:
                 is_loud = name == "log" and re.search("level|WARNING", ast.unparse(node.args[0]))
                 if name in _LOUD_METHODS or is_loud:
                     yield node

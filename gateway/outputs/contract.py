@@ -159,7 +159,10 @@ class Output(ABC):
         """Do periodic work without blocking. Called once a second in the event loop."""
 
     def is_configured_like(self, other: "Output") -> bool:
-        """Return whether a reload can keep this output because ``other`` would behave the same."""
+        """Return whether a reload can keep this output because ``other`` would behave the same.
+
+        ``has_tool_poses`` may differ: the gateway changes it without opening the output again.
+        """
         return self is other
 
     def count_losses(self, source: str, losses: Losses) -> None:

@@ -1,9 +1,10 @@
 """The route from one source to one output: publishers, pacing, counters and failures."""
 
 import logging
+import time
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, Final
 
 import rtc3d
 
@@ -17,6 +18,11 @@ from gateway.outputs.status import OutputStatus
 from gateway.publish.pacing import Pacer
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
+
+_NOT_OPEN: Final = "not open"  # the cause in an OutputError
+
+OPENING_S: Final = 2.0
+"""How long a new output may take to open, as long as the gateway waits for its outputs at its start."""
 
 logger = logging.getLogger(__name__)
 
@@ -63,6 +69,7 @@ class OutputRoute:
         self.status_route = TopicRoute(self, ("status",), rtc3d.status_t, "status")
         self.clock_route = TopicRoute(self, ("clock",), rtc3d.clock_t, "clock")
         output.count_losses(source, self.losses)
+        self._opening_until_s = time.monotonic() + OPENING_S
         output.announce(source)
 
     @property
@@ -80,7 +87,9 @@ class OutputRoute:
         """Count a message of ``frame`` that the output did not accept; None if it belongs to no frame."""
         cause = error.cause if isinstance(error, OutputError) else type(error).__name__
         text = str(error) if isinstance(error, OutputError) else f"{cause}: {error}"
-        self.losses.message_lost(cause, text, frame)
+        # A reload replaces an output by one that takes a moment to open. That is no reason for a warning.
+        is_opening = cause == _NOT_OPEN and time.monotonic() < self._opening_until_s
+        self.losses.message_lost(cause, text, frame, level=logging.INFO if is_opening else logging.WARNING)
 
     def close(self) -> None:
         """Close the publishers and withdraw the source from the output."""

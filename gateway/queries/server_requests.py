@@ -1,12 +1,14 @@
 """Commands that peers' queries send to the server of one source: one at a time, and shared where equal."""
 
 import asyncio
+import logging
 import time
 from collections.abc import Awaitable, Callable, Coroutine, Hashable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 from gateway.config.settings import SourceSettings
-from gateway.errors import LinkError, QueryError, ReplyTimeoutError, ServerError
+from gateway.errors import GatewayError, LinkError, QueryError, ReplyTimeoutError, ServerError
+from gateway.log import DefectLog
 from gateway.rtc3d.commands import Command
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet
@@ -17,6 +19,8 @@ SendCommand = Callable[[Command], Awaitable[Packet]]
 """Sends a command to the server and returns its reply; raises ServerError, ReplyTimeoutError or LinkError."""
 
 _Result = TypeVar("_Result")
+
+logger = logging.getLogger(__name__)
 
 
 class StreamAccess(NamedTuple):
@@ -35,6 +39,7 @@ class ServerRequests:
         self._streams = streams
         self._pending: dict[Hashable, asyncio.Task[Any]] = {}
         self._lock = asyncio.Lock()
+        self._defects = DefectLog(logger, settings.name)
 
     @property
     def session(self) -> int:
@@ -116,5 +121,8 @@ class ServerRequests:
 
     def _finish(self, key: Hashable, task: asyncio.Task[Any]) -> None:
         del self._pending[key]
-        if not task.cancelled():
-            task.exception()  # retrieve it, even if no caller waits any more
+        if task.cancelled():
+            return
+        error = task.exception()  # retrieve it, even if no caller waits any more
+        if error is not None and not isinstance(error, GatewayError):
+            self._defects.log(error)

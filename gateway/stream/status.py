@@ -154,7 +154,7 @@ class StreamStatus:
         """Note and log why the connection ended or could not be opened."""
         self.record_error(str(error))
         if isinstance(error, DefectError):
-            self._defects.log(error)
+            self._defects.log(error.__cause__ or error, str(error))
         else:
             self._failures.failed(str(error))
         self._enter(Phase.WAITING, "the connection ended", str(error))

@@ -195,6 +195,55 @@ async def test_a_changed_output_is_reopened_and_the_other_output_loses_nothing()
             assert len(server.connections) == 1
 
 
+@pytest.mark.parametrize("output", ["lcm", "zenoh"])
+async def test_switching_tool_poses_does_not_reopen_the_output(
+    output: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    builder = SettingsBuilder()
+    scene = SyntheticScene(markers=1, tools=2, analog=0, plates=0, rate_hz=200)
+    async with Simulator(scene) as server, running(builder.settings({"lab": server.port})) as gateway:
+        with subscribed(builder) as received:
+            await received.wait_for_more("mocap/lab/3d")
+            await received.wait_for_more("MOCAP_LAB_3D")
+            outputs = list(gateway.outputs)
+            poses: list[bytes] = []
+            session = open_zenoh(builder.endpoint)
+            session.declare_subscriber(
+                "mocap/lab/6d/*", lambda sample: poses.append(sample.payload.to_bytes())
+            )
+            for is_on in (True, False, True):
+                changed = {output: getattr(builder, output)(tool_poses=is_on)}
+                settings = builder.settings({"lab": server.port}, **changed)
+                assert await gateway.reload(settings) == [f"output {output} changed"]
+                assert await gateway.reload(settings) == []
+                await received.wait_for_more("mocap/lab/3d")
+                await received.wait_for_more("MOCAP_LAB_3D")
+            assert list(gateway.outputs) == outputs
+            if output == "zenoh":
+                await wait_until_async(lambda: poses)
+            received.assert_gapless("mocap/lab/3d")
+            received.assert_gapless("MOCAP_LAB_3D")
+            session.close()
+    assert [record.message for record in caplog.records if record.levelno >= logging.WARNING] == []
+
+
+@pytest.mark.parametrize("output", ["lcm", "zenoh"])
+async def test_replacing_an_output_is_no_reason_for_a_warning(
+    output: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    builder = SettingsBuilder()
+    async with simulator() as server, running(builder.settings({"lab": server.port})) as gateway:
+        with subscribed(builder) as received:
+            await received.wait_for_more("mocap/lab/3d")
+            changed = {output: getattr(builder, output)(prefix={"lcm": "OTHER", "zenoh": "other"}[output])}
+            assert await gateway.reload(builder.settings({"lab": server.port}, **changed)) == [
+                f"output {output} changed"
+            ]
+            await received.wait_for_more({"lcm": "OTHER_LAB_3D", "zenoh": "other/lab/3d"}[output])
+    assert [record.message for record in caplog.records if record.levelno >= logging.WARNING] == []
+
+
 async def test_zenoh_reopens_at_the_same_address_and_publishes_cached_parameters() -> None:
     builder, server = SettingsBuilder(), ParameterServer("known")
     async with (

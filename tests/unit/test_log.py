@@ -5,7 +5,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from gateway.log import FIELDS, FailureLog, log_fields
+from gateway.log import FIELDS, DefectLog, FailureLog, log_fields
 from gateway.service.log_format import ContextFilter
 
 LOGGER = logging.getLogger("tests.failures")
@@ -156,3 +156,23 @@ async def test_tasks_and_callbacks_inherit_the_fields_of_the_code_that_starts_th
     await asyncio.gather(run("hall"), run("lab"))
     logged = [(fields(record)["source"], record.getMessage()) for record in records]
     assert sorted(logged) == [("hall", "callback"), ("hall", "task"), ("lab", "callback"), ("lab", "task")]
+
+
+def test_a_defect_is_an_error_with_its_traceback_once_for_each_place(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    defects = DefectLog(logging.getLogger("test"), "lab")
+    for text in ("one", "two", "3"):
+        try:
+            number = int(text)
+            [0, 1].remove(number)
+        except ValueError as defect:
+            defects.log(defect)
+    first, again, other = caplog.records
+    assert first.levelname == other.levelname == "ERROR"
+    assert first.message.startswith("lab: defect in the gateway: ValueError: invalid literal")
+    assert first.message.endswith("'one'; report this with the log")
+    assert first.exc_info is not None
+    assert (again.levelname, again.exc_info) == ("DEBUG", None)
+    assert again.message.endswith("'two'; report this with the log (again)")

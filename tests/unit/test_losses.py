@@ -141,6 +141,14 @@ def test_causes_that_alternate_are_logged_once_each(
     assert logged(caplog) == []
 
 
+def test_a_loss_that_is_expected_at_first_is_logged_again_as_warning(
+    losses: Losses, caplog: pytest.LogCaptureFixture
+) -> None:
+    for level in (logging.INFO, logging.INFO, logging.WARNING, logging.INFO, logging.WARNING):
+        losses.message_lost("not open", "it opens", None, level=level)
+    assert logged(caplog) == ["INFO lab: it opens", "WARNING lab: it opens"]
+
+
 @pytest.mark.parametrize("period_s", [6.0, 20.0, 59.0])
 def test_loss_that_comes_and_goes_does_not_fill_the_log(
     losses: Losses, clock: Clock, caplog: pytest.LogCaptureFixture, period_s: float

@@ -410,6 +410,23 @@ async def test_a_missing_file_is_an_error_for_the_peer(
     assert caught.value.code == "nothing-yet"
 
 
+async def test_a_defect_in_a_task_of_the_source_is_an_error_and_streams_continue(
+    servers: Servers, spool: Spool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    lab = Lab(servers, spool)
+    monkeypatch.setattr(lab, "files", None)  # what takes the description of a file raises AttributeError
+    async with running(lab):
+        await lab.connected()
+        lab.server.connection.send(packet(5, b"a file"))
+        await settle()
+        lab.threads.finish()
+        await settle()
+        assert len(lab.server.connections) == 1
+    [error] = [record for record in caplog.records if record.levelno == logging.ERROR]
+    assert error.message.startswith("lab: defect in the gateway: AttributeError: ")
+    assert error.exc_info is not None
+
+
 # Recording -----------------------------------------------------------------------------------
 
 

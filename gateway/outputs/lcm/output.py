@@ -63,7 +63,9 @@ class LcmOutput(Output):
 
     def is_configured_like(self, other: Output) -> bool:
         """Return whether the settings are the same."""
-        return isinstance(other, LcmOutput) and self.settings == other.settings
+        return isinstance(other, LcmOutput) and self.settings == other.settings.model_copy(
+            update={"tool_poses": self.settings.tool_poses}
+        )
 
     def count_losses(self, source: str, losses: Losses) -> None:
         """Count in ``losses`` ignored requests about ``source``, and parameters and replies not sent."""

@@ -170,7 +170,7 @@ class ZenohOutput(Output):
         """Return whether the settings and the content of Zenoh's configuration file are the same."""
         return (
             isinstance(other, ZenohOutput)
-            and self.settings == other.settings
+            and self.settings == other.settings.model_copy(update={"tool_poses": self.settings.tool_poses})
             and str(self.config) == str(other.config)
         )
 

@@ -205,6 +205,8 @@ def test_characters_of_regular_expressions_in_a_prefix_are_taken_as_they_are() -
     [
         ((LcmOutput(LcmSettings(prefix="A")), LcmOutput(LcmSettings(prefix="A"))), True),
         ((LcmOutput(LcmSettings(prefix="A")), LcmOutput(LcmSettings(prefix="B"))), False),
+        ((LcmOutput(LcmSettings(tool_poses=True)), LcmOutput(LcmSettings())), True),
+        ((ZenohOutput(ZenohSettings(tool_poses=True)), ZenohOutput(ZenohSettings())), True),
         ((ZenohOutput(ZenohSettings(prefix="a")), ZenohOutput(ZenohSettings(prefix="a"))), True),
         ((ZenohOutput(ZenohSettings(prefix="a")), ZenohOutput(ZenohSettings(prefix="b"))), False),
         ((LcmOutput(LcmSettings()), ZenohOutput(ZenohSettings())), False),

@@ -1,6 +1,7 @@
 """The log, word for word, when an output does not accept messages or tool poses cannot be published."""
 
 import logging
+from types import SimpleNamespace
 
 import pytest
 
@@ -38,6 +39,21 @@ def test_a_message_that_an_output_does_not_accept_is_logged(
     output.error = error
     FanOut("lab", [output]).publish_status(b"status")
     assert logged(caplog) == [f"WARNING lab to zenoh: {text}"]
+
+
+@pytest.mark.interpreted
+def test_an_output_that_has_just_been_added_may_take_a_moment_to_open(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "gateway.publish.routes")
+    clock = SimpleNamespace(now_s=100.0)
+    monkeypatch.setattr("gateway.publish.routes.time", SimpleNamespace(monotonic=lambda: clock.now_s))
+    output = ToyOutput("lcm")
+    output.error = OutputError("LCM is not open", cause="not open")
+    fan_out = FanOut("lab", [output])
+    for clock.now_s in (101.9, 101.9, 102.1, 102.2):
+        fan_out.publish_status(b"status")
+    assert logged(caplog) == ["INFO lab to lcm: LCM is not open", "WARNING lab to lcm: LCM is not open"]
 
 
 def test_too_many_tools_are_logged_with_what_is_lost(caplog: pytest.LogCaptureFixture) -> None:
