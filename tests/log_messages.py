@@ -19,7 +19,7 @@ _WARNING_METHODS: Final = {"failed", "add_limitation", "file_lost", *_LOSS_METHO
 
 _LOGGED_CLASSES: Final = {
     *("LinkError", "ConnectError", "ReplyTimeoutError", "SilenceError", "ClosedError"),
-    *("RequestError", "DefectError"),
+    *("RequestError", "DefectError", "StreamPlan", "RateDifference"),
     *("PacketError", "OutputError", "OutputHealth", "SpoolError"),
 }
 """Classes whose texts are logged as WARNING or ERROR."""

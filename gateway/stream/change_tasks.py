@@ -82,6 +82,11 @@ class ChangeTasks:
         self._components = components
         self._changed.set()
 
+    @property
+    def is_full_rate(self) -> bool:
+        """Whether the server was asked for the configured rate, and for nothing less since then."""
+        return not (self._control.is_stopped or self._halvings or self._requested_halvings)
+
     def cancel(self) -> None:
         """Cancel all tasks."""
         for task in self._tasks:

@@ -8,7 +8,8 @@ from gateway.messages.stamp import Stamp
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
 from gateway.stream.rate_control import MAX_HALVINGS, LagControl
-from gateway.stream.status import StreamStatus
+from gateway.stream.rate_watch import Arrivals
+from gateway.stream.status import FRAME_REJECTED, StreamStatus
 
 Publish = Callable[[Frame, Stamp, frozenset[ComponentType]], None]
 """Takes a frame, its stamp, and the types of the components to publish."""
@@ -44,7 +45,9 @@ class Ingest:
         self._on_restart = on_restart
         self._clock = status.clock  # outlives the session: it detects a restart of the server by itself
         self._followed_type: ComponentType | None = None
-        self._frame_number = 0  # the newest of a component of _followed_type
+        self._frame_number = 0  # the newest of a component of _followed_type, like the time stamp
+        self._timestamp_us = 0
+        self._num_followed = 0  # how many frames began with a component of _followed_type
         self._lag = LagControl(source.max_lag_ms / 1000, MAX_HALVINGS if stream.adapt_rate else 1)
         self._unwanted = ""  # the components of the newest frame, if none of them is wanted
         self.want(stream.components)
@@ -55,6 +58,19 @@ class Ingest:
         self._wanted_events = self._wanted & _EVENTS
         self._skippable = self._wanted - _EVENTS
         self._layout: FrameLayout | None = None  # of the newest frame
+
+    @property
+    def arrivals(self) -> Arrivals:
+        """What has arrived so far."""
+        components = () if self._layout is None else self._layout.components
+        rejected = sum(loss.frames for loss in self._status.losses.report() if loss.cause == FRAME_REJECTED)
+        return Arrivals(
+            self._status.frames_in + rejected,
+            self._followed_type,
+            self._num_followed,
+            self._timestamp_us,
+            frozenset([component.type for component in components]),
+        )
 
     def receive(self, frames: list[Frame], utime: int, steady_us: int) -> None:
         """Take frames that arrived together, oldest first.
@@ -98,7 +114,7 @@ class Ingest:
 
     def _stamp(self, frame: Frame, utime: int, steady_us: int) -> Stamp:
         frame_number, timestamp_us = frame.number_and_timestamp
-        self._follow_frame_number(frame.layout.first_component_type, frame_number)
+        self._follow(frame.layout.first_component_type, frame_number, timestamp_us)
         clock = self._clock
         capture_us, lag_s, restarted = clock.observe(timestamp_us, self._frame_number, steady_us)
         if restarted:
@@ -117,8 +133,10 @@ class Ingest:
             clock.has_clock,
         )
 
-    def _follow_frame_number(self, first_component_type: ComponentType | None, frame_number: int) -> None:
-        """Keep ``frame_number`` if the followed type comes first in the frame.
+    def _follow(
+        self, first_component_type: ComponentType | None, frame_number: int, timestamp_us: int
+    ) -> None:
+        """Keep the frame's number and time stamp if the followed type comes first in it.
 
         Servers may number each type separately, so only one is followed: the first type that arrives, or
         the first after it if that was the event type.
@@ -127,3 +145,5 @@ class Ingest:
         if first_component_type is followed or followed is None or followed is ComponentType.EVENT:
             self._followed_type = first_component_type
             self._frame_number = frame_number
+            self._timestamp_us = timestamp_us
+            self._num_followed += 1

@@ -30,12 +30,15 @@ class StreamPlan(NamedTuple):
     def on_one_connection(self, reason: str) -> "StreamPlan":
         """Return the plan with one connection for all components, because of ``reason``."""
         slowest_hz = rate_text(self.rates_hz[0])
-        costs = [
-            f"{keys_text(group)} arrive{'s' if len(group) == 1 else ''} at {slowest_hz} Hz instead of "
-            f"{rate_text(rate_hz)} Hz"
-            for group, rate_hz in zip(self.groups[1:], self.rates_hz[1:], strict=True)
-        ]
-        return StreamPlan((WIRE_ORDER,), self.rates_hz[:1], f"{', '.join(costs)}: {reason}")
+        faster = zip(self.groups[1:], self.rates_hz[1:], strict=True)
+        (first, first_hz), *others = ((keys_text(group), rate_text(rate_hz)) for group, rate_hz in faster)
+        announced = ", ".join([f"{first_hz} Hz", *(f"{keys} instead of {hz} Hz" for keys, hz in others)])
+        verb = "arrives" if len(self.groups[1]) == 1 else "arrive"
+        return StreamPlan(
+            (WIRE_ORDER,),
+            self.rates_hz[:1],
+            f"{first} {verb} at {slowest_hz} Hz instead of {announced}: {reason}",
+        )
 
 
 def announced_rates_hz(parameters: Parameters) -> dict[ComponentType, float]:
@@ -52,13 +55,16 @@ def announced_rates_hz(parameters: Parameters) -> dict[ComponentType, float]:
 def plan_streams(parameters: Parameters | None) -> StreamPlan:
     """Return the plan for a server with these parameters; None if it gave none."""
     if parameters is None:
-        return StreamPlan(limitation=_no_rates("its components"))
+        return StreamPlan((WIRE_ORDER,), (), _no_rates("its components"))
     rates_hz = announced_rates_hz(parameters)
     described = [component for component in WIRE_ORDER if num_described_items(parameters, component)]
     groups = _groups(rates_hz)
     if not groups:
-        cost = "" if len(described) == 1 else _no_rates("its components")
-        return StreamPlan(limitation=cost)
+        return (
+            StreamPlan()
+            if len(described) == 1
+            else StreamPlan((WIRE_ORDER,), (), _no_rates("its components"))
+        )
     fast = {component for group in groups[1:] for component in group}
     first = tuple(component for component in WIRE_ORDER if component not in fast)
     silent = [component for component in described if component not in rates_hz]

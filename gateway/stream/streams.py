@@ -10,6 +10,7 @@ from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import General, Parameters
 from gateway.stream.plan import Components, StreamPlan, announced_rates_hz, plan_streams
+from gateway.stream.rate_watch import AnnouncedRates
 from gateway.stream.state import StreamState
 from gateway.stream.supervisor import Listener, Supervisor
 
@@ -40,11 +41,12 @@ NewStream = Callable[[StreamSettings, Listener], Supervisor]
 """Creates a stream; the listener follows its connections."""
 
 
-class ConfiguredStreams:
+class ConfiguredStreams(Listener):
     """The streams of a configuration that lists them."""
 
     def __init__(self, settings: Sequence[StreamSettings], new_stream: NewStream) -> None:
-        self.streams: Sequence[Supervisor] = [new_stream(each, Listener()) for each in settings]
+        self._announced_hz: AnnouncedRates = {}
+        self.streams: Sequence[Supervisor] = [new_stream(each, self) for each in settings]
         """The streams, in the order of the configuration."""
         self.known = self.streams
         """The same."""
@@ -55,11 +57,18 @@ class ConfiguredStreams:
             for stream in self.streams:
                 tasks.create_task(stream.run())
 
+    def planning(self, _stream: Supervisor, parameters: Parameters | None) -> None:
+        """Note the rates that the server announces."""
+        self._announced_hz = {} if parameters is None else announced_rates_hz(parameters)
+
     def parameters_changed(self, parameters: Parameters) -> None:
-        """Note that the server announces other parameters than at the last handshake."""
+        """Note the rates that the server announces now."""
+        self._announced_hz = announced_rates_hz(parameters)
 
     def check(self) -> None:
-        """Check the streams. Call it once a second."""
+        """Check the rates of the streams. Call it once a second."""
+        for stream in self.streams:
+            stream.check_rate(self._announced_hz, reports_sharing=True)
 
 
 class _Server(NamedTuple):
@@ -272,7 +281,11 @@ class AutomaticStreams(Listener):
     # Once a second.
 
     def check(self) -> None:
-        """Use one connection if frames arrive on some connections only. Call it once a second."""
+        """Check the rates, and use one connection if only some have frames. Call it once a second."""
+        announced_hz = {} if self._server is None else self._server.rates_hz
+        for stream in self.streams:
+            # The limitation of the plan says which components are slow because they share a connection.
+            stream.check_rate(announced_hz, reports_sharing=False)
         further = [self._further[group] for group in self._plan.groups[1:]]
         if self._first.session is None or not further:
             return

@@ -15,6 +15,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.stream.change_tasks import ChangeTasks
 from gateway.stream.ingest import Ingest, Publish, Skip
+from gateway.stream.rate_watch import AnnouncedRates, RateWatch
 from gateway.stream.session import OnFile, ReadClocks, Session
 from gateway.stream.state import StreamState
 from gateway.stream.status import FrameRate, StreamStatus
@@ -88,6 +89,7 @@ class Supervisor:
         """The settings of the stream, with its present components."""
         self.status = status
         self.frame_rate = FrameRate()
+        self._rate_watch = RateWatch(status)
         self._callbacks = callbacks
         self._connect = connect
         self._read_clocks = read_clocks
@@ -117,6 +119,18 @@ class Supervisor:
             self._ingest.want(components)
         if self.session is not None and self._changes is not None:
             self._changes.request_components(components)
+
+    def check_rate(self, announced_hz: AnnouncedRates, *, reports_sharing: bool) -> None:
+        """Report frames that arrive at another rate than requested or announced. Call it once a second."""
+        if self.session is not None and self._ingest is not None and self._changes is not None:
+            self._rate_watch.check(
+                self.settings,
+                announced_hz,
+                self._ingest.arrivals,
+                self._read_clocks()[1] / 1e6,
+                is_full_rate=self._changes.is_full_rate,
+                reports_sharing=reports_sharing,
+            )
 
     async def run(self) -> None:
         """Keep the stream running until cancelled; then send Bye.

@@ -16,6 +16,7 @@ from gateway.rtc3d_server.server import RtServer
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.memory_gateway import MemoryGateway, run_gateway
+from tests.waiting import wait_until_async
 
 ONE_CONNECTION = "analog and force arrive at 200 Hz instead of 2000 Hz: "
 EVERYTHING = "3d 6d analog force event"
@@ -301,3 +302,16 @@ async def test_configured_streams_are_not_planned() -> None:
         assert steps(await lab.wait_for("analog", 50)) == {10}
         assert components(lab) == ["3d analog"]
         assert server.num_opened == 1
+
+
+async def test_rates_that_differ_from_the_announced_ones_are_reported() -> None:
+    """The server announces 200 and 2000 Hz, but measures 3D at 100 Hz and analog at 4000 Hz."""
+    scene = lab_scene(100, 4000)
+    scene.parameters = lab_scene().parameters
+    async with OneClientServer("serve", scene) as server, run_gateway(server.port) as lab:
+        await wait_until_async(
+            lambda: all(status.limitations for status in lab.source.statuses), timeout_s=30
+        )
+        [slow], [fast] = (status.limitations for status in lab.source.statuses)
+        assert slow.startswith("frames arrive at 100 Hz instead of the announced 200 Hz")
+        assert fast.startswith("frames arrive at 4000 Hz instead of the announced 2000 Hz")

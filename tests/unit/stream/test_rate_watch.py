@@ -1,0 +1,235 @@
+"""Rates that differ from the requested or announced ones are reported once; nothing else is."""
+
+import logging
+from collections.abc import Iterable
+
+import pytest
+
+from gateway.config.settings import StreamSettings
+from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.protocol_state import ProtocolState
+from gateway.stream.rate_watch import Arrivals, RateWatch
+from gateway.stream.state import StreamState
+from gateway.stream.status import StreamStatus
+
+MARKERS, TOOLS, ANALOG, EVENT = (
+    ComponentType.MARKERS,
+    ComponentType.TOOLS,
+    ComponentType.ANALOG,
+    ComponentType.EVENT,
+)
+ANNOUNCED = {MARKERS: 200.0, TOOLS: 200.0}
+SLOW = (
+    "frames arrive at 100 Hz instead of the announced 200 Hz; check the server's real-time processing rate "
+    "and its load"
+)
+
+
+class Lab:
+    """A watched stream, whose server sends frames as the test says."""
+
+    def __init__(self, *components: ComponentType, rate: Rate | None = None, has_clock: bool = True) -> None:
+        self.stream = StreamSettings(components=components or (MARKERS, TOOLS), rate=rate or AllFrames())
+        self.status = StreamStatus("3d 6d", name="lab (3d 6d)")
+        self.watch = RateWatch(self.status)
+        self.announced = dict(ANNOUNCED)
+        self.is_full_rate = True
+        self.has_clock = has_clock
+        self.now_s = 1000.0
+        self.timestamp_us = 0.0
+        self.num_frames = self.num_followed = 0
+        self.connect()
+
+    def connect(self) -> None:
+        self.status.connecting("lab")
+        self.status.connected("lab")
+        self.status.handshake_done(ProtocolState.STREAMING, "lab", "AllFrames")
+        assert self.status.state is StreamState.STREAMING
+        self.status.clock.has_clock = self.has_clock
+
+    def second(self, frames: int, *, advance_s: float = 1.0, followed: int | None = None) -> None:
+        """Let a second pass in which frames arrive whose time stamps advance by ``advance_s``."""
+        self.now_s += 1
+        self.timestamp_us += 1e6 * advance_s
+        self.num_frames += frames
+        self.num_followed += frames if followed is None else followed
+        self.check()
+
+    def check(self, followed: ComponentType | None = None) -> None:
+        arrivals = Arrivals(
+            self.num_frames,
+            followed or self.stream.components[0],
+            self.num_followed,
+            int(self.timestamp_us),
+            frozenset(self.stream.components),
+        )
+        self.watch.check(
+            self.stream,
+            self.announced,
+            arrivals,
+            self.now_s,
+            is_full_rate=self.is_full_rate,
+            reports_sharing=True,
+        )
+
+    def seconds(self, counts: Iterable[int]) -> list[str]:
+        for count in counts:
+            self.second(count)
+        return self.status.limitations
+
+
+def test_frames_that_are_too_slow_are_reported_once(caplog: pytest.LogCaptureFixture) -> None:
+    lab = Lab()
+    assert lab.seconds([100] * 60) == [SLOW]
+    assert [record.message for record in caplog.records if record.levelno == logging.WARNING] == [
+        f"lab (3d 6d): {SLOW}"
+    ]
+
+
+def test_frames_that_are_too_fast_are_reported() -> None:
+    assert Lab().seconds([400] * 20) == [
+        "frames arrive at 400 Hz instead of the announced 200 Hz; check the rates in the server's settings"
+    ]
+
+
+@pytest.mark.parametrize(
+    ("rate", "arriving", "expected"),
+    [(Frequency(60.0), 200, "60"), (FrequencyDivisor(4), 200, "50"), (Frequency(60.0), 30, "60")],
+)
+def test_a_requested_rate_is_compared(rate: Rate, arriving: int, expected: str) -> None:
+    [limitation] = Lab(rate=rate).seconds([arriving] * 60)
+    assert limitation.startswith(f"frames arrive at {arriving} Hz instead of the requested {expected} Hz")
+
+
+def test_a_requested_rate_is_compared_even_if_none_is_announced() -> None:
+    lab = Lab(rate=Frequency(60.0))
+    lab.announced = {}
+    [limitation] = lab.seconds([100] * 20)
+    assert limitation.startswith("frames arrive at 100 Hz instead of the requested 60 Hz")
+
+
+def test_a_requested_rate_above_the_announced_one_is_limited_by_it() -> None:
+    assert Lab(rate=Frequency(1000.0)).seconds([200] * 30) == []
+
+
+def test_a_component_that_is_slow_because_of_another_one_is_reported() -> None:
+    lab = Lab(MARKERS, ANALOG)
+    lab.announced[ANALOG] = 2000.0
+    [limitation] = lab.seconds([200] * 30)
+    assert limitation.startswith(
+        "analog arrives at 200 Hz instead of 2000 Hz: a stream is as fast as its slowest"
+    )
+
+
+def test_the_end_of_a_difference_is_logged_and_shown(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    lab = Lab()
+    assert lab.seconds([100] * 20) == [SLOW]
+    assert lab.seconds([200] * 20) == []
+    assert "lab (3d 6d): frames arrive at the right rate again" in caplog.messages
+
+
+def test_a_difference_is_shown_for_the_next_connection_again_without_another_warning(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    lab = Lab()
+    lab.seconds([100] * 20)
+    lab.connect()
+    assert lab.status.limitations == []
+    assert lab.seconds([100] * 20) == [SLOW]
+    assert len([record for record in caplog.records if record.levelno == logging.WARNING]) == 1
+
+
+@pytest.mark.parametrize(
+    "counts", [[195, 205] * 30, [185] * 60, [215] * 60, [0, 0, 600] * 20, [200, 0, 400] * 20]
+)
+def test_irregular_arrival_is_not_reported(counts: list[int]) -> None:
+    lab = Lab()
+    for count in counts:
+        lab.second(count, advance_s=count / 200 if count in (0, 400, 600) else 1.0)
+    assert lab.status.limitations == []
+
+
+@pytest.mark.parametrize("speed", [2, 4])
+@pytest.mark.parametrize("stopped_s", [5, 30])
+def test_a_stop_of_the_process_and_its_backlog_are_not_reported(stopped_s: int, speed: int) -> None:
+    lab = Lab()
+    lab.seconds([200] * 20)
+    lab.now_s += stopped_s
+    for _ in range(stopped_s // (speed - 1)):
+        lab.second(200 * speed, advance_s=speed)
+    assert lab.seconds([200] * 20) == []
+
+
+def test_a_backlog_without_a_clock_is_not_reported() -> None:
+    lab = Lab(has_clock=False)
+    lab.seconds([200] * 20)
+    lab.now_s += 10
+    assert lab.seconds([400] * 10 + [200] * 60) == []
+
+
+def test_time_stamps_that_are_no_clock_are_ignored() -> None:
+    lab = Lab(has_clock=False)
+    for _ in range(60):
+        lab.second(200, advance_s=0.001)
+    assert lab.status.limitations == []
+    for _ in range(60):
+        lab.second(100, advance_s=0.0)
+    assert lab.status.limitations == [SLOW]
+
+
+def test_restarts_of_the_server_are_not_reported() -> None:
+    lab = Lab()
+    for _ in range(20):
+        lab.seconds([200] * 4)
+        lab.timestamp_us = 0.0
+        lab.status.server_restarted()
+    assert lab.status.limitations == []
+
+
+def test_a_lower_rate_on_our_request_is_not_reported() -> None:
+    lab = Lab()
+    lab.is_full_rate = False
+    assert lab.seconds([100] * 60) == []
+
+
+def test_components_that_are_left_out_at_times_are_not_reported() -> None:
+    lab = Lab()
+    for _ in range(60):
+        lab.second(200, followed=100)
+    assert lab.status.limitations == []
+
+
+def test_components_in_frames_of_their_own_are_not_reported() -> None:
+    lab = Lab(MARKERS, ANALOG)
+    lab.announced[ANALOG] = 2000.0
+    for _ in range(60):
+        lab.second(2200, followed=200)
+    assert lab.status.limitations == []
+
+
+def test_events_have_no_rate() -> None:
+    lab = Lab(EVENT, rate=Frequency(60.0))
+    assert lab.seconds([500] * 60) == []
+
+
+def test_nothing_is_reported_without_a_rate_to_compare() -> None:
+    lab = Lab()
+    lab.announced = {}
+    assert lab.seconds([3] * 100) == []
+
+
+def test_changed_parameters_begin_a_new_measurement() -> None:
+    lab = Lab()
+    assert lab.seconds([100] * 20) == [SLOW]
+    lab.announced = {MARKERS: 100.0, TOOLS: 100.0}
+    assert lab.seconds([100] * 20) == []
+
+
+def test_a_slow_stream_is_measured_for_longer() -> None:
+    lab = Lab()
+    lab.announced = {MARKERS: 2.0, TOOLS: 2.0}
+    assert lab.seconds([2] * 100) == []
+    [limitation] = lab.seconds([1] * 100)
+    assert limitation.startswith("frames arrive at 1 Hz instead of the announced 2 Hz")
