@@ -35,6 +35,7 @@ class Gateway:
         self._outputs = self._build_outputs(settings)
         self._spool = _new_spool(settings.spool)
         self._sources: dict[str, Source] = {}
+        self._removed_sources: dict[str, Source] = {}  # their numbers continue if a reload adds them again
         self._source_tasks: dict[str, asyncio.Task[None]] = {}
         self._tasks = asyncio.TaskGroup()
         self._reload_lock = asyncio.Lock()
@@ -169,12 +170,20 @@ class Gateway:
         new = [settings for name, settings in wanted.items() if name in stopped or name not in self._sources]
         await asyncio.gather(*map(self._stop_source, stopped))
         for name in stopped.keys() - wanted.keys():
-            self._sources.pop(name).fan_out.close()
+            self._removed_sources[name] = source = self._sources.pop(name)
+            source.fan_out.close()
         for settings in new:
-            self._add_source(settings, stopped.get(settings.name))
+            self._add_source(settings, stopped.get(settings.name) or self._reopened(settings.name))
             self._start_source(settings.name)
         self._sources = {name: self._sources[name] for name in wanted}
         return _changes("source", stopped, [settings.name for settings in new])
+
+    def _reopened(self, name: str) -> Source | None:
+        """Return the source of this name that was removed earlier, with the present outputs; None if new."""
+        source = self._removed_sources.pop(name, None)
+        if source is not None:
+            source.fan_out.set_outputs(self._outputs)
+        return source
 
     async def _stop_source(self, name: str) -> None:
         task = self._source_tasks.pop(name)

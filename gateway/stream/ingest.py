@@ -76,15 +76,15 @@ class Ingest:
         """Take frames that arrived together, oldest first.
 
         ``utime`` is when they arrived, in µs since the Unix epoch; ``steady_us`` is the same moment on the
-        steady clock (see HostClock). While frames are late, ``backlog: latest`` publishes only the newest
-        frame whole. Of the other frames it publishes the events, which are never skipped, and counts the
-        frames as skipped.
+        steady clock (see HostClock). While frames are late, ``backlog: latest`` publishes the newest of each
+        component and all events, and counts the rest as skipped. Usually that is the newest frame, but
+        servers leave out components that are empty (field note 5), or send empty frames.
         """
         status = self._status
         status.frames_received(len(frames), utime)
-        newest = frames[-1]
+        newest: list[frozenset[ComponentType]] | None = None
         has_wanted = False
-        for frame in frames:
+        for index, frame in enumerate(frames):
             if frame.layout is not self._layout:
                 self._set_layout(frame.layout)
             has_wanted = has_wanted or not self._unwanted
@@ -93,14 +93,34 @@ class Ingest:
             if not frame.layout.components:
                 continue
             stamp = self._stamp(frame, utime, steady_us)
-            if self._lag.behind and self._skips_when_behind and frame is not newest:
-                self._publish(frame, stamp, self._wanted_events)
-                num_lost = self._skip(frame, stamp, self._skippable)
-                if num_lost:
-                    status.frame_skipped(num_lost)
+            if self._lag.behind and self._skips_when_behind and index < len(frames) - 1:
+                if newest is None:
+                    newest = self._newest_components(frames)
+                self._publish_newest(frame, stamp, newest[index])
             else:
                 self._publish(frame, stamp, self._wanted)
         status.components_received("" if has_wanted else self._unwanted)
+
+    def _newest_components(self, frames: list[Frame]) -> list[frozenset[ComponentType]]:
+        """Return the wanted components of each frame that no later one of these frames has."""
+        later: frozenset[ComponentType] = frozenset()
+        newest = []
+        for frame in reversed(frames):
+            types = self._wanted.intersection([component.type for component in frame.layout.components])
+            newest.append(types - later)
+            later |= types
+        newest.reverse()
+        return newest
+
+    def _publish_newest(self, frame: Frame, stamp: Stamp, newest: frozenset[ComponentType]) -> None:
+        """Publish the events and the ``newest`` components of a late frame; skip the others."""
+        published, skipped = self._wanted_events, self._skippable
+        if newest:
+            published, skipped = published | newest, skipped - newest
+        self._publish(frame, stamp, published)
+        num_lost = self._skip(frame, stamp, skipped)
+        if num_lost:
+            self._status.frame_skipped(num_lost)
 
     def _set_layout(self, layout: FrameLayout) -> None:
         types = [component.type for component in layout.components]

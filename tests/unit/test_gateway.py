@@ -110,10 +110,10 @@ def example(gateway: Gateway, index: int = 0) -> ExampleOutput:
     return output
 
 
-def subscribe(address: str, *, component: str = "3d") -> list[Any]:
-    """Return a list that collects the messages published at an address."""
+def subscribe(address: str, *, component: str = "3d", source: str | None = None) -> list[Any]:
+    """Return a list that collects the messages published at an address, by one source or by all."""
     messages: list[Any] = []
-    request = SubscriptionRequest(component=component)
+    request = SubscriptionRequest(component=component, source=source)
     ExampleSubscription(address, request, lambda _, message: messages.append(decode(message)))
     return messages
 
@@ -328,6 +328,56 @@ async def test_sources_can_be_added_and_removed(servers: Servers) -> None:
             await output.query("hall/status")
         assert decode((await output.query("new/status")).payload).source == "new"
         assert len(servers["lab"].connections) == 1
+
+
+async def test_a_source_that_is_removed_and_added_again_continues_its_numbers(servers: Servers) -> None:
+    hall = subscribe("local", source="hall")
+    statuses = subscribe("local", source="hall", component="status")
+    async with running(settings("lab", "hall")) as (gateway, _):
+        for changed in (None, settings("lab"), settings("lab", "hall"), settings("lab"), settings("hall")):
+            if changed is not None:
+                await gateway.reload(changed)
+            if any(source.name == "hall" for source in gateway.sources):
+                await connected(gateway)
+                servers["hall"].connection.send_frames(1, 2)
+                await asyncio.sleep(1.5)
+    assert [(each.session, each.sequence) for each in hall] == [
+        (session, 2 * (session - 1) + index) for session in (1, 2, 3) for index in (0, 1)
+    ]
+    assert [each.sequence for each in statuses] == list(range(1, len(statuses) + 1))
+    assert sorted({each.session for each in statuses}) == [1, 2, 3]
+
+
+@pytest.mark.parametrize("order", [(2, 1), (1, 2), (2, 3, 1, 2)])
+async def test_sessions_never_go_back_when_a_reload_changes_the_number_of_streams(
+    servers: Servers, order: tuple[int, ...]
+) -> None:
+    everything = ("3d", "6d", "analog")
+
+    def streams(number: int) -> Settings:
+        rest = everything[number - 1 :]
+        components = [[key] for key in everything[: number - 1]] + [list(rest)]
+        source = SourceSettings.model_validate(
+            {"name": "lab", "host": "lab", "streams": [{"components": keys} for keys in components]}
+        )
+        return settings().model_copy(update={"sources": (source,)})
+
+    statuses = subscribe("local", component="status")
+    markers = subscribe("local")
+    async with running(streams(order[0])) as (gateway, _):
+        for number in order:
+            await gateway.reload(streams(number))
+            await connected(gateway)
+            for connection in servers["lab"].connections:
+                connection.send_frames(1)
+            await asyncio.sleep(2.1)
+            servers["lab"].connection.end()
+            await asyncio.sleep(2.1)
+    sessions = [each.session for each in statuses]
+    assert sessions == sorted(sessions)
+    assert len(set(sessions)) >= len(order) + 1
+    sessions = [each.session for each in markers]
+    assert sessions == sorted(sessions)
 
 
 async def test_a_changed_spool_is_used_by_running_sources(servers: Servers, tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def frame_of(tick: int, *numbered: tuple[ComponentType, int]) -> Frame:
 class Lab:
     """An ingest; ``published`` and ``skipped`` are the frame numbers and component keys it passed on."""
 
-    def __init__(self, backlog: str, *, adapt_rate: bool = True) -> None:
+    def __init__(self, backlog: str, *components: str, adapt_rate: bool = True) -> None:
         self.backlog = backlog
         self.status = StreamStatus("3d event", name="lab (3d event)")
         self.published: list[tuple[int, list[str]]] = []
@@ -51,7 +51,7 @@ class Lab:
         self.set_by_us = 0
         """How far somebody has set the wall clock forward."""
         stream = StreamSettings.model_validate(
-            {"components": ["all"], "backlog": backlog, "adapt_rate": adapt_rate}
+            {"components": components or ["all"], "backlog": backlog, "adapt_rate": adapt_rate}
         )
         source = SourceSettings(name="lab", host="127.0.0.1")
         self.ingest = Ingest(
@@ -92,7 +92,12 @@ class Lab:
 
 @pytest.fixture(params=["latest", "all"])
 def lab(request: pytest.FixtureRequest) -> Lab:
-    lab = Lab(request.param)
+    return learned_lab(request.param)
+
+
+def learned_lab(backlog: str, *components: str) -> Lab:
+    """Return a lab whose clock has learned for three seconds."""
+    lab = Lab(backlog, *components)
     for number in range(3 * RATE_HZ):
         lab.receive(frame(number))
     assert [number for number, _ in lab.published] == list(range(600))
@@ -124,6 +129,33 @@ def test_while_behind_the_newest_is_published_and_no_event_is_skipped(lab: Lab) 
     else:
         assert [number for number, _ in lab.published] == list(range(600, 605))
         assert not lab.status.losses.report()
+
+
+EMPTY = split_frame(encode_frame([]), "big")
+FORCE, TOOLS = ComponentType.FORCE, ComponentType.TOOLS
+
+
+@pytest.mark.parametrize("last", [(EMPTY,), (EMPTY, EMPTY), (frame_of(603, (FORCE, 603)),)])
+def test_while_behind_the_newest_frame_that_is_not_empty_is_published(last: tuple[Frame, ...]) -> None:
+    lab = learned_lab("latest", "3d", "event")
+    late = [frame(600), frame(601, event=True), frame(602)]
+    lab.receive_at(BOOT_UTIME + 605 * PERIOD_US + 200_000, *late, *last)
+    assert lab.published == [(601, ["event"]), (602, ["3d"])]
+    assert amounts(lab.status.losses.report()) == {"skipped while behind": (2, 2)}
+
+
+def test_while_behind_the_newest_of_each_component_is_published() -> None:
+    """Servers leave out components that are empty (field note 5)."""
+    lab = learned_lab("latest")
+    late = [
+        frame_of(600, (MARKERS, 600), (TOOLS, 600)),
+        frame_of(601, (MARKERS, 601), (TOOLS, 601)),
+        frame_of(602, (MARKERS, 602)),
+        frame_of(603, (MARKERS, 603)),
+    ]
+    lab.receive(*late, late_us=200_000)
+    assert lab.published == [(601, ["6d"]), (603, ["3d"])]
+    assert amounts(lab.status.losses.report()) == {"skipped while behind": (4, 3)}
 
 
 def test_frames_that_stay_late_request_lower_rates(lab: Lab) -> None:
