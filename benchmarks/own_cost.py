@@ -105,9 +105,12 @@ class _FedGateway:
         )
         self._running = self._loop.create_task(gateway.run(self._stop))
         [source_gateway] = gateway.sources
-        await wait_until_async(lambda: source_gateway.statuses[0].state is StreamState.NO_MEASUREMENT)
-        session = source_gateway.streams[0].session
-        assert session is not None  # noqa: S101 - a stream in this state has a session
+        [stream] = source_gateway.streams
+        await wait_until_async(
+            lambda: stream.session is not None and stream.status.state is StreamState.NO_MEASUREMENT
+        )
+        session = stream.session
+        assert session is not None  # noqa: S101 - that was waited for
         return session
 
     def run(self, loops: int, per_read: int, *, segments: bool = False) -> float:

@@ -155,7 +155,10 @@ async def test_late_frames_make_the_gateway_request_a_lower_rate_until_they_are_
     monkeypatch.setattr("gateway.stream.rate_control.FIRST_WAIT_S", 0.3)
     caplog.set_level("INFO", "gateway.stream")
     server = Recorder()
-    async with ScriptedServer(server.script) as listening, run_gateway(listening.port) as lab:
+    async with (
+        ScriptedServer(server.script) as listening,
+        run_gateway(listening.port, streams=(StreamSettings(adapt_rate=True),)) as lab,
+    ):
         await lab.wait_until(lambda: server.count(START) == 1)
         loop = asyncio.get_running_loop()
         start_s = loop.time()
