@@ -2,19 +2,23 @@
 
 import math
 import re
+from collections.abc import Collection
 from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
 from lxml import etree
 
 from gateway.errors import ParametersError
-from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters import SECTIONS, Parameters
 from gateway.rtc3d.parameters_layout import LAYOUT, PARENT_TAGS, ROOT, TAGS
 
 MAX_XML_BYTES: Final = 1024 * 1024
 """Larger documents are not parsed. This is enough for about 8000 markers; parsing takes seconds at worst."""
 MAX_RECOVERED: Final = 20
 """The highest number of entries in ``ParsedParameters.recovered``."""
+_PADDING: Final = b"\0 \t\r\n"
+"""Bytes at both ends of an XML reply that are ignored (field note 9)."""
+_SECTION_TAGS: Final = {field.name: field.path for field in LAYOUT[Parameters]}
 _MAX_NOTE_CHARACTERS: Final = 200
 _MAX_QUOTED_CHARACTERS: Final = 60
 
@@ -53,7 +57,7 @@ def parse_parameters(xml: bytes) -> ParsedParameters:
     Raises ParametersError, and nothing else, if the XML has no parameters, declares entities, or is larger
     than MAX_XML_BYTES.
     """
-    body = xml.strip(b"\0 \t\r\n")
+    body = xml.strip(_PADDING)
     if len(body) > MAX_XML_BYTES:
         raise ParametersError(
             f"the server's parameters take {len(body)} bytes, above the limit of {MAX_XML_BYTES}: "
@@ -68,6 +72,27 @@ def parse_parameters(xml: bytes) -> ParsedParameters:
     notes: list[str] = []
     tree = _parse_tree(body, notes)
     return ParsedParameters(_read(Parameters, tree, notes), tuple(notes))
+
+
+def extract_sections(xml: bytes, sections: Collection[str]) -> bytes | None:
+    """Return the elements of ``sections`` (keys of SECTIONS) in an XML reply, below the reply's root element.
+
+    They have everything that the server wrote in them, also what §6 does not define, but comments are left
+    out, and the result is in ASCII. Returns None if the XML lacks one of the sections or is not well-formed.
+    """
+    body = xml.strip(_PADDING)
+    if len(body) > MAX_XML_BYTES or b"<!ENTITY" in body:
+        return None
+    root, errors = _parse(body, None if _is_utf8(body) else "iso-8859-1")
+    if root is None or errors or _tag(root) != ROOT:
+        return None
+    tags = {_SECTION_TAGS[SECTIONS[section].field] for section in sections}
+    if not tags <= {_tag(element) for element in root}:
+        return None
+    for element in list(root):
+        if _tag(element) not in tags:
+            root.remove(element)
+    return etree.tostring(root)
 
 
 def _parse_tree(body: bytes, notes: list[str]) -> etree._Element:

@@ -25,7 +25,13 @@ from gateway.rtc3d.parameters import (
     Tool,
     sections_of,
 )
-from gateway.rtc3d.parameters_xml import MAX_RECOVERED, encode_parameters, parse_parameters
+from gateway.rtc3d.parameters_xml import (
+    MAX_RECOVERED,
+    MAX_XML_BYTES,
+    encode_parameters,
+    extract_sections,
+    parse_parameters,
+)
 from tests.spec_parameters import (
     ALL,
     BY_SECTION,
@@ -354,3 +360,44 @@ class TestEncoding:
         markers = Parameters3D(markers=(Marker("1\0", "a\x1bb\ud800", "c\uffff\nd"),))
         xml = encode_parameters(Parameters(markers=markers))
         assert markers_of(xml).markers == (Marker("1", "ab", "c\nd"),)
+
+
+# One section of a reply ------------------------------------------------------------------------
+
+WHOLE = (
+    b"<?xml version='1.0'?><RT_Parameters Ver='1.00'><General/><!-- a comment -->"
+    b"<The_3D><Unit>mm</Unit><Colour of='marker 1'>red &amp; blue</Colour></The_3D>\n"
+    b"<the_6d/></RT_Parameters>\0\0"
+)
+
+
+def test_a_section_has_everything_that_the_server_wrote_in_it() -> None:
+    assert extract_sections(WHOLE, ["3d"]) == (
+        b'<RT_Parameters Ver="1.00">'
+        b'<The_3D><Unit>mm</Unit><Colour of="marker 1">red &amp; blue</Colour></The_3D>\n</RT_Parameters>'
+    )
+
+
+def test_several_sections_are_in_the_order_of_the_reply() -> None:
+    both = extract_sections(WHOLE, ["6d", "general"])
+    assert both == b'<RT_Parameters Ver="1.00"><General/><the_6d/></RT_Parameters>'
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_names_in_a_section_are_readable_in_any_encoding(encoding: str) -> None:
+    label = "<The_3D><Markers><Marker id='1'><Label>Fuß</Label></Marker></Markers></The_3D>"
+    xml = extract_sections(in_root(label).decode().encode(encoding), ["3d"])
+    assert xml is not None
+    assert [marker.label for marker in markers_of(xml).markers] == ["Fuß"]
+
+
+@pytest.mark.parametrize(
+    "xml",
+    [
+        *(WHOLE.replace(b"The_3D", b"Other"), WHOLE.replace(b"</The_3D>", b""), b"", b"OK"),
+        *(b"<html><The_3D/></html>", in_root("<The_3D/>" + " " * MAX_XML_BYTES)),
+        b"<!DOCTYPE a [<!ENTITY b 'c'>]>" + in_root("<The_3D>&b;</The_3D>"),
+    ],
+)
+def test_a_section_that_cannot_be_taken_from_the_reply_is_none(xml: bytes) -> None:
+    assert extract_sections(xml, ["3d"]) is None

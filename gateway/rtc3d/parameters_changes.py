@@ -1,0 +1,68 @@
+"""What differs between two sets of parameters, in words for the log."""
+
+from dataclasses import replace
+from typing import Final
+
+from gateway.rtc3d.parameters import SECTIONS, Parameters, Parameters3D, Parameters6D, without_statistics
+
+_MAX_NAMED: Final = 3
+"""How many items with a new name are listed for each section; the others are counted."""
+
+_MAX_LABEL_CHARACTERS: Final = 40
+
+
+def differ_in_statistics_only(before: bytes, after: bytes) -> bool:
+    """Return whether two XML replies are the same except for the statistics of §6.1. Cheap for long XML."""
+    return _cut_statistics(before) == _cut_statistics(after)
+
+
+def _cut_statistics(xml: bytes) -> bytes:
+    start = xml.find(b"<Stats")
+    end = xml.find(b"</Stats>", start)
+    return xml if start < 0 or end < 0 else xml[:start] + xml[end:]
+
+
+def describe_renames(before: Parameters, after: Parameters) -> str:
+    """Return which markers and tools have another name than before; "" if none has.
+
+    Data frames have no names: the position of an item decides which name it has (§6.2, §6.3). So items at
+    the same position are compared. The text is bounded, and control characters are escaped.
+    """
+    texts = []
+    for section in ("3d", "6d"):
+        labels = zip(_labels(before, section), _labels(after, section), strict=False)
+        renamed = [f"{_quote(old)} to {_quote(new)}" for old, new in labels if old != new]
+        if renamed:
+            rest = f" and {len(renamed) - _MAX_NAMED} more" if len(renamed) > _MAX_NAMED else ""
+            texts.append(f"{section} {', '.join(renamed[:_MAX_NAMED])}{rest}")
+    return "; ".join(texts)
+
+
+def changed_sections(before: Parameters, after: Parameters) -> list[str]:
+    """Return the sections that differ in more than the statistics and the names of markers and tools."""
+    before, after = _without_labels(before), _without_labels(after)
+    return [name for name, section in SECTIONS.items() if section.of(before) != section.of(after)]
+
+
+def _labels(parameters: Parameters, section: str) -> list[str]:
+    match SECTIONS[section].of(parameters):
+        case Parameters3D(markers=items) | Parameters6D(tools=items):
+            return [item.label for item in items]
+    return []
+
+
+def _without_labels(parameters: Parameters) -> Parameters:
+    """Return the parameters without statistics, and without the labels of markers and tools."""
+    parameters = without_statistics(parameters)
+    if parameters.markers is not None:
+        markers = tuple(replace(marker, label="") for marker in parameters.markers.markers)
+        parameters = replace(parameters, markers=replace(parameters.markers, markers=markers))
+    if parameters.tools is not None:
+        tools = tuple(replace(tool, label="") for tool in parameters.tools.tools)
+        parameters = replace(parameters, tools=replace(parameters.tools, tools=tools))
+    return parameters
+
+
+def _quote(label: str) -> str:
+    """Return a server's text quoted, shortened, and with control characters escaped."""
+    return repr(label[:_MAX_LABEL_CHARACTERS]) + ("…" if len(label) > _MAX_LABEL_CHARACTERS else "")
