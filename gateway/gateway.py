@@ -17,6 +17,7 @@ from gateway.source import Source
 
 _STATUS_PERIOD_S: Final = 1.0
 _OPENING_TIMEOUT_S: Final = 2.0
+_SENDING_TIMEOUT_S: Final = 0.5
 _OPENING_POLL_S: Final = 0.02
 
 logger = logging.getLogger(__name__)
@@ -156,11 +157,10 @@ class Gateway:
 
     def _publish_known_parameters(self, output: Output) -> None:
         for name, source in self._sources.items():
-            xml = source.queries.parameters.xml
-            if xml is not None:
-                output.publish_parameters(
-                    name, ServerParameters(xml, source.queries.session, source.queries.parameters_version)
-                )
+            known = source.queries.parameters.known
+            if known.version:
+                xml = b"" if known.newest is None else known.newest.xml
+                output.publish_parameters(name, ServerParameters(xml, source.queries.session, known.version))
 
     async def _change_sources(self, wanted_sources: Sequence[SourceSettings]) -> list[str]:
         wanted = {settings.name: settings for settings in wanted_sources}
@@ -196,9 +196,12 @@ class Gateway:
             settings, fan_out, self._spool, self._publish_parameters, self._announce_file, before
         )
 
-    def _publish_parameters(self, source: str, parameters: ServerParameters) -> None:
-        for output in self._outputs:
-            output.publish_parameters(source, parameters)
+    async def _publish_parameters(self, source: str, parameters: ServerParameters) -> None:
+        """Publish on every output; wait until they have sent it, but at most _SENDING_TIMEOUT_S."""
+        sent = [output.publish_parameters(source, parameters) for output in self._outputs]
+        pending = [future for future in sent if future is not None]
+        if pending:
+            await asyncio.wait(pending, timeout=_SENDING_TIMEOUT_S)
 
     def _announce_file(self, source: str, description: Mapping[str, Any]) -> None:
         for output in self._outputs:

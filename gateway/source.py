@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import math
-from collections.abc import Callable, Coroutine, Sequence
+from collections.abc import Awaitable, Callable, Coroutine, Sequence
 from typing import Any, Final
 
 from gateway.c3d_spool import Spool
@@ -14,10 +14,13 @@ from gateway.outputs.contract import Answer, ServerParameters
 from gateway.outputs.encodings import C3D
 from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
-from gateway.queries.server_requests import SendCommand, StreamAccess
+from gateway.queries.known_parameters import ServerAnswer
+from gateway.queries.parameter_refresh import ParameterRefresh
+from gateway.queries.server_requests import StreamAccess
 from gateway.queries.source_queries import SourceQueries
-from gateway.rtc3d.parameters import Parameters, without_statistics
+from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import ParsedParameters
+from gateway.stream.parameters import Connection
 from gateway.stream.state import StreamState
 from gateway.stream.status import SessionNumbers, StreamStatus
 from gateway.stream.streams import AutomaticStreams, ConfiguredStreams
@@ -33,9 +36,9 @@ class Source:
     """Runs the streams of one source, publishes their data through ``fan_out``, and answers queries.
 
     ``publish_parameters`` is called with the source's name and its parameters, for every connection and when
-    they change; ``announce_file`` with the name and the description of every C3D file that was stored.
-    ``before`` is the source that this one replaces after a reload; its session and sequence numbers and
-    the version of its parameters continue.
+    they change, and returns when they have been sent; ``announce_file`` with the name and the description of
+    every C3D file that was stored. ``before`` is the source that this one replaces after a reload; its
+    session and sequence numbers and its parameters continue.
     """
 
     def __init__(
@@ -43,14 +46,19 @@ class Source:
         settings: SourceSettings,
         fan_out: FanOut,
         spool: Spool,
-        publish_parameters: Callable[[str, ServerParameters], None],
+        publish_parameters: Callable[[str, ServerParameters], Awaitable[None]],
         announce_file: Callable[[str, dict[str, Any]], None],
         before: "Source | None" = None,
     ) -> None:
         self.settings = settings
         self.spool = spool
         self.fan_out = fan_out
-        self.fan_out.on_items_changed = self._refresh_parameters_soon
+        self._refresh = ParameterRefresh(
+            settings,
+            lambda: self.queries.parameters.refresh(),  # noqa: PLW0108 - assigned below
+            lambda: self.queries.parameters.last_read_s,
+        )
+        self.fan_out.on_items_changed = self._refresh.request
         self.sessions: SessionNumbers = SessionNumbers() if before is None else before.sessions
         """The numbers of the connections."""
         self.parameters_version: int = 0 if before is None else before.parameters_version
@@ -60,31 +68,33 @@ class Source:
             if settings.streams == "auto"
             else ConfiguredStreams(settings.streams, self._new_stream)
         )
-        self.queries = self._new_queries()
+        self.queries = self._new_queries(before)
         self._publish_parameters = publish_parameters
         self._announce_file = announce_file
         self._tasks: set[asyncio.Task[None]] = set()
         self._defects = DefectLog(logger, self.name)
-        self.parameters: Parameters | None = None if before is None else before.parameters
-        """The newest parameters, without the server's statistics; None before the first."""
+        # Names and units of another server do not hold here, not even until the first handshake.
+        self._has_new_server = before is not None and (before.settings.host, before.settings.port) != (
+            *(settings.host, settings.port),
+        )
         self._num_unstored_files = 0
-        self._is_refresh_planned = False
         self.sequence: int = 0 if before is None else before.sequence
         """The sequence number of the newest status and clock messages."""
         self._newest_status: bytes = self._encoded_status()
 
-    def _new_queries(self) -> SourceQueries:
+    def _new_queries(self, before: "Source | None") -> SourceQueries:
         return SourceQueries(
             self.settings,
             lambda: [
-                StreamAccess(stream.settings.components, stream.status, _session_ask(stream))
+                StreamAccess(stream.settings.components, stream.status, stream.session)
                 for stream in self.streams
             ],
             newest_message=self.fan_out.newest,
             status_message=lambda: self._newest_status,
             last_c3d=self._last_c3d,
             record=self._record,
-            on_change=self._on_changed_parameters,
+            announce_parameters=self._announce_parameters,
+            before=None if before is None else before.queries,
         )
 
     @property
@@ -109,8 +119,12 @@ class Source:
 
     async def run(self) -> None:
         """Run every stream until cancelled; then send Bye to the server."""
+        if self._has_new_server:
+            await self.queries.parameters.known.make_void("the configuration names another server")
         try:
-            await self._streams.run()
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._refresh.run())
+                await self._streams.run()
         finally:
             for task in self._tasks:
                 task.cancel()
@@ -151,67 +165,48 @@ class Source:
         status = StreamStatus(
             component_keys(stream.components),
             name=stream_name(self.settings, stream.components),
-            on_state=self._on_state,
+            on_state=lambda former: self._on_state(status, former),
             session=self.sessions.newest,
             sessions=self.sessions,
             parameters_version=self.parameters_version,
         )
         return Supervisor(self.settings, stream, status, self._callbacks(status), listener)
 
-    def _on_state(self, _state: StreamState) -> None:
+    def _on_state(self, status: StreamStatus, former: StreamState) -> None:
         is_streaming = any(status.state is StreamState.STREAMING for status in self.statuses)
         self.fan_out.show_streaming(is_streaming)
+        if former is StreamState.NO_MEASUREMENT and status.state is StreamState.STREAMING:
+            self._refresh.request()  # a new measurement may have other markers and tools
 
     # Parameters.
 
     def _callbacks(self, status: StreamStatus) -> Callbacks:
-        def on_parameters(xml: bytes, parsed: ParsedParameters) -> None:
-            self.queries.parameters.store(xml, parsed)
-            self._publish_new_parameters(xml, parsed)
 
         return Callbacks(
             publish=self.fan_out.publish,
             skip=self.fan_out.skip,
-            on_parameters=on_parameters,
-            on_connected=lambda: self._start_task(self.queries.parameters.fill()),
-            on_restart=self._refresh_parameters_soon,
+            read_parameters=self._read_parameters,
+            on_restart=self._refresh.request,
             on_file=lambda content: self._on_file(status, content),
             has_subscribers=self.fan_out.has_subscribers,
         )
 
-    def _on_changed_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
-        """Publish parameters that have changed, and request every section again."""
-        self._publish_new_parameters(xml, parsed)
-        self._start_task(self.queries.parameters.fill())
+    def _read_parameters(self, connection: Connection) -> Awaitable[ParsedParameters]:
+        return self.queries.parameters.read_for_handshake(connection)
 
-    def _publish_new_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
-        """Publish parameters; if they differ from the former ones, they are a new version."""
-        parameters = without_statistics(parsed.parameters)
-        if parameters != self.parameters:
-            self.parameters = parameters
-            self.parameters_version += 1
-            for stream in self._streams.known:
-                stream.status.parameters_changed(self.parameters_version)
-        self._streams.parameters_changed(parameters)
-        self.fan_out.set_parameters(parameters)
-        self._publish_parameters(
-            self.name, ServerParameters(xml, self.queries.session, self.parameters_version)
-        )
-
-    def _refresh_parameters_soon(self) -> None:
-        """Request the parameters again after ``fresh_interval_s``: the scene may have changed."""
-        if not self._is_refresh_planned:
-            self._is_refresh_planned = True
-            self._start_task(self._refresh_parameters())
-
-    async def _refresh_parameters(self) -> None:
+    async def _announce_parameters(self, answer: ServerAnswer | None, version: int) -> None:
+        """Publish parameters, empty ones if the former are void; then mark the frames with their version."""
+        parameters = Parameters() if answer is None else answer.parsed.parameters
+        xml = b"" if answer is None else answer.xml
         try:
-            await asyncio.sleep(self.settings.fresh_interval_s)
-            await self.queries.parameters.get((), fresh=True, stale_ok=False)
-        except QueryError as error:
-            logger.debug("%s: parameters not refreshed: %s", self.name, error)
+            await self._publish_parameters(self.name, ServerParameters(xml, self.queries.session, version))
         finally:
-            self._is_refresh_planned = False
+            if version != self.parameters_version:
+                self.parameters_version = version
+                for stream in self._streams.known:
+                    stream.status.parameters_changed(version)
+                self._streams.parameters_changed(parameters)
+            self.fan_out.set_parameters(parameters)
 
     def _start_task(self, work: Coroutine[Any, Any, None]) -> None:
         task = asyncio.create_task(work)
@@ -268,15 +263,6 @@ class Source:
                     continue
                 return True
         return False
-
-
-def _session_ask(supervisor: Supervisor) -> Callable[[], SendCommand | None]:
-    """Return a function that returns ``ask`` of the current session; None while there is none."""
-
-    def ask() -> SendCommand | None:
-        return None if supervisor.session is None else supervisor.session.ask
-
-    return ask
 
 
 def _uncertainty_us(status: StreamStatus) -> float:

@@ -41,7 +41,10 @@ class ParameterServer:
         """The packets that are not commands."""
         self.xml = parameters_xml(marker)
         self.sections = {section: spec_xml(section) for section in SECTIONS}
-        """The replies to SendParameters for one section; ``xml`` is the reply to all others."""
+        """The replies to SendParameters for one section; ``xml`` is the reply to all others.
+
+        The gateway requests a section only if ``xml`` lacks it.
+        """
         self.refused_commands: tuple[str, ...] = ()
         """The prefixes of the commands that get an error."""
         self.ignored_commands: tuple[str, ...] = ()
@@ -89,6 +92,14 @@ class ParameterServer:
     def send(self, data: bytes) -> None:
         assert self.client is not None
         self.client.send(data)
+
+
+class ServerOfSections(ParameterServer):
+    """A server that sends most of its parameters only when they are requested by section."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.xml = in_root("<Other/>")
 
 
 def parameters_xml(*markers: str) -> bytes:
@@ -158,11 +169,11 @@ def output_queries(gateway: Gateway) -> Any:
     return only
 
 
-async def wait_until_cached(gateway: Gateway, server: ParameterServer) -> None:
-    """Wait until the gateway has requested all parameters and each section, and has cached them."""
-    await wait_until_async(lambda: server.count("SendParameters") >= 7)
+async def wait_until_cached(gateway: Gateway) -> None:
+    """Wait until the gateway knows the parameters, and its handshakes are done."""
     [source] = gateway.sources
-    await wait_until_async(lambda: not source._tasks)
+    await wait_until_async(lambda: source.queries.parameters.known.newest)
+    await wait_until_async(lambda: all(stream.session for stream in source.streams))
 
 
 class Reply(NamedTuple):
@@ -230,7 +241,7 @@ async def gateway_with_server(
         ScriptedServer(server.script) as listening,
         run_gateway(listening.port, listen=endpoint, **settings) as gateway,
     ):
-        await wait_until_cached(gateway, server)
+        await wait_until_cached(gateway)
         with zenoh_peer(endpoint) as peer:
             yield QuerySetup(server, listening.port, gateway, peer)
 

@@ -29,6 +29,7 @@ from gateway.config.values import (
     Components,
     FileLimit,
     Host,
+    IntervalSeconds,
     Milliseconds,
     Port,
     Seconds,
@@ -159,6 +160,9 @@ class SourceSettings(Section):
 
     fresh_interval_s: Seconds = 1.0
     """How long a reply of the server counts as fresh. It limits how often peers can query the server."""
+
+    parameters_interval_s: IntervalSeconds = 10.0
+    """How often to read the server's parameters again, for example for renamed markers. 0 means never."""
 
     remote_control: Switch = False
     """Whether peers may start and stop a recording on the server."""

@@ -35,11 +35,23 @@ def _absolute_path(text: str) -> str:
     return text
 
 
+def _zero_or_interval(seconds: float) -> float:
+    if 0 < seconds < 0.1:
+        raise ValueError
+    return seconds
+
+
 Switch = Annotated[bool, Field(strict=True), expects("true or false")]
 Seconds = Annotated[
     float,
     Field(strict=True, ge=0.001, le=86400, allow_inf_nan=False),
     expects("a number of seconds from 0.001 to 86400"),
+]
+IntervalSeconds = Annotated[
+    float,
+    Field(strict=True, ge=0, le=86400, allow_inf_nan=False),
+    AfterValidator(_zero_or_interval),
+    expects("0 for never, or a number of seconds from 0.1 to 86400"),
 ]
 Milliseconds = Annotated[
     float,

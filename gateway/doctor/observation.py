@@ -9,10 +9,12 @@ import numpy.typing as npt
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.findings import MessageLoad
 from gateway.messages.encode import ITEMS_OFFSET
+from gateway.rtc3d.commands import SendParameters
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import Parameters
-from gateway.rtc3d.parameters_xml import ParsedParameters
+from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
+from gateway.stream.parameters import Connection, process_xml
 from gateway.stream.plan import StreamPlan, plan_streams
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
@@ -105,7 +107,7 @@ class ObservedStream:
         self.observed: dict[ComponentType, ObservedComponent] = {}
         self.session = Session(source, stream, self.status, self._on_frames, lambda _content: None)
         self.control = StreamControl(
-            source, stream, self.status, self.session, self._on_parameters, self._planned_components
+            source, stream, self.status, self.session, self._read_parameters, self._planned_components
         )
         self._plans = plans
         self.plan = StreamPlan()
@@ -128,8 +130,10 @@ class ObservedStream:
         self._set_components(plan.groups[0])
         await self.control.request_components(plan.groups[0])
 
-    def _on_parameters(self, _xml: bytes, parsed: ParsedParameters) -> None:
-        self.parsed = parsed
+    async def _read_parameters(self, connection: Connection) -> ParsedParameters:
+        packet = await connection.ask(SendParameters())
+        self.parsed = await process_xml(packet.body, parse_parameters)
+        return self.parsed
 
     def _on_frames(self, frames: list[Frame], utime: int, steady_us: int) -> None:
         self.status.frames_received(len(frames), utime)

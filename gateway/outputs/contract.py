@@ -5,6 +5,7 @@ method or an attribute with a default that does nothing. An output overrides the
 caller checks the class of an output.
 """
 
+import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple, Protocol
@@ -71,7 +72,7 @@ class Answer(NamedTuple):
 
 
 class ServerParameters(NamedTuple):
-    """A server's parameters (§6): the XML as received.
+    """A server's parameters (§6): the XML as received, empty if the server gives none any more.
 
     ``session`` is the number of its session, ``version`` grows whenever the parameters change.
     """
@@ -190,8 +191,13 @@ class Output(ABC):
 
     # Parameters and files from the server.
 
-    def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
-        """Publish the parameters of a source's server. Called for every connection and every change."""
+    def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
+        """Publish the parameters of a source's server. Called for every connection and every change.
+
+        Returns a future if messages that are published from now on could overtake the parameters; it is done
+        when that is over.
+        """
+        return None
 
     def announce_file(self, source: str, description: Mapping[str, Any]) -> None:
         """Announce a C3D file that the server sent: ``name``, and ``bytes``, its size."""

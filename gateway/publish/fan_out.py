@@ -88,7 +88,7 @@ class FanOut:
     under the same number, except for those with a maximum rate (ComponentRoute).
 
     It calls ``on_items_changed``, which may be assigned later, when the number of markers, tools, channels
-    or plates changes.
+    or plates changes within a session.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class FanOut:
         self._tool_poses = ToolPoses()
         self._plan_for = lru_cache(_MAX_PLANS)(self._new_plan)
         self._plan: _Plan | None = None  # of the previous frame
-        self._num_items: dict[ComponentType, int] = {}
+        self._num_items: dict[ComponentType, tuple[int, int]] = {}  # with the session
         self._is_streaming = False
         self.set_outputs(outputs)
 
@@ -165,7 +165,7 @@ class FanOut:
     def publish(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> None:
         """Publish the ``wanted`` components of a frame. Raises nothing if an output fails."""
         # This is the inner loop of the gateway; benchmarks/own_cost.py measures it.
-        plan = self._plan_of(frame, wanted)
+        plan = self._plan_of(frame, stamp, wanted)
         if not plan.components:
             return
         for frame_route in self._frame_routes:
@@ -183,7 +183,7 @@ class FanOut:
 
         Returns how many messages are lost thereby. A message that pacing leaves out on every output is not.
         """
-        plan = self._plan_of(frame, components)
+        plan = self._plan_of(frame, stamp, components)
         if not plan.components:
             return 0
         self._frame_sequence += 1
@@ -194,11 +194,11 @@ class FanOut:
             num_lost += any(is_lost) or bool(self._frame_routes)
         return num_lost
 
-    def _plan_of(self, frame: Frame, wanted: frozenset[ComponentType]) -> _Plan:
+    def _plan_of(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> _Plan:
         plan = self._plan
         if plan is None or plan.layout is not frame.layout or plan.wanted is not wanted:
             self._plan = plan = self._plan_for(frame.layout, wanted)
-            self._check_item_counts(plan)
+            self._check_item_counts(plan, stamp.session)
         return plan
 
     def _new_plan(self, layout: FrameLayout, wanted: frozenset[ComponentType]) -> _Plan:
@@ -215,17 +215,18 @@ class FanOut:
         tools = [index for index, component in indexed if component.type is ComponentType.TOOLS]
         return _Plan(layout, wanted, plans, tools if self._tool_poses.is_used else [])
 
-    def _check_item_counts(self, plan: _Plan) -> None:
-        """Log and report every component whose number of items has changed."""
+    def _check_item_counts(self, plan: _Plan, session: int) -> None:
+        """Log every component whose number of items has changed, and report it if that is news."""
         for component, num_items in plan.num_items.items():
-            before = self._num_items.get(component)
-            self._num_items[component] = num_items
-            if before is not None and before != num_items:
+            before, session_before = self._num_items.get(component, (num_items, session))
+            self._num_items[component] = (num_items, session)
+            if before != num_items:
                 logger.info(
                     "%s: number of items in %s changed from %d to %d",
                     *(self._source, component.key, before, num_items),
                 )
-                self.on_items_changed()
+                if session == session_before:  # otherwise the handshake has just been done
+                    self.on_items_changed()
 
     def has_subscribers(self, components: Collection[ComponentType]) -> bool:
         """Return whether any output may have a subscriber to any of ``components``."""

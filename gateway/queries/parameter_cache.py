@@ -1,184 +1,304 @@
-"""The parameters of one source's server: cached, and requested again where the cache is not enough.
+"""The parameters of one source's server: read at each connection, read again, and given to peers.
 
-For ``fresh_interval_s`` after an answer, a ``fresh`` query gets that answer and does not reach the server.
+The server is asked for all of its parameters at once, and a peer's query for one section is answered from
+that. For ``fresh_interval_s`` after an answer, a ``fresh`` query gets that answer and does not reach the
+server, and neither does the handshake of another connection.
 """
 
 import asyncio
+import contextlib
 import logging
-import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Final, NamedTuple
+import math
+from dataclasses import dataclass, field, replace
 
 from gateway.config.settings import SourceSettings
-from gateway.errors import ParametersError, QueryError
-from gateway.queries.answers import parameters_json
+from gateway.errors import (
+    GatewayError,
+    ParametersError,
+    QueryError,
+    ReplyTimeoutError,
+    ServerError,
+)
+from gateway.log import FailureLog
+from gateway.queries.known_parameters import (
+    Announce,
+    KnownParameters,
+    Sections,
+    ServerAnswer,
+    now_s,
+    unreadable,
+)
 from gateway.queries.server_requests import ServerRequests
 from gateway.rtc3d.commands import SendParameters
-from gateway.rtc3d.parameters import SECTIONS, without_statistics
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
-
-LONG_XML_BYTES: Final = 64 * 1024
-"""Longer XML is parsed in a thread: 1 MiB of it, made to be slow, takes 4 s."""
-
-Sections = tuple[str, ...]
-"""The parameter sections of a query, as in SECTIONS; () for all."""
+from gateway.stream.parameters import Connection, process_xml
 
 logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class CachedParameters:
-    """A server's answer to SendParameters. ``parsed`` is None if nothing could be read from it."""
-
-    sections: Sections
-    xml: bytes
-    parsed: ParsedParameters | None
-    session: int
-    received_s: float = field(default_factory=time.monotonic)
-
-    @property
-    def age_s(self) -> float:
-        """How long ago the answer arrived."""
-        return time.monotonic() - self.received_s
-
-    @cached_property
-    def json(self) -> bytes | None:
-        """The parameters as JSON, built once for all queries; None if the answer has none of them."""
-        if self.parsed is None:
-            return None
-        return parameters_json(self.parsed.parameters, self.sections[0] if len(self.sections) == 1 else "")
-
-    @cached_property
-    def without_statistics(self) -> object:
-        """What is compared to find changes: the parameters without the server's statistics (§6.1)."""
-        if self.parsed is None:
-            return self.xml
-        return without_statistics(self.parsed.parameters)
-
-
-def parse_answer(sections: Sections, xml: bytes, session: int) -> CachedParameters:
-    """Parse the server's answer to SendParameters for ``sections``, and convert it to JSON."""
-    try:
-        cached = CachedParameters(sections, xml, parse_parameters(xml), session)
-    except ParametersError:
-        return CachedParameters(sections, xml, None, session)
-    _ = cached.json  # convert it here, because this function may run in a thread
-    return cached
-
-
-class _Refusal(NamedTuple):
+class _Refusal:
     """The server's refusal of SendParameters."""
 
-    text: str
-    session: int
-    received_s: float
+    error: QueryError
+    received_s: float = field(default_factory=now_s)
 
 
 class ParameterCache:
-    """The answers to SendParameters, by the sections that were requested.
+    """The answers to SendParameters. ``known`` has the newest for all sections; ``announce`` gets changes.
 
-    ``on_change`` is called with all parameters when they differ from the last ones.
+    ``former`` is the cache of the source before a reload.
     """
 
     def __init__(
         self,
         settings: SourceSettings,
         requests: ServerRequests,
-        on_change: Callable[[bytes, ParsedParameters], None],
+        announce: Announce,
+        former: "ParameterCache | None" = None,
     ) -> None:
         self._settings = settings
         self._requests = requests
-        self._on_change = on_change
-        self._cached: dict[Sections, CachedParameters] = {}
+        self.known: KnownParameters = KnownParameters(
+            settings.name, announce, None if former is None else former.known
+        )
+        # To servers that gave the newest parameters: there, or at the same time on another connection.
+        self._connections: list[Connection] = []
+        self._refusing: Connection | None = None  # one of these, on which the server refused them later on
+        # By a handshake; None as result means that other handshakes have to ask themselves.
+        self._reading: asyncio.Future[ParsedParameters | None] | None = None
+        # What the server answered about sections that the answer for all of them does not give, or for all
+        # of them if that cannot be read. All of this is cleared when a connection begins.
+        self._answers: dict[Sections, ServerAnswer] = {}
         self._refusals: dict[Sections, _Refusal] = {}
-        self._session_without_sections: int | None = None  # whose server does not send single sections
-
-    def store(self, xml: bytes, parsed: ParsedParameters) -> None:
-        """Cache all parameters, as the server sent them at the start of a connection."""
-        self._cached[()] = CachedParameters((), xml, parsed, self._requests.session)
+        self._sends_sections = True
+        self._problems = FailureLog(logger, settings.name)
 
     @property
-    def xml(self) -> bytes | None:
-        """All parameters as the server last sent them; None before the first time."""
-        cached = self._cached.get(())
-        return None if cached is None else cached.xml
+    def last_read_s(self) -> float:
+        """When the server last sent all its parameters, on the event loop's clock; -inf if it never did."""
+        newest = self.known.newest
+        return -math.inf if newest is None else newest.received_s
 
-    async def get(self, sections: Sections, *, fresh: bool, stale_ok: bool) -> CachedParameters:
+    # At the start of a connection.
+
+    async def read_for_handshake(self, connection: Connection) -> ParsedParameters:
+        """Return the parameters for the handshake of a new connection; see ReadParameters.
+
+        If the server gives none, those of earlier connections are void. Streams of one source that connect
+        at the same time share one request, but not with a connection that has ended meanwhile: after a
+        restart, the server may be another one.
+        """
+        while self._reading is not None:
+            shared = await asyncio.shield(self._reading)
+            if shared is not None:
+                return await self._share(connection, shared)
+        newest = self.known.newest
+        if newest is not None and self._is_current and self._is_valid(newest, fresh=True):
+            return await self._share(connection, newest.parsed)
+        self._reading = reading = asyncio.get_running_loop().create_future()
+        try:
+            parsed = await self._read(connection)
+        except (ServerError, ReplyTimeoutError, ParametersError) as error:
+            reading.set_exception(error)
+            reading.exception()  # retrieve it, even if no other stream waits
+            raise
+        except BaseException:  # The connection was lost, or the stream is stopped.
+            reading.set_result(None)
+            raise
+        else:
+            reading.set_result(parsed)
+            return parsed
+        finally:
+            self._reading = None
+
+    async def _share(self, connection: Connection, parsed: ParsedParameters) -> ParsedParameters:
+        self._connections.append(connection)
+        await self.known.share(self._requests.session)
+        return parsed
+
+    async def _read(self, connection: Connection) -> ParsedParameters:
+        self._connections = [each for each in self._connections if each.is_open]
+        self._answers.clear()
+        self._refusals.clear()
+        self._sends_sections = True
+        command = SendParameters()
+        try:
+            packet = await connection.ask(command)
+        except ServerError as error:
+            self._refusals[()] = _Refusal(self._requests.refused(command, error))
+            await self._lose(f"it refuses {command}: {error}")
+            raise
+        except ReplyTimeoutError as error:
+            await self._lose(str(error))
+            raise
+        try:
+            answer = await self.known.take(packet.body, self._requests.session, announce_always=True)
+        except ParametersError as error:
+            self._keep_unreadable((), packet.body, error)
+            await self._lose(str(error))
+            raise
+        self._connections.append(connection)
+        self._problems.recovered("the server sends its parameters again")
+        return answer.parsed
+
+    async def _lose(self, reason: str) -> None:
+        """Make the former parameters void, unless the server still gives them on another connection."""
+        if not self._is_current:
+            await self.known.make_void(reason)
+
+    # While connections are open.
+
+    async def refresh(self) -> None:
+        """Ask again for all parameters, over a connection on which the server gave them and did not refuse.
+
+        Without such a connection, do nothing. If there is no answer, the former parameters stay valid.
+        """
+        for connection in self._connections:
+            if connection is not self._refusing and connection in self._requests.connections:
+                with contextlib.suppress(QueryError):
+                    await self._request_all(connection)
+                return
+
+    async def get(self, sections: Sections, *, fresh: bool, stale_ok: bool) -> ServerAnswer:
         """Return the server's answer for some sections, () for all, from the cache or from the server.
 
         The answer of an earlier connection is returned only while there is none, and only if ``stale_ok``.
         Raises QueryError.
         """
-        cached = self._cached.get(sections)
         if not self._requests.is_connected:
-            if cached is None or not stale_ok:
+            stale = await self._stale(sections) if stale_ok else None
+            if stale is None:
                 raise self._requests.no_connection_error()
-            return cached
-        if cached is not None and self._is_valid(cached, fresh=fresh):
-            return cached
+            return stale
+        try:
+            return await self._get(sections, fresh=fresh)
+        except QueryError as error:
+            if self.known.is_void and error.code in {"refused", "timeout"}:
+                text = f"{error}; the parameters of its earlier connections are void"
+                raise QueryError(text, code=error.code) from error
+            raise
+
+    async def _stale(self, sections: Sections) -> ServerAnswer | None:
+        newest = self.known.newest
+        if newest is None or not sections:
+            return newest
+        return await newest.part(sections) or self._answers.get(sections)
+
+    async def _get(self, sections: Sections, *, fresh: bool) -> ServerAnswer:
+        everything = None
+        try:
+            everything = await self._get_all(fresh=fresh)
+        except QueryError as error:
+            if not sections or error.code != "refused":
+                raise
+        if everything is not None:
+            part = await everything.part(sections) if sections else everything
+            if part is not None:
+                return part
+        # The answer for all sections lacks these, or is not well-formed: only the server can tell.
+        answer = self._answers.get(sections)
+        if answer is not None and self._is_valid(answer, fresh=fresh):
+            return answer
+        self._check_refusal(sections, fresh=fresh)
+        return await self._requests.share(
+            ("parameters", sections), lambda: self._request_sections(sections, everything)
+        )
+
+    async def _get_all(self, *, fresh: bool) -> ServerAnswer:
+        for answer in (self.known.newest if self._is_current else None, self._answers.get(())):
+            if answer is not None and self._is_valid(answer, fresh=fresh):
+                return answer
+        self._check_refusal((), fresh=fresh)
+        return await self._request_all(self._any_connection())
+
+    @property
+    def _is_current(self) -> bool:
+        """Whether the newest parameters are those of a server that is still connected."""
+        return any(connection.is_open for connection in self._connections)
+
+    def _is_valid(self, answer: ServerAnswer | _Refusal, *, fresh: bool) -> bool:
+        return not fresh or now_s() - answer.received_s < self._settings.fresh_interval_s
+
+    def _check_refusal(self, sections: Sections, *, fresh: bool) -> None:
         refusal = self._refusals.get(sections)
         if refusal is not None and self._is_valid(refusal, fresh=fresh):
-            raise QueryError(refusal.text, code="refused")
-        return await self._requests.share(("parameters", sections), lambda: self._request(sections))
+            raise refusal.error
 
-    async def fill(self) -> None:
-        """Request each section, so that the cache has the server's own answer to every query.
+    # Requests to the server.
 
-        Do nothing if the server did not send its parameters at the start of the connection.
-        """
-        everything = self._cached.get(())
-        if everything is None or everything.session != self._requests.session:
-            return
-        for section in SECTIONS:
-            try:
-                await self.get((section,), fresh=False, stale_ok=False)
-            except QueryError as error:
-                logger.debug("%s: section %s is not available: %s", self._settings.name, section, error)
-                if error.code != "refused":
-                    return
+    def _any_connection(self) -> Connection:
+        """Return a connection, if possible one on which the server gave its parameters; raises QueryError."""
+        ready = self._requests.connections
+        if not ready:
+            raise self._requests.no_connection_error()
+        return next((connection for connection in self._connections if connection in ready), ready[0])
 
-    def _is_valid(self, answer: CachedParameters | _Refusal, *, fresh: bool) -> bool:
-        """Return whether an answer is of this connection and, for ``fresh``, recent enough."""
-        if answer.session != self._requests.session:
-            return False
-        return not fresh or time.monotonic() - answer.received_s < self._settings.fresh_interval_s
+    async def _request_all(self, connection: Connection) -> ServerAnswer:
+        return await self._requests.share(("parameters", ()), lambda: self._send_request(connection))
 
-    async def _request(self, sections: Sections) -> CachedParameters:
-        """Request some sections; request all parameters if the server does not send single sections."""
-        session = self._requests.session
-        everything = SendParameters()
-        takes_sections = bool(sections) and self._session_without_sections != session
-        command = SendParameters(sections) if takes_sections else everything
+    async def _send_request(self, connection: Connection) -> ServerAnswer:
         try:
-            answered, packet = await self._requests.send(
-                command, fallback=everything if takes_sections else None
-            )
+            _, packet = await self._requests.send(SendParameters(), connection=connection)
         except QueryError as error:
             if error.code == "refused":
-                self._refusals[sections] = _Refusal(str(error), session, time.monotonic())
+                self._refusals[()] = _Refusal(error)
+                self._refusing = connection
+            if error.code in {"refused", "timeout"}:
+                self._report_problem(connection, error)
             raise
-        if answered != command:
-            self._session_without_sections = session
-        if len(packet.body) > LONG_XML_BYTES:
-            answer = await asyncio.to_thread(parse_answer, sections, packet.body, session)
-        else:
-            answer = parse_answer(sections, packet.body, session)
-        before, self._cached[sections] = self._cached.get(sections), answer
-        if (
-            before is None
-            or before.session != session
-            or answer.without_statistics != before.without_statistics
-        ):
-            self._handle_change(answer, before)
+        version = self.known.version
+        try:
+            answer = await self.known.take(packet.body, self._requests.session)
+        except ParametersError as error:
+            self._report_problem(connection, error)
+            return self._keep_unreadable((), packet.body, error)
+        self._refusing = None
+        if connection not in self._connections:
+            self._connections.append(connection)
+        if answer.version != version:
+            self._answers.clear()
+        self._answers.pop((), None)
+        self._problems.recovered("the server sends its parameters again")
         return answer
 
-    def _handle_change(self, answer: CachedParameters, before: CachedParameters | None) -> None:
-        """Report changed parameters. If only a section was requested, request all of them first."""
-        if answer.sections:
-            if before is not None and before.session == answer.session:
-                self._requests.start(("parameters", ()), lambda: self._request(()))
-        elif answer.parsed is not None:
-            self._cached = {(): answer}  # every section must be requested again
-            self._on_change(answer.xml, answer.parsed)
+    def _report_problem(self, connection: Connection, error: GatewayError) -> None:
+        """Log once that parameters cannot be read again over a connection on which that was possible."""
+        if connection in self._connections and connection.is_open:
+            self._problems.failed(
+                f"the parameters cannot be read again: {error}; names and units stay as they were, and "
+                "changes on the server are not noticed"
+            )
+
+    async def _request_sections(self, sections: Sections, everything: ServerAnswer | None) -> ServerAnswer:
+        """Request some sections; if the server does not send single ones, return ``everything``."""
+        if everything is not None and not self._sends_sections:
+            answer = replace(everything, sections=sections)
+        else:
+            try:
+                _, packet = await self._requests.send(
+                    SendParameters(sections), connection=self._any_connection()
+                )
+            except QueryError as error:
+                if error.code == "refused":
+                    self._refusals[sections] = _Refusal(error)
+                if everything is None or error.code not in {"refused", "timeout"}:
+                    raise
+                self._sends_sections = False
+                answer = replace(everything, sections=sections)
+            else:
+                answer = await self._parse(sections, packet.body)
+        self._answers[sections] = answer
+        return answer
+
+    async def _parse(self, sections: Sections, xml: bytes) -> ServerAnswer:
+        session, version = self._requests.session, self.known.version
+        try:
+            return ServerAnswer(sections, xml, await process_xml(xml, parse_parameters), session, version)
+        except ParametersError as error:
+            return self._keep_unreadable(sections, xml, error)
+
+    def _keep_unreadable(self, sections: Sections, xml: bytes, error: ParametersError) -> ServerAnswer:
+        session, version = self._requests.session, self.known.version
+        self._answers[sections] = answer = unreadable(sections, xml, session, version, error)
+        return answer

@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Hashable, Sequence
+from collections.abc import Callable, Coroutine, Hashable, Sequence
 from typing import Any, NamedTuple, TypeVar
 
 from gateway.config.settings import SourceSettings
@@ -12,11 +12,9 @@ from gateway.log import DefectLog
 from gateway.rtc3d.commands import Command
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet
+from gateway.stream.parameters import Connection
 from gateway.stream.running_time import running_timeout
 from gateway.stream.status import StreamStatus
-
-SendCommand = Callable[[Command], Awaitable[Packet]]
-"""Sends a command to the server and returns its reply; raises ServerError, ReplyTimeoutError or LinkError."""
 
 _Result = TypeVar("_Result")
 
@@ -24,11 +22,11 @@ logger = logging.getLogger(__name__)
 
 
 class StreamAccess(NamedTuple):
-    """What queries need of one stream. ``sender`` returns None while there is no connection."""
+    """What queries need of one stream now. ``connection`` is None while there is none that takes commands."""
 
     components: Sequence[ComponentType]
     status: StreamStatus
-    sender: Callable[[], SendCommand | None]
+    connection: Connection | None
 
 
 class ServerRequests:
@@ -54,7 +52,7 @@ class ServerRequests:
     @property
     def is_connected(self) -> bool:
         """Whether any stream has a connection."""
-        return any(stream.sender() is not None for stream in self._streams())
+        return bool(self.connections)
 
     def no_connection_error(self) -> QueryError:
         """Return the error that says why there is no connection, since when, and what to do about it."""
@@ -69,23 +67,22 @@ class ServerRequests:
         return QueryError(text, code="no-connection")
 
     async def send(
-        self, command: Command, *, fallback: Command | None = None, stream: StreamAccess | None = None
+        self, command: Command, *, fallback: Command | None = None, connection: Connection | None = None
     ) -> tuple[Command, Packet]:
         """Send a command, and ``fallback`` if the server refuses or ignores it; return the one answered.
 
-        The second value is the server's reply. Without ``stream`` any connection is used. Raises QueryError,
-        at the latest after query_timeout_s, which includes the wait for earlier requests.
+        The second value is the server's reply. Without ``connection`` any one is used. Raises QueryError, at
+        the latest after query_timeout_s, which includes the wait for earlier requests.
         """
         name, timeout_s = f"source {self._settings.name!r}", self._settings.query_timeout_s
-        streams = self._streams() if stream is None else [stream]
         try:
             async with running_timeout(timeout_s), self._lock:
                 try:
-                    return command, await self._send(command, streams)
+                    return command, await self._send(command, connection)
                 except QueryError:
                     if fallback is None:
                         raise
-                return fallback, await self._send(fallback, streams)
+                return fallback, await self._send(fallback, connection)
         except LinkError as error:
             raise QueryError(f"{name} has just lost its connection: {error}", code="no-connection") from error
         except TimeoutError:
@@ -93,18 +90,28 @@ class ServerRequests:
             text = f"{name}: no answer within {timeout_s:g} s; {waiting}"
             raise QueryError(text, code="timeout") from None
 
-    async def _send(self, command: Command, streams: Sequence[StreamAccess]) -> Packet:
-        send = next((sender for stream in streams if (sender := stream.sender()) is not None), None)
-        if send is None:
+    @property
+    def connections(self) -> list[Connection]:
+        """The connections that take commands."""
+        return [stream.connection for stream in self._streams() if stream.connection is not None]
+
+    async def _send(self, command: Command, connection: Connection | None) -> Packet:
+        if connection is None:
+            connection = next(iter(self.connections), None)
+        if connection is None:
             raise self.no_connection_error()
         name = f"source {self._settings.name!r}"
         try:
-            return await send(command)
+            return await connection.ask(command)
         except ServerError as error:
-            text = f"{name}: the server does not know {command}, or refuses it: {error}"
-            raise QueryError(text, code="refused") from error
+            raise self.refused(command, error) from error
         except ReplyTimeoutError as error:
             raise QueryError(f"{name}: {error}", code="timeout") from error
+
+    def refused(self, command: Command, error: ServerError) -> QueryError:
+        """Return the error that says that the server refuses ``command``."""
+        text = f"source {self._settings.name!r}: the server does not know {command}, or refuses it: {error}"
+        return QueryError(text, code="refused")
 
     async def share(self, key: Hashable, work: Callable[[], Coroutine[Any, Any, _Result]]) -> _Result:
         """Return the result of ``work``; callers with an equal ``key`` at the same time share one run."""

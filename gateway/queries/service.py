@@ -82,8 +82,7 @@ class SourceQueryService:
         """See QueryService."""
         check_sections(sections)
         ordered = tuple(section for section in SECTIONS if section in sections)
-        queries = self._sources()[source]
-        cached = await queries.parameters.get(
+        cached = await self._sources()[source].parameters.get(
             () if ordered == tuple(SECTIONS) else ordered, fresh=fresh, stale_ok=False
         )
-        return ServerParameters(cached.xml, cached.session, queries.parameters_version, cached.age_s)
+        return ServerParameters(cached.xml, cached.session, cached.version, cached.age_s)

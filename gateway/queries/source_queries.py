@@ -15,6 +15,7 @@ from gateway.messages.stamp import NOT_PUBLISHED, Stamp
 from gateway.outputs.contract import Answer
 from gateway.outputs.encodings import JSON, XML, json_bytes
 from gateway.queries.answers import message_answer, schema_answer
+from gateway.queries.known_parameters import Announce
 from gateway.queries.parameter_cache import ParameterCache
 from gateway.queries.questions import Question
 from gateway.queries.server_requests import ServerRequests, StreamAccess
@@ -22,7 +23,7 @@ from gateway.rtc3d.commands import SendCurrentFrame
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, Component, ComponentType
 from gateway.rtc3d.frames import detect_byte_order, split_frame
 from gateway.rtc3d.packets import PacketType
-from gateway.rtc3d.parameters_xml import ParsedParameters
+from gateway.stream.parameters import process_xml
 from gateway.stream.state import StreamState
 
 
@@ -31,8 +32,9 @@ class SourceQueries:
 
     ``newest_message`` returns the newest message of a component as the output of a name numbers it.
     ``last_c3d`` raises QueryError if there is no file. ``record`` starts (True) or stops a recording, and
-    returns False if there is no connection. ``on_change`` is called with all parameters when the server's
-    parameters change.
+    returns False if there is no connection. ``announce_parameters`` takes the server's parameters when they
+    change. ``before`` are the queries of the source that this one replaces after a reload; its parameters
+    continue.
     """
 
     def __init__(
@@ -43,7 +45,8 @@ class SourceQueries:
         status_message: Callable[[], bytes],
         last_c3d: Callable[[], Coroutine[Any, Any, Answer]],
         record: Callable[[bool], bool],
-        on_change: Callable[[bytes, ParsedParameters], None],
+        announce_parameters: Announce,
+        before: "SourceQueries | None" = None,
     ) -> None:
         self._settings = settings
         self._streams = streams
@@ -52,7 +55,9 @@ class SourceQueries:
         self._last_c3d = last_c3d
         self._record = record
         self._requests = ServerRequests(settings, streams)
-        self.parameters = ParameterCache(settings, self._requests, on_change)
+        self.parameters: ParameterCache = ParameterCache(
+            settings, self._requests, announce_parameters, None if before is None else before.parameters
+        )
 
     @property
     def components(self) -> frozenset[ComponentType]:
@@ -94,27 +99,28 @@ class SourceQueries:
         attachment: dict[str, Any] = {
             "age_s": round(cached.age_s, 3),
             "session": cached.session,
-            "parameters_version": self.parameters_version,
+            "parameters_version": cached.version,
         }
         if not self._requests.is_connected:
             attachment["stale"] = True
         if not question.as_json:
             return Answer(cached.xml, XML, attachment)
-        if cached.parsed is None:
+        if not cached.is_readable:
             raise QueryError(
                 "the server's XML cannot be read; ask without format=json to see it as received",
                 code="unreadable",
             )
-        if cached.json is None:
+        payload = await process_xml(cached.xml, lambda _xml: cached.json)
+        if payload is None:
             raise QueryError(f"the server's answer has no section {question.name}", code="nothing-yet")
-        return Answer(cached.json, JSON, attachment | {"recovered": list(cached.parsed.recovered)})
+        return Answer(payload, JSON, attachment | {"recovered": list(cached.parsed.recovered)})
 
     async def _component(self, question: Question, output: str) -> Answer:
         """Return the newest message of the stream; while it does not run, ask for the current frame."""
         component = COMPONENTS_BY_KEY[question.name]
         stream = next(stream for stream in self._streams() if component in stream.components)
         session = stream.status.session
-        if stream.sender() is None:
+        if stream.connection is None:
             raise self._requests.no_connection_error()
         if stream.status.state is StreamState.STREAMING:
             message = self._newest_message(component, output)
@@ -140,7 +146,7 @@ class SourceQueries:
         If the server does not accept the component's name, request the whole frame (field note 2).
         """
         _, packet = await self._requests.send(
-            SendCurrentFrame((component,)), fallback=SendCurrentFrame(), stream=stream
+            SendCurrentFrame((component,)), fallback=SendCurrentFrame(), connection=stream.connection
         )
         if packet.type == PacketType.NO_DATA:
             raise QueryError(f"source {self._settings.name!r}: no measurement runs", code="nothing-yet")

@@ -13,13 +13,24 @@ _MAX_LABEL_CHARACTERS: Final = 40
 
 def differ_in_statistics_only(before: bytes, after: bytes) -> bool:
     """Return whether two XML replies are the same except for the statistics of §6.1. Cheap for long XML."""
-    return _cut_statistics(before) == _cut_statistics(after)
+    return _without(before, _statistics(before)) == _without(after, _statistics(after))
 
 
-def _cut_statistics(xml: bytes) -> bytes:
-    start = xml.find(b"<Stats")
+def statistics_xml(xml: bytes) -> bytes:
+    """Return the statistics of §6.1 in an XML reply as a reply of their own; b"" if it has none."""
+    found = xml[_statistics(xml)]
+    return b"<RT_Parameters><General><Server>%b</Server></General></RT_Parameters>" % found if found else b""
+
+
+def _statistics(xml: bytes) -> slice:
+    """Return where the element of the statistics is; an empty slice if there is none."""
+    start = xml.find(b"<Stats>")
     end = xml.find(b"</Stats>", start)
-    return xml if start < 0 or end < 0 else xml[:start] + xml[end:]
+    return slice(0, 0) if start < 0 or end < 0 else slice(start, end + len(b"</Stats>"))
+
+
+def _without(xml: bytes, part: slice) -> bytes:
+    return xml[: part.start] + xml[part.stop :]
 
 
 def describe_renames(before: Parameters, after: Parameters) -> str:

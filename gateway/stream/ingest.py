@@ -57,6 +57,7 @@ class Ingest:
         self._wanted = frozenset(components)
         self._wanted_events = self._wanted & _EVENTS
         self._skippable = self._wanted - _EVENTS
+        self._has_stamped = False  # a frame of this session
         self._layout: FrameLayout | None = None  # of the newest frame
 
     @property
@@ -140,11 +141,13 @@ class Ingest:
         if restarted:
             self._status.server_restarted()
             self._lag.restart()
-            self._on_restart()
+            if self._has_stamped:  # otherwise the handshake has just been done
+                self._on_restart()
         elif clock.has_clock:
             self._status.lag_measured(lag_s)
             if self._lag.observe(steady_us * 1e-6, lag_s):
                 self._on_lateness(self._lag.halvings)
+        self._has_stamped = True
         return Stamp(
             utime,
             capture_us + (utime - steady_us),

@@ -59,21 +59,21 @@ class StreamStatus:
     Most methods are named after the event that they report.
 
     ``components`` are the stream's components, separated by spaces. ``name`` begins the stream's log
-    lines. ``on_state`` is called with each new state. ``parameters_version`` is that of the server's
-    parameters, 0 before the first; all streams of a source have the same. ``last_frame_utime`` is when the
-    newest frame arrived, in µs since the Unix epoch, 0 before the first; ``last_frame_s`` is the same on the
-    running clock (see ``gateway.stream.running_clock``), None before the first. ``tries`` counts the attempts
-    to connect since the last completed handshake, ``reconnects`` all attempts except the first. ``restarts``
-    counts how often the server's time or frame numbers started again within a connection. ``losses`` counts
-    by cause what arrived and was not published. ``limitations`` lists what the current connection lacks.
-
-    ``unwanted_components`` are the components of the newest frame if it had none of this stream's;
-    ``unwanted_since_s`` is since when all frames were like that, on the running clock.
+    lines. ``on_state`` is called after each change of the state, with the former one. ``parameters_version``
+    is that of the server's parameters, 0 before the first; all streams of a source have the same.
+    ``last_frame_utime`` is when the newest frame arrived, in µs since the Unix epoch, 0 before the first;
+    ``last_frame_s`` is the same on the running clock (see ``gateway.stream.running_clock``), None before the
+    first. ``tries`` counts the attempts to connect since the last completed handshake, ``reconnects`` all
+    attempts except the first. ``restarts`` counts how often the server's time or frame numbers started again
+    within a connection. ``losses`` counts by cause what arrived and was not published. ``limitations`` lists
+    what the current connection lacks. ``unwanted_components`` are the components of the newest frame if it
+    had none of this stream's; ``unwanted_since_s`` is since when all frames were like that, on the running
+    clock.
     """
 
     components: str
     name: str = ""
-    on_state: Callable[[StreamState], None] = lambda _state: None
+    on_state: Callable[[StreamState], None] = lambda _former: None
     state: StreamState = StreamState.WAITING
     byte_order: str = ""
     rate: str = ""
@@ -278,7 +278,7 @@ class StreamStatus:
         logger.log(level, "%s: %s → %s: %s (%s)", self.name, before.value, self.state.value, event, cause)
         if self.state in _RECEIVING:
             self._failures.recovered(f"{self.state.value} again")
-        self.on_state(self.state)
+        self.on_state(before)
 
 
 class FrameRate:

@@ -18,13 +18,10 @@ from gateway.rtc3d.commands import (
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import Parameters
-from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
+from gateway.stream.parameters import ReadParameters
 from gateway.stream.rate_control import halved, stream_requests
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
-
-OnParameters = Callable[[bytes, ParsedParameters], None]
-"""Takes the server's XML as received, and its parsed form."""
 
 logger = logging.getLogger(__name__)
 
@@ -52,7 +49,7 @@ class StreamControl:
         stream: StreamSettings,
         status: StreamStatus,
         session: Session,
-        on_parameters: OnParameters,
+        read_parameters: ReadParameters,
         choose_components: Callable[[Parameters | None], Sequence[ComponentType]] | None = None,
     ) -> None:
         self._source = source
@@ -60,7 +57,7 @@ class StreamControl:
         self._stream = stream
         self._status = status
         self._session = session
-        self._on_parameters = on_parameters
+        self._read_parameters = read_parameters
         self._choose_components = choose_components or (lambda _parameters: stream.components)
         self._frequency_hz: float | None = None  # of the markers, as the server announces it
         self.accepted = StreamFrames()
@@ -205,19 +202,21 @@ class StreamControl:
         return outcome
 
     async def _fetch_parameters(self) -> Parameters | None:
-        """Return the server's parameters and pass them on; None if there are none."""
-        packet = await self._ask_optional(SendParameters())
-        if packet is None:
-            return None
+        """Return the server's parameters; None if there are none."""
         try:
-            parsed = parse_parameters(packet.body)
+            parsed = await self._read_parameters(self._session)
+        except ServerError as error:
+            self._status.add_limitation(f"the server refused {SendParameters()}: {error}")
+        except ReplyTimeoutError:
+            self._is_slow = True
+            self._status.add_limitation(f"the server did not answer {SendParameters()}")
         except ParametersError as error:
             self._status.add_limitation(f"no parameters: {error}")
-            return None
-        for text in parsed.recovered:
-            logger.info("%s: parameters repaired: %s", self._source.name, text)
-        self._on_parameters(packet.body, parsed)
-        return parsed.parameters
+        else:
+            for text in parsed.recovered:
+                logger.info("%s: parameters repaired: %s", self._source.name, text)
+            return parsed.parameters
+        return None
 
     async def _ask_optional(self, command: Command) -> Packet | None:
         """Send ``command``; return the answer, or None if the server refused or did not answer."""

@@ -15,11 +15,12 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.stream.change_tasks import ChangeTasks
 from gateway.stream.ingest import Ingest, Publish, Skip
+from gateway.stream.parameters import ReadParameters
 from gateway.stream.rate_watch import AnnouncedRates, RateWatch
 from gateway.stream.session import OnFile, ReadClocks, Session
 from gateway.stream.state import StreamState
 from gateway.stream.status import FrameRate, StreamStatus
-from gateway.stream.stream_control import OnParameters, StreamControl
+from gateway.stream.stream_control import StreamControl
 from gateway.stream.tcp import Connect, open_connection
 
 logger = logging.getLogger(__name__)
@@ -32,10 +33,8 @@ class Callbacks(NamedTuple):
     """Takes a frame to publish."""
     skip: Skip
     """Takes a frame that is not published because frames are late."""
-    on_parameters: OnParameters
-    """Takes the parameters that the server sends in each handshake."""
-    on_connected: Callable[[], None]
-    """Called when the handshake is done and ``Supervisor.session`` takes commands."""
+    read_parameters: ReadParameters
+    """Returns the server's parameters for each handshake."""
     on_restart: Callable[[], None]
     """Called when the server's frame numbers or time stamps start again within a connection."""
     on_file: OnFile
@@ -200,7 +199,7 @@ class Supervisor:
             self.settings,
             self.status,
             session,
-            self._callbacks.on_parameters,
+            self._callbacks.read_parameters,
             self._planned_components,
         )
         changes = self._changes = ChangeTasks(
@@ -218,7 +217,6 @@ class Supervisor:
             self._ready_session = session
             if set(control.accepted.components) not in (set(), set(self.settings.components)):
                 changes.request_components(self.settings.components)  # they changed in the meantime
-            self._callbacks.on_connected()
             changes.start()
             await session.monitor(control.check_silence)
         finally:

@@ -49,7 +49,7 @@ class parameters_t(object):
 
         self.xml = ""
         """
-        The server's XML, unchanged.
+        The server's XML, unchanged. Empty: the server gives no parameters now, and the earlier ones are void.
         LCM Type: string
         """
 

@@ -76,7 +76,7 @@ async def test_bytes_behind_every_body_change_nothing_that_is_published() -> Non
         contents = [data[40:] for topic, data in gateway.output.messages if topic.path == ("3d",)]
         assert contents == [each[20:] for each in frames for _ in range(3)]
         assert "bytes behind the last component of a frame are ignored" in gateway.status.limitations
-        assert gateway.source.queries.parameters.xml is not None
+        assert gateway.source.queries.parameters.known.newest is not None
 
 
 async def test_each_stream_has_its_own_connection() -> None:

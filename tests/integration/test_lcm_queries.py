@@ -17,7 +17,13 @@ from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.rtc3d.parameters import SECTIONS
 from tests.networks import free_port, lcm_url
-from tests.queried_gateway import ParameterServer, output_queries, run_gateway, wait_until_cached
+from tests.queried_gateway import (
+    ParameterServer,
+    ServerOfSections,
+    output_queries,
+    run_gateway,
+    wait_until_cached,
+)
 from tests.servers import ScriptedServer
 from tests.spec_parameters import in_root, spec_xml
 from tests.waiting import wait_until_async
@@ -92,7 +98,7 @@ async def gateway_with_lcm_peer(
         ScriptedServer(server.script) as listening,
         run_gateway(listening.port, lcm_url=url, **settings) as gateway,
     ):
-        await wait_until_cached(gateway, server)
+        await wait_until_cached(gateway)
         peer = LcmPeer(url)
         try:
             yield LcmSetup(server, gateway, peer)
@@ -118,7 +124,7 @@ async def test_requests_can_use_a_separate_url() -> None:
         ScriptedServer(server.script) as listening,
         run_gateway(listening.port, lcm_url=data_url, queries_url=queries_url) as gateway,
     ):
-        await wait_until_cached(gateway, server)
+        await wait_until_cached(gateway)
         wrong_url_peer, peer = LcmPeer(data_url, data_url), LcmPeer(data_url, queries_url)
         try:
             wrong_url_peer.send(encode_request(1))  # on the URL for data
@@ -148,12 +154,12 @@ async def test_a_queries_url_that_does_not_open_does_not_stop_the_output(
 
 @pytest.mark.parametrize("section", SECTIONS)
 async def test_each_section_is_answered_unchanged(section: str) -> None:
-    async with gateway_with_lcm_peer() as (_, _, peer):
+    async with gateway_with_lcm_peer(ServerOfSections()) as (_, _, peer):
         assert (await peer.request(1, [section])).xml.encode() == spec_xml(section)
 
 
 async def test_several_sections_are_requested_with_one_command() -> None:
-    server = ParameterServer()
+    server = ServerOfSections()
     server.sections["3d force"] = both = in_root("<The_3D/>", "<Force/>")
     async with gateway_with_lcm_peer(server) as (_, _, peer):
         assert (await peer.request(1, ["force", "3d", "3d"])).xml.encode() == both
@@ -167,13 +173,13 @@ async def test_several_sections_are_requested_with_one_command() -> None:
 
 async def test_fresh_parameters_are_requested_from_the_server() -> None:
     async with gateway_with_lcm_peer() as (server, _, peer):
-        server.sections["3d"] = b"<RT_Parameters><The_3D/></RT_Parameters>"
-        assert (await peer.request(1, ["3d"])).xml.encode() == spec_xml("3d")
+        server.xml = b"<RT_Parameters><The_3D/></RT_Parameters>"
+        assert "Marker 1" in (await peer.request(1, ["3d"])).xml
         assert (await peer.request(2, ["3d"], fresh=True)).xml == "<RT_Parameters><The_3D/></RT_Parameters>"
 
 
 async def test_xml_in_latin1_with_trailing_nuls_is_decoded() -> None:
-    server = ParameterServer()
+    server = ServerOfSections()
     server.sections["3d"] = (
         "<RT_Parameters><The_3D><Unit>µm</Unit></The_3D></RT_Parameters>".encode("latin-1") + b"\0"
     )

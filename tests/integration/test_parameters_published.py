@@ -28,7 +28,6 @@ from tests.queried_gateway import (
     zenoh_peer,
 )
 from tests.servers import ScriptedServer, markers_frame
-from tests.spec_parameters import in_root
 from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
@@ -84,7 +83,7 @@ async def gateway_with_cache(server: ParameterServer, router: str, url: str) -> 
         ScriptedServer(server.script) as listening,
         run_gateway(listening.port, router=router, lcm_url=url) as gateway,
     ):
-        await wait_until_cached(gateway, server)
+        await wait_until_cached(gateway)
         yield gateway
 
 
@@ -190,20 +189,16 @@ async def test_a_change_found_by_a_fresh_query_is_published(
     router: str, url: str, subscribers: Subscribers
 ) -> None:
     server = ParameterServer()
-    async with gateway_with_cache(server, router, url) as gateway:
+    async with gateway_with_cache(server, router, url):
         await subscribers.wait_for(server.xml)
         server.xml = parameters_xml("One more", "Marker 1")
         with zenoh_peer(router) as peer:
             assert (await query(peer, f"{KEY}?fresh=true")).payload == server.xml
             await subscribers.wait_for(server.xml)
-
-            # Wait until the gateway has requested each section again.
-            await wait_until_async(lambda: not gateway.sources[0]._tasks)
             server.xml = parameters_xml("Another")
-            server.sections["3d"] = in_root("<The_3D><Unit>cm</Unit></The_3D>")
-            assert (await query(peer, f"{KEY}/3d?fresh=true")).payload == server.sections["3d"]
+            assert b"Another" in (await query(peer, f"{KEY}/3d?fresh=true")).payload
             await subscribers.wait_for(server.xml)  # all parameters, although the query was for one section
-            assert (await query(peer, f"{KEY}/3d")).payload == server.sections["3d"]
+            assert b"Another" in (await query(peer, f"{KEY}/3d")).payload
 
 
 async def test_a_change_of_the_statistics_is_not_published(
@@ -263,7 +258,7 @@ async def test_frames_between_a_command_and_its_reply_are_published() -> None:
         ScriptedServer(server.script) as listening,
         run_gateway(listening.port, listen=endpoint) as gateway,
     ):
-        await wait_until_cached(gateway, server)
+        await wait_until_cached(gateway)
         published = gateway.sources[0].fan_out
         with zenoh_peer(endpoint) as peer:
             server.may_answer.clear()

@@ -15,7 +15,7 @@ import zenoh
 from gateway.outputs.encodings import json_bytes
 from gateway.outputs.lcm import queries as lcm_queries
 from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
-from tests.queried_gateway import ParameterServer, run_gateway, wait_until_cached
+from tests.queried_gateway import ParameterServer, ServerOfSections, run_gateway, wait_until_cached
 from tests.servers import ScriptedServer
 from tests.spec_parameters import spec_xml
 from tests.waiting import wait_until_async
@@ -61,7 +61,7 @@ async def lab(server: ParameterServer | None = None, **settings: Any) -> AsyncIt
         ScriptedServer(server.script) as listening,
         run_gateway(listening.port, listen=endpoint, lcm_url=url, **settings) as gateway,
     ):
-        await wait_until_cached(gateway, server)
+        await wait_until_cached(gateway)
         yield Lab(server, endpoint, url)
 
 
@@ -89,7 +89,6 @@ async def test_a_table_is_printed_by_default(side: str) -> None:
 @sides
 async def test_sections_are_shown_as_json(side: str) -> None:
     async with lab() as at:
-        at.server.sections["3d force"] = at.server.xml
         done = await run("params", "3d", "force", "--json", *at.options(side))
     assert (done.status, done.stderr) == (0, "")
     source = json.loads(done.stdout)["lab"]
@@ -101,7 +100,7 @@ async def test_sections_are_shown_as_json(side: str) -> None:
 @sides
 @pytest.mark.parametrize("section", ["force", "events"])
 async def test_the_malformed_xml_of_the_specification_is_printed_unchanged(side: str, section: str) -> None:
-    async with lab() as at:
+    async with lab(ServerOfSections()) as at:
         done = await run("params", section, "--xml", *at.options(side))
     assert (done.status, done.stderr) == (0, "")
     assert done.stdout == spec_xml(section).decode().rstrip() + "\n"
@@ -220,7 +219,7 @@ async def test_a_source_without_a_server_does_not_hide_other_sources() -> None:
             run_gateway(listening.port, router=endpoint) as gateway,
             run_gateway(free_port(), router=endpoint, name="hall"),
         ):
-            await wait_until_cached(gateway, server)
+            await wait_until_cached(gateway)
             done = await run("params", "3d", "--json", "--connect", endpoint)
     finally:
         router.close()
@@ -243,8 +242,8 @@ async def test_sources_of_the_same_name_on_two_gateways_are_both_shown() -> None
             run_gateway(a.port, router=endpoint) as one,
             run_gateway(b.port, router=endpoint) as other,
         ):
-            await wait_until_cached(one, first)
-            await wait_until_cached(other, second)
+            await wait_until_cached(one)
+            await wait_until_cached(other)
             done = await run("params", "--json", "--connect", endpoint)
     finally:
         router.close()
@@ -263,8 +262,8 @@ async def test_several_sources_are_found_on_lcm() -> None:
         run_gateway(a.port, lcm_url=url) as one,
         run_gateway(b.port, lcm_url=url, name="hall-2") as other,
     ):
-        await wait_until_cached(one, first)
-        await wait_until_cached(other, second)
+        await wait_until_cached(one)
+        await wait_until_cached(other)
         done = await run("params", "--json", "--lcm", "--url", url)
     assert (done.status, done.stderr) == (0, "")
     labels = {

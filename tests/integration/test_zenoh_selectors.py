@@ -104,8 +104,8 @@ async def test_a_wildcard_for_sources_is_answered_by_every_source() -> None:
             run_gateway(first_server.port, router=router) as lab_gateway,
             run_gateway(second_server.port, router=router, name="hall") as hall_gateway,
         ):
-            await wait_until_cached(lab_gateway, first)
-            await wait_until_cached(hall_gateway, second)
+            await wait_until_cached(lab_gateway)
+            await wait_until_cached(hall_gateway)
             with zenoh_peer(router) as peer:
                 replies = {reply.key: reply for reply in await query_all(peer, "mocap/*/parameters")}
                 assert replies["mocap/lab/parameters"].payload == first.xml
@@ -122,12 +122,12 @@ async def test_queries_work_through_a_router() -> None:
             ScriptedServer(server.script) as listening,
             run_gateway(listening.port, router=router) as gateway,
         ):
-            await wait_until_cached(gateway, server)
+            await wait_until_cached(gateway)
             await wait_until_async(lambda: gateway.sources[0].fan_out.newest(ComponentType.MARKERS, "zenoh"))
             with zenoh_peer(router) as peer:
                 assert (await query(peer, "mocap/lab/parameters")).payload == server.xml
                 fresh = await query(peer, "mocap/lab/parameters/3d?fresh=true;format=json")
-                assert fresh.json["markers"][0]["label"] == "marker 1"
+                assert fresh.json["markers"][0]["label"] == "Marker 1"
                 assert (await query(peer, "mocap/*/3d?format=json")).json["frame_number"] == 7
                 assert (await query(peer, "mocap/lab/markers")).code == "bad-request"
                 assert (await query(peer, "mocap/lab/schema/marker_t")).payload

@@ -18,22 +18,16 @@ from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerParameters
 from gateway.publish.fan_out import FanOut
 from gateway.queries.questions import Question
-from gateway.rtc3d.commands import SendParameters
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import SECTIONS
 from gateway.source import Source
 from tests.servers import packet
-from tests.spec_parameters import in_root
 from tests.toy_output import ToyOutput, ToyPublisher
-from tests.unit.publish.test_tool_poses import IN_VIEW, tools_frame
-from tests.unit.queries.fake_source import parameters_xml
 from tests.unit.scripted_sources import Servers, SlowThreads
-from tests.unit.stream.scripted_server import XML, ScriptedServer, obliging
+from tests.unit.stream.scripted_server import ScriptedServer
 from tests.unit.stream.virtual_time import settle, until
 
 HOST = "192.0.2.20"
 STREAM = "lab (3d 6d analog force event)"
-OTHER_XML = packet(2, "<RT_Parameters Ver='1.00'><The_6D/></RT_Parameters>")
 TWO_STREAMS = (
     StreamSettings(components=(ComponentType.MARKERS,)),
     StreamSettings(components=(ComponentType.ANALOG,)),
@@ -69,10 +63,13 @@ class Lab:
             SourceSettings(name="lab", host=HOST, **settings).model_copy(update={"fresh_interval_s": 0.0}),
             FanOut("lab", [self.output]),
             spool,
-            lambda *each: self.parameters.append(each),
+            self._publish_parameters,
             lambda *each: self.files.append(each),
             before,
         )
+
+    async def _publish_parameters(self, source: str, parameters: ServerParameters) -> None:
+        self.parameters.append((source, parameters))
 
     def messages(self, component: str) -> list[Any]:
         return [decode(message) for topic, message in self.output.messages if topic.path == (component,)]
@@ -202,129 +199,7 @@ async def test_a_source_that_replaces_another_continues_its_numbers(servers: Ser
     assert [message.sequence for message in after.messages("status")] == [2]
 
 
-# Parameters ----------------------------------------------------------------------------------
-
-
-async def test_parameters_are_published_with_every_connection(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool)
-    async with running(lab):
-        await lab.connected()
-        assert lab.parameters == [("lab", ServerParameters(XML[8:], 1, 1))]
-        lab.server.connection.end()
-        await settle()
-        await lab.connected()
-        assert lab.parameters[1:] == [("lab", ServerParameters(XML[8:], 2, 1))]
-
-
-async def test_the_cache_is_filled_after_connecting(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool)
-    async with running(lab):
-        await lab.connected()
-        requests = [each for each in lab.server.connection.commands if each.startswith("SendParameters")]
-        everything, sections = SendParameters(), [SendParameters((each,)) for each in SECTIONS]
-        assert requests == [str(command) for command in (everything, *sections)]
-
-
-async def test_a_changed_number_of_items_requests_the_parameters_once(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool)
-    async with running(lab):
-        await lab.connected()
-        before = lab.count("SendParameters")
-        tasks = asyncio.all_tasks()
-        for _ in range(3):
-            lab.source.fan_out.on_items_changed()
-        assert len(asyncio.all_tasks() - tasks) == 1
-        await settle()
-        assert lab.count("SendParameters") == before + 1
-        lab.source.fan_out.on_items_changed()
-        await settle()
-        assert lab.count("SendParameters") == before + 2
-
-
-async def test_frame_numbers_that_go_back_request_the_parameters(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool)
-    async with running(lab):
-        await lab.connected()
-        before = lab.count("SendParameters")
-        lab.server.connection.send_frames(5000)
-        lab.server.connection.send_frames(1)
-        await settle()
-        assert lab.count("SendParameters") == before + 1
-
-
-async def test_tools_are_named_by_their_labels_in_the_parameters(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool, output=ToyOutput("toy", "Probe", has_tool_poses=True))
-    labels = packet(2, in_root("<The_6D><Tools><Tool id='1'><Label>Probe</Label></Tool></Tools></The_6D>"))
-    lab.server.answer = lambda command: labels if command.startswith("SendParameters") else obliging(command)
-    async with running(lab):
-        await lab.connected()
-        lab.server.connection.send(packet(3, tools_frame(IN_VIEW).body))
-        assert lab.output.tool_names() == ["Probe"]
-
-
-async def test_a_refresh_that_fails_raises_nothing_and_can_be_repeated(
-    servers: Servers, spool: Spool
-) -> None:
-    raised: list[dict[str, Any]] = []
-    asyncio.get_running_loop().set_exception_handler(lambda _loop, context: raised.append(context))
-    lab = Lab(servers, spool)
-    lab.source.fan_out.on_items_changed()
-    await settle()
-    assert raised == []
-    async with running(lab):
-        await lab.connected()
-        before = lab.count("SendParameters")
-        lab.source.fan_out.on_items_changed()
-        await settle()
-        assert lab.count("SendParameters") == before + 1
-
-
-async def test_changed_parameters_are_published_and_every_section_is_requested_again(
-    servers: Servers, spool: Spool
-) -> None:
-    lab = Lab(servers, spool)
-    async with running(lab):
-        await lab.connected()
-        lab.server.answer = lambda command: (
-            OTHER_XML if command.startswith("SendParameters") else obliging(command)
-        )
-        before = lab.count("SendParameters Force")
-        lab.source.fan_out.on_items_changed()
-        await until(lambda: lab.count("SendParameters Force") == before + 1)
-        assert lab.parameters[1:] == [("lab", ServerParameters(OTHER_XML[8:], 1, 2))]
-
-
-async def test_every_message_carries_the_version_of_the_parameters(servers: Servers, spool: Spool) -> None:
-    lab = Lab(servers, spool, streams=TWO_STREAMS)
-
-    async def check_version(version: int) -> None:
-        """Check the version of a new frame, of the status and of the clock."""
-        lab.server.connections[0].send_frames(1)
-        lab.source.publish_status()
-        await settle()
-        newest = [lab.messages(name)[-1] for name in ("3d", "status", "clock")]
-        assert [message.parameters_version for message in newest] == [version] * 3
-
-    async def change_parameters(xml: bytes) -> None:
-        lab.server.answer = lambda command: (
-            packet(2, xml.decode()) if command.startswith("SendParameters") else obliging(command)
-        )
-        await lab.source.queries.answer(Question("parameters", fresh=True))
-        await settle()
-
-    assert [status.parameters_version for status in lab.source.statuses] == [0, 0]
-    async with running(lab):
-        await lab.connected(2)
-        await check_version(1)
-        for xml, version in (
-            (parameters_xml("cm"), 2),
-            (parameters_xml("cm", frames_sent=2), 2),
-            (parameters_xml("m"), 3),
-            (parameters_xml("cm"), 4),
-        ):
-            await change_parameters(xml)
-            await check_version(version)
-            assert lab.parameters[-1][1].version == version
+# Tasks ---------------------------------------------------------------------------------------
 
 
 async def test_background_tasks_end_with_the_source(servers: Servers, spool: Spool) -> None:

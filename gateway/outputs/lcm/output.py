@@ -83,7 +83,7 @@ class LcmOutput(Output):
             self._queries.remove(source)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
-        """Publish the XML as ``parameters_t``, now and every few seconds."""
+        """Publish the XML as ``parameters_t``, now and every few seconds. LCM keeps the order of messages."""
         if self._queries is not None:
             self._queries.publish_parameters(source, parameters)
 

@@ -213,10 +213,9 @@ class ZenohOutput(Output):
             if self._queries is not None and self._session is not None:
                 self._queries.add(source)
 
-    def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
+    def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
         """Publish the XML on PREFIX/SOURCE/parameters, now and for each later subscriber."""
-        if self._queries is not None:
-            self._queries.publish_parameters(source, parameters)
+        return None if self._queries is None else self._queries.publish_parameters(source, parameters)
 
     def announce_file(self, source: str, description: Mapping[str, Any]) -> None:
         """Publish the description of a C3D file on PREFIX/SOURCE/c3d, the key that returns it."""

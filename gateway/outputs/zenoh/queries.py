@@ -119,29 +119,33 @@ class ZenohQueries:
         subscriber_watch.declare_matching_listener(on_matching)
         return _Declared(queryable, publisher, subscriber_watch)
 
-    def _call_in_loop(self, call: Callable[..., None], *arguments: Any) -> None:
+    def _call_in_loop(self, call: Callable[..., object], *arguments: Any) -> None:
         """Call ``call`` in the event loop, from one of Zenoh's threads."""
         with contextlib.suppress(RuntimeError):  # the loop has just ended
             self._loop.call_soon_threadsafe(call, *arguments)
 
     # Parameters and files.
 
-    def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
-        """Publish a source's parameters as the server sent them."""
+    def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
+        """Publish a source's parameters as the server sent them.
+
+        Returns a future that is done when they have been sent; None while the session is not open.
+        """
         self._parameters[source] = parameters
-        self._publish_again(source)
+        return self._publish_again(source)
 
     def _publish_all(self) -> None:
         for source in self._parameters:
             self._publish_again(source)
 
-    def _publish_again(self, source: str) -> None:
+    def _publish_again(self, source: str) -> asyncio.Future[None] | None:
         declared = self._declared.get(source)
         parameters = self._parameters.get(source)
         if declared is not None and parameters is not None:
             attachment = {"session": parameters.session, "parameters_version": parameters.version}
             put = functools.partial(declared.publisher.put, attachment=json_bytes(attachment))
-            self._send(source, put, parameters.xml)
+            return self._send(source, put, parameters.xml)
+        return None
 
     def announce_file(self, source: str, description: Mapping[str, Any]) -> None:
         """Announce a C3D file on the key that returns it."""
@@ -152,9 +156,11 @@ class ZenohQueries:
             )
             self._send(source, put, key, json_bytes(description))
 
-    def _send(self, source: str, put: Callable[..., None], *arguments: Any) -> None:
-        if not self._is_closed:
-            self._sender.submit(functools.partial(self._put, source, put, *arguments))
+    def _send(self, source: str, put: Callable[..., None], *arguments: Any) -> asyncio.Future[None] | None:
+        if self._is_closed:
+            return None
+        put = functools.partial(self._put, source, put, *arguments)
+        return asyncio.wrap_future(self._sender.submit(put), loop=self._loop)
 
     def _put(self, source: str, put: Callable[..., None], *arguments: Any) -> None:
         """Publish, in the sending thread."""

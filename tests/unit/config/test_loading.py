@@ -129,7 +129,8 @@ MISTAKES: list[tuple[str, str]] = [
         "lab.yaml:4:5: sources[0].prot: unknown key (did you mean 'port'?); known keys: name, host, port, "
         "byte_order, streams, reconnect, connect_timeout_s, reply_timeout_s, stall_timeout_s, "
         "max_lag_ms, "
-        "max_packet_bytes, max_c3d_bytes, query_timeout_s, fresh_interval_s, remote_control",
+        "max_packet_bytes, max_c3d_bytes, query_timeout_s, fresh_interval_s, parameters_interval_s, "
+        "remote_control",
     ),
     (
         "sorces: 1",

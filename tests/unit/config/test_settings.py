@@ -145,7 +145,7 @@ def test_all_mistakes_are_reported_together() -> None:
         "sources.0.prt": "unknown key (did you mean 'port'?); known keys: name, host, port, byte_order, "
         "streams, reconnect, connect_timeout_s, reply_timeout_s, stall_timeout_s, max_lag_ms, "
         "max_packet_bytes, max_c3d_bytes, "
-        "query_timeout_s, fresh_interval_s, remote_control",
+        "query_timeout_s, fresh_interval_s, parameters_interval_s, remote_control",
         "sources.1.host": "missing; this key is required",
         "lcm": "found nothing; expected a mapping with any of the keys enabled, prefix, url, queries_url, "
         "max_rate_hz, tool_poses",

@@ -10,15 +10,14 @@ import rtc3d
 from gateway.config.settings import SourceSettings
 from gateway.errors import QueryError
 from gateway.outputs.contract import Answer
-from gateway.queries.parameter_cache import CachedParameters
+from gateway.queries.known_parameters import ServerAnswer
 from gateway.queries.questions import Question
 from gateway.queries.server_requests import StreamAccess
 from gateway.queries.source_queries import SourceQueries
 from gateway.rtc3d.commands import Command
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, PacketType
-from gateway.rtc3d.parameters_xml import parse_parameters
-from gateway.stream.status import StreamStatus
+from gateway.stream.status import SessionNumbers, StreamStatus
 from tests.spec_parameters import in_root
 from tests.waiting import wait_until_async
 
@@ -61,35 +60,69 @@ class FakeServer:
         await wait_until_async(lambda: len(self.commands) >= count)
 
 
-class FakeSource:
-    """A source "lab" with one stream of 3D and 6D, in session 1; ``settings`` replace its defaults."""
+class FakeConnection:
+    """One connection of a stream with the server."""
 
-    def __init__(self, **settings: Any) -> None:
+    def __init__(self, server: FakeServer) -> None:
+        self._server = server
+        self.is_open = True
+
+    async def ask(self, command: Command) -> Packet:
+        return await self._server.send(command)
+
+
+class FakeSource:
+    """A source "lab" with a stream of 3D and 6D, in session 1; ``settings`` replace its defaults.
+
+    With ``two_streams``, it has another one of analog channels, which is not connected.
+    """
+
+    def __init__(self, *, two_streams: bool = False, **settings: Any) -> None:
         self.server = FakeServer()
-        self.status = StreamStatus("3d 6d", session=1)
+        sessions = SessionNumbers()
+        self.status = StreamStatus("3d 6d", sessions=sessions)
+        self.second_status = StreamStatus("analog", sessions=sessions)
         self.newest_messages: dict[ComponentType, bytes] = {}
-        self.changes: list[bytes] = []
-        """The XML of each reported change of the parameters."""
+        self.announced: list[tuple[bytes | None, int]] = []
+        """The XML of all announced parameters, None if they are void, with their version."""
         self.num_file_reads = 0
         self.recorded: list[bool] = []
         # The configuration does not accept 0. It sends every fresh query to the server.
         source_settings = SourceSettings(name="lab", host="192.0.2.1").model_copy(
             update={"fresh_interval_s": 0.0} | settings
         )
-        self.stream = StreamAccess(
-            (ComponentType.MARKERS, ComponentType.TOOLS),
-            self.status,
-            lambda: self.server.send if self.server.is_connected else None,
-        )
+        self.connection = FakeConnection(self.server)
+        self.second_connection: FakeConnection | None = None
+        self._has_two_streams = two_streams
         self.queries = SourceQueries(
             source_settings,
-            lambda: [self.stream],
+            lambda: self.streams,
             lambda component, _output: self.newest_messages.get(component),
             rtc3d.status_t().encode,
             self._last_c3d,
             self._record,
-            lambda xml, _parsed: self.changes.append(xml),
+            self._announce,
         )
+        self.status.connected("the server")
+
+    @property
+    def streams(self) -> list[StreamAccess]:
+        """The streams at present."""
+        first = StreamAccess(
+            (ComponentType.MARKERS, ComponentType.TOOLS), self.status, self._ready(self.connection)
+        )
+        second = StreamAccess(
+            (ComponentType.ANALOG,), self.second_status, self._ready(self.second_connection)
+        )
+        return [first, second] if self._has_two_streams else [first]
+
+    def _ready(self, connection: FakeConnection | None) -> FakeConnection | None:
+        return connection if self.server.is_connected and connection and connection.is_open else None
+
+    async def _announce(self, answer: ServerAnswer | None, version: int) -> None:
+        self.announced.append((None if answer is None else answer.xml, version))
+        for status in (self.status, self.second_status):
+            status.parameters_changed(version)
 
     async def _last_c3d(self) -> Answer:
         self.num_file_reads += 1
@@ -100,13 +133,39 @@ class FakeSource:
         self.recorded.append(start)
         return self.server.is_connected
 
-    def store_parameters(self, xml: bytes) -> None:
-        """Store all parameters, as at the start of a connection."""
-        self.queries.parameters.store(xml, parse_parameters(xml))
+    def disconnect(self) -> None:
+        """Lose the connection of the first stream."""
+        self.connection.is_open = False
 
-    async def parameters(
-        self, *sections: str, fresh: bool = False, stale_ok: bool = False
-    ) -> CachedParameters:
+    async def connect(self, reply: bytes | Exception | None) -> None:
+        """Connect the first stream again.
+
+        In the handshake, SendParameters gets this reply, or it is answered later. Raises an exception.
+        """
+        self.disconnect()
+        self.status.connected("the server")
+        self.connection = FakeConnection(self.server)
+        await self._do_handshake(self.connection, reply)
+
+    async def connect_second(self, reply: bytes | Exception | None) -> None:
+        """Connect the second stream, like ``connect``."""
+        self.second_status.connected("the server")
+        self.second_connection = FakeConnection(self.server)
+        await self._do_handshake(self.second_connection, reply)
+
+    async def _do_handshake(self, connection: FakeConnection, reply: bytes | Exception | None) -> None:
+        if reply is None:
+            self.server.replies.pop("SendParameters", None)
+        else:
+            self.server.replies["SendParameters"] = reply
+        await self.queries.parameters.read_for_handshake(connection)
+
+    async def store_parameters(self, xml: bytes) -> None:
+        """Read all parameters, as at the start of the first connection."""
+        await self._do_handshake(self.connection, xml)
+        self.server.commands.clear()
+
+    async def parameters(self, *sections: str, fresh: bool = False, stale_ok: bool = False) -> ServerAnswer:
         return await self.queries.parameters.get(sections, fresh=fresh, stale_ok=stale_ok)
 
     async def parameters_error(self, *sections: str, **options: bool) -> QueryError:

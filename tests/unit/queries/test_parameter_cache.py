@@ -1,170 +1,447 @@
+"""Parameters at each connection, of several streams, void, and given to peers."""
+
 import asyncio
+import logging
 
 import pytest
 
-from gateway.errors import ReplyTimeoutError, ServerError
-from gateway.queries.parameter_cache import LONG_XML_BYTES
-from gateway.rtc3d.parameters import SECTIONS
+from gateway.errors import ClosedError, ParametersError, ReplyTimeoutError, ServerError
+from gateway.queries.parameter_cache import ParameterCache
+from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
+from gateway.stream.parameters import LONG_XML_BYTES
+from tests.spec_parameters import in_root
 from tests.unit.queries.fake_source import FakeSource, parameters_xml
-from tests.waiting import wait_until_async
+
+MM, CM = parameters_xml("mm"), parameters_xml("cm")
+SILENCE = ReplyTimeoutError("192.0.2.1:3020 did not answer SendParameters within 2 s")
+GARBAGE = b"It is 3 o'clock."
+
+no_parameters = pytest.mark.parametrize("reply", [ServerError("err-what?"), SILENCE, GARBAGE])
+
+
+def warnings_of(caplog: pytest.LogCaptureFixture) -> list[str]:
+    """Return the warnings about parameters, not those about lost connections."""
+    return [
+        record.message
+        for record in caplog.records
+        if record.levelno == logging.WARNING and record.name.startswith("gateway.queries")
+    ]
+
+
+# At each connection --------------------------------------------------------------------------
+
+
+async def test_parameters_are_announced_at_every_connection() -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    await source.connect(MM)
+    await source.connect(CM)
+    assert source.announced == [(MM, 1), (MM, 1), (CM, 2)]
+    assert (await source.parameters()).session == 3
+
+
+async def test_the_statistics_of_a_new_connection_are_no_change() -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    other = parameters_xml("mm", frames_sent=7)
+    await source.connect(other)
+    assert source.announced == [(MM, 1), (other, 1)]
+
+
+@no_parameters
+async def test_a_server_without_parameters_makes_the_former_ones_void(
+    reply: bytes | Exception, caplog: pytest.LogCaptureFixture
+) -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    with pytest.raises((ServerError, ReplyTimeoutError, ParametersError)):
+        await source.connect(reply)
+    assert source.announced == [(MM, 1), (None, 2)]
+    [warning] = warnings_of(caplog)
+    assert warning.startswith("lab: the server gives no parameters any more: ")
+    with pytest.raises((ServerError, ReplyTimeoutError, ParametersError)):
+        await source.connect(reply)
+    assert len(source.announced) == 2
+    await source.connect(MM)
+    assert source.announced[2:] == [(MM, 3)]
+
+
+async def test_a_server_that_never_gave_parameters_announces_nothing() -> None:
+    source = FakeSource()
+    with pytest.raises(ServerError):
+        await source.connect(ServerError("err-what?"))
+    assert source.announced == []
+
+
+async def test_a_lost_connection_keeps_the_parameters() -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    with pytest.raises(ClosedError):
+        await source.connect(ClosedError("closed"))
+    source.disconnect()
+    assert source.announced == [(MM, 1)]
+    assert (await source.parameters(stale_ok=True)).xml == MM
+
+
+@pytest.mark.parametrize(
+    ("reply", "code", "text"),
+    [
+        (ServerError("err-what?"), "refused", "or refuses it: err-what?; the parameters of its earlier"),
+        (SILENCE, "timeout", "did not answer SendParameters within 2 s; the parameters of its earlier"),
+    ],
+)
+async def test_peers_are_told_that_the_parameters_are_void(reply: Exception, code: str, text: str) -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    with pytest.raises(type(reply)):
+        await source.connect(reply)
+    source.server.replies["SendParameters 3D"] = reply
+    for sections in ((), ("3d",)):
+        error = await source.parameters_error(*sections)
+        assert error.code == code
+        assert text in str(error)
+
+
+async def test_xml_that_cannot_be_read_is_given_to_peers_as_it_is() -> None:
+    source = FakeSource()
+    with pytest.raises(ParametersError):
+        await source.connect(GARBAGE)
+    answer = await source.parameters()
+    assert (answer.xml, answer.is_readable, answer.json) == (GARBAGE, False, None)
+    assert source.server.commands == ["SendParameters"]
+
+
+async def test_a_reload_continues_the_version() -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    await source.connect(CM)
+    after = FakeSource()
+    after.queries.parameters = ParameterCache(
+        after.queries._settings, after.queries._requests, after._announce, source.queries.parameters
+    )
+    await after.store_parameters(CM)
+    await after.connect(MM)
+    assert after.announced == [(CM, 2), (MM, 3)]
+
+
+# Several streams -----------------------------------------------------------------------------
+
+
+async def test_streams_that_connect_at_the_same_time_share_one_request() -> None:
+    source = FakeSource(two_streams=True)
+    first = asyncio.create_task(source.connect(None))
+    second = asyncio.create_task(source.connect_second(None))
+    await source.server.wait_for_commands(1)
+    await asyncio.sleep(0)
+    source.server.answer(MM)
+    await asyncio.gather(first, second)
+    assert source.server.commands == ["SendParameters"]
+    assert source.announced == [(MM, 1), (MM, 1)]
+    assert (await source.parameters()).session == 3
+
+
+@pytest.mark.parametrize("reply", [ServerError("err-what?"), SILENCE])
+async def test_streams_that_connect_at_the_same_time_share_a_refusal(reply: Exception) -> None:
+    source = FakeSource(two_streams=True)
+    first = asyncio.create_task(source.connect(None))
+    second = asyncio.create_task(source.connect_second(None))
+    await source.server.wait_for_commands(1)
+    await asyncio.sleep(0)
+    source.server.unanswered.popleft().set_exception(reply)
+    for task in (first, second):
+        with pytest.raises(type(reply)):
+            await task
+    assert source.server.commands == ["SendParameters"]
+
+
+@pytest.mark.parametrize("is_cancelled", [False, True])
+async def test_a_stream_asks_itself_if_the_other_connection_ends(is_cancelled: bool) -> None:
+    source = FakeSource(two_streams=True)
+    first = asyncio.create_task(source.connect(None))
+    second = asyncio.create_task(source.connect_second(None))
+    await source.server.wait_for_commands(1)
+    await asyncio.sleep(0)
+    if is_cancelled:
+        first.cancel()
+    else:
+        source.server.unanswered.popleft().set_exception(ClosedError("closed"))
+    await source.server.wait_for_commands(2)
+    source.server.unanswered.pop().set_result(Packet(PacketType.XML, MM))
+    await second
+    await asyncio.gather(first, return_exceptions=True)
+    assert source.server.commands == ["SendParameters"] * 2
+    assert source.announced == [(MM, 1)]
+
+
+async def test_a_second_connection_need_not_ask_again_for_a_while() -> None:
+    source = FakeSource(two_streams=True, fresh_interval_s=3600.0)
+    await source.store_parameters(MM)
+    await source.connect_second(CM)
+    assert source.server.commands == []
+    assert source.announced == [(MM, 1), (MM, 1)]
+
+
+async def test_a_second_connection_asks_if_the_first_one_has_ended() -> None:
+    source = FakeSource(two_streams=True, fresh_interval_s=3600.0)
+    await source.store_parameters(MM)
+    source.disconnect()
+    await source.connect_second(CM)  # the server may be another one
+    assert source.announced == [(MM, 1), (CM, 2)]
+
+
+async def test_parameters_are_not_void_while_another_connection_gives_them() -> None:
+    source = FakeSource(two_streams=True)
+    await source.store_parameters(MM)
+    with pytest.raises(ServerError):
+        await source.connect_second(ServerError("only one client"))
+    assert source.announced == [(MM, 1)]
+    assert (await source.parameters()).xml == MM
+    with pytest.raises(ServerError):
+        await source.connect(ServerError("only one client"))
+    assert source.announced == [(MM, 1), (None, 2)]
+
+
+# Reading again -------------------------------------------------------------------------------
+
+
+async def test_changes_are_announced() -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    source.server.replies["SendParameters"] = CM
+    await source.queries.parameters.refresh()
+    await source.queries.parameters.refresh()
+    assert source.announced == [(MM, 1), (CM, 2)]
+    assert (await source.parameters()).xml == CM
+    assert source.server.commands == ["SendParameters"] * 2
+
+
+async def test_a_change_of_the_statistics_is_not_announced_but_answered() -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    source.server.replies["SendParameters"] = parameters_xml("mm", frames_sent=2)
+    await source.queries.parameters.refresh()
+    assert source.announced == [(MM, 1)]
+    answer = await source.parameters()
+    assert answer.xml == parameters_xml("mm", frames_sent=2)
+    general = answer.parsed.parameters.general
+    assert general is not None
+    assert general.frames_sent == 2
+
+
+async def test_unchanged_xml_is_not_parsed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    parsed: list[bytes] = []
+
+    def parse(xml: bytes) -> ParsedParameters:
+        parsed.append(xml)
+        return parse_parameters(xml)
+
+    monkeypatch.setattr("gateway.queries.known_parameters.parse_parameters", parse)
+    source = FakeSource()
+    long = parameters_xml("mm") + b" " * LONG_XML_BYTES
+    await source.store_parameters(long)
+    source.server.replies["SendParameters"] = long.replace(b">1<", b">2<")
+    await source.queries.parameters.refresh()
+    assert parsed[0] == long
+    assert all(len(xml) < 1000 for xml in parsed[1:])  # the statistics alone
+
+
+async def test_the_parameters_are_not_read_again_where_the_server_does_not_give_them() -> None:
+    source = FakeSource()
+    await source.queries.parameters.refresh()
+    with pytest.raises(ServerError):
+        await source.connect(ServerError("err-what?"))
+    await source.queries.parameters.refresh()
+    assert source.server.commands == ["SendParameters"]
+
+
+async def test_a_refusal_later_on_keeps_the_parameters_and_ends_the_reading(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    source.server.replies["SendParameters"] = ServerError("busy")
+    for _ in range(3):
+        await source.queries.parameters.refresh()
+    assert source.server.commands == ["SendParameters"]
+    assert (await source.parameters()).xml == MM
+    assert source.announced == [(MM, 1)]
+    [warning] = warnings_of(caplog)
+    assert warning.startswith("lab: the parameters cannot be read again: ")
+    source.server.replies["SendParameters"] = CM
+    assert (await source.parameters(fresh=True)).xml == CM  # a peer may ask nevertheless
+    await source.queries.parameters.refresh()
+    assert source.server.commands == ["SendParameters"] * 3
+
+
+@pytest.mark.parametrize("reply", [SILENCE, GARBAGE])
+async def test_no_answer_later_on_keeps_the_parameters_and_is_logged_once(
+    reply: bytes | Exception, caplog: pytest.LogCaptureFixture
+) -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    source.server.replies["SendParameters"] = reply
+    for _ in range(3):
+        await source.queries.parameters.refresh()
+    assert source.server.commands == ["SendParameters"] * 3
+    assert (await source.parameters()).xml == MM
+    assert source.announced == [(MM, 1)]
+    assert len(warnings_of(caplog)) == 1
+
+
+async def test_an_answer_to_a_peer_is_read_again_later() -> None:
+    source = FakeSource()
+    with pytest.raises(ReplyTimeoutError):
+        await source.connect(SILENCE)
+    source.server.replies["SendParameters"] = MM
+    assert (await source.parameters()).xml == MM
+    assert source.announced == [(MM, 1)]
+    source.server.replies["SendParameters"] = CM
+    await source.queries.parameters.refresh()
+    assert source.announced == [(MM, 1), (CM, 2)]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "level", "text"),
+    [
+        (
+            "A B",
+            "A C",
+            logging.WARNING,
+            "lab: markers or tools have other names on the server: 3d 'B' to 'C';",
+        ),
+        ("A B", "A B C", logging.INFO, "lab: the server's parameters changed: 3d (parameters_version 2)"),
+    ],
+)
+async def test_changes_are_logged(
+    before: str, after: str, level: int, text: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    source = FakeSource()
+    await source.store_parameters(labelled(before))
+    source.server.replies["SendParameters"] = labelled(after)
+    await source.queries.parameters.refresh()
+    [record] = [record for record in caplog.records if record.name == "gateway.queries.known_parameters"]
+    assert record.levelno == level
+    assert record.message.startswith(text)
+
+
+def labelled(labels: str) -> bytes:
+    markers = "".join(f"<Marker id='1'><Label>{label}</Label></Marker>" for label in labels.split())
+    return in_root(f"<The_3D><Markers>{markers}</Markers></The_3D>")
+
+
+# Peers ---------------------------------------------------------------------------------------
 
 
 async def test_cached_parameters_are_returned_without_a_request() -> None:
     source = FakeSource()
-    source.store_parameters(parameters_xml("mm"))
+    await source.store_parameters(MM)
     cached = await source.parameters()
-    assert (cached.xml, cached.session) == (parameters_xml("mm"), 1)
+    assert (cached.xml, cached.session, cached.version) == (MM, 1, 1)
     assert cached.age_s >= 0
     assert source.server.commands == []
-    assert source.queries.parameters.xml == parameters_xml("mm")
 
 
-async def test_missing_parameters_are_requested_once() -> None:
+async def test_a_section_is_taken_from_all_parameters() -> None:
     source = FakeSource()
-    source.server.replies["SendParameters 3D"] = parameters_xml("mm")
-    assert (await source.parameters("3d")).xml == parameters_xml("mm")
-    assert (await source.parameters("3d")).xml == parameters_xml("mm")
-    assert source.server.commands == ["SendParameters 3D"]
+    await source.store_parameters(MM)
+    for _ in range(2):
+        section = await source.parameters("3d")
+        assert parse_parameters(section.xml).parameters.markers is not None
+        assert parse_parameters(section.xml).parameters.general is None
+    assert (await source.parameters("general", "3d")).json == (await source.parameters()).json
+    assert source.server.commands == []
+    source.server.replies["SendParameters"] = CM
+    fresh = await source.parameters("3d", fresh=True)
+    assert b"<Unit>cm</Unit>" in fresh.xml
+    assert source.server.commands == ["SendParameters"]
 
 
-async def test_parameters_of_an_earlier_connection_are_requested_again() -> None:
+async def test_a_section_that_is_missing_is_requested_once() -> None:
     source = FakeSource()
-    source.store_parameters(parameters_xml("mm"))
-    source.status.session = 2
-    source.server.replies["SendParameters"] = parameters_xml("cm")
-    assert (await source.parameters()).xml == parameters_xml("cm")
+    await source.store_parameters(MM)
+    tools = source.server.replies["SendParameters 6D"] = in_root("<The_6D/>")
+    assert (await source.parameters("6d")).xml == tools
+    assert (await source.parameters("6d")).xml == tools
+    assert source.server.commands == ["SendParameters 6D"]
+    source.server.replies["SendParameters"] = CM
+    await source.parameters(fresh=True)
+    assert (await source.parameters("6d")).xml == tools
+    assert source.server.commands[1:] == ["SendParameters", "SendParameters 6D"]  # asked again after a change
+
+
+async def test_a_section_of_malformed_xml_is_requested() -> None:
+    source = FakeSource()
+    await source.store_parameters(MM.replace(b"</Unit>", b""))
+    source.server.replies["SendParameters 3D"] = in_root("<The_3D/>")
+    assert (await source.parameters("3d")).xml == in_root("<The_3D/>")
+
+
+@pytest.mark.parametrize("problem", [ServerError("err-what?"), ReplyTimeoutError("did not answer")])
+async def test_a_server_without_single_sections_is_not_asked_again_in_the_connection(
+    problem: Exception,
+) -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    source.server.replies["SendParameters 6D"] = problem
+    assert (await source.parameters("6d")).xml == MM
+    assert (await source.parameters("force")).xml == MM
+    assert source.server.commands == ["SendParameters 6D"]
+    await source.connect(MM)
+    source.server.replies["SendParameters 6D"] = in_root("<The_6D/>")
+    assert (await source.parameters("6d")).xml == in_root("<The_6D/>")  # another server may know sections
+
+
+async def test_a_server_may_know_single_sections_only() -> None:
+    source = FakeSource()
+    with pytest.raises(ServerError):
+        await source.connect(ServerError("err-what?"))
+    source.server.replies["SendParameters 6D"] = in_root("<The_6D/>")
+    source.server.replies["SendParameters 3D"] = ServerError("err-what?")
+    assert (await source.parameters("6d")).xml == in_root("<The_6D/>")
+    for _ in range(2):
+        assert (await source.parameters_error("3d")).code == "refused"
+    assert source.server.commands[1:] == ["SendParameters 6D", "SendParameters 3D"]
 
 
 async def test_an_answer_counts_as_fresh_within_the_interval() -> None:
     source = FakeSource(fresh_interval_s=3600.0)
-    source.store_parameters(parameters_xml("mm"))
-    assert (await source.parameters(fresh=True)).xml == parameters_xml("mm")
+    await source.store_parameters(MM)
+    assert (await source.parameters(fresh=True)).xml == MM
     assert source.server.commands == []
 
 
 async def test_a_refusal_is_cached_for_the_connection_unless_the_query_is_fresh() -> None:
     source = FakeSource()
-    source.server.replies["SendParameters"] = ServerError("err-what?")
+    with pytest.raises(ServerError):
+        await source.connect(ServerError("err-what?"))
     texts = {str(await source.parameters_error()) for _ in range(3)}
     assert texts == {"source 'lab': the server does not know SendParameters, or refuses it: err-what?"}
     assert source.server.commands == ["SendParameters"]
     assert (await source.parameters_error(fresh=True)).code == "refused"
     assert source.server.commands == ["SendParameters"] * 2
-    source.status.session = 2
-    assert (await source.parameters_error()).code == "refused"
-    assert source.server.commands == ["SendParameters"] * 3
 
 
 async def test_a_refusal_counts_as_fresh_within_the_interval() -> None:
     source = FakeSource(fresh_interval_s=3600.0)
-    source.server.replies["SendParameters"] = ServerError("err-what?")
+    with pytest.raises(ServerError):
+        await source.connect(ServerError("err-what?"))
     for _ in range(3):
         assert (await source.parameters_error(fresh=True)).code == "refused"
     assert source.server.commands == ["SendParameters"]
 
 
-@pytest.mark.parametrize("problem", [ServerError("err-what?"), ReplyTimeoutError("did not answer")])
-async def test_a_server_without_single_sections_is_asked_for_all_for_the_rest_of_the_connection(
-    problem: Exception,
-) -> None:
-    source = FakeSource()
-    source.server.replies = {"SendParameters 3D": problem, "SendParameters": parameters_xml("mm")}
-    assert (await source.parameters("3d")).xml == parameters_xml("mm")
-    assert (await source.parameters("6d")).xml == parameters_xml("mm")
-    assert source.server.commands == ["SendParameters 3D", "SendParameters", "SendParameters"]
-    source.status.session = 2
-    source.server.replies["SendParameters 3D"] = parameters_xml("cm")
-    assert (await source.parameters("3d")).xml == parameters_xml("cm")  # another server may know sections
-
-
 async def test_stale_parameters_are_returned_only_without_a_connection() -> None:
     source = FakeSource()
-    source.store_parameters(parameters_xml("mm"))
-    source.server.is_connected = False
+    await source.store_parameters(MM)
+    source.disconnect()
     assert (await source.parameters_error()).code == "no-connection"
-    assert (await source.parameters(stale_ok=True, fresh=True)).xml == parameters_xml("mm")
-    source.server.is_connected = True
-    source.status.session = 2
-    source.server.replies["SendParameters"] = parameters_xml("cm")
-    assert (await source.parameters(stale_ok=True)).xml == parameters_xml("cm")
-
-
-async def test_filling_the_cache_requests_each_section_once() -> None:
-    source = FakeSource()
-    source.store_parameters(parameters_xml("mm"))
-    words = ("General", "3D", "6D", "Analog", "Force", "Events")
-    source.server.replies = {f"SendParameters {word}": parameters_xml("mm") for word in words}
-    await source.queries.parameters.fill()
-    assert source.server.commands == [f"SendParameters {word}" for word in words]
-    for section in SECTIONS:
-        await source.parameters(section)
-    await source.queries.parameters.fill()
-    assert len(source.server.commands) == 6
-    assert source.changes == []
-
-
-async def test_the_cache_is_not_filled_if_the_server_sent_no_parameters_in_this_connection() -> None:
-    source = FakeSource()
-    await source.queries.parameters.fill()
-    source.store_parameters(parameters_xml("mm"))
-    source.status.session = 2
-    await source.queries.parameters.fill()
-    assert source.server.commands == []
-
-
-async def test_filling_the_cache_stops_when_the_server_does_not_answer() -> None:
-    source = FakeSource()
-    source.store_parameters(parameters_xml("mm"))
-    silence = ReplyTimeoutError("did not answer")
-    source.server.replies = {"SendParameters General": silence, "SendParameters": silence}
-    await source.queries.parameters.fill()
-    assert source.server.commands == ["SendParameters General", "SendParameters"]
-
-
-async def test_a_change_is_reported_and_clears_the_cached_sections() -> None:
-    source = FakeSource()
-    source.store_parameters(parameters_xml("mm"))
-    source.server.replies = {
-        "SendParameters": parameters_xml("cm"),
-        "SendParameters 3D": parameters_xml("mm"),
-    }
-    await source.parameters("3d")
-    await source.parameters(fresh=True)
-    assert source.changes == [parameters_xml("cm")]
-    source.server.replies["SendParameters 3D"] = parameters_xml("cm")
-    assert (await source.parameters("3d")).xml == parameters_xml("cm")
-    assert source.changes == [parameters_xml("cm")]
-
-
-async def test_a_change_of_the_statistics_is_not_reported() -> None:
-    source = FakeSource()
-    source.store_parameters(parameters_xml("mm", frames_sent=1))
-    source.server.replies["SendParameters"] = parameters_xml("mm", frames_sent=2)
-    assert (await source.parameters(fresh=True)).xml == parameters_xml("mm", frames_sent=2)
-    assert source.changes == []
-
-
-async def test_a_change_of_a_section_leads_to_a_request_for_all_parameters() -> None:
-    source = FakeSource()
-    source.store_parameters(parameters_xml("mm"))
-    source.server.replies = {
-        "SendParameters": parameters_xml("cm"),
-        "SendParameters 3D": parameters_xml("mm"),
-    }
-    await source.parameters("3d")
-    assert source.server.commands == ["SendParameters 3D"]
-    source.server.replies["SendParameters 3D"] = parameters_xml("cm")
-    await source.parameters("3d", fresh=True)
-    await wait_until_async(lambda: source.changes == [parameters_xml("cm")])
-    assert source.server.commands == ["SendParameters 3D", "SendParameters 3D", "SendParameters"]
-
-
-async def test_the_first_parameters_are_reported_as_a_change() -> None:
-    source = FakeSource()
-    source.server.replies["SendParameters"] = parameters_xml("mm")
-    await source.parameters()
-    assert source.changes == [parameters_xml("mm")]
+    assert (await source.parameters(stale_ok=True, fresh=True)).xml == MM
+    assert b"<Unit>mm</Unit>" in (await source.parameters("3d", stale_ok=True)).xml
+    assert (await source.parameters_error("6d", stale_ok=True)).code == "no-connection"
+    await source.connect(CM)
+    assert (await source.parameters(stale_ok=True)).xml == CM
 
 
 async def test_long_xml_is_parsed_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -179,13 +456,8 @@ async def test_long_xml_is_parsed_in_a_thread(monkeypatch: pytest.MonkeyPatch) -
             in_event_loop.append(True)
         return parse_parameters(xml)
 
-    monkeypatch.setattr("gateway.queries.parameter_cache.parse_parameters", parse)
+    monkeypatch.setattr("gateway.queries.known_parameters.parse_parameters", parse)
     source = FakeSource()
-    padding = b" " * LONG_XML_BYTES
-    source.server.replies = {
-        "SendParameters 3D": parameters_xml("mm"),
-        "SendParameters 6D": parameters_xml("mm") + padding,
-    }
-    await source.parameters("3d")
-    assert (await source.parameters("6d")).xml.endswith(padding)
+    await source.store_parameters(MM)
+    await source.connect(CM + b" " * LONG_XML_BYTES)
     assert in_event_loop == [True, False]

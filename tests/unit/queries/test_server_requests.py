@@ -12,17 +12,17 @@ from tests.unit.queries.fake_source import FakeSource, parameters_xml
 
 async def test_equal_requests_share_a_reply_and_different_ones_wait_for_each_other() -> None:
     source = FakeSource()
-    tasks = [asyncio.create_task(source.parameters("3d", fresh=True)) for _ in range(5)]
+    tasks = [asyncio.create_task(source.parameters(fresh=True)) for _ in range(5)]
     tasks += [asyncio.create_task(source.parameters("6d", fresh=True)) for _ in range(5)]
     await source.server.wait_for_commands(1)
     await asyncio.sleep(0)
-    assert source.server.commands == ["SendParameters 3D"]  # one at a time
+    assert source.server.commands == ["SendParameters"]  # one at a time
     source.server.answer(parameters_xml("mm"))
     await source.server.wait_for_commands(2)
     source.server.answer(parameters_xml("cm"))
     results = await asyncio.gather(*tasks)
     assert [result.xml for result in results] == [parameters_xml("mm")] * 5 + [parameters_xml("cm")] * 5
-    assert source.server.commands == ["SendParameters 3D", "SendParameters 6D"]
+    assert source.server.commands == ["SendParameters", "SendParameters 6D"]
     assert len({id(result) for result in results}) == 2  # each reply is parsed once
 
 
@@ -40,7 +40,7 @@ async def test_cancelling_one_caller_does_not_cancel_a_shared_request() -> None:
 async def test_the_fallback_is_sent_if_the_command_is_refused() -> None:
     source = FakeSource()
     source.server.replies = {"SendParameters 3D": ServerError("err-what?"), "SendParameters": b"<a/>"}
-    requests = ServerRequests(source.queries._settings, lambda: [source.stream])
+    requests = ServerRequests(source.queries._settings, lambda: source.streams)
     command, packet = await requests.send(SendParameters(("3d",)), fallback=SendParameters())
     assert (command, packet.body) == (SendParameters(), b"<a/>")
 
@@ -48,8 +48,8 @@ async def test_the_fallback_is_sent_if_the_command_is_refused() -> None:
 async def test_the_error_of_the_fallback_is_raised() -> None:
     source = FakeSource()
     source.server.replies = {"SendCurrentFrame 3D": ServerError("a"), "SendCurrentFrame": ServerError("b")}
-    requests = ServerRequests(source.queries._settings, lambda: [source.stream])
-    [component, _] = source.stream.components
+    requests = ServerRequests(source.queries._settings, lambda: source.streams)
+    [component, _] = source.streams[0].components
     with pytest.raises(QueryError, match="the server does not know SendCurrentFrame, or refuses it: b"):
         await requests.send(SendCurrentFrame((component,)), fallback=SendCurrentFrame())
 
@@ -84,14 +84,16 @@ async def test_losing_the_connection_during_a_request_is_an_error() -> None:
 
 async def test_losing_the_connection_while_waiting_for_another_request_is_an_error() -> None:
     source = FakeSource()
-    first = asyncio.create_task(source.parameters("3d"))
-    second = asyncio.create_task(source.parameters_error("6d"))
+    first = asyncio.create_task(source.parameters())
     await source.server.wait_for_commands(1)
+    second = asyncio.create_task(source.queries._requests.send(SendCurrentFrame()))
     source.server.is_connected = False
     source.server.answer(parameters_xml("mm"))
     await first
-    assert (await second).code == "no-connection"
-    assert source.server.commands == ["SendParameters 3D"]
+    with pytest.raises(QueryError) as caught:
+        await second
+    assert caught.value.code == "no-connection"
+    assert source.server.commands == ["SendParameters"]
 
 
 async def test_before_the_first_failure_the_error_names_the_address() -> None:

@@ -70,9 +70,10 @@ async def test_sections_are_checked_before_the_server_is_asked() -> None:
 
 async def test_sections_are_requested_in_the_order_of_the_specification() -> None:
     source = FakeSource()
-    source.server.replies["SendParameters 3D Force"] = parameters_xml("mm")
+    source.server.replies["SendParameters"] = parameters_xml("mm")  # without Force
+    source.server.replies["SendParameters 3D Force"] = parameters_xml("cm")
     parameters = await service_of(source).parameters("lab", ["force", "3d", "3d"], fresh=False)
-    assert (parameters.xml, parameters.session) == (parameters_xml("mm"), 1)
+    assert (parameters.xml, parameters.session) == (parameters_xml("cm"), 1)
 
 
 @pytest.mark.parametrize("sections", [(), tuple(SECTIONS), tuple(reversed(SECTIONS))])

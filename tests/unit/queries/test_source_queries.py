@@ -19,17 +19,16 @@ FRAME = markers_frame(7, (1.0, 2.0, 3.0))[8:]
 
 async def test_parameters_are_answered_with_their_xml_age_session_and_version() -> None:
     source = FakeSource()
-    source.status.parameters_changed(4)
-    source.store_parameters(parameters_xml("mm"))
+    await source.store_parameters(parameters_xml("mm"))
     answer = await source.answer("parameters")
     assert (answer.payload, answer.encoding) == (parameters_xml("mm"), XML)
     assert answer.attachment.keys() == {"age_s", "session", "parameters_version"}
-    assert (answer.attachment["session"], answer.attachment["parameters_version"]) == (1, 4)
+    assert (answer.attachment["session"], answer.attachment["parameters_version"]) == (1, 1)
 
 
 async def test_stale_parameters_are_marked_as_stale() -> None:
     source = FakeSource()
-    source.store_parameters(parameters_xml("mm"))
+    await source.store_parameters(parameters_xml("mm"))
     source.server.is_connected = False
     answer = await source.answer("parameters", stale_ok=True)
     assert answer.attachment["stale"] is True
@@ -37,7 +36,7 @@ async def test_stale_parameters_are_marked_as_stale() -> None:
 
 async def test_parameters_are_converted_to_json_once() -> None:
     source = FakeSource()
-    source.store_parameters(parameters_xml("mm"))
+    await source.store_parameters(parameters_xml("mm"))
     first = await source.answer("parameters", as_json=True)
     second = await source.answer("parameters", as_json=True)
     assert first.payload is second.payload
@@ -57,6 +56,7 @@ async def test_parameters_that_cannot_be_converted_to_json_are_an_error(
     xml: bytes, code: str, text: str
 ) -> None:
     source = FakeSource()
+    await source.store_parameters(parameters_xml("mm"))
     source.server.replies["SendParameters 6D"] = xml
     assert (await source.answer("parameters", "6d")).payload == xml
     with pytest.raises(QueryError, match=text) as caught:

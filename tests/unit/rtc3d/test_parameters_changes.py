@@ -17,8 +17,10 @@ from gateway.rtc3d.parameters_changes import (
     changed_sections,
     describe_renames,
     differ_in_statistics_only,
+    statistics_xml,
 )
-from tests.spec_parameters import ALL, ANALOG, GENERAL
+from gateway.rtc3d.parameters_xml import parse_parameters
+from tests.spec_parameters import ALL, ANALOG, GENERAL, spec_xml
 
 
 def scene(markers: str = "", tools: str = "", **section: Any) -> Parameters:
@@ -84,6 +86,7 @@ def test_statistics_are_left_out() -> None:
         (b"<a><Stats>1</Stats></a>", b"<a><Stats>22</Stats></a>", True),
         (b"<a><Stats>1</Stats></a>", b"<a><Stats>1</Stats><b/></a>", False),
         (b"<a><Stats>1</Stats></a>", b"<a><Stats>1</a>", False),
+        (b"<a><Stats>1</Stats></a>", b"<a></a>", True),
         (b"<a/>", b"<a/>", True),
         (b"<a/>", b"<b/>", False),
     ],
@@ -92,3 +95,10 @@ def test_replies_that_differ_in_their_statistics_are_recognised_unparsed(
     before: bytes, after: bytes, expected: bool
 ) -> None:
     assert differ_in_statistics_only(before, after) is expected
+
+
+def test_statistics_can_be_read_alone() -> None:
+    general = parse_parameters(statistics_xml(spec_xml("general"))).parameters.general
+    assert general is not None
+    assert (general.frames_sent, general.frames_per_s) == (GENERAL.frames_sent, GENERAL.frames_per_s)
+    assert statistics_xml(spec_xml("3d")) == b""

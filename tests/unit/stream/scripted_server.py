@@ -8,6 +8,9 @@ from typing import Any
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import ConnectError
+from gateway.rtc3d.commands import SendParameters
+from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
+from gateway.stream.parameters import Connection as ClientConnection
 from gateway.stream.session import Session
 from tests.servers import markers_frame, ok, packet
 
@@ -39,6 +42,12 @@ def refusing_without_name(*refused: str, by: Answer = obliging) -> Answer:
 def silent_to(*ignored: str, by: Answer = obliging) -> Answer:
     """Return an answer that ignores the commands that begin with one of these texts."""
     return lambda command: None if command.startswith(ignored) else by(command)
+
+
+async def read_parameters(client: ClientConnection) -> ParsedParameters:
+    """Ask for the parameters, as in a handshake."""
+    packet = await client.ask(SendParameters())
+    return parse_parameters(packet.body)
 
 
 class Connection(asyncio.Transport):

@@ -11,7 +11,7 @@ from gateway.stream.change_tasks import DEMAND_POLL_S, ChangeTasks
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
-from tests.unit.stream.scripted_server import ScriptedServer, refusing, silent_to
+from tests.unit.stream.scripted_server import ScriptedServer, read_parameters, refusing, silent_to
 from tests.unit.stream.virtual_time import settle
 
 START, STOP = "StreamFrames AllFrames", "StreamFrames Stop"
@@ -29,7 +29,7 @@ class Lab:
         self.session = Session(
             source, settings, self.status, lambda *_: None, lambda _: None, self.server.connect
         )
-        self._control = StreamControl(source, settings, self.status, self.session, lambda *_: None)
+        self._control = StreamControl(source, settings, self.status, self.session, read_parameters)
         self.adaptation = ChangeTasks(
             source, settings, self.status, self.session, self._control, lambda: self.has_subscribers
         )

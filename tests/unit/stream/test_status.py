@@ -65,7 +65,7 @@ def test_a_change_of_state_is_logged_with_source_states_and_cause(caplog: pytest
         "lab (3d): stalled → waiting to reconnect: the connection ended (closed by the server)",
     ]
     assert len(states) == 8
-    assert states[-1] is status.state
+    assert (states[-1], status.state) == (StreamState.STALLED, StreamState.WAITING)
 
 
 def test_attempts_to_connect_are_logged_as_debug(caplog: pytest.LogCaptureFixture) -> None:

@@ -9,25 +9,33 @@ import pytest
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import LinkError
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
+from gateway.stream.parameters import Connection
 from gateway.stream.session import Session
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
 from tests.servers import markers_frame, ok, packet
-from tests.unit.stream.scripted_server import XML, Answer, ScriptedServer, obliging, refusing, silent_to
+from tests.unit.stream.scripted_server import (
+    XML,
+    Answer,
+    ScriptedServer,
+    obliging,
+    read_parameters,
+    refusing,
+    silent_to,
+)
 from tests.unit.stream.virtual_time import read_clocks, settle
 
 RATE_XML = packet(2, "<RT_Parameters Ver='1.00'><The_3D><Frequency>200</Frequency></The_3D></RT_Parameters>")
 
 
 class Lab:
-    """The control of one session. ``parameters`` are the XML texts that it passed on."""
+    """The control of one session. ``parameters`` are those that it has read."""
 
     def __init__(self, answer: Answer = obliging, *, byte_order: str = "big", **stream: Any) -> None:
         self.server = ScriptedServer(answer)
         self.status = StreamStatus("3d", name="lab (3d)")
-        self.parameters: list[bytes] = []
-        self.parsed: list[ParsedParameters] = []
+        self.parameters: list[ParsedParameters] = []
         source = SourceSettings.model_validate(
             {"name": "lab", "host": "192.0.2.20", "byte_order": byte_order}
         )
@@ -41,11 +49,12 @@ class Lab:
             self.server.connect,
             read_clocks,
         )
-        self.control = StreamControl(source, settings, self.status, self.session, self._on_parameters)
+        self.control = StreamControl(source, settings, self.status, self.session, self._read_parameters)
 
-    def _on_parameters(self, xml: bytes, parsed: ParsedParameters) -> None:
-        self.parameters.append(xml)
-        self.parsed.append(parsed)
+    async def _read_parameters(self, connection: Connection) -> ParsedParameters:
+        parsed = await read_parameters(connection)
+        self.parameters.append(parsed)
+        return parsed
 
     @property
     def commands(self) -> list[str]:
@@ -60,8 +69,7 @@ async def test_the_handshake_asks_for_version_parameters_and_frames() -> None:
     lab = Lab()
     await lab.start()
     assert lab.commands == ["Version 1.0", "SendParameters", "StreamFrames AllFrames 3D"]
-    assert lab.parameters == [XML[8:]]
-    assert lab.parsed == [parse_parameters(XML[8:])]
+    assert lab.parameters == [parse_parameters(XML[8:])]
     assert lab.status.rate == "AllFrames"
     assert lab.status.state is StreamState.IDLE
     assert lab.status.limitations == []

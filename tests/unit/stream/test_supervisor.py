@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import AsyncIterator, Collection, Mapping
+from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from contextlib import asynccontextmanager
 from itertools import pairwise
 from typing import Any
@@ -12,16 +12,25 @@ import pytest
 from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
 from gateway.log import current_log_fields
 from gateway.messages.stamp import Stamp
+from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
-from gateway.stream.supervisor import Callbacks, Supervisor, backoff_delays_s
+from gateway.stream.supervisor import Callbacks, Listener, Supervisor, backoff_delays_s
 from tests.servers import packet
-from tests.unit.stream.scripted_server import ScriptedServer, refusing, silent_to
+from tests.unit.stream.scripted_server import ScriptedServer, read_parameters, refusing, silent_to
 from tests.unit.stream.virtual_time import read_clocks, settle, until
 
 FIRST_DELAY_S, MAX_DELAY_S = 0.2, 10.0
+
+
+class _Listener(Listener):
+    def __init__(self, on_connected: Callable[[], None]) -> None:
+        self._on_connected = on_connected
+
+    def connected(self, stream: Supervisor, request: StreamFrames) -> None:  # noqa: ARG002 - Listener's
+        self._on_connected()
 
 
 class Lab:
@@ -46,12 +55,12 @@ class Lab:
             Callbacks(
                 publish=self._publish,
                 skip=lambda *_: 0,
-                on_parameters=lambda *_: None,
-                on_connected=self._on_connected,
+                read_parameters=read_parameters,
                 on_restart=self._on_restart,
                 on_file=self.files.append,
                 has_subscribers=self._has_subscribers,
             ),
+            _Listener(lambda: self._on_connected()),  # noqa: PLW0108 - tests replace the method
             connect=self.server.connect,
             read_clocks=read_clocks,
         )
@@ -61,7 +70,6 @@ class Lab:
 
     def _on_connected(self) -> None:
         self.connected += 1
-        assert self.supervisor.session is not None  # commands can be sent
 
     def _has_subscribers(self, _components: Collection[ComponentType]) -> bool:
         if self.has_defect:

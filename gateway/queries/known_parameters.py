@@ -1,0 +1,207 @@
+"""The parameters of one source's server as the gateway knows them, and their version."""
+
+import asyncio
+import logging
+from collections.abc import Awaitable, Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple
+
+from gateway.errors import ParametersError
+from gateway.queries.answers import parameters_json
+from gateway.rtc3d.parameters import Parameters, without_statistics
+from gateway.rtc3d.parameters_changes import (
+    changed_sections,
+    describe_renames,
+    differ_in_statistics_only,
+    statistics_xml,
+)
+from gateway.rtc3d.parameters_xml import ParsedParameters, extract_sections, parse_parameters
+from gateway.stream.parameters import process_xml
+
+Sections = tuple[str, ...]
+"""The parameter sections of a query, as in SECTIONS; () for all."""
+
+logger = logging.getLogger(__name__)
+
+
+def now_s() -> float:
+    """Return the time on the event loop's clock, in s."""
+    return asyncio.get_running_loop().time()
+
+
+@dataclass(frozen=True)
+class ServerAnswer:
+    """A server's answer to SendParameters for ``sections``.
+
+    ``session`` is the source's number of connections when it arrived, ``version`` that of the parameters.
+    ``is_readable`` is False if nothing could be read from the XML; then ``parsed`` is empty.
+    """
+
+    sections: Sections
+    xml: bytes
+    parsed: ParsedParameters
+    session: int
+    version: int
+    is_readable: bool = True
+    received_s: float = field(default_factory=now_s)
+    _single_sections: dict[Sections, "ServerAnswer | None"] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    @property
+    def age_s(self) -> float:
+        """How long ago the answer arrived."""
+        return now_s() - self.received_s
+
+    @cached_property
+    def json(self) -> bytes | None:
+        """The parameters as JSON, built once for all queries; None if the answer has none of them."""
+        if not self.is_readable:
+            return None
+        return parameters_json(self.parsed.parameters, self.sections[0] if len(self.sections) == 1 else "")
+
+    async def part(self, sections: Sections) -> "ServerAnswer | None":
+        """Return the answer for some sections, taken from this one.
+
+        Returns None if this answer lacks one of them, or if it is not well-formed. Then only the server
+        itself can answer.
+        """
+        if sections in self._single_sections:
+            return self._single_sections[sections]
+        xml = await process_xml(self.xml, lambda whole: extract_sections(whole, sections))
+        answer = None if xml is None else replace(self, sections=sections, xml=xml)
+        if len(sections) == 1:
+            self._single_sections[sections] = answer
+        return answer
+
+
+def unreadable(
+    sections: Sections, xml: bytes, session: int, version: int, error: ParametersError
+) -> ServerAnswer:
+    """Return an answer from which nothing can be read, for peers that ask for it as it is."""
+    return ServerAnswer(sections, xml, ParsedParameters(Parameters(), (str(error),)), session, version, False)
+
+
+Announce = Callable[[ServerAnswer | None, int], Awaitable[None]]
+"""Takes new parameters, None if the former ones are void, and their version.
+
+Publishes them, and then marks the frames that follow with the version.
+"""
+
+
+class KnownParameters:
+    """The newest parameters of one source's server.
+
+    The version grows by one whenever they mean something else than before, and when they become void.
+    ``former`` are those of the source before a reload, which are continued.
+    """
+
+    def __init__(self, source: str, announce: Announce, former: "KnownParameters | None" = None) -> None:
+        self._source = source
+        self._announce = announce
+        self._lock = asyncio.Lock()  # for one change at a time
+        self.newest: ServerAnswer | None = None if former is None else former.newest
+        """The newest answer for all sections; None before the first, and while the former ones are void."""
+        self.version: int = 0 if former is None else former.version
+        """The version of ``newest``; 0 before the first."""
+
+    @property
+    def is_void(self) -> bool:
+        """Whether there were parameters, and the server gives none now."""
+        return self.newest is None and self.version > 0
+
+    async def take(self, xml: bytes, session: int, *, announce_always: bool = False) -> ServerAnswer:
+        """Keep an answer for all sections, and announce it if it means something else than the former one.
+
+        Raises ParametersError if nothing can be read from it; then nothing changes.
+        """
+        async with self._lock:
+            before = self.newest
+            reading = await process_xml(xml, lambda xml: _read(xml, before))
+            if reading.is_changed:
+                self.version += 1
+                self._log_change(reading, is_first=before is None)
+            self.newest = answer = ServerAnswer((), xml, reading.parsed, session, self.version)
+            if reading.is_changed or announce_always:
+                await self._announce(answer, self.version)
+            return answer
+
+    async def share(self, session: int) -> None:
+        """Announce the newest parameters again, for a new connection to the same server."""
+        async with self._lock:
+            if self.newest is not None:
+                self.newest = replace(self.newest, session=session)
+                await self._announce(self.newest, self.version)
+
+    async def make_void(self, reason: str) -> None:
+        """Forget the parameters, because the server does not give any now (field note 23)."""
+        async with self._lock:
+            if self.newest is None:
+                return
+            self.newest = None
+            self.version += 1
+            logger.warning(
+                "%s: the server gives no parameters any more: %s; the former names and units are void "
+                "(parameters_version %d)",
+                *(self._source, reason, self.version),
+            )
+            await self._announce(None, self.version)
+
+    def _log_change(self, reading: "_Reading", *, is_first: bool) -> None:
+        if is_first:
+            if self.version > 1:
+                logger.info(
+                    "%s: the server gives parameters again (parameters_version %d)",
+                    *(self._source, self.version),
+                )
+            return
+        if reading.renamed:
+            logger.warning(
+                "%s: markers or tools have other names on the server: %s; programs that use the names need "
+                "the new ones (parameters_version %d)",
+                *(self._source, reading.renamed, self.version),
+            )
+        if reading.changed_sections:
+            logger.info(
+                "%s: the server's parameters changed: %s (parameters_version %d)",
+                *(self._source, ", ".join(reading.changed_sections), self.version),
+            )
+
+
+class _Reading(NamedTuple):
+    """Parsed parameters, and how they differ from the former ones."""
+
+    parsed: ParsedParameters
+    is_changed: bool
+    renamed: str = ""
+    changed_sections: Sequence[str] = ()
+
+
+def _read(xml: bytes, before: ServerAnswer | None) -> _Reading:
+    """Parse XML and compare it with the former answer. It may run in a thread."""
+    if before is None:
+        return _Reading(parse_parameters(xml), True)
+    old = before.parsed
+    if differ_in_statistics_only(before.xml, xml):
+        return _Reading(_with_statistics(old, xml), False)
+    parsed = parse_parameters(xml)
+    return _Reading(
+        parsed,
+        without_statistics(parsed.parameters) != without_statistics(old.parameters),
+        describe_renames(old.parameters, parsed.parameters),
+        changed_sections(old.parameters, parsed.parameters),
+    )
+
+
+def _with_statistics(parsed: ParsedParameters, xml: bytes) -> ParsedParameters:
+    """Return parsed parameters with the statistics of ``xml``, which is the same otherwise."""
+    statistics = statistics_xml(xml)
+    old = parsed.parameters.general
+    if not statistics or old is None:
+        return parsed
+    new = parse_parameters(statistics).parameters.general
+    if new is None:
+        return parsed
+    general = replace(old, frames_sent=new.frames_sent, frames_per_s=new.frames_per_s)
+    return parsed._replace(parameters=replace(parsed.parameters, general=general))

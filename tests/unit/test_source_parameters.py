@@ -1,0 +1,295 @@
+"""When a source reads and publishes its server's parameters; with a scripted server, in virtual time."""
+
+import asyncio
+import logging
+
+import pytest
+
+from gateway.c3d_spool import Spool
+from gateway.config.settings import StreamSettings
+from gateway.errors import QueryError
+from gateway.outputs.contract import ServerParameters
+from gateway.queries.questions import Question
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import SECTIONS
+from tests.servers import markers_frame, packet
+from tests.spec_parameters import in_root
+from tests.toy_output import ToyOutput
+from tests.unit.publish.test_tool_poses import IN_VIEW, tools_frame
+from tests.unit.queries.fake_source import parameters_xml
+from tests.unit.scripted_sources import Servers
+from tests.unit.stream.scripted_server import XML, Answer, obliging, refusing, silent_to
+from tests.unit.stream.virtual_time import settle
+from tests.unit.test_source import TWO_STREAMS, Lab, running, spool
+
+__all__ = ["spool"]  # a fixture
+
+OTHER_XML = packet(2, in_root("<The_3D><Unit>cm</Unit></The_3D>"))
+NO_DATA = packet(4)
+REQUEST = "SendParameters"
+ORIGIN = (0.0, 0.0, 0.0)
+
+
+def sending(xml: bytes, by: Answer = obliging) -> Answer:
+    """Return an answer that sends these parameters (a packet)."""
+    return lambda command: xml if command.startswith(REQUEST) else by(command)
+
+
+def tools(*labels: str) -> bytes:
+    items = "".join(f"<Tool id='{n}'><Label>{label}</Label></Tool>" for n, label in enumerate(labels, 1))
+    return packet(2, in_root(f"<The_6D><Tools>{items}</Tools></The_6D>"))
+
+
+async def test_parameters_are_published_with_every_connection(servers: Servers, spool: Spool) -> None:
+    lab = Lab(servers, spool)
+    async with running(lab):
+        await lab.connected()
+        assert lab.parameters == [("lab", ServerParameters(XML[8:], 1, 1))]
+        lab.server.connection.end()
+        await settle()
+        await lab.connected()
+        assert lab.parameters[1:] == [("lab", ServerParameters(XML[8:], 2, 1))]
+
+
+async def test_one_request_per_connection_is_enough(servers: Servers, spool: Spool) -> None:
+    sections = ("General", "The_3D", "The_6D", "Analog", "Force", "Events")
+    whole = packet(2, in_root(*(f"<{section}/>" for section in sections)))
+    lab = Lab(servers, spool, parameters_interval_s=0.0, stall_timeout_s=3600.0)
+    lab.server.answer = sending(whole)
+    async with running(lab):
+        # The frames of the second connection have other numbers, and another number of markers.
+        for frame in (markers_frame(7000, ORIGIN), markers_frame(1, ORIGIN, ORIGIN)):
+            await lab.connected()
+            lab.server.connection.send(frame)
+            for section in SECTIONS:
+                await lab.source.queries.answer(Question("parameters", section))
+            await asyncio.sleep(60)
+            commands = lab.server.connection.commands
+            assert [each for each in commands if each.startswith(REQUEST)] == [REQUEST]
+            lab.server.connection.end()
+            await settle()
+
+
+async def test_streams_that_connect_together_need_one_request(servers: Servers, spool: Spool) -> None:
+    lab = Lab(servers, spool, streams=TWO_STREAMS)
+    async with running(lab):
+        await lab.connected(2)
+        assert lab.count(REQUEST) == 1
+        assert [status.parameters_version for status in lab.source.statuses] == [1, 1]
+        for connection in lab.server.connections:
+            connection.end()
+        lab.server.answer = sending(OTHER_XML)
+        await settle()
+        await lab.connected(2)
+        assert [status.parameters_version for status in lab.source.statuses] == [2, 2]
+
+
+@pytest.mark.parametrize("on_demand", [False, True])
+async def test_parameters_are_read_again_at_the_interval(
+    servers: Servers, spool: Spool, on_demand: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    stream = StreamSettings(components=(ComponentType.TOOLS,), on_demand=on_demand)
+    output = ToyOutput("toy", *([] if on_demand else ["6d"]), has_tool_poses=True)
+    lab = Lab(servers, spool, streams=(stream,), output=output, stall_timeout_s=3600.0)
+    lab.server.answer = sending(tools("Probe"))
+    async with running(lab):
+        await lab.connected()
+        await asyncio.sleep(9.5)
+        assert lab.count(REQUEST) == 1
+        assert lab.count("StreamFrames Stop") == on_demand
+        lab.server.answer = sending(tools("Head"))
+        await asyncio.sleep(1)
+        assert lab.count(REQUEST) == 2
+        assert lab.parameters[1:] == [("lab", ServerParameters(tools("Head")[8:], 1, 2))]
+        assert (await lab.source.queries.answer(Question("parameters"))).payload == tools("Head")[8:]
+        lab.server.connection.send(packet(3, tools_frame(IN_VIEW).body))
+        if not on_demand:
+            assert lab.output.tool_names() == ["Head"]
+        await asyncio.sleep(100)
+        assert lab.count(REQUEST) == 12
+    [warning] = [record.message for record in caplog.records if record.levelno == logging.WARNING]
+    assert warning.startswith("lab: markers or tools have other names on the server: 6d 'Probe' to 'Head';")
+
+
+@pytest.mark.parametrize("answer", [refusing(REQUEST), silent_to(REQUEST)])
+async def test_a_server_that_gives_no_parameters_is_not_asked_again(
+    servers: Servers, spool: Spool, answer: Answer
+) -> None:
+    lab = Lab(servers, spool)
+    lab.server.answer = answer
+    async with running(lab):
+        await lab.connected()
+        lab.server.connection.send(NO_DATA)
+        lab.source.fan_out.on_items_changed()
+        await asyncio.sleep(100)
+        assert lab.count(REQUEST) == 1
+        assert lab.parameters == []
+
+
+async def test_a_changed_number_of_items_requests_the_parameters_once(servers: Servers, spool: Spool) -> None:
+    lab = Lab(servers, spool)
+    async with running(lab):
+        await lab.connected()
+        lab.server.connection.send(NO_DATA)
+        before = lab.count(REQUEST)
+        for _ in range(3):
+            lab.source.fan_out.on_items_changed()
+        await settle()
+        assert lab.count(REQUEST) == before + 1
+        lab.source.fan_out.on_items_changed()
+        await asyncio.sleep(9)
+        assert lab.count(REQUEST) == before + 1
+        await asyncio.sleep(2)
+        assert lab.count(REQUEST) == before + 2
+
+
+async def test_a_new_measurement_requests_the_parameters(servers: Servers, spool: Spool) -> None:
+    lab = Lab(servers, spool)
+    async with running(lab):
+        await lab.connected()
+        lab.server.connection.send_frames(1)
+        await settle()
+        assert lab.count(REQUEST) == 1
+        lab.server.connection.send(NO_DATA)
+        await settle()
+        assert lab.count(REQUEST) == 1
+        lab.server.connection.send_frames(2)
+        await settle()
+        assert lab.count(REQUEST) == 2
+
+
+@pytest.mark.parametrize(("interval_s", "expected"), [(10.0, 11), (0.0, 11), (20.0, 6)])
+async def test_a_server_that_plays_in_a_loop_is_not_asked_at_every_pass(
+    servers: Servers, spool: Spool, interval_s: float, expected: int
+) -> None:
+    lab = Lab(servers, spool, parameters_interval_s=interval_s)
+    async with running(lab):
+        await lab.connected()
+        for _ in range(100):
+            lab.server.connection.send_frames(5000)
+            lab.server.connection.send_frames(1)
+            await asyncio.sleep(1)
+        assert lab.count(REQUEST) == pytest.approx(expected, abs=1)
+
+
+async def test_tools_are_named_by_their_labels_in_the_parameters(servers: Servers, spool: Spool) -> None:
+    lab = Lab(servers, spool, output=ToyOutput("toy", "Probe", has_tool_poses=True))
+    lab.server.answer = sending(tools("Probe"))
+    async with running(lab):
+        await lab.connected()
+        lab.server.connection.send(packet(3, tools_frame(IN_VIEW).body))
+        assert lab.output.tool_names() == ["Probe"]
+
+
+@pytest.mark.parametrize("answer", [refusing(REQUEST), silent_to(REQUEST), sending(packet(2, "what?"))])
+async def test_parameters_are_void_if_another_server_gives_none(
+    servers: Servers, spool: Spool, answer: Answer
+) -> None:
+    lab = Lab(servers, spool, output=ToyOutput("toy", has_tool_poses=True))
+    lab.server.answer = sending(tools("Probe"))
+    async with running(lab):
+        await lab.connected()
+        lab.server.connection.send(packet(3, tools_frame(IN_VIEW).body))
+        lab.server.answer = answer
+        lab.server.connection.end()
+        await settle()
+        assert len(lab.parameters) == 1
+        assert (await lab.source.queries.answer(Question("parameters", stale_ok=True))).payload
+        await lab.connected()
+        assert lab.parameters[1:] == [("lab", ServerParameters(b"", 2, 2))]
+        lab.server.connection.send(packet(3, tools_frame(IN_VIEW).body))
+        assert lab.output.tool_names()[-1] == "tool 1"
+        assert lab.messages("6d")[-1].parameters_version == 2
+        lab.server.answer = sending(tools("Probe"))
+        lab.server.connection.end()
+        await settle()
+        await lab.connected()
+        assert lab.parameters[2:] == [("lab", ServerParameters(tools("Probe")[8:], 3, 3))]
+
+
+async def test_parameters_are_published_before_the_frames_that_have_their_version(
+    servers: Servers, spool: Spool
+) -> None:
+    lab = Lab(servers, spool)
+    is_sent = asyncio.Event()
+    is_sent.set()
+
+    async def publish(_source: str, parameters: ServerParameters) -> None:
+        await is_sent.wait()
+        lab.parameters.append(("lab", parameters))
+
+    lab.source._publish_parameters = publish
+    async with running(lab):
+        await lab.connected()
+        lab.server.answer = sending(OTHER_XML)
+        is_sent.clear()
+        lab.source.fan_out.on_items_changed()
+        await settle()
+        for version in (1, 2):
+            lab.server.connection.send_frames(version)
+            assert lab.messages("3d")[-1].parameters_version == version
+            assert lab.parameters[-1][1].version == version
+            is_sent.set()
+            await settle()
+
+
+async def test_a_reload_continues_the_version(servers: Servers, spool: Spool) -> None:
+    lab = Lab(servers, spool)
+    async with running(lab):
+        await lab.connected()
+        lab.server.answer = sending(OTHER_XML)
+        lab.source.fan_out.on_items_changed()
+        await settle()
+    after = Lab(servers, spool, lab.source, query_timeout_s=3.0)
+    assert after.source.statuses[0].parameters_version == 2
+    async with running(after):
+        await after.connected()
+        assert after.parameters == [("lab", ServerParameters(OTHER_XML[8:], 2, 2))]
+
+
+async def test_the_parameters_of_another_server_are_void_after_a_reload(
+    servers: Servers, spool: Spool
+) -> None:
+    lab = Lab(servers, spool)
+    async with running(lab):
+        await lab.connected()
+    lab.server.refuses = True
+    after = Lab(servers, spool, lab.source, port=3021)
+    async with running(after):
+        await settle()
+        assert after.parameters == [("lab", ServerParameters(b"", 1, 2))]
+        with pytest.raises(QueryError, match="has no connection"):
+            await after.source.queries.answer(Question("parameters", stale_ok=True))
+
+
+async def test_every_message_carries_the_version_of_the_parameters(servers: Servers, spool: Spool) -> None:
+    lab = Lab(servers, spool, streams=TWO_STREAMS)
+
+    async def check_version(version: int) -> None:
+        """Check the version of a new frame, of the status and of the clock."""
+        lab.server.connections[0].send_frames(1)
+        lab.source.publish_status()
+        await settle()
+        newest = [lab.messages(name)[-1] for name in ("3d", "status", "clock")]
+        assert [message.parameters_version for message in newest] == [version] * 3
+
+    async def change_parameters(xml: bytes) -> None:
+        lab.server.answer = lambda command: (
+            packet(2, xml.decode()) if command.startswith("SendParameters") else obliging(command)
+        )
+        await lab.source.queries.answer(Question("parameters", fresh=True))
+        await settle()
+
+    assert [status.parameters_version for status in lab.source.statuses] == [0, 0]
+    async with running(lab):
+        await lab.connected(2)
+        await check_version(1)
+        for xml, version in (
+            (parameters_xml("cm"), 2),
+            (parameters_xml("cm", frames_sent=2), 2),
+            (parameters_xml("m"), 3),
+            (parameters_xml("cm"), 4),
+        ):
+            await change_parameters(xml)
+            await check_version(version)
+            assert lab.parameters[-1][1].version == version
