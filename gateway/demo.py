@@ -30,6 +30,7 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER
 from gateway.rtc3d_server.scene import Scene
 from gateway.simulator.simulator import Simulator
 from gateway.stream.state import StreamState
+from gateway.stream.status import SKIPPED
 
 SOURCE: Final = "demo"
 _START_TIMEOUT_S: Final = 10.0
@@ -180,7 +181,9 @@ def _num_missing(sent: Counter[str], received: _Received) -> int:
 def _num_skipped(gateway: Gateway) -> int:
     """Return how many messages the gateway skipped before any output."""
     statuses = [status for source in gateway.sources for status in source.statuses]
-    return sum(loss.messages for status in statuses for loss in status.losses.report())
+    return sum(
+        loss.messages for status in statuses for loss in status.losses.report() if loss.cause == SKIPPED
+    )
 
 
 def _table(

@@ -5,8 +5,10 @@ from typing import Final
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.messages.stamp import Stamp
+from gateway.rtc3d.commands import Frequency
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
+from gateway.stream.frame_numbers import FrameNumbers
 from gateway.stream.rate_control import MAX_HALVINGS, LagControl
 from gateway.stream.rate_watch import Arrivals
 from gateway.stream.status import FRAME_REJECTED, StreamStatus
@@ -48,6 +50,9 @@ class Ingest:
         self._frame_number = 0  # the newest of a component of _followed_type, like the time stamp
         self._timestamp_us = 0
         self._num_followed = 0  # how many frames began with a component of _followed_type
+        # With Frequency:n the server chooses the frames, so that gaps in the numbers are normal.
+        self._numbers = None if isinstance(stream.rate, Frequency) else FrameNumbers()
+        self._num_state_changes = status.num_state_changes
         self._lag = LagControl(source.max_lag_ms / 1000, MAX_HALVINGS if stream.adapt_rate else 1)
         self._unwanted = ""  # the components of the newest frame, if none of them is wanted
         self.want(stream.components)
@@ -59,6 +64,7 @@ class Ingest:
         self._skippable = self._wanted - _EVENTS
         self._has_stamped = False  # a frame of this session
         self._layout: FrameLayout | None = None  # of the newest frame
+        self._num_skippable = 0  # how many of its components are wanted and no events
 
     @property
     def arrivals(self) -> Arrivals:
@@ -83,6 +89,9 @@ class Ingest:
         """
         status = self._status
         status.frames_received(len(frames), utime)
+        if status.num_state_changes != self._num_state_changes and self._numbers is not None:
+            self._num_state_changes = status.num_state_changes
+            self._numbers.interrupt()
         newest: list[frozenset[ComponentType]] | None = None
         has_wanted = False
         for index, frame in enumerate(frames):
@@ -126,6 +135,7 @@ class Ingest:
     def _set_layout(self, layout: FrameLayout) -> None:
         types = [component.type for component in layout.components]
         self._layout = layout
+        self._num_skippable = len(self._skippable.intersection(types))
         if self._wanted.isdisjoint(types):
             self._unwanted = " ".join(each.key for each in types) or "nothing"
         else:
@@ -138,7 +148,11 @@ class Ingest:
         self._follow(frame.layout.first_component_type, frame_number, timestamp_us)
         clock = self._clock
         capture_us, lag_s, restarted = clock.observe(timestamp_us, self._frame_number, steady_us)
+        if self._numbers is not None and self._num_skippable:
+            self._count_unsent(self._numbers, frame, frame_number, timestamp_us)
         if restarted:
+            if self._numbers is not None:
+                self._numbers.interrupt()
             self._status.server_restarted()
             self._lag.restart()
             if self._has_stamped:  # otherwise the handshake has just been done
@@ -155,6 +169,18 @@ class Ingest:
             self._status.parameters_version,
             clock.has_clock,
         )
+
+    def _count_unsent(
+        self, numbers: FrameNumbers, frame: Frame, frame_number: int, timestamp_us: int
+    ) -> None:
+        """Count the frames that the server's numbers prove to be missing."""
+        first_type = frame.layout.first_component_type
+        if first_type is not self._followed_type or first_type is ComponentType.EVENT:
+            numbers.interrupt()  # this frame has no number of the followed type
+            return
+        num_missing = numbers.observe(frame_number, timestamp_us)
+        if num_missing:
+            self._status.frames_unsent(num_missing, num_missing * self._num_skippable)
 
     def _follow(
         self, first_component_type: ComponentType | None, frame_number: int, timestamp_us: int

@@ -22,6 +22,9 @@ MAX_ERROR_LENGTH: Final = 500
 MAX_LIMITATIONS: Final = 20
 """How many limitations of a connection are kept, and how many logged ones are remembered."""
 
+SKIPPED: Final = "skipped while behind"
+"""The cause of loss of late frames with ``backlog: latest``."""
+
 FRAME_REJECTED: Final = "frame rejected"
 """The cause of loss of frames that contradict themselves."""
 
@@ -68,7 +71,7 @@ class StreamStatus:
     within a connection. ``losses`` counts by cause what arrived and was not published. ``limitations`` lists
     what the current connection lacks. ``unwanted_components`` are the components of the newest frame if it
     had none of this stream's; ``unwanted_since_s`` is since when all frames were like that, on the running
-    clock.
+    clock. ``num_state_changes`` grows with every change of ``state``.
     """
 
     components: str
@@ -77,6 +80,7 @@ class StreamStatus:
     state: StreamState = StreamState.WAITING
     byte_order: str = ""
     rate: str = ""
+    num_state_changes: int = 0
     session: int = 0
     parameters_version: int = 0
     sessions: SessionNumbers = field(default_factory=SessionNumbers)
@@ -204,9 +208,19 @@ class StreamStatus:
     def frame_skipped(self, num_messages: int) -> None:
         """Count a frame of which only the events are published, because frames are late."""
         self.losses.lost(
-            "skipped while behind",
+            SKIPPED,
             "frames arrive late and are skipped, except for the newest one (backlog: latest)",
             messages=num_messages,
+        )
+
+    def frames_unsent(self, num_frames: int, num_messages: int) -> None:
+        """Count frames that the server numbered and did not send."""
+        self.losses.lost(
+            "not sent by the server",
+            f"the server did not send {num_frames} of the frames that it numbered; "
+            "is it too busy, or did this gateway not read for too long?",
+            messages=num_messages,
+            frames=num_frames,
         )
 
     def unknown_components_skipped(self, types: Sequence[int]) -> None:
@@ -272,6 +286,7 @@ class StreamStatus:
         before, self.state = self.state, stream_state(self._phase, protocol_state)
         if self.state is before:
             return
+        self.num_state_changes += 1
         # Up to the end of the handshake, these states alternate while a server is away.
         is_attempt = self.state in _CONNECTING or (before in _CONNECTING and self.state not in _RECEIVING)
         level = logging.DEBUG if is_attempt else logging.INFO

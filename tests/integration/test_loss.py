@@ -91,6 +91,26 @@ async def test_a_rejected_frame_now_and_then_degrades_the_gateway() -> None:
         assert reason.endswith(" (frame rejected)")
 
 
+async def test_frames_that_the_server_numbered_and_did_not_send_are_counted() -> None:
+    numbers = (*range(1, 301), *range(351, 401))
+
+    async def script(client: Client) -> None:
+        def answer(command: str) -> bytes:
+            is_stream = command.startswith("StreamFrames") and "Stop" not in command
+            frames = (markers_frame(number, (0.0, 0.0, 0.0)) for number in numbers) if is_stream else ()
+            return ok(f"OK-{command}") + b"".join(frames)
+
+        await client.commands(answer)
+
+    async with ScriptedServer(script) as server, run_gateway(server.port) as gateway:
+        await gateway.wait_until(gateway.status.losses.report)
+        [loss] = gateway.status.losses.report()
+        assert (loss.cause, loss.messages, loss.frames) == ("not sent by the server", 50, 50)
+        assert health(gateway)[1]["status"] == "degraded"
+        messages = await gateway.wait_for("3d", len(numbers))
+        assert [message.sequence for message in messages] == list(range(len(numbers)))
+
+
 # A process that stands still -----------------------------------------------------------------
 
 
