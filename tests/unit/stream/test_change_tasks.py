@@ -7,11 +7,19 @@ from typing import Any
 import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.stream.change_tasks import DEMAND_POLL_S, ChangeTasks
+from gateway.errors import DefectError, RequestError
+from gateway.stream.change_tasks import DEMAND_POLL_S, MAX_RESUMES, ChangeTasks
 from gateway.stream.session import Session
+from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
-from tests.unit.stream.scripted_server import ScriptedServer, read_parameters, refusing, silent_to
+from tests.unit.stream.scripted_server import (
+    ScriptedServer,
+    obliging,
+    read_parameters,
+    refusing,
+    silent_to,
+)
 from tests.unit.stream.virtual_time import settle
 
 START, STOP = "StreamFrames AllFrames", "StreamFrames Stop"
@@ -25,19 +33,28 @@ class Lab:
         self.server = ScriptedServer()
         self.status = StreamStatus("3d", name="lab (3d)")
         self.has_subscribers = True
+        self.has_defect = False
         source, settings = SourceSettings(name="lab", host="192.0.2.20"), StreamSettings(**stream)
         self.session = Session(
             source, settings, self.status, lambda *_: None, lambda _: None, self.server.connect
         )
         self._control = StreamControl(source, settings, self.status, self.session, read_parameters)
         self.adaptation = ChangeTasks(
-            source, settings, self.status, self.session, self._control, lambda: self.has_subscribers
+            source, settings, self.status, self.session, self._control, self._ask_for_subscribers
         )
 
     async def start(self) -> None:
         await self.session.connect()
         await self._control.start()
         self.adaptation.start()
+
+    def _ask_for_subscribers(self) -> bool:
+        if self.has_defect:
+            raise ZeroDivisionError
+        return self.has_subscribers
+
+    async def check_silence(self) -> None:
+        """Find nothing wrong."""
 
     @property
     def requests(self) -> list[str]:
@@ -189,3 +206,82 @@ async def test_cancelling_ends_every_task() -> None:
     lab.adaptation.cancel()
     await settle()
     assert asyncio.all_tasks() == tasks_before
+
+
+# --- one owner of the rate
+
+
+async def test_a_stopped_stream_stays_stopped_while_its_rate_changes_and_resumes_at_that_rate() -> None:
+    lab = Lab(on_demand=True, idle_after_s=5.0, adapt_rate=True)
+    await lab.start()
+    lab.adaptation.lateness_changed(1)
+    await settle()
+    lab.has_subscribers = False
+    await asyncio.sleep(6)
+    lab.adaptation.lateness_changed(2)
+    await asyncio.sleep(60)
+    assert lab.requests == [HALF, STOP]
+    lab.has_subscribers = True
+    await asyncio.sleep(1)
+    assert lab.requests == [HALF, STOP, "StreamFrames FrequencyDivisor:4"]
+    lab.adaptation.cancel()
+
+
+async def test_a_refused_resume_is_repeated_until_the_server_accepts_it() -> None:
+    lab = Lab(on_demand=True, idle_after_s=5.0)
+    await lab.start()
+    lab.has_subscribers = False
+    await asyncio.sleep(6)
+    lab.server.answer = refusing("StreamFrames AllFrames")
+    lab.has_subscribers = True
+    await asyncio.sleep(2)
+    assert lab.requests == [STOP, START, START]
+    lab.server.answer = obliging
+    await asyncio.sleep(60)
+    assert lab.requests == [STOP, START, START, START]
+    assert lab.status.rate == "AllFrames"
+    assert lab.session.is_open
+    lab.adaptation.cancel()
+
+
+async def test_a_server_that_refuses_every_resume_is_left_with_a_reason() -> None:
+    lab = Lab(on_demand=True, idle_after_s=5.0)
+    await lab.start()
+    lab.has_subscribers = False
+    await asyncio.sleep(6)
+    lab.server.answer = refusing("StreamFrames")
+    lab.has_subscribers = True
+    with pytest.raises(
+        RequestError, match="refuses to send frames again after they were stopped; connecting"
+    ):
+        await lab.session.monitor(lab.check_silence)
+    assert lab.requests.count(START) == MAX_RESUMES
+    lab.adaptation.cancel()
+
+
+async def test_a_refused_stop_is_repeated_ever_later_and_not_once_frames_are_wanted_again() -> None:
+    lab = Lab(on_demand=True, idle_after_s=5.0)
+    await lab.start()
+    lab.server.connection.send_frames(1)
+    lab.server.answer = refusing("StreamFrames Stop")
+    lab.has_subscribers = False
+    await asyncio.sleep(5.5)
+    assert lab.requests == [STOP]
+    await asyncio.sleep(300)
+    assert 8 < len(lab.requests) < 20
+    assert lab.status.state is StreamState.STREAMING
+    assert lab.status.rate == "AllFrames"
+    lab.has_subscribers = True
+    num_before = len(lab.requests)
+    await asyncio.sleep(300)
+    assert len(lab.requests) == num_before
+    lab.adaptation.cancel()
+
+
+async def test_a_defect_ends_the_session() -> None:
+    lab = Lab(on_demand=True)
+    await lab.start()
+    lab.has_defect = True
+    with pytest.raises(DefectError, match="defect in the gateway: ZeroDivisionError: "):
+        await lab.session.monitor(lab.check_silence)
+    lab.adaptation.cancel()

@@ -7,14 +7,14 @@ from typing import Any
 import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.errors import LinkError
+from gateway.errors import LinkError, RequestError, SilenceError
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from gateway.stream.parameters import Connection
 from gateway.stream.session import Session
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
-from tests.servers import markers_frame, ok, packet
+from tests.servers import error, markers_frame, ok, packet
 from tests.unit.stream.scripted_server import (
     XML,
     Answer,
@@ -24,7 +24,7 @@ from tests.unit.stream.scripted_server import (
     refusing,
     silent_to,
 )
-from tests.unit.stream.virtual_time import read_clocks, settle
+from tests.unit.stream.virtual_time import read_clocks, settle, until
 
 RATE_XML = packet(2, "<RT_Parameters Ver='1.00'><The_3D><Frequency>200</Frequency></The_3D></RT_Parameters>")
 
@@ -166,6 +166,153 @@ async def test_a_refused_change_of_rate_leaves_the_rate() -> None:
     assert lab.status.limitations == [
         "the server refused StreamFrames Frequency:100 3D: Error-StreamFrames Frequency:100 3D"
     ]
+
+
+async def test_a_request_without_an_answer_is_not_accepted_unless_data_comes() -> None:
+    lab = Lab(silent_to("StreamFrames AllFrames"))
+    await lab.start()
+    assert lab.commands[2:] == [
+        "StreamFrames AllFrames 3D",
+        "StreamFrames AllFrames",
+        "StreamFrames FrequencyDivisor:1",
+    ]
+    assert lab.status.rate == "FrequencyDivisor:1"
+
+
+async def test_late_refusals_of_an_accepted_request_do_not_end_the_handshake() -> None:
+    """The server sends frames, although what it has answered looks like a refusal of every form."""
+
+    def answer(command: str) -> bytes | None:
+        return error("what?") if command.startswith("StreamFrames") else None
+
+    lab = Lab(answer)
+    starting = asyncio.create_task(lab.start())
+    await until(lambda: "StreamFrames" in lab.commands if lab.server.connections else False)
+    await asyncio.sleep(1)
+    lab.server.connection.send_frames(1)
+    await starting
+    assert lab.status.state is StreamState.STREAMING
+
+
+# --- silence
+
+
+async def probes_after(lab: Lab, answer: Answer, silence_s: float = 10) -> list[str]:
+    """Return what the gateway sends while the server is silent, after frames or No Data were requested."""
+    await lab.start()
+    num_before = len(lab.commands)
+    lab.server.answer = answer
+    monitoring = asyncio.create_task(lab.session.monitor(lab.control.check_silence))
+    await asyncio.sleep(silence_s)
+    assert not monitoring.done()
+    monitoring.cancel()
+    return lab.commands[num_before:]
+
+
+def no_measurement(by: Answer = obliging) -> Answer:
+    """Return an answer with No Data after each acknowledgement of StreamFrames."""
+
+    def answer(command: str) -> bytes | None:
+        reply = by(command)
+        return reply if reply is None or not command.startswith("StreamFrames") else reply + packet(4)
+
+    return answer
+
+
+@pytest.mark.parametrize(
+    ("by", "probe"),
+    [
+        (obliging, "Version 1.0"),
+        (refusing("Version"), "Version 1.0"),
+        (silent_to("Version"), "SendParameters"),
+        (refusing("SendParameters", by=silent_to("Version")), "SendParameters"),
+        (silent_to("Version", "SendParameters"), "StreamFrames AllFrames 3D"),
+    ],
+    ids=["answered", "refused", "ignored", "ignored and refused", "all ignored"],
+)
+async def test_silence_is_checked_with_a_command_that_the_server_has_answered(by: Answer, probe: str) -> None:
+    answer = no_measurement(by)
+    lab = Lab(answer)
+    assert await probes_after(lab, answer) == [probe] * 3
+
+
+async def test_silence_after_a_stop_is_not_checked_by_a_request_for_frames() -> None:
+    answer = silent_to("Version", "SendParameters")
+    lab = Lab(answer)
+    await lab.start()
+    await lab.control.stop()
+    monitoring = asyncio.create_task(lab.session.monitor(lab.control.check_silence))
+    await asyncio.sleep(10)
+    assert lab.commands[3:] == ["StreamFrames Stop"] * 4
+    monitoring.cancel()
+
+
+async def test_a_server_that_no_longer_answers_is_not_alive() -> None:
+    lab = Lab(no_measurement())
+    await lab.start()
+    lab.server.answer = silent_to("")
+    with pytest.raises(SilenceError, match=r"did not answer Version 1\.0 within 2 s, and sends no frames"):
+        await lab.session.monitor(lab.control.check_silence)
+
+
+async def test_a_stream_of_events_alone_is_not_requested_again() -> None:
+    lab = Lab(components=["event"])
+    assert await probes_after(lab, obliging) == ["Version 1.0"] * 3
+
+
+async def test_frames_that_do_not_come_are_requested_again_then_the_connection_ends(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    lab = Lab()
+    await lab.start()
+    text = "192.0.2.20:3020 accepted StreamFrames AllFrames 3D and sends neither frames nor No Data"
+    began_s = asyncio.get_running_loop().time()
+    with pytest.raises(SilenceError) as caught:
+        await lab.session.monitor(lab.control.check_silence)
+    assert str(caught.value) == f"{text}, although the gateway asked again; connecting again"
+    assert asyncio.get_running_loop().time() - began_s == pytest.approx(6)
+    assert lab.commands[2:] == ["StreamFrames AllFrames 3D"] * 2
+    assert f"lab (3d): {text}; asking again" in caplog.messages
+
+
+async def test_frames_that_come_after_the_second_request_are_streaming() -> None:
+    lab = Lab()
+    await lab.start()
+    monitoring = asyncio.create_task(lab.session.monitor(lab.control.check_silence))
+    await until(lambda: len(lab.commands) == 4)
+    lab.server.connection.send_frames(1)
+    assert lab.status.state is StreamState.STREAMING
+    await asyncio.sleep(2.9)
+    assert not monitoring.done()
+    monitoring.cancel()
+
+
+async def test_a_second_request_that_is_refused_ends_the_connection() -> None:
+    lab = Lab()
+    await lab.start()
+    lab.server.answer = refusing("StreamFrames")
+    with pytest.raises(RequestError, match="no longer accepts StreamFrames AllFrames 3D; connecting again"):
+        await lab.session.monitor(lab.control.check_silence)
+
+
+# --- stopping
+
+
+async def test_a_refused_or_ignored_stop_leaves_the_stream_as_it_is() -> None:
+    lab = Lab()
+    await lab.start()
+    lab.server.connection.send_frames(1)
+    lab.server.answer = refusing("StreamFrames Stop")
+    assert not await lab.control.stop()
+    assert (lab.control.is_stopped, lab.status.state) == (False, StreamState.STREAMING)
+    assert lab.status.rate == "AllFrames"
+    lab.server.answer = silent_to("StreamFrames Stop")
+    stopping = asyncio.create_task(lab.control.stop())
+    await asyncio.sleep(1)
+    assert not stopping.done()
+    assert await stopping
+    assert lab.status.rate == ""
 
 
 async def test_a_paused_stream_has_no_rate_until_it_is_resumed() -> None:

@@ -183,7 +183,7 @@ async def test_a_server_that_hangs_streams_within_5_s_of_being_well(
             return XML
         return ok(f"OK-{text}") if known in {command, FIRST_FORM} else error(f"Error-{text}")
 
-    for hang_s in (1.0, 3.0, 5.5, 7.0, 9.0, 11.0, 14.0, 33.0, 61.0):
+    for hang_s in (1.0, 5.5, 11.0, 33.0):
         lab = Lab()
         server = StreamingServer(lab, answer)
         server.hangs_at = hang_at
@@ -224,7 +224,7 @@ SERVERS: dict[str, Answer] = {
 
 @pytest.mark.parametrize(("first", "second"), list(product(SERVERS, SERVERS)))
 async def test_a_server_that_comes_back_as_another_program_streams(first: str, second: str) -> None:
-    for at_s in (0.0, 1.0, 2.5, 5.0, 20.0):
+    for at_s in (0.0, 2.5, 20.0):
         lab = Lab()
         server = StreamingServer(lab, SERVERS[first])
         async with serving(lab, server):
