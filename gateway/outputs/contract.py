@@ -55,8 +55,8 @@ class FramePublisher(Protocol):
     ) -> None:
         """Send the ``components`` of one frame without blocking.
 
-        ``sequence`` counts the frames of the source from 0. Raises OutputError if the output does not accept
-        the frame.
+        ``sequence`` counts the frames of the source from 0, including those that are skipped. Raises
+        OutputError if the output does not accept the frame.
         """
 
     def close(self) -> None:

@@ -110,7 +110,7 @@ async def test_time_stamps_that_go_back_are_a_restart_without_a_reconnect() -> N
 
 async def test_states_follow_the_server_and_the_outputs_show_them(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level("INFO")
-    async with Simulator(SyntheticScene(rate_hz=200)) as simulator:
+    async with Simulator(SyntheticScene(rate_hz=200, analog_rate_hz=200)) as simulator:
         simulator.stop_measurement()
         async with run_gateway(simulator.port) as lab:
             await lab.wait_until(lambda: lab.status.state is StreamState.NO_MEASUREMENT)
