@@ -135,6 +135,12 @@ class ObservedStream:
         self.parsed = await process_xml(packet.body, parse_parameters)
         return self.parsed
 
+    @property
+    def load_bytes_per_s(self) -> float:
+        """What the server sends on this connection, in bytes per second."""
+        loads = [component.message_load for component in self.observed.values()]
+        return sum(load.rate_hz * load.largest_bytes for load in loads)
+
     def _on_frames(self, frames: list[Frame], utime: int, steady_us: int) -> None:
         self.status.frames_received(len(frames), utime)
         for frame in frames:

@@ -1,4 +1,4 @@
-"""Checks of one source: host name, TCP, protocol, parameters, frames, rate, visibility."""
+"""Checks of one source: host name, TCP, protocol, parameters, frames, rate, buffer, visibility."""
 
 import asyncio
 import ipaddress
@@ -10,12 +10,13 @@ from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.doctor.frame_checks import check_frames, check_visibility
 from gateway.doctor.observation import COMPONENTS_WITH_VISIBILITY, ObservedStream
 from gateway.doctor.rate_check import check_rate
+from gateway.doctor.receive_buffer_check import check_receive_buffer
 from gateway.errors import ConnectError, LinkError, PacketError
 from gateway.findings import Finding, MessageLoad, Result, Subject
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 from gateway.rtc3d.parameters import Parameters
 
-CHECKS: Final = ("name", "TCP", "protocol", "parameters", "frames", "rate", "visibility")
+CHECKS: Final = ("name", "TCP", "protocol", "parameters", "frames", "rate", "buffer", "visibility")
 """The checks in order. If one of the first three fails, those after it are not made."""
 
 _PORTS: Final = f"{FIRST_PRINCIPLES_PORT} is First Principles, {WAVEFRONT_PORT} WaveFront"
@@ -53,6 +54,7 @@ class SourceChecks:
             for stream in self._streams:
                 yield check_frames(self._subject, stream, self._parameters)
                 yield check_rate(self._subject, stream, self._parameters)
+                yield check_receive_buffer(self._subject, stream.load_bytes_per_s)
                 if set(COMPONENTS_WITH_VISIBILITY).intersection(stream.settings.components):
                     yield check_visibility(self._subject, stream, self._parameters)
         await asyncio.gather(*(stream.session.close() for stream in self._streams))

@@ -3,7 +3,6 @@
 import asyncio
 import contextlib
 import logging
-import socket
 from collections.abc import Awaitable, Callable
 from typing import Final, NoReturn
 
@@ -39,7 +38,7 @@ from gateway.stream.backlog import MAX_TOGETHER, Backlog
 from gateway.stream.running_clock import running_clock
 from gateway.stream.running_time import running_timeout
 from gateway.stream.status import StreamStatus
-from gateway.stream.tcp import Connect, open_connection
+from gateway.stream.tcp import Connect, open_connection, set_socket_options
 
 _MIN_WAIT_S: Final = 0.001
 """The shortest timer. uvloop has whole milliseconds, and would run shorter ones without waiting."""
@@ -261,13 +260,12 @@ class Session:
     # The methods of an asyncio.Protocol, which the event loop calls.
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        """Let the kernel detect a server that has disappeared. The event loop has turned Nagle off (§2.1).
+        """Set the options of the socket. The event loop has turned Nagle off (§2.1).
 
         This method does not store the transport; ``connect`` does. If ``connect`` is cancelled, uvloop closes
         the transport without calling ``connection_lost``.
         """
-        sock = transport.get_extra_info("socket")
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        set_socket_options(transport.get_extra_info("socket"))
 
     def data_received(self, data: bytes) -> None:
         """Process the bytes of one read. From here to the outputs there are only plain calls, no tasks."""

@@ -3,7 +3,7 @@
 import asyncio
 import socket
 from collections.abc import Awaitable, Callable
-from typing import Any
+from typing import Any, Final
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import ConnectError
@@ -11,6 +11,23 @@ from gateway.stream.running_time import running_timeout
 
 Connect = Callable[[SourceSettings, Any], Awaitable[asyncio.Transport]]
 """Connects a protocol, an object with the methods of ``asyncio.Protocol``, to a source's server."""
+
+
+_RECEIVE_BUFFER_BYTES: Final = 16 * 1024 * 1024
+"""How much the kernel should be able to hold; it limits this to half of the maximum in tcp_rmem."""
+
+
+def set_socket_options(connection: socket.socket) -> None:
+    """Have the kernel detect a server that has disappeared, and hold what comes while this process stops.
+
+    The kernel's autotuning enlarges a receive buffer only as far as one round trip needs. In a local network
+    that is next to nothing: at 2 MB/s it stays at 128 KiB, which holds 50 ms. SO_RCVLOWAT has the kernel make
+    room for that many bytes before it wakes the reader. The room stays when the value is reset. SO_RCVBUF
+    would be limited to net.core.rmem_max, usually 208 KiB, and switch the autotuning off.
+    """
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT, _RECEIVE_BUFFER_BYTES)
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT, 1)
 
 
 async def open_connection(source: SourceSettings, protocol: Any) -> asyncio.Transport:

@@ -122,7 +122,7 @@ async def test_an_unknown_host_name_fails_and_ends_the_checks_of_its_source() ->
         "Correct the source's host, add the name to DNS or /etc/hosts, or use an IP address."
     )
     assert findings.failing() == ["name"]
-    later = ("TCP", "protocol", "parameters", "frames", "rate", "visibility")
+    later = ("TCP", "protocol", "parameters", "frames", "rate", "buffer", "visibility")
     assert findings.not_tested(*later) == {"it needs name, which failed"}
     assert findings.failing("other") == []
 
@@ -133,7 +133,7 @@ async def test_a_refused_connection_fails() -> None:
     assert findings.of("TCP").found == f"connection refused by 127.0.0.1:{port}"
     assert findings.of("TCP").remedy == "Is the RT server running, and is this its port?"
     assert findings.failing() == ["TCP"]
-    later = ("protocol", "parameters", "frames", "rate", "visibility")
+    later = ("protocol", "parameters", "frames", "rate", "buffer", "visibility")
     assert findings.not_tested(*later) == {"it needs TCP, which failed"}
 
 

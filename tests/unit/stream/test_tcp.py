@@ -5,6 +5,7 @@ import errno
 import socket
 import threading
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ import uvloop
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import ConnectError
-from gateway.stream.tcp import open_connection
+from gateway.stream.tcp import open_connection, set_socket_options
 from tests.networks import free_port
 
 
@@ -114,3 +115,21 @@ def test_the_host_and_the_port_are_looked_up(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(socket, "getaddrinfo", look_up)
     error_of(source(host="lab-pc", port=3030))
     assert asked == [("lab-pc", 3030)]
+
+
+def test_the_kernel_holds_seconds_of_frames_while_the_process_stands_still() -> None:
+    """The server has a small send buffer, as on Windows, and the client reads nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 64 * 1024)
+        client = socket.create_connection(listener.getsockname())
+        server, _ = listener.accept()
+    with client, server:
+        set_socket_options(client)
+        server.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        server.settimeout(1)
+        sent = 0
+        with suppress(TimeoutError):
+            while sent < 10_000_000:
+                sent += server.send(bytes(2252))
+        assert sent > 2_500_000
+        assert client.getsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT) == 1
