@@ -123,6 +123,7 @@ async def run_gateway(
     lcm_url: str | None = None,
     queries_url: str | None = None,
     spool: Path | None = None,
+    tool_poses: bool = False,
     **source: Any,
 ) -> AsyncIterator[Gateway]:
     """Run a gateway with the source "lab", whose server listens on ``port`` of this host.
@@ -146,8 +147,10 @@ async def run_gateway(
     keys = zenoh_keys("client", connect=router) if router else zenoh_keys("peer", listen=listen)
     settings = make_settings(
         sources=(lab,),
-        zenoh=ZenohSettings(enabled=bool(listen or router), config=keys),
-        lcm=LcmSettings(enabled=lcm_url is not None, url=lcm_url, queries_url=queries_url),
+        zenoh=ZenohSettings(enabled=bool(listen or router), config=keys, tool_poses=tool_poses),
+        lcm=LcmSettings(
+            enabled=lcm_url is not None, url=lcm_url, queries_url=queries_url, tool_poses=tool_poses
+        ),
         spool=SpoolSettings(directory=None if spool is None else str(spool)),
         metrics=MetricsSettings(enabled=False),
     )

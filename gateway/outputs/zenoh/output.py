@@ -111,9 +111,9 @@ class ZenohOutput(Output):
             for source in tokens:
                 tokens[source] = self._token(session, source, name)
         self._session = session
-        self._update_link()
         if self._queries is not None:
-            self._queries.open(session, list(self._alive))
+            self._queries.open(session, list(self._alive))  # the parameters, before the first frame
+        self._update_link()
 
     def _on_transport(self, event: zenoh.TransportEvent) -> None:
         self._num_transports += 1 if event.kind == zenoh.SampleKind.PUT else -1

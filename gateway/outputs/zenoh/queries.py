@@ -35,6 +35,12 @@ LONG_ANSWER_BYTES: Final = 1024 * 1024
 _RELIABLE: Final = zenoh.CongestionControl.BLOCK
 _LOW_PRIORITY: Final = zenoh.Priority.DATA_LOW
 
+_OVERTAKING_S: Final = 0.05
+"""For how long messages of streams could overtake parameters, because of their priority.
+
+With 1000 messages per second on a busy computer, they did so for up to 7 ms after 2 of 80 publications.
+"""
+
 logger = logging.getLogger(__name__)
 
 
@@ -129,10 +135,16 @@ class ZenohQueries:
     def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
         """Publish a source's parameters as the server sent them.
 
-        Returns a future that is done when they have been sent; None while the session is not open.
+        Returns a future that is done when messages can no longer overtake them; None while the session is
+        not open.
         """
         self._parameters[source] = parameters
-        return self._publish_again(source)
+        sent = self._publish_again(source)
+        if sent is None:
+            return None
+        arrived = self._loop.create_future()
+        sent.add_done_callback(lambda _: self._loop.call_later(_OVERTAKING_S, _set_done, arrived))
+        return arrived
 
     def _publish_all(self) -> None:
         for source in self._parameters:
@@ -270,6 +282,11 @@ def _parameters_publisher(session: zenoh.Session, key: str) -> _AnyPublisher:
         return session.declare_publisher(
             key, encoding=XML, congestion_control=_RELIABLE, priority=_LOW_PRIORITY
         )
+
+
+def _set_done(future: asyncio.Future[None]) -> None:
+    if not future.done():
+        future.set_result(None)
 
 
 # These functions may block, so they run in a SendThread.
