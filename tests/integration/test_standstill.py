@@ -5,7 +5,12 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import Final
+
+import pytest
+
+from tests.gateway_process import GatewayProcess, gaps, gateway_process, simulator
 
 ROUNDS: Final = 5
 
@@ -47,3 +52,54 @@ def test_what_arrives_during_a_stop_is_read_before_a_timeout_ends() -> None:
             process.send_signal(signal.SIGCONT)
             assert process.stdout.readline() == f"read b'{number}'\n"
         process.kill()
+
+
+ALL_200: Final = ("--rate", "200", "--analog-rate", "200")
+DENSE_1000: Final = ("--rate", "1000", "--analog-rate", "1000", "--markers", "50")
+
+
+def assert_nothing_is_lost(gateway: GatewayProcess) -> None:
+    assert set(gateway.headers) == {"3d", "6d", "analog", "force", "event"}
+    for component in ("3d", "6d", "analog", "force"):
+        headers = gateway.headers[component]
+        assert gaps([header.frame_number for header in headers]) == [], component
+        assert gaps([header.sequence for header in headers]) == [], component
+        assert {header.session for header in headers} == {1}, component
+    events = [header.sequence for header in gateway.headers["event"]]
+    assert gaps(events) == []
+    assert "connecting again" not in gateway.log
+    assert gateway.statuses[-1].streams[0].reconnects == 0
+
+
+@pytest.mark.parametrize(
+    ("scene", "rate_hz", "stop_s"),
+    [
+        pytest.param(ALL_200, 200, 0.3, id="200 Hz, 0.3 s"),
+        pytest.param(ALL_200, 200, 5.0, id="200 Hz, 5 s"),
+        pytest.param(DENSE_1000, 1000, 0.3, id="1000 Hz, 0.3 s"),
+        pytest.param(DENSE_1000, 1000, 5.0, id="1000 Hz, 5 s"),
+    ],
+)
+def test_a_stop_of_the_gateway_loses_nothing(
+    tmp_path: Path, scene: tuple[str, ...], rate_hz: int, stop_s: float
+) -> None:
+    with simulator(*scene) as (port, _), gateway_process(tmp_path, port) as gateway:
+        gateway.wait_for_clock()
+        gateway.wait_for_frames(rate_hz)
+        gateway.stop_for(stop_s)
+        gateway.wait_for_frames(round(rate_hz * (stop_s + 2)))
+        assert_nothing_is_lost(gateway)
+
+
+def test_a_stop_of_gateway_and_server_together_keeps_the_connection(tmp_path: Path) -> None:
+    """As when a computer with both, or a virtual machine, stands still: nothing waits in the socket then."""
+    with simulator(*ALL_200) as (port, server), gateway_process(tmp_path, port) as gateway:
+        gateway.wait_for_clock()
+        server.send_signal(signal.SIGSTOP)
+        os.waitid(os.P_PID, server.pid, os.WSTOPPED)
+        gateway.stop_for(5.0)
+        time.sleep(0.5)  # the server continues after the gateway
+        server.send_signal(signal.SIGCONT)
+        gateway.wait_for_frames(200)
+        assert {header.session for header in gateway.headers["3d"]} == {1}
+        assert "connecting again" not in gateway.log
