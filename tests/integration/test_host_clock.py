@@ -1,0 +1,103 @@
+"""Somebody sets the clock of the gateway's computer while frames arrive."""
+
+import struct
+import subprocess
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from tests.gateway_process import GatewayProcess, gaps, gateway_process, simulator
+from tests.waiting import wait_until
+
+RATE_HZ: Final = 200
+
+SHIM: Final = r"""
+#define _GNU_SOURCE
+#include <dlfcn.h>
+#include <fcntl.h>
+#include <stdlib.h>
+#include <sys/mman.h>
+#include <time.h>
+
+static volatile long long *offset_ns;
+
+__attribute__((constructor)) static void map_offset(void) {
+    int file = open(getenv("CLOCK_OFFSET_FILE"), O_RDONLY);
+    offset_ns = mmap(NULL, sizeof *offset_ns, PROT_READ, MAP_SHARED, file, 0);
+}
+
+int clock_gettime(clockid_t clock, struct timespec *time) {
+    static int (*real)(clockid_t, struct timespec *);
+    if (!real) real = (int (*)(clockid_t, struct timespec *))dlsym(RTLD_NEXT, "clock_gettime");
+    int result = real(clock, time);
+    if (result == 0 && (clock == CLOCK_REALTIME || clock == CLOCK_REALTIME_COARSE)) {
+        long long now_ns = time->tv_sec * 1000000000LL + time->tv_nsec + *offset_ns;
+        time->tv_sec = now_ns / 1000000000;
+        time->tv_nsec = now_ns % 1000000000;
+    }
+    return result;
+}
+"""
+"""Adds the number in a file to the wall clock of one process."""
+
+
+class WallClock:
+    """The wall clock that a process with ``environ`` sees."""
+
+    def __init__(self, folder: Path) -> None:
+        source, library, self._file = folder / "shim.c", folder / "shim.so", folder / "offset"
+        source.write_text(SHIM)
+        subprocess.run(["gcc", "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True)
+        self._file.write_bytes(bytes(8))
+        self.environ = {"LD_PRELOAD": str(library), "CLOCK_OFFSET_FILE": str(self._file)}
+
+    def set(self, offset_s: float) -> None:
+        """Set the clock to the true time plus ``offset_s``."""
+        with self._file.open("r+b") as file:  # in place, because the process has mapped the file
+            file.write(struct.pack("<q", round(1e9 * offset_s)))
+
+
+def capture_offsets_s(gateway: GatewayProcess, component: str) -> list[float]:
+    """Return how far the capture time of each message is ahead of the server's even time, in s."""
+    headers = gateway.headers[component]
+    first = headers[0]
+    return [
+        (header.capture_utime - first.capture_utime) / 1e6
+        - (header.frame_number - first.frame_number) / RATE_HZ
+        for header in headers
+    ]
+
+
+@pytest.mark.parametrize("offset_s", [0.5, -0.5, 200 * 86_400.0])
+def test_a_step_changes_time_stamps_and_nothing_else(tmp_path: Path, offset_s: float) -> None:
+    clock = WallClock(tmp_path)
+    stream = {"components": ["3d", "6d"], "backlog": "latest", "adapt_rate": True}
+    options = ("--rate", str(RATE_HZ), "--analog", "0", "--plates", "0")
+    with (
+        simulator(*options) as (port, _),
+        # Frames that are late on a busy machine must not be skipped; a step is larger than this.
+        gateway_process(tmp_path, port, clock.environ, streams=[stream], max_lag_ms=400) as gateway,
+    ):
+        gateway.wait_for_clock()
+        gateway.wait_for_frames(2 * RATE_HZ)
+        assert "set " not in gateway.log
+        clock.set(offset_s)
+        gateway.wait_for_frames(4 * RATE_HZ)
+        wait_until(lambda: "the clock of this computer was set" in gateway.log)
+
+        [stream_status] = gateway.statuses[-1].streams
+        assert (stream_status.rate, stream_status.restarts, stream_status.drops) == ("AllFrames", 0, [])
+        direction, size = ("forward", offset_s) if offset_s > 0 else ("back", -offset_s)
+        assert gateway.log.count("the clock of this computer was set") == 1
+        assert f"was set {direction} by {size:.1f}"[:-2] in gateway.log
+        for component in ("3d", "6d"):
+            headers = gateway.headers[component]
+            assert gaps([header.sequence for header in headers]) == []
+            assert gaps([header.frame_number for header in headers]) == []
+            assert all(header.capture_utime <= header.utime for header in headers)
+            offsets_s = capture_offsets_s(gateway, component)[RATE_HZ:]
+            followed = [abs(each - offset_s) < 0.1 for each in offsets_s]
+            assert followed == sorted(followed), "the capture time follows once, and for good"
+            assert followed.count(True) >= 4 * RATE_HZ - 10
+            assert all(abs(each) < 0.1 for each, has in zip(offsets_s, followed, strict=True) if not has)
