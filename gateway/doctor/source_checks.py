@@ -108,13 +108,6 @@ class SourceChecks:
                 await stream.control.start()
             except LinkError as error:
                 return self._protocol_failure(stream, error)
-            if not stream.status.bytes_in:
-                return self._subject.failing(
-                    "protocol",
-                    f"{self._server} accepts a connection but sends nothing",
-                    f"Correct the source's host and port ({_PORTS}). If they are correct, restart the RT "
-                    "server.",
-                )
         if self._source.streams == "auto":
             await self._open_further_streams(self._streams[0])
         limitations = dict.fromkeys(text for stream in self._streams for text in stream.status.limitations)
@@ -148,6 +141,12 @@ class SourceChecks:
                 "protocol",
                 f"the program at {self._server} is not an RT server; its first bytes are {text!r}",
                 f"Correct the source's host and port: {_PORTS}.",
+            )
+        if stream.session.is_open and not stream.status.bytes_in:
+            return self._subject.failing(
+                "protocol",
+                f"{self._server} accepts a connection but sends nothing",
+                f"Correct the source's host and port ({_PORTS}). If they are correct, restart the RT server.",
             )
         if stream.session.is_open:  # only the refusal of StreamFrames leaves it open
             return self._subject.failing(
