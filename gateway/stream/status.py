@@ -163,6 +163,10 @@ class StreamStatus:
             self._failures.failed(str(error))
         self._enter(Phase.WAITING, "the connection ended", str(error))
 
+    def stopped(self, reason: str) -> None:
+        """Note that the gateway closed the connection itself."""
+        self._enter(Phase.WAITING, "the gateway ends the connection", reason)
+
     def reconnecting(self) -> None:
         """Count an attempt to connect after the first."""
         self.reconnects += 1

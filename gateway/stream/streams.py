@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
 
 from gateway.config.settings import StreamSettings
-from gateway.errors import ClosedError, LinkError, SilenceError
+from gateway.errors import LinkError, SilenceError
 from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import General, Parameters
@@ -132,7 +132,7 @@ class _Further:
         """Close the connection."""
         if self.task is not None and self.is_running:
             self.task.cancel()
-            self.stream.status.disconnected(ClosedError(reason))
+            self.stream.status.stopped(reason)
 
     async def _run_after(self, former: asyncio.Task[None] | None) -> None:
         if former is not None:

@@ -9,7 +9,13 @@ import pytest
 from tests.unit.scripted_sources import Servers, SlowThreads, use_scripted_servers
 from tests.unit.stream.virtual_time import VirtualTimeLoop
 
-_IN_VIRTUAL_TIME: Final = {"test_daemon.py", "test_gateway.py", "test_source.py", "test_source_parameters.py"}
+_IN_VIRTUAL_TIME: Final = {
+    "test_automatic_streams.py",
+    "test_daemon.py",
+    "test_gateway.py",
+    "test_source.py",
+    "test_source_parameters.py",
+}
 
 
 def pytest_asyncio_loop_factories(

@@ -1,0 +1,303 @@
+"""``streams: auto`` with default time-outs, in virtual time."""
+
+import asyncio
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+
+from gateway.c3d_spool import Spool
+from gateway.stream.state import StreamState
+from tests.servers import error, ok, packet
+from tests.spec_parameters import in_root
+from tests.unit.scripted_sources import Servers
+from tests.unit.stream.scripted_server import Connection, ScriptedServer
+from tests.unit.stream.virtual_time import settle, until
+from tests.unit.test_source import HOST, Lab
+
+EVERYTHING = "3d 6d analog force event"
+TWO = ["3d 6d force event", "analog"]
+ONE_CONNECTION = "analog arrives at 200 Hz instead of 2000 Hz: "
+ONE_ONLY = f"{ONE_CONNECTION}the server ends the first connection when there is a second one"
+NO_FRAMES = f"{ONE_CONNECTION}the server sends no frames on a connection for them"
+NO_DATA = packet(4)
+
+
+def parameters(analog_hz: int = 2000, version: str = "1") -> bytes:
+    return packet(
+        2,
+        in_root(
+            f"<General><Server><Name>NDI</Name><Ver>{version}</Ver></Server></General>"
+            "<The_3D><Frequency>200</Frequency><Markers><Marker id='1'><Label>A</Label></Marker></Markers>"
+            "</The_3D>"
+            "<Analog><Channels><Channel id='1'><Label>B</Label>"
+            f"<Frequency>{analog_hz}</Frequency></Channel></Channels></Analog>"
+        ),
+    )
+
+
+def answering(xml: bytes) -> Callable[["Numbered", str], bytes | None]:
+    """Return an answer to every command, with these parameters; frames are requested while none run."""
+
+    def answer(_connection: "Numbered", command: str) -> bytes | None:
+        if command.startswith("SendParameters"):
+            return xml
+        return ok(f"OK-{command}") + (NO_DATA if command.startswith("StreamFrames") else b"")
+
+    return answer
+
+
+class Numbered(Connection):
+    """A connection that knows its number, from 1, among those that are open."""
+
+    def __init__(self, server: "Server", session: object) -> None:
+        super().__init__(server, session)  # type: ignore[arg-type]  # a Session
+        self._numbering = server
+
+    @property
+    def number(self) -> int:
+        return [each for each in self._numbering.connections if each.is_open].index(self) + 1
+
+    def _on_command(self, command: str) -> None:
+        self.commands.append(command)
+        answer = self._numbering.answer_on(self, command)
+        if answer is not None:
+            asyncio.get_running_loop().call_soon(self.send, answer)
+
+
+class Server(ScriptedServer):
+    """A server whose answers depend on the connection."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.answer_on = answering(parameters())
+
+    async def connect(self, _source: object, session: object) -> asyncio.Transport:
+        await super().connect(_source, session)  # type: ignore[arg-type]  # a SourceSettings
+        connection = Numbered(self, session)
+        connection.is_open = True
+        self.connections[-1] = connection
+        return connection
+
+    @property
+    def num_open(self) -> int:
+        return sum(each.is_open for each in self.connections)
+
+
+class AutoLab(Lab):
+    """A source with ``streams: auto``, checked every second, and its server."""
+
+    def __init__(self, servers: Servers, tmp_path: Path) -> None:
+        self.scripted = Server()
+        servers._servers[HOST] = self.scripted
+        super().__init__(servers, Spool(tmp_path, max_files=10, max_bytes=1000))
+
+    @property
+    def components(self) -> list[str]:
+        return [status.components for status in self.source.statuses]
+
+    @property
+    def states(self) -> list[StreamState]:
+        return [status.state for status in self.source.statuses]
+
+    @property
+    def limitations(self) -> list[str]:
+        return self.source.statuses[0].limitations
+
+    async def uses_two(self) -> None:
+        await until(lambda: self.components == TWO and set(self.states) == {StreamState.NO_MEASUREMENT})
+        await settle()
+
+
+@pytest.fixture
+async def lab(servers: Servers, tmp_path: Path) -> AutoLab:
+    return AutoLab(servers, tmp_path)
+
+
+@asynccontextmanager
+async def running(lab: AutoLab) -> AsyncIterator[None]:
+    async def check() -> None:
+        while True:
+            await asyncio.sleep(1)
+            lab.source.publish_status()
+
+    tasks = [asyncio.create_task(lab.source.run()), asyncio.create_task(check())]
+    try:
+        yield
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)
+
+
+async def test_two_connections_stay(lab: AutoLab) -> None:
+    async with running(lab):
+        await lab.uses_two()
+        await asyncio.sleep(3600)
+        assert (lab.components, lab.limitations, lab.scripted.num_open) == (TWO, [], 2)
+        assert len(lab.scripted.connections) == 2
+
+
+async def test_a_second_connection_without_any_reply(lab: AutoLab) -> None:
+    answer = lab.scripted.answer_on
+    lab.scripted.answer_on = lambda each, command: answer(each, command) if each.number == 1 else None
+    async with running(lab):
+        began_s = asyncio.get_running_loop().time()
+        await until(lambda: lab.limitations)
+        assert asyncio.get_running_loop().time() - began_s < 10
+        assert (lab.components, lab.limitations) == ([EVERYTHING], [NO_FRAMES])
+        await asyncio.sleep(3600)
+        assert lab.scripted.num_open == 1
+        assert len(lab.scripted.connections) == 2
+
+
+async def test_a_second_connection_that_is_accepted_and_brings_no_frames(lab: AutoLab) -> None:
+    answer = lab.scripted.answer_on
+
+    def without_frames(each: Numbered, command: str) -> bytes | None:
+        if each.number > 1 and command.startswith("StreamFrames"):
+            return ok(f"OK-{command}")
+        return answer(each, command)
+
+    lab.scripted.answer_on = without_frames
+    async with running(lab):
+        await until(lambda: lab.limitations)
+        assert lab.components == [EVERYTHING]
+        await asyncio.sleep(100)
+        assert lab.scripted.num_open == 1
+        assert len(lab.scripted.connections) <= 3
+
+
+async def test_frames_on_the_second_connection_only(lab: AutoLab) -> None:
+    answer = lab.scripted.answer_on
+
+    def without_first(each: Numbered, command: str) -> bytes | None:
+        if each.number == 1 and command.startswith("StreamFrames") and "3D" in command:
+            return ok(f"OK-{command}")
+        return answer(each, command)
+
+    lab.scripted.answer_on = without_first
+    async with running(lab):
+        await until(lambda: lab.scripted.num_open == 2)
+        for _ in range(100):
+            await asyncio.sleep(0.1)
+            lab.scripted.connections[-1].send_frames(1)
+            if lab.limitations:
+                break
+        assert lab.components == [EVERYTHING]
+        assert lab.states == [StreamState.NO_MEASUREMENT]
+
+
+async def test_a_second_connection_that_breaks_later_is_opened_again(lab: AutoLab) -> None:
+    async with running(lab):
+        await lab.uses_two()
+        for _ in range(10):
+            await asyncio.sleep(20)
+            lab.scripted.connections[-1].end()
+            await settle()
+            await lab.uses_two()
+        assert (lab.limitations, lab.scripted.connections[0].is_open) == ([], True)
+
+
+async def test_a_second_connection_that_always_breaks_soon_is_given_up(lab: AutoLab) -> None:
+    async with running(lab):
+        for _ in range(2):
+            await lab.uses_two()
+            await asyncio.sleep(3)
+            lab.scripted.connections[-1].end()
+            await settle()
+        await until(lambda: lab.limitations)
+        assert lab.limitations[0].startswith(f"{ONE_CONNECTION}the server accepts one connection only (")
+        await asyncio.sleep(3600)
+        assert len(lab.scripted.connections) == 3
+
+
+async def test_the_further_connection_ends_with_the_first(lab: AutoLab) -> None:
+    async with running(lab):
+        await lab.uses_two()
+        await asyncio.sleep(20)
+        first, second = lab.scripted.connections
+        lab.scripted.refuses = True
+        first.end()
+        await until(lambda: not second.is_open)
+        assert "Bye" in second.commands
+        await asyncio.sleep(60)
+        lab.scripted.refuses = False
+        await lab.uses_two()
+        assert (len(lab.scripted.connections), lab.limitations) == (4, [])
+
+
+async def end_all(lab: AutoLab) -> None:
+    for connection in lab.scripted.connections:
+        connection.end()
+    await settle()
+
+
+async def test_a_server_that_is_restarted_at_times_keeps_two_connections(lab: AutoLab) -> None:
+    async with running(lab):
+        for number in range(10):
+            await lab.uses_two()
+            await asyncio.sleep(0.5 if number % 3 else 20)
+            await end_all(lab)
+        await lab.uses_two()
+        assert lab.limitations == []
+
+
+async def test_a_server_that_ends_with_every_second_connection_is_remembered(lab: AutoLab) -> None:
+    async with running(lab):
+        for _ in range(3):
+            await lab.uses_two()
+            await end_all(lab)
+        await until(lambda: lab.limitations == [ONE_ONLY] and lab.scripted.num_open == 1)
+        for _ in range(5):
+            await asyncio.sleep(3600)
+            await end_all(lab)
+            await until(lambda: lab.limitations == [ONE_ONLY] and lab.scripted.num_open == 1)
+            assert lab.components == [EVERYTHING]
+        assert len(lab.scripted.connections) == 3 * 2 + 6
+
+
+async def test_another_version_of_the_server_is_tried_again(lab: AutoLab) -> None:
+    async with running(lab):
+        for _ in range(3):
+            await lab.uses_two()
+            await end_all(lab)
+        await until(lambda: lab.limitations == [ONE_ONLY] and lab.scripted.num_open == 1)
+        lab.scripted.answer_on = answering(parameters(version="2"))
+        await end_all(lab)
+        await lab.uses_two()
+        assert lab.limitations == []
+
+
+async def test_a_server_that_refused_is_tried_again_after_ten_minutes(lab: AutoLab) -> None:
+    answer = lab.scripted.answer_on
+    lab.scripted.answer_on = lambda each, command: (
+        answer(each, command) if each.number == 1 else error("err-busy")
+    )
+    async with running(lab):
+        await until(lambda: lab.limitations)
+        lab.scripted.answer_on = answer
+        await asyncio.sleep(300)
+        await end_all(lab)
+        await until(lambda: lab.limitations)
+        assert lab.components == [EVERYTHING]
+        await asyncio.sleep(400)
+        await end_all(lab)
+        await lab.uses_two()
+        assert lab.limitations == []
+
+
+async def test_a_server_without_parameters_after_one_with_rates_gets_one_connection(lab: AutoLab) -> None:
+    async with running(lab):
+        await lab.uses_two()
+        answer = lab.scripted.answer_on
+        lab.scripted.answer_on = lambda each, command: (
+            error("err-unknown") if command.startswith("SendParameters") else answer(each, command)
+        )
+        await asyncio.sleep(20)
+        await end_all(lab)
+        await until(lambda: lab.components == [EVERYTHING] and len(lab.limitations) > 1)
+        assert "does not announce the rates of its components" in lab.limitations[-1]
+        await settle()
+        assert lab.scripted.num_open == 1
