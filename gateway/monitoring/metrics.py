@@ -56,7 +56,7 @@ def _if_valid(value: Callable[[ServerClock], float]) -> Callable[[StreamStatus],
 _STREAM_COUNTERS: Final = (
     _StreamMetric("frames_received", "Frames received from the server.", lambda status: status.frames_in),
     _StreamMetric("received_bytes", "Bytes received from the server.", lambda status: status.bytes_in),
-    _StreamMetric("sessions", "Connections established with the server.", lambda status: status.session),
+    _StreamMetric("sessions", "Connections established with the server.", lambda status: status.connections),
     _StreamMetric("reconnects", "Connection attempts after the first.", lambda status: status.reconnects),
     _StreamMetric(
         "server_restarts",

@@ -29,6 +29,11 @@ class Ingest:
     ``on_restart`` when the server's frame numbers or time stamps start again within the session.
     """
 
+    _wanted: frozenset[ComponentType]
+    _wanted_events: frozenset[ComponentType]
+    _skippable: frozenset[ComponentType]
+    _layout: FrameLayout | None  # of the newest frame; None before the first, and after a change of _wanted
+
     def __init__(
         self,
         source: SourceSettings,
@@ -54,6 +59,8 @@ class Ingest:
         self._numbers = None if isinstance(stream.rate, Frequency) else FrameNumbers()
         self._num_state_changes = status.num_state_changes
         self._lag = LagControl(source.max_lag_ms / 1000, MAX_HALVINGS if stream.adapt_rate else 1)
+        self._has_stamped = False  # a frame of this session
+        self._num_skippable = 0  # how many components of the newest frame are wanted and no events
         self._unwanted = ""  # the components of the newest frame, if none of them is wanted
         self.want(stream.components)
 
@@ -62,9 +69,7 @@ class Ingest:
         self._wanted = frozenset(components)
         self._wanted_events = self._wanted & _EVENTS
         self._skippable = self._wanted - _EVENTS
-        self._has_stamped = False  # a frame of this session
-        self._layout: FrameLayout | None = None  # of the newest frame
-        self._num_skippable = 0  # how many of its components are wanted and no events
+        self._layout = None
 
     @property
     def arrivals(self) -> Arrivals:

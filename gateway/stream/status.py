@@ -66,12 +66,12 @@ class StreamStatus:
     is that of the server's parameters, 0 before the first; all streams of a source have the same.
     ``last_frame_utime`` is when the newest frame arrived, in µs since the Unix epoch, 0 before the first;
     ``last_frame_s`` is the same on the running clock (see ``gateway.stream.running_clock``), None before the
-    first. ``tries`` counts the attempts to connect since the last completed handshake, ``reconnects`` all
-    attempts except the first. ``restarts`` counts how often the server's time or frame numbers started again
-    within a connection. ``losses`` counts by cause what arrived and was not published. ``limitations`` lists
-    what the current connection lacks. ``unwanted_components`` are the components of the newest frame if it
-    had none of this stream's; ``unwanted_since_s`` is since when all frames were like that, on the running
-    clock. ``num_state_changes`` grows with every change of ``state``.
+    first. ``connections`` counts the connections, ``tries`` the attempts to connect since the last completed
+    handshake, ``reconnects`` all attempts except the first. ``restarts`` counts how often the server's time
+    or frame numbers started again within a connection. ``losses`` counts by cause what arrived and was not
+    published. ``limitations`` lists what the current connection lacks. ``unwanted_components`` are the
+    components of the newest frame if it had none of this stream's; ``unwanted_since_s`` is since when all
+    frames were like that, on the running clock. ``num_state_changes`` grows with every change of ``state``.
     """
 
     components: str
@@ -88,6 +88,7 @@ class StreamStatus:
     last_frame_utime: int = 0
     last_frame_s: float | None = None
     bytes_in: int = 0
+    connections: int = 0
     tries: int = 0
     reconnects: int = 0
     restarts: int = 0
@@ -134,6 +135,7 @@ class StreamStatus:
     def connected(self, server: str) -> None:
         """Count a new session, and forget what was agreed in the previous one."""
         self.session = self.sessions.next_after(self.session)
+        self.connections += 1
         self.limitations.clear()
         self.byte_order = self.rate = ""
         self._enter(Phase.HANDSHAKING, "connected", server)

@@ -77,7 +77,7 @@ ANALOG = {"source": "lab", "stream": "analog"}
 async def test_every_stream_has_its_counters(lab: Lab) -> None:
     lab.markers.frames_in, lab.analog.frames_in = 7, 70
     lab.markers.bytes_in = 1000
-    lab.markers.session, lab.markers.reconnects, lab.markers.restarts = 3, 5, 2
+    lab.markers.connections, lab.markers.reconnects, lab.markers.restarts = 3, 5, 2
     lab.markers.last_frame_utime = 1_700_000_000_250_000
     lab.markers.lag_s = 0.125
     assert lab.value("frames_received_total", **MARKERS) == 7
