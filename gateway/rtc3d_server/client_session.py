@@ -193,8 +193,10 @@ class ClientSession:
 
     def _start_stream(self, command: StreamFrames, elapsed_us: int) -> None:
         builder = self._callbacks.frame_builder(command.components)
-        # a frame that is due right now is sent, unless the client already has it
-        first_tick = builder.tick_after(max(elapsed_us - 1, self._newest_us))
+        # A frame that is due right now is sent, unless the client already has it. A request during a stream
+        # continues that stream, so frames that are overdue are sent, too.
+        start_us = elapsed_us if self._schedule is None else min(elapsed_us, self._schedule.due_us)
+        first_tick = builder.tick_after(max(start_us - 1, self._newest_us))
         self._schedule = FrameSchedule(builder, command.rate, first_tick)
 
     def _build(self, builder: FrameBuilder, tick: int) -> DataPacket:

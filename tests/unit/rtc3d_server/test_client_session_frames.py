@@ -104,6 +104,14 @@ def test_a_new_stream_replaces_the_old_one(client: ScriptedClient) -> None:
     ]
 
 
+def test_a_new_stream_sends_the_overdue_frames_of_the_old_one(client: ScriptedClient) -> None:
+    client.send("StreamFrames 3D")
+    assert client.numbers_until(20_000) == [1, 2, 3]
+    client.elapsed_us = 55_000  # three frames are due, and not sent yet
+    client.send("StreamFrames All")
+    assert client.numbers_until(60_000) == [4, 5, 6, 7]
+
+
 def test_stop_ends_the_stream_for_later_measurements_too(client: ScriptedClient) -> None:
     client.send("StreamFrames")
     client.send("StreamFrames Stop")
