@@ -95,7 +95,6 @@ async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool
     console.print(_report(simulator.components_sent, received))
     lost = sum(max(0, _num_missing(simulator.components_sent, each) - skipped) for each in received.values())
     late = sum(each.late.total() for each in received.values())
-    console.print("[green]Nothing was lost.[/]" if not lost else f"[red]{lost} messages were lost.[/]")
     console.print(
         f"{skipped} messages were skipped, and {late} arrived late "
         f"(more than {settings.sources[0].max_lag_ms:g} ms after their capture)."
@@ -104,6 +103,7 @@ async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool
         console.print(
             f"The simulator left out {simulator.frames_dropped} frames that were more than 1 s late."
         )
+    console.print("[green]Nothing was lost.[/]" if not lost else f"[red]{lost} messages were lost.[/]")
     return not lost
 
 

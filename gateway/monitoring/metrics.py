@@ -33,7 +33,13 @@ from gateway.stream.status import StreamStatus
 METRIC_PREFIX: Final = "rtc3d_gateway_"
 
 # Counters of these causes exist from the start, so that PromQL sees the first drop as an increase.
-_STREAM_DROP_CAUSES: Final = ("frame rejected", "unknown component", "skipped while behind", "C3D file")
+_STREAM_DROP_CAUSES: Final = (
+    "frame rejected",
+    "unknown component",
+    "skipped while behind",
+    "not sent by the server",
+    "C3D file",
+)
 
 Labels = tuple[str, ...]
 Sample = tuple[Labels, float]

@@ -121,6 +121,7 @@ async def test_drops_have_a_cause_and_common_causes_start_at_0(lab: Lab) -> None
         "frame rejected": 2,
         "unknown component": 0,
         "skipped while behind": 0,
+        "not sent by the server": 0,
         "C3D file": 0,
         "quite unusual": 1,
     }
