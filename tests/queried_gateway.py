@@ -19,6 +19,7 @@ from gateway.gateway import Gateway
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import SendParameters, parse_command
+from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
 from tests.configurations import make_settings
 from tests.networks import free_endpoint, free_port, open_zenoh, zenoh_keys
@@ -124,11 +125,13 @@ async def run_gateway(
     queries_url: str | None = None,
     spool: Path | None = None,
     tool_poses: bool = False,
+    max_rate_hz: dict[ComponentType, float] | None = None,
     **source: Any,
 ) -> AsyncIterator[Gateway]:
     """Run a gateway with the source "lab", whose server listens on ``port`` of this host.
 
-    On Zenoh, it is a peer that listens at an endpoint, or a client of a router. On LCM, it uses the URLs.
+    On Zenoh, it is a peer that listens at an endpoint, or a client of a router, and ``max_rate_hz`` applies
+    there. On LCM, it uses the URLs.
     ``source`` replaces settings of the source.
     """
     defaults: dict[str, Any] = {
@@ -147,7 +150,12 @@ async def run_gateway(
     keys = zenoh_keys("client", connect=router) if router else zenoh_keys("peer", listen=listen)
     settings = make_settings(
         sources=(lab,),
-        zenoh=ZenohSettings(enabled=bool(listen or router), config=keys, tool_poses=tool_poses),
+        zenoh=ZenohSettings(
+            enabled=bool(listen or router),
+            config=keys,
+            tool_poses=tool_poses,
+            max_rate_hz=max_rate_hz or {},
+        ),
         lcm=LcmSettings(
             enabled=lcm_url is not None, url=lcm_url, queries_url=queries_url, tool_poses=tool_poses
         ),

@@ -12,14 +12,17 @@ import zenoh
 
 from gateway.queries.questions import SCHEMA_TYPES
 from gateway.rtc3d.components import ComponentType
+from tests.networks import free_endpoint, lcm_url
 from tests.queried_gateway import (
     ParameterServer,
     gateway_with_server,
     gateway_without_server,
     query,
     query_all,
+    run_gateway,
+    zenoh_peer,
 )
-from tests.servers import packet
+from tests.servers import ScriptedServer, markers_frame, packet
 from tests.waiting import wait_until_async
 
 
@@ -33,6 +36,31 @@ async def test_a_streaming_component_is_answered_with_its_newest_message() -> No
         assert (message.frame_number, message.num_markers) == (7, 1)
         assert message.sequence == 0
         assert server.count("SendCurrentFrame") == 0
+
+
+@pytest.mark.netns
+async def test_the_newest_frame_is_answered_even_if_pacing_leaves_it_out() -> None:
+    server, endpoint = ParameterServer(), free_endpoint()
+    async with (
+        ScriptedServer(server.script) as listening,
+        run_gateway(
+            listening.port,
+            listen=endpoint,
+            lcm_url=lcm_url(),
+            max_rate_hz={ComponentType.MARKERS: 0.001},
+        ) as gateway,
+    ):
+        fan_out = gateway.sources[0].fan_out
+        await wait_until_async(lambda: fan_out.newest(ComponentType.MARKERS, "zenoh"))
+        for number in range(8, 20):
+            server.send(markers_frame(number, (1.0, 2.0, 3.0)))
+        await wait_until_async(lambda: fan_out.frames[ComponentType.MARKERS] == 13)
+        with zenoh_peer(endpoint) as peer:
+            message = rtc3d.markers_t.decode((await query(peer, "mocap/lab/3d")).payload)
+        sent = {output.name: status.messages["3d"] for output, status in fan_out.outputs}
+    # Zenoh published the first frame only. LCM published all, and has other numbers.
+    assert sent == {"zenoh": 1, "lcm": 13}
+    assert (message.frame_number, message.sequence) == (19, 0)
 
 
 async def test_without_a_running_stream_the_current_frame_is_requested() -> None:
