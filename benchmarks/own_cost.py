@@ -20,7 +20,7 @@ from benchmarks.comparison import Pair, table_cell
 from benchmarks.processes import PLAIN_PYTHON, run_measured
 from benchmarks.report import Goal, Progress, Table
 from benchmarks.workloads import DENSE, Frames
-from gateway.config.settings import MetricsSettings, SourceSettings
+from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
@@ -98,7 +98,15 @@ class _FedGateway:
         self._server = Simulator(DENSE.scene())
         await self._server.start()
         self._server.stop_measurement()
-        source = SourceSettings(name="lab", host="127.0.0.1", port=self._server.port, max_lag_ms=60_000.0)
+        # With backlog: all, a read of 64 frames would be published at a pace, by timers. With latest and
+        # such a max_lag_ms, all frames of a read are published at once.
+        source = SourceSettings(
+            name="lab",
+            host="127.0.0.1",
+            port=self._server.port,
+            max_lag_ms=60_000.0,
+            streams=(StreamSettings(backlog="latest"),),
+        )
         self._stop = asyncio.Event()
         gateway = Gateway(
             make_settings(sources=(source,), metrics=MetricsSettings(enabled=False)), [self._output]

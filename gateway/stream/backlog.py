@@ -27,6 +27,9 @@ _IDLE_S: Final = 0.5
 _TURN_S: Final = 0.005
 """How long one call may publish, except for what its last frames take."""
 
+_RESOLUTION_S: Final = 0.001
+"""The event loop's timers have whole milliseconds, so what is due in the next one is published now."""
+
 _MAX_CHUNK: Final = 16
 """How many frames are published between two looks at the time."""
 
@@ -105,7 +108,7 @@ class Backlog:
         last = min(len(self._frames), at + _MAX_CHUNK)
         if not self._clock.has_clock:
             return last
-        while at < last and self._due_s <= now_s:
+        while at < last and self._due_s < now_s + _RESOLUTION_S:
             self._due_s += self._wait_s(self._frames[at])
             at += 1
         return at

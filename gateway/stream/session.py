@@ -40,9 +40,6 @@ from gateway.stream.running_time import running_timeout
 from gateway.stream.status import StreamStatus
 from gateway.stream.tcp import Connect, open_connection, set_socket_options
 
-_MIN_WAIT_S: Final = 0.001
-"""The shortest timer. uvloop has whole milliseconds, and would run shorter ones without waiting."""
-
 _BYE_S: Final = 0.5
 """How long a server may take to close after Bye; some never do (field note 10)."""
 
@@ -318,9 +315,7 @@ class Session:
             self._set_reading(True)
         else:
             self._set_reading(False)
-            self._backlog_timer = self._loop.call_later(
-                max(wait_s, _MIN_WAIT_S) if wait_s else 0.0, self._publish_backlog
-            )
+            self._backlog_timer = self._loop.call_later(wait_s, self._publish_backlog)
 
     def _set_reading(self, is_reading: bool) -> None:
         """Read from the server, or let the data wait in the kernel."""

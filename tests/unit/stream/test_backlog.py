@@ -65,12 +65,9 @@ def test_a_backlog_is_published_at_a_multiple_of_the_streams_rate(speed: float) 
     subscriber.arrive(frames(1000))
     subscriber.run()
     assert subscriber.numbers == list(range(1000))
-    assert subscriber.times_ms[-1] == pytest.approx(998 / speed, abs=0.002)
-    steps = [
-        after - before
-        for before, after in zip(subscriber.times_ms[1:], subscriber.times_ms[2:], strict=False)
-    ]
-    assert steps == pytest.approx([1 / speed] * 998, abs=0.002)
+    early_ms = [number / speed - time_ms for number, time_ms in enumerate(subscriber.times_ms)]
+    assert min(early_ms) > -0.01
+    assert max(early_ms) < 2, "timers have whole milliseconds"
 
 
 def test_the_pace_continues_from_one_read_to_the_next() -> None:
