@@ -113,7 +113,7 @@ async def test_parameters_are_published_for_every_connection(
     router: str, url: str, subscribers: Subscribers
 ) -> None:
     port = free_port()
-    async with run_gateway(port, router=router, lcm_url=url):
+    async with run_gateway(port, router=router, lcm_url=url) as gateway:
         first, second = ParameterServer("Marker before"), ParameterServer("Marker after")
         async with ScriptedServer(first.script, port):
             await subscribers.wait_for(first.xml)
@@ -125,6 +125,7 @@ async def test_parameters_are_published_for_every_connection(
             await subscribers.wait_for(second.xml)
             assert subscribers.lcm[-1].session > message.session
             assert (subscribers.lcm[-1].parameters_version, subscribers.versions[-1]) == (2, 2)
+            await wait_until_cached(gateway)
             with zenoh_peer(router) as peer:
                 reply = await query(peer, KEY)
                 assert (reply.payload, reply.attachment["parameters_version"]) == (second.xml, 2)
