@@ -110,9 +110,9 @@ class ZenohOutput(Output):
         for tokens, name in ((self._alive, "alive"), (self._streaming, "server")):
             for source in tokens:
                 tokens[source] = self._token(session, source, name)
-        self._session = session
         if self._queries is not None:
             self._queries.open(session, list(self._alive))  # the parameters, before the first frame
+        self._session = session
         self._update_link()
 
     def _on_transport(self, event: zenoh.TransportEvent) -> None:
