@@ -299,7 +299,10 @@ class StreamStatus:
         logger.log(level, "%s: %s → %s: %s (%s)", self.name, before.value, self.state.value, event, cause)
         if self.state in _RECEIVING:
             self._failures.recovered(f"{self.state.value} again")
-        self.on_state(before)
+        try:
+            self.on_state(before)
+        except Exception as defect:  # noqa: BLE001 - what shows the state must not stop the stream
+            self._defects.log(defect)
 
 
 class FrameRate:

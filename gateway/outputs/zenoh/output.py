@@ -142,8 +142,10 @@ class ZenohOutput(Output):
                 self._publishers.remove(publisher)
 
     def _refusal(self) -> OutputError:
-        cause = "not open" if self._session is None else "no router"
-        return OutputError(self.health().problem, cause=cause)
+        if self._session is not None and self.lacks_router:
+            return OutputError(_NO_ROUTER.problem, cause="no router")
+        # The session may be there already, and what is declared on it not yet.
+        return OutputError(self._problem, cause="not open")
 
     def health(self) -> OutputHealth:
         """Return whether messages can be sent."""

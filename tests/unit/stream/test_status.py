@@ -68,6 +68,22 @@ def test_a_change_of_state_is_logged_with_source_states_and_cause(caplog: pytest
     assert (states[-1], status.state) == (StreamState.STALLED, StreamState.WAITING)
 
 
+def test_a_defect_in_what_shows_the_state_is_an_error_once(caplog: pytest.LogCaptureFixture) -> None:
+    def fail(_before: StreamState) -> None:
+        raise ZeroDivisionError("by the test")
+
+    status = StreamStatus("3d", name="lab (3d)", on_state=fail)
+    status.connecting(SERVER)
+    status.connected(SERVER)
+    assert status.state is StreamState.HANDSHAKING
+    [error] = caplog.records
+    assert error.message == (
+        "lab (3d): defect in the gateway: ZeroDivisionError: by the test; report this with the log"
+    )
+    assert error.levelname == "ERROR"
+    assert error.exc_info is not None
+
+
 def test_attempts_to_connect_are_logged_as_debug(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     status = StreamStatus("3d", name="lab (3d)")

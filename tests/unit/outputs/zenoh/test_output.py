@@ -3,9 +3,9 @@ import logging
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 import zenoh
@@ -15,6 +15,7 @@ from gateway.messages.topics import Topic
 from gateway.outputs.status import OutputHealth
 from gateway.outputs.zenoh.config import zenoh_config
 from gateway.outputs.zenoh.output import ZenohOutput
+from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.networks import free_endpoint, open_zenoh, zenoh_keys
 from tests.waiting import wait_until
@@ -175,6 +176,34 @@ def test_a_client_that_has_lost_its_router_refuses_messages() -> None:
     assert caught.value.cause == "no router"
     assert str(caught.value) == output.health().problem
     output.close()
+
+
+def test_a_message_is_refused_as_not_open_while_the_session_opens() -> None:
+    """The gateway publishes from its own thread while another one declares everything on the new session."""
+    refused: list[OutputError] = []
+
+    class Queries:
+        """Publishes at the moment when the session is set and messages cannot be sent yet."""
+
+        def __getattr__(self, _name: str) -> Callable[..., None]:
+            def publish(*_: object) -> None:
+                with pytest.raises(OutputError) as caught:
+                    publisher.publish(b"message")
+                refused.append(caught.value)
+
+            return publish
+
+    output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer", listen=free_endpoint())))
+    output._queries = cast(ZenohQueries, Queries())
+    publisher = output.publisher(MARKERS)
+    try:
+        output.start()
+        wait_until(lambda: refused)
+        assert refused[0].cause == "not open"
+        assert str(refused[0]).startswith("the Zenoh session is not open yet; ")
+    finally:
+        output._queries = None
+        output.close()
 
 
 def test_a_message_that_zenoh_refuses_is_an_error_with_its_key_and_reason(lab: Lab) -> None:
