@@ -15,7 +15,7 @@ import pytest
 from rich.console import Console
 
 from gateway import demo
-from gateway.config.settings import StreamSettings
+from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.outputs.kind import DemoSide, Receive, Subscription
 from gateway.outputs.lcm.kind import LCM
 from gateway.outputs.registry import OUTPUTS
@@ -71,7 +71,8 @@ async def test_the_demo_loses_nothing_on_a_busy_machine_and_says_what_is_late() 
 
 
 async def test_what_the_gateway_skips_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(demo, "StreamSettings", partial(StreamSettings, backlog="latest"))
+    streams = (StreamSettings.model_validate({"backlog": "latest"}),)
+    monkeypatch.setattr(demo, "SourceSettings", partial(SourceSettings, streams=streams))
     is_complete, text = await report(StallingScene(), 3.0)
     assert is_complete, text
     assert "Nothing was lost." in text
