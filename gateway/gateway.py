@@ -86,6 +86,8 @@ class Gateway:
                     task.cancel()
         finally:
             await asyncio.gather(*map(_close, self._outputs))
+            for source in self._sources.values():
+                source.fan_out.end_losses()
 
     async def _wait_for_outputs(self, stop: asyncio.Event) -> None:
         deadline_s = asyncio.get_running_loop().time() + _OPENING_TIMEOUT_S

@@ -248,6 +248,11 @@ class FanOut:
         for route in self._routes:
             route.losses.check()
 
+    def end_losses(self) -> None:
+        """Log what was lost and is not logged yet, because the gateway stops."""
+        for route in self._routes:
+            route.losses.close()
+
     def publish_status(self, message: bytes) -> None:
         """Publish an encoded ``status_t``."""
         for route in self._routes:

@@ -156,6 +156,18 @@ async def test_stopping_while_outputs_open_closes_them(
     assert not servers["lab"].connections
 
 
+async def test_what_an_output_was_losing_is_logged_when_the_gateway_stops(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level("INFO", "gateway.publish.routes")
+    async with running(settings(example=UNREACHABLE)) as (gateway, _):
+        gateway.sources[0].fan_out.publish_status(b"status")
+        assert not [record for record in caplog.records if "lost within" in record.getMessage()]
+    [end] = [record.getMessage() for record in caplog.records if "lost within" in record.getMessage()]
+    assert end.startswith("lab to example: lost within ")
+    assert "1 message (not open)" in end
+
+
 async def test_outputs_are_maintained_and_status_is_published_every_second() -> None:
     statuses = subscribe("local", component="status")
     async with running(settings()) as (gateway, _):
