@@ -2,6 +2,7 @@
 
 import json
 import logging
+import time
 from typing import Any
 
 import pytest
@@ -67,6 +68,13 @@ def set_state(status: StreamStatus, state: StreamState, age_s: float | None) -> 
 async def test_a_recent_frame_is_healthy_in_every_state(state: StreamState) -> None:
     lab = Lab(StreamSettings(components=MARKERS))
     set_state(lab.statuses[0], state, STALL_TIMEOUT_S - 1)
+    assert lab.problem() == ""
+
+
+async def test_a_stop_of_this_process_does_not_make_frames_older() -> None:
+    lab = Lab(StreamSettings(components=MARKERS))
+    set_state(lab.statuses[0], StreamState.STREAMING, STALL_TIMEOUT_S - 0.5)
+    time.sleep(0.8)  # noqa: ASYNC251 - the process stands still
     assert lab.problem() == ""
 
 
