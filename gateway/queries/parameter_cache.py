@@ -70,7 +70,7 @@ class ParameterCache:
         # What the server answered about sections that the answer for all of them does not give, or for all
         # of them if that cannot be read. All of this is cleared when a connection begins.
         self._answers: dict[Sections, ServerAnswer] = {}
-        self._refusals: dict[Sections, _Refusal] = {}
+        self._refusal: _Refusal | None = None
         self._sends_sections = True
         self._problems = FailureLog(logger, settings.name)
 
@@ -120,13 +120,13 @@ class ParameterCache:
     async def _read(self, connection: Connection) -> ParsedParameters:
         self._connections = [each for each in self._connections if each.is_open]
         self._answers.clear()
-        self._refusals.clear()
+        self._refusal = None
         self._sends_sections = True
         command = SendParameters()
         try:
             packet = await connection.ask(command)
         except ServerError as error:
-            self._refusals[()] = _Refusal(self._requests.refused(command, error))
+            self._refusal = _Refusal(self._requests.refused(command, error))
             await self._lose(f"it refuses {command}: {error}")
             raise
         except ReplyTimeoutError as error:
@@ -186,21 +186,14 @@ class ParameterCache:
         return await newest.part(sections) or self._answers.get(sections)
 
     async def _get(self, sections: Sections, *, fresh: bool) -> ServerAnswer:
-        everything = None
-        try:
-            everything = await self._get_all(fresh=fresh)
-        except QueryError as error:
-            if not sections or error.code != "refused":
-                raise
-        if everything is not None:
-            part = await everything.part(sections) if sections else everything
-            if part is not None:
-                return part
+        everything = await self._get_all(fresh=fresh)
+        part = await everything.part(sections) if sections else everything
+        if part is not None:
+            return part
         # The answer for all sections lacks these, or is not well-formed: only the server can tell.
         answer = self._answers.get(sections)
         if answer is not None and self._is_valid(answer, fresh=fresh):
             return answer
-        self._check_refusal(sections, fresh=fresh)
         return await self._requests.share(
             ("parameters", sections), lambda: self._request_sections(sections, everything)
         )
@@ -209,7 +202,8 @@ class ParameterCache:
         for answer in (self.known.newest if self._is_current else None, self._answers.get(())):
             if answer is not None and self._is_valid(answer, fresh=fresh):
                 return answer
-        self._check_refusal((), fresh=fresh)
+        if self._refusal is not None and self._is_valid(self._refusal, fresh=fresh):
+            raise self._refusal.error
         return await self._request_all(self._any_connection())
 
     @property
@@ -219,11 +213,6 @@ class ParameterCache:
 
     def _is_valid(self, answer: ServerAnswer | _Refusal, *, fresh: bool) -> bool:
         return not fresh or now_s() - answer.received_s < self._settings.fresh_interval_s
-
-    def _check_refusal(self, sections: Sections, *, fresh: bool) -> None:
-        refusal = self._refusals.get(sections)
-        if refusal is not None and self._is_valid(refusal, fresh=fresh):
-            raise refusal.error
 
     # Requests to the server.
 
@@ -242,7 +231,7 @@ class ParameterCache:
             _, packet = await self._requests.send(SendParameters(), connection=connection)
         except QueryError as error:
             if error.code == "refused":
-                self._refusals[()] = _Refusal(error)
+                self._refusal = _Refusal(error)
                 self._refusing = connection
             if error.code in {"refused", "timeout"}:
                 self._report_problem(connection, error)
@@ -270,9 +259,9 @@ class ParameterCache:
                 "changes on the server are not noticed"
             )
 
-    async def _request_sections(self, sections: Sections, everything: ServerAnswer | None) -> ServerAnswer:
+    async def _request_sections(self, sections: Sections, everything: ServerAnswer) -> ServerAnswer:
         """Request some sections; if the server does not send single ones, return ``everything``."""
-        if everything is not None and not self._sends_sections:
+        if not self._sends_sections:
             answer = replace(everything, sections=sections)
         else:
             try:
@@ -280,9 +269,7 @@ class ParameterCache:
                     SendParameters(sections), connection=self._any_connection()
                 )
             except QueryError as error:
-                if error.code == "refused":
-                    self._refusals[sections] = _Refusal(error)
-                if everything is None or error.code not in {"refused", "timeout"}:
+                if error.code not in {"refused", "timeout"}:
                     raise
                 self._sends_sections = False
                 answer = replace(everything, sections=sections)
