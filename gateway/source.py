@@ -181,7 +181,6 @@ class Source:
     # Parameters.
 
     def _callbacks(self, status: StreamStatus) -> Callbacks:
-
         return Callbacks(
             publish=self.fan_out.publish,
             skip=self.fan_out.skip,

@@ -237,8 +237,8 @@ class AutomaticStreams(Listener):
 
     def parameters_changed(self, parameters: Parameters) -> None:
         """Plan anew if the server announces other rates; it is still the same server."""
-        if self._first.session is None:
-            return
+        if self._first.session is None or not announced_rates_hz(parameters):
+            return  # a server that no longer says its rates still has them
         if self._verdict is not None:
             self._verdict = self._verdict._replace(server=_server(parameters))
         self._plan_for(parameters)
