@@ -5,9 +5,15 @@ from typing import NamedTuple
 
 
 class Result(StrEnum):
-    """The result of a check. The values appear in the doctor's JSON."""
+    """The result of a check. The values appear in the doctor's JSON.
+
+    A warning is about something that may cost data or make it less useful; a note needs no action. Neither
+    is a failure.
+    """
 
     PASSING = "green"
+    NOTE = "note"
+    WARNING = "warning"
     FAILING = "red"
     NOT_TESTED = "not tested"
 
@@ -17,6 +23,7 @@ class Finding(NamedTuple):
 
     ``subject`` is what was checked: the name of a source, or for example "zenoh". ``check`` names the check.
     ``found`` says what was found, or why the check was not made. ``remedy`` says what to do if it fails.
+    ``stream`` are the components of the stream that was checked, if its source has several.
     """
 
     subject: str
@@ -24,24 +31,37 @@ class Finding(NamedTuple):
     result: Result
     found: str
     remedy: str = ""
+    stream: str = ""
 
 
 class Subject(NamedTuple):
-    """Something that is checked: a source, an output or this computer. Creates its findings."""
+    """Something that is checked: a source, one of its streams, an output or this computer.
+
+    Creates its findings.
+    """
 
     name: str
+    stream: str = ""
 
     def passing(self, check: str, found: str) -> Finding:
         """Return a passing finding."""
-        return Finding(self.name, check, Result.PASSING, found)
+        return Finding(self.name, check, Result.PASSING, found, "", self.stream)
+
+    def note(self, check: str, found: str, remedy: str = "") -> Finding:
+        """Return a note, and what to do if it is not as intended."""
+        return Finding(self.name, check, Result.NOTE, found, remedy, self.stream)
+
+    def warning(self, check: str, found: str, remedy: str) -> Finding:
+        """Return a warning and what to do about it."""
+        return Finding(self.name, check, Result.WARNING, found, remedy, self.stream)
 
     def failing(self, check: str, found: str, remedy: str) -> Finding:
         """Return a failing finding and what to do about it."""
-        return Finding(self.name, check, Result.FAILING, found, remedy)
+        return Finding(self.name, check, Result.FAILING, found, remedy, self.stream)
 
     def not_tested(self, check: str, reason: str) -> Finding:
         """Return a finding for a check that could not be made."""
-        return Finding(self.name, check, Result.NOT_TESTED, reason)
+        return Finding(self.name, check, Result.NOT_TESTED, reason, "", self.stream)
 
 
 class MessageLoad(NamedTuple):

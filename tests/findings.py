@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.config.settings import MetricsSettings, SourceSettings, StreamSettings
 from gateway.doctor.all_checks import run_checks
 from gateway.findings import Finding, Result
 from gateway.outputs.lcm.settings import LcmSettings
@@ -19,8 +19,11 @@ class Findings:
         self.all = findings
 
     def of(self, check: str, subject: str = "lab") -> Finding:
-        [finding] = [each for each in self.all if (each.subject, each.check) == (subject, check)]
+        [finding] = self.all_of(check, subject)
         return finding
+
+    def all_of(self, check: str, subject: str = "lab") -> list[Finding]:
+        return [each for each in self.all if (each.subject, each.check) == (subject, check)]
 
     def failing(self, subject: str = "lab") -> list[str]:
         return [each.check for each in self.all if each.subject == subject and each.result is Result.FAILING]
@@ -36,18 +39,26 @@ async def run_doctor(
     *sources: SourceSettings,
     zenoh_settings: ZenohSettings | None = None,
     lcm: LcmSettings | None = None,
+    metrics: MetricsSettings | None = None,
     seconds: float = SECONDS,
+    connects: bool = True,
 ) -> Findings:
-    """Return the findings for ``sources``; by default, Zenoh is disabled and LCM stays in memory."""
+    """Return the findings for ``sources``.
+
+    By default, Zenoh is disabled, LCM stays in memory, and no running gateway is asked.
+    """
     settings = make_settings(
         sources=sources,
         zenoh=zenoh_settings or ZenohSettings(enabled=False),
         lcm=lcm or LcmSettings(url="memq://"),
+        metrics=metrics or MetricsSettings(enabled=False),
     )
-    return Findings([finding async for finding in run_checks(settings, "lab.yaml", seconds)])
+    checks = run_checks(settings, "lab.yaml", seconds, connects=connects)
+    return Findings([finding async for finding in checks])
 
 
 def lab(port: int, *streams: StreamSettings, **keys: Any) -> SourceSettings:
     """Return the settings of the source "lab" on this machine; ``keys`` are further settings."""
     source: dict[str, Any] = {"host": "127.0.0.1", "reply_timeout_s": 0.1, "connect_timeout_s": 5.0}
-    return SourceSettings(name="lab", port=port, streams=streams or (StreamSettings(),), **(source | keys))
+    source["streams"] = streams or (StreamSettings(),)
+    return SourceSettings(name="lab", port=port, **(source | keys))

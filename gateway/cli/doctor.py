@@ -7,7 +7,7 @@ import typer
 import uvloop
 from rich.console import Console
 
-from gateway.cli.options import ConfigOption, ServerOption, configuration_from_options
+from gateway.cli.options import ConfigOption, ServerOption, ZenohConfigOption, configuration_from_options
 from gateway.doctor.all_checks import run_checks, run_checks_without_settings
 from gateway.doctor.report import Report
 from gateway.errors import ConfigError
@@ -23,6 +23,13 @@ def doctor(
         float,
         typer.Option(min=0.1, max=3600, help="How many seconds to watch each source and to wait for Zenoh."),
     ] = 3.0,
+    no_connect: Annotated[
+        bool,
+        typer.Option(
+            "--no-connect", help="Ask the running gateway only; open no connection to the RT servers."
+        ),
+    ] = False,
+    zenoh_config: ZenohConfigOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
 ) -> None:
     """Find out why no data arrives, layer by layer. Exit status 1 if a check fails.
@@ -31,14 +38,24 @@ def doctor(
     """
     set_up_log(LogLevel.ERROR, LogFormat.TEXT)  # warnings would repeat the findings
     report = Report(Console(quiet=as_json))
-    uvloop.run(_report_findings(report, config, server, seconds))
+    uvloop.run(
+        _report_findings(report, config, server, seconds, connects=not no_connect, zenoh_config=zenoh_config)
+    )
     if as_json:
         print(report.as_json())
     if not report.is_ok:
         raise typer.Exit(1)
 
 
-async def _report_findings(report: Report, config: Path | None, server: str | None, seconds: float) -> None:
+async def _report_findings(
+    report: Report,
+    config: Path | None,
+    server: str | None,
+    seconds: float,
+    *,
+    connects: bool,
+    zenoh_config: Path | None,
+) -> None:
     if config is None and server is None and _INSTALLED_CONFIG.exists():
         config = _INSTALLED_CONFIG
     try:
@@ -48,6 +65,10 @@ async def _report_findings(report: Report, config: Path | None, server: str | No
             report.add(finding)
     else:
         origin = str(config or server or "environment")
-        async for finding in run_checks(settings, origin, seconds):
+        sections = {}
+        if zenoh_config is not None:
+            sections["zenoh"] = settings.outputs["zenoh"].model_copy(update={"config": zenoh_config})
+        findings = run_checks(settings, origin, seconds, connects=connects, output_sections=sections)
+        async for finding in findings:
             report.add(finding)
     report.end()

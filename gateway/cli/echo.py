@@ -10,7 +10,7 @@ from typing import Annotated, Final, TextIO
 import typer
 
 from gateway.cli.message_lines import json_line, text_line
-from gateway.cli.options import ConnectOption, PrefixOption, SourceOption, UrlOption
+from gateway.cli.options import ConnectOption, PrefixOption, SourceOption, UrlOption, ZenohConfigOption
 from gateway.outputs.kind import SubscriptionRequest
 from gateway.outputs.registry import OUTPUTS
 
@@ -41,6 +41,7 @@ def echo(
     seconds: Annotated[float | None, typer.Option(min=0, help="Stop after this many seconds.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")] = False,
     connect: ConnectOption = None,
+    zenoh_config: ZenohConfigOption = None,
     url: UrlOption = None,
     prefix: PrefixOption = None,
 ) -> None:
@@ -48,7 +49,9 @@ def echo(
     if sum((zenoh, lcm, output is not None)) > 1:
         raise typer.BadParameter("give only one of --zenoh, --lcm and --output")
     name = output or ("lcm" if lcm else "zenoh")
-    request = SubscriptionRequest(source, component, prefix, connect or url)
+    if zenoh_config is not None and name != "zenoh":
+        raise typer.BadParameter("--zenoh-config is for subscribing on Zenoh")
+    request = SubscriptionRequest(source, component, prefix, connect or url, zenoh_config)
     with subscribed(name, request) as messages:
         try:
             printed = print_messages(messages, sys.stdout, count=count, as_json=as_json, timeout_s=seconds)

@@ -52,6 +52,13 @@ ConnectOption = Annotated[
     str | None,
     typer.Option(help="Zenoh endpoint of the gateway or router, for example tcp/192.0.2.5:7447."),
 ]
+ZenohConfigOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Zenoh's configuration (JSON5) for this command's session: endpoints, certificates, password.",
+    ),
+]
 UrlOption = Annotated[
     str | None, typer.Option(help="LCM URL; the default is $LCM_DEFAULT_URL, else LCM's default URL.")
 ]

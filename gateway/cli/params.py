@@ -5,11 +5,12 @@ from typing import Annotated, Final
 
 import typer
 
-from gateway.cli.options import ConnectOption, PrefixOption, SourceOption, UrlOption
+from gateway.cli.options import ConnectOption, PrefixOption, SourceOption, UrlOption, ZenohConfigOption
 from gateway.cli.params_lcm import query_lcm
 from gateway.cli.params_output import write_replies
 from gateway.cli.params_zenoh import query_zenoh
 from gateway.outputs.lcm.settings import effective_lcm_url
+from gateway.outputs.zenoh.subscriber import open_zenoh
 from gateway.rtc3d.parameters import SECTIONS
 
 EXIT_STATUSES: Final = {"no-gateway": 3, "no-connection": 4, "timeout": 5}
@@ -33,6 +34,7 @@ def params(
         typer.Option("--fresh", help="Make the gateway query the server now instead of using its cache."),
     ] = False,
     connect: ConnectOption = None,
+    zenoh_config: ZenohConfigOption = None,
     url: UrlOption = None,
     queries_url: Annotated[
         str | None,
@@ -47,6 +49,8 @@ def params(
     """
     if zenoh and lcm:
         raise typer.BadParameter("give either --zenoh or --lcm")
+    if zenoh_config is not None and lcm:
+        raise typer.BadParameter("--zenoh-config is for queries on Zenoh")
     if as_json and as_xml:
         raise typer.BadParameter("give either --json or --xml")
     wanted = tuple(dict.fromkeys(sections or ()))
@@ -64,7 +68,12 @@ def params(
         )
     else:
         replies, problems = query_zenoh(
-            prefix or "mocap", source, wanted, fresh=fresh, connect=connect, timeout_s=timeout
+            prefix or "mocap",
+            source,
+            wanted,
+            fresh=fresh,
+            open_session=lambda: open_zenoh(connect, zenoh_config),
+            timeout_s=timeout,
         )
     problems += write_replies(replies, "json" if as_json else "xml" if as_xml else "table", sys.stdout)
     for problem in problems:

@@ -3,6 +3,7 @@
 import contextlib
 import json
 import time
+from collections.abc import Callable
 
 import zenoh
 
@@ -10,19 +11,24 @@ from gateway.cli.params_query import RETRY_S, ParametersReply, Replies, Sections
 from gateway.errors import OutputError, QueryError
 from gateway.messages.topics import unique_name, zenoh_key
 from gateway.outputs.encodings import TEXT
-from gateway.outputs.zenoh.subscriber import open_zenoh
 
 
 def query_zenoh(
-    prefix: str, source: str | None, sections: Sections, *, fresh: bool, connect: str | None, timeout_s: float
+    prefix: str,
+    source: str | None,
+    sections: Sections,
+    *,
+    fresh: bool,
+    open_session: Callable[[], zenoh.Session],
+    timeout_s: float,
 ) -> Replies:
     """Query each of ``sections`` from the gateways that serve ``source``, or from all gateways (None).
 
-    A session that does not open is one of the problems, not an exception.
+    If ``open_session`` raises OutputError, that is one of the problems, not an exception.
     """
     replies = Replies([], [])
     try:
-        session = open_zenoh(connect)
+        session = open_session()
     except OutputError as error:
         replies.problems.append(QueryError(str(error), code="no-gateway"))
         return replies

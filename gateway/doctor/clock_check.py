@@ -1,6 +1,7 @@
 """Check of this computer's clock, on which utime and capture_utime depend."""
 
 import ctypes
+from collections.abc import Sequence
 from typing import Final
 
 from gateway.findings import Finding, Subject
@@ -38,8 +39,12 @@ def read_clock() -> tuple[bool, int]:
     return not timex.status & _STA_UNSYNC, timex.maxerror
 
 
-def check_clock() -> Finding:
-    """Check that this computer's clock is synchronised."""
+def check_clock(leaving: Sequence[str]) -> Finding:
+    """Check that this computer's clock is synchronised.
+
+    ``leaving`` names the outputs whose messages leave this computer. Without any, an unsynchronised clock is
+    a warning: programs on this computer use the same clock.
+    """
     try:
         is_synchronised, max_error_us = read_clock()
     except OSError as error:
@@ -48,10 +53,14 @@ def check_clock() -> Finding:
         return _computer.passing(
             "clock", f"synchronised, with an error of at most {max_error_us / 1000:.1f} ms"
         )
-    return _computer.failing(
-        "clock",
+    found = (
         "this computer's clock is not synchronised, so utime cannot be compared with the clocks of other "
-        "computers",
-        "Set up chrony or systemd-timesyncd with the lab's time server; `chronyc tracking` or `timedatectl` "
-        "shows the state. In a container, do this on the host.",
+        "computers"
     )
+    remedy = (
+        "Set up chrony or systemd-timesyncd with the lab's time server; `chronyc tracking` or `timedatectl` "
+        "shows the state. In a container, do this on the host."
+    )
+    if leaving:
+        return _computer.failing("clock", f"{found}, which {' and '.join(leaving)} can reach", remedy)
+    return _computer.warning("clock", f"{found}; so far, all messages stay on this computer", remedy)

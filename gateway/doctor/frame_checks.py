@@ -1,4 +1,4 @@
-"""Checks of the frames that one stream received: completeness, and visibility of markers and tools."""
+"""Checks of the frames that one stream received: completeness, byte order, visible markers and tools."""
 
 from typing import Final
 
@@ -10,6 +10,10 @@ from gateway.rtc3d.server_description import described_labels, num_described_ite
 from gateway.stream.state import StreamState
 from gateway.stream.status import FRAME_REJECTED
 
+_MAX_SILENCE_S: Final = 0.5
+_MAX_SILENT_FRAMES: Final = 5
+"""Frames have stopped if none has arrived for this long, and for the time of this number of frames."""
+
 _MIN_VISIBLE: Final = 0.5
 """The check fails if a smaller share of the markers, or of the tools, is in view."""
 
@@ -17,8 +21,16 @@ _MAX_NAMES: Final = 5
 """How many markers or tools a finding names."""
 
 
-def check_frames(subject: Subject, stream: ObservedStream, parameters: Parameters | None) -> Finding:
-    """Check that well-formed frames arrive, with every component that the stream requested."""
+_START: Final = "Start a measurement on the server; the gateway then streams automatically."
+
+
+def check_frames(
+    subject: Subject, stream: ObservedStream, parameters: Parameters | None, *, others_receive: bool
+) -> Finding:
+    """Check that well-formed frames arrive until the end, with every component that the stream requested.
+
+    ``others_receive`` tells whether another stream of the source has received frames.
+    """
     is_partial = len(stream.settings.components) < len(ComponentType)
     of_stream = f" of stream {stream.component_keys}" if is_partial else ""
     if not stream.session.is_open:
@@ -30,23 +42,65 @@ def check_frames(subject: Subject, stream: ObservedStream, parameters: Parameter
     if stream.status.losses.frames(FRAME_REJECTED):
         return _malformed_frames(subject, stream, of_stream)
     if not stream.observed:
-        return _no_frames(subject, stream, of_stream)
-    missing = _missing_components(stream, parameters)
-    if missing:
-        names = ", ".join(missing)
-        return subject.failing(
-            "frames",
-            f"the server's parameters list items of {names}, but no frame contains {names}",
-            f"Enable the real-time output of {names} on the server, or remove {names} from the stream's "
-            "components.",
-        )
+        return _no_frames(subject, stream, of_stream, parameters, others_receive=others_receive)
+    if _has_stopped(stream):
+        return _stopped_frames(subject, stream, of_stream)
+    return _check_components(subject, stream, parameters)
+
+
+def _check_components(subject: Subject, stream: ObservedStream, parameters: Parameters | None) -> Finding:
     names = ", ".join(
         component.key for component in stream.settings.components if component in stream.observed
     )
     largest = max(component.message_load.largest_bytes for component in stream.observed.values())
-    return subject.passing(
-        "frames", f"{stream.status.frames_in} frames with {names}; the largest message has {largest} bytes"
+    received = f"{stream.status.frames_in} frames with {names}; the largest message has {largest} bytes"
+    missing = ", ".join(_missing_components(stream, parameters))
+    if not missing:
+        return subject.passing("frames", received)
+    absent = f"the server's parameters list items of {missing}, but no frame contains {missing}"
+    if stream.requests_all:
+        return subject.note("frames", f"{received}; {absent}", _enable(missing))
+    return subject.failing(
+        "frames",
+        absent,
+        f"Enable the real-time output of {missing} on the server, or remove {missing} from the stream's "
+        "components.",
     )
+
+
+def _has_stopped(stream: ObservedStream) -> bool:
+    """Return whether no frame has come for longer than usual. Events do not count, because they are rare."""
+    rates_hz = [
+        observed.rate_hz
+        for component, observed in stream.observed.items()
+        if component is not ComponentType.EVENT
+    ]
+    if not rates_hz:
+        return False
+    if stream.status.state is StreamState.NO_MEASUREMENT:
+        return True
+    rate_hz = max(rates_hz)
+    usual_s = _MAX_SILENT_FRAMES / rate_hz if rate_hz else 0.0
+    return stream.silence_s > max(_MAX_SILENCE_S, usual_s)
+
+
+def _stopped_frames(subject: Subject, stream: ObservedStream, of_stream: str) -> Finding:
+    found = (
+        f"the server stopped sending after {stream.status.frames_in} frames{of_stream}: none arrived for "
+        f"{stream.silence_s:.1f} s, and the server"
+    )
+    if stream.status.state is StreamState.NO_MEASUREMENT:
+        return subject.failing("frames", f"{found} reports that no measurement is running", _START)
+    return subject.failing(
+        "frames",
+        f"{found} did not report that no measurement is running",
+        "Check whether the server's own display has stopped, too, and its load; then the cable and the "
+        "switch. A longer watch with --seconds shows whether frames come again.",
+    )
+
+
+def _enable(components: str) -> str:
+    return f"If you need {components}, enable its real-time output on the server."
 
 
 def _malformed_frames(subject: Subject, stream: ObservedStream, of_stream: str) -> Finding:
@@ -68,20 +122,55 @@ def _missing_components(stream: ObservedStream, parameters: Parameters | None) -
     ]
 
 
-def _no_frames(subject: Subject, stream: ObservedStream, of_stream: str) -> Finding:
+def _no_frames(
+    subject: Subject,
+    stream: ObservedStream,
+    of_stream: str,
+    parameters: Parameters | None,
+    *,
+    others_receive: bool,
+) -> Finding:
     if stream.status.state is StreamState.NO_MEASUREMENT:
         return subject.failing(
             "frames",
             "the server reports that no measurement is running",
-            "Start a measurement on the server; the gateway then streams automatically.",
+            _START,
         )
     if stream.settings.components == (ComponentType.EVENT,):
         return subject.not_tested("frames", "no event occurred during the check")
+    if stream.requests_all and others_receive:
+        missing = ", ".join(_missing_components(stream, parameters))
+        return subject.note(
+            "frames",
+            f"the server's parameters list items of {missing}, but no frame{of_stream} arrived",
+            _enable(missing),
+        )
+    if stream.status.frames_in:
+        return subject.failing(
+            "frames",
+            f"{stream.status.frames_in} frames arrived, but none has a component{of_stream or ' with data'}",
+            "Check the server's real-time output, and the components in the source's streams.",
+        )
     return subject.failing(
         "frames",
         f"no frame{of_stream} arrived, and the server did not report that no measurement is running",
         "Check that the server shows live data and that its real-time output is enabled. Try other "
         "components in the stream, or watch longer with --seconds.",
+    )
+
+
+def check_byte_order(subject: Subject, stream: ObservedStream, requested: str) -> Finding:
+    """Check that the frames have the byte order that was ``requested`` (field note 4)."""
+    byte_order = stream.session.byte_order
+    if not byte_order:
+        return subject.not_tested("byte order", "no frames arrived")
+    if byte_order == requested:
+        return subject.passing("byte order", f"the frames are {byte_order}-endian, as requested")
+    return subject.warning(
+        "byte order",
+        f"the server sends {byte_order}-endian frames, although the gateway requests {requested}-endian ones",
+        "The gateway reads the frames as they are, and publishes the same messages. To request what the "
+        f"server sends, set byte_order: {byte_order} for this source.",
     )
 
 

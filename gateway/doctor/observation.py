@@ -10,12 +10,13 @@ from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.findings import MessageLoad
 from gateway.messages.encode import ITEMS_OFFSET
 from gateway.rtc3d.commands import SendParameters
-from gateway.rtc3d.components import Component, ComponentType
+from gateway.rtc3d.components import WIRE_ORDER, Component, ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
 from gateway.stream.parameters import Connection, process_xml
 from gateway.stream.plan import StreamPlan, plan_streams
+from gateway.stream.running_clock import running_clock
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
@@ -101,6 +102,8 @@ class ObservedStream:
 
     def __init__(self, source: SourceSettings, stream: StreamSettings, *, plans: bool = False) -> None:
         self.settings = stream
+        self.requests_all = source.streams == "auto" or set(stream.components) == set(WIRE_ORDER)
+        """Whether the components are the default, which is all, instead of chosen in the configuration."""
         self.component_keys = component_keys(stream.components)
         self.status = StreamStatus(self.component_keys, name=stream_name(source, stream.components))
         self.parsed: ParsedParameters | None = None
@@ -112,6 +115,12 @@ class ObservedStream:
         self._plans = plans
         self.plan = StreamPlan()
         """What the server's rates need, with ``streams: auto``."""
+
+    @property
+    def silence_s(self) -> float:
+        """How long no frame has arrived, in s; 0 before the first frame."""
+        last_frame_s = self.status.last_frame_s
+        return 0.0 if last_frame_s is None else running_clock().time() - last_frame_s
 
     def _planned_components(self, parameters: Parameters | None) -> Sequence[ComponentType]:
         if self._plans:

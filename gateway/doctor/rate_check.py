@@ -5,20 +5,21 @@ from typing import Final
 
 from gateway.doctor.observation import ObservedStream
 from gateway.findings import Finding, Subject
-from gateway.rtc3d.commands import Frequency, FrequencyDivisor
+from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.server_description import described_rate_hz
 
 _MIN_SHARE: Final = 0.9
-"""The check fails if a component arrives at a smaller share of its expected rate."""
+_MAX_SHARE: Final = 1.1
+"""The check fails if a component arrives at a smaller or a larger share of its expected rate."""
 
 _Rates = Mapping[ComponentType, float]
 """Rates in Hz."""
 
 
 def check_rate(subject: Subject, stream: ObservedStream, parameters: Parameters | None) -> Finding:
-    """Check that each component arrives at the rate that the server describes, or the one configured."""
+    """Check that each component arrives at the rate that the server announces, or the one configured."""
     rates_hz: _Rates = {
         component: observed.rate_hz
         for component, observed in stream.observed.items()
@@ -26,14 +27,21 @@ def check_rate(subject: Subject, stream: ObservedStream, parameters: Parameters 
     }
     if not rates_hz:
         return subject.not_tested("rate", "too few frames to measure the rate")
-    expected_hz = {} if parameters is None else _expected_rates_hz(stream, parameters)
+    expected_hz = _expected_rates_hz(stream, parameters)
     found = f"{', '.join(_rate_text(component, rates_hz, expected_hz) for component in rates_hz)} Hz"
     compared = [component for component in rates_hz if component in expected_hz]
+    if not compared and isinstance(stream.settings.rate, FrequencyDivisor):
+        return subject.note(
+            "rate",
+            f"{found}; the server announces no rate, so the configured divisor "
+            f"{stream.settings.rate.divisor} cannot be compared",
+        )
     if not compared:
         return subject.not_tested("rate", f"{found}; the server's parameters have no rate to compare with")
     slow = [component for component in compared if rates_hz[component] < _MIN_SHARE * expected_hz[component]]
     if not slow:
-        return subject.passing("rate", found)
+        is_fast = any(rates_hz[component] > _MAX_SHARE * expected_hz[component] for component in compared)
+        return _too_fast(subject, stream, found) if is_fast else subject.passing("rate", found)
     if _is_limited_by_others(slow, rates_hz, expected_hz):
         names = " and ".join(component.key for component in slow)
         return subject.failing(
@@ -47,6 +55,21 @@ def check_rate(subject: Subject, stream: ObservedStream, parameters: Parameters 
         found,
         "The server or the network is too slow. Check the server's real-time processing rate and load, the "
         "cable and the switch, or configure a lower rate for the stream.",
+    )
+
+
+def _too_fast(subject: Subject, stream: ObservedStream, found: str) -> Finding:
+    if isinstance(stream.settings.rate, AllFrames):
+        return subject.failing(
+            "rate",
+            f"{found}: the server sends more frames than its parameters announce",
+            "Correct the rate in the server's settings. Programs that rely on the announced rate compute "
+            "wrong times, and the load on the network is higher than expected.",
+        )
+    return subject.failing(
+        "rate",
+        f"{found}: the server ignores the requested rate",
+        "Lower the rate on the server, or limit what the gateway publishes with max_rate_hz of the outputs.",
     )
 
 
@@ -69,20 +92,20 @@ def _is_limited_by_others(slow: Sequence[ComponentType], rates_hz: _Rates, expec
     )
 
 
-def _expected_rates_hz(stream: ObservedStream, parameters: Parameters) -> dict[ComponentType, float]:
-    """Return the rate at which each component should arrive, for those with a rate in the parameters.
+def _expected_rates_hz(stream: ObservedStream, parameters: Parameters | None) -> dict[ComponentType, float]:
+    """Return the rate at which each component should arrive, for those with an announced or requested one.
 
     A divisor applies to the rate of the stream, which is that of its slowest component (§5.3.5).
     """
     rates_hz = {
         component: rate
         for component in stream.observed
-        if (rate := described_rate_hz(parameters, component)) is not None and rate > 0
+        if parameters and (rate := described_rate_hz(parameters, component)) is not None and rate > 0
     }
     match stream.settings.rate:
         case Frequency(hz):
-            return {component: min(rate, hz) for component, rate in rates_hz.items()}
-        case FrequencyDivisor(divisor):
+            return {component: min(rates_hz.get(component, hz), hz) for component in stream.observed}
+        case FrequencyDivisor(divisor) if rates_hz:
             return {component: min(rates_hz.values()) / divisor for component in rates_hz}
         case _:
             return rates_hz

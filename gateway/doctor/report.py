@@ -11,6 +11,8 @@ from gateway.findings import Finding, Result
 
 _MARKS: Final = {
     Result.PASSING: ("ok", "bold green"),
+    Result.NOTE: ("note", "cyan"),
+    Result.WARNING: ("warn", "bold yellow"),
     Result.FAILING: ("FAIL", "bold red"),
     Result.NOT_TESTED: ("skip", "yellow"),
 }
@@ -31,9 +33,10 @@ class Report:
     def add(self, finding: Finding) -> None:
         """Add and print one finding."""
         self.findings.append(finding)
-        if finding.subject != self._subject:
-            self._subject = finding.subject
-            self._print(Text(finding.subject, "bold"))
+        subject = f"{finding.subject} ({finding.stream})" if finding.stream else finding.subject
+        if subject != self._subject:
+            self._subject = subject
+            self._print(Text(subject, "bold"))
         mark, style = _MARKS[finding.result]
         columns = Text.assemble("  ", (f"{mark:<4}", style), f"  {finding.check:<12}")
         text = "not tested: " if finding.result is Result.NOT_TESTED else ""
@@ -45,13 +48,17 @@ class Report:
             self._print(Text(_INDENT + ("→ " if number == 0 else "  ") + line, "bold"))
 
     def end(self) -> None:
-        """Print how many checks passed, failed and were not tested."""
+        """Print how many checks passed, failed and were not tested, and how many warnings and notes."""
         counts = {result: sum(each.result is result for each in self.findings) for result in Result}
         text = (
             f"{counts[Result.PASSING]} ok, {counts[Result.FAILING]} failed, "
             f"{counts[Result.NOT_TESTED]} not tested"
         )
-        self._print(Text(text, "bold green" if self.is_ok else "bold red"))
+        for result in (Result.WARNING, Result.NOTE):
+            if counts[result]:
+                text += f", {counts[result]} {result.value}{'' if counts[result] == 1 else 's'}"
+        passed_style = "bold yellow" if counts[Result.WARNING] else "bold green"
+        self._print(Text(text, passed_style if self.is_ok else "bold red"))
 
     @property
     def is_ok(self) -> bool:
@@ -59,8 +66,18 @@ class Report:
         return all(finding.result is not Result.FAILING for finding in self.findings)
 
     def as_json(self) -> str:
-        """Return a JSON object: ok, and findings with subject, check, result, found and remedy."""
-        findings = [{**finding._asdict(), "result": finding.result.value} for finding in self.findings]
+        """Return a JSON object: ok, and findings with subject, check, result, found and remedy.
+
+        A finding has ``stream`` only if its source has several.
+        """
+        findings = [
+            {
+                name: value
+                for name, value in {**finding._asdict(), "result": finding.result.value}.items()
+                if name != "stream" or value
+            }
+            for finding in self.findings
+        ]
         return json.dumps({"ok": self.is_ok, "findings": findings}, indent=2, ensure_ascii=False)
 
     def _wrapped(self, text: str) -> list[str]:

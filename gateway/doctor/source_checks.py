@@ -1,35 +1,52 @@
 """Checks of one source: host name, TCP, protocol, parameters, frames, rate, buffer, visibility."""
 
 import asyncio
+import contextlib
 import ipaddress
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from typing import Final
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.doctor.frame_checks import check_frames, check_visibility
+from gateway.doctor.frame_checks import check_byte_order, check_frames, check_visibility
 from gateway.doctor.observation import COMPONENTS_WITH_VISIBILITY, ObservedStream
 from gateway.doctor.rate_check import check_rate
 from gateway.doctor.receive_buffer_check import check_receive_buffer
+from gateway.doctor.running_gateway import HealthReport
 from gateway.errors import ConnectError, LinkError, PacketError
 from gateway.findings import Finding, MessageLoad, Result, Subject
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 from gateway.rtc3d.parameters import Parameters
 
-CHECKS: Final = ("name", "TCP", "protocol", "parameters", "frames", "rate", "buffer", "visibility")
+CHECKS: Final = (
+    "name",
+    "TCP",
+    "protocol",
+    "parameters",
+    "frames",
+    "byte order",
+    "rate",
+    "buffer",
+    "visibility",
+)
 """The checks in order. If one of the first three fails, those after it are not made."""
 
 _PORTS: Final = f"{FIRST_PRINCIPLES_PORT} is First Principles, {WAVEFRONT_PORT} WaveFront"
 
 
 class SourceChecks:
-    """Runs the checks of one source, once. Create it in a running event loop."""
+    """Runs the checks of one source, once. Create it in a running event loop.
 
-    def __init__(self, source: SourceSettings, seconds: float) -> None:
+    ``running`` is the health page of the running gateway; None if there is none.
+    """
+
+    def __init__(self, source: SourceSettings, seconds: float, running: HealthReport | None = None) -> None:
         self._source = source
         self._seconds = seconds
         self._subject = Subject(source.name)
         self._server = f"{source.host}:{source.port}"
+        self._running = running
+        self._addresses: frozenset[str] = frozenset()  # of the source's host, as far as they are known
         self._streams: list[ObservedStream] = []
 
     @property
@@ -41,6 +58,8 @@ class SourceChecks:
         """Run the checks in order, yield their findings, and close the connections."""
         remaining = list(CHECKS)
         for check in (self._check_name, self._check_tcp, self._check_protocol):
+            if check == self._check_tcp and await self._gateway_is_connected():
+                yield self._second_connection()
             finding = await check()
             yield finding
             remaining.remove(finding.check)
@@ -52,12 +71,46 @@ class SourceChecks:
             yield self._check_parameters()
             await asyncio.sleep(self._seconds)
             for stream in self._streams:
-                yield check_frames(self._subject, stream, self._parameters)
-                yield check_rate(self._subject, stream, self._parameters)
-                yield check_receive_buffer(self._subject, stream.load_bytes_per_s)
-                if set(COMPONENTS_WITH_VISIBILITY).intersection(stream.settings.components):
-                    yield check_visibility(self._subject, stream, self._parameters)
+                for finding in self._check_stream(stream):
+                    yield finding
         await asyncio.gather(*(stream.session.close() for stream in self._streams))
+
+    async def run_without_connecting(self) -> AsyncIterator[Finding]:
+        """Check the host name, and yield for each other check that it is not made."""
+        yield await self._check_name()
+        for name in CHECKS[1:]:
+            yield self._subject.not_tested(name, "--no-connect")
+
+    def _check_stream(self, stream: ObservedStream) -> Iterator[Finding]:
+        name = stream.component_keys if len(self._streams) > 1 else ""
+        subject = Subject(self._source.name, name)
+        others_receive = any(other.observed for other in self._streams if other is not stream)
+        yield check_frames(subject, stream, self._parameters, others_receive=others_receive)
+        yield check_byte_order(subject, stream, self._source.byte_order)
+        yield check_rate(subject, stream, self._parameters)
+        yield check_receive_buffer(subject, stream.load_bytes_per_s)
+        if set(COMPONENTS_WITH_VISIBILITY).intersection(stream.settings.components):
+            yield check_visibility(subject, stream, self._parameters)
+
+    async def _gateway_is_connected(self) -> bool:
+        """Return whether the running gateway is connected to this server, perhaps by another host name."""
+        hosts = self._running.connected_hosts(self._source.port) if self._running else set()
+        if self._source.host in hosts:
+            return True
+        for host in hosts:
+            with contextlib.suppress(OSError):
+                if self._addresses & await self._resolve(host):
+                    return True
+        return False
+
+    def _second_connection(self) -> Finding:
+        """Return a note that says what doctor is about to do (field note 21)."""
+        return self._subject.note(
+            "connection",
+            f"the running gateway is connected to {self._server}; doctor now opens further connections to it",
+            "Some servers serve one client only, or fail with two. With --no-connect, doctor asks the "
+            "running gateway instead.",
+        )
 
     @property
     def _parameters(self) -> Parameters | None:
@@ -72,11 +125,10 @@ class SourceChecks:
         except ValueError:
             pass
         else:
+            self._addresses = frozenset([host])
             return self._subject.passing("name", f"{host} is an IP address")
-        loop = asyncio.get_running_loop()
         try:
-            async with asyncio.timeout(self._source.connect_timeout_s):
-                found = await loop.getaddrinfo(host, self._source.port, type=socket.SOCK_STREAM)
+            self._addresses = await self._resolve(host)
         except OSError as error:  # includes TimeoutError, which has no text
             reason = error.strerror or f"no answer within {self._source.connect_timeout_s:g} s"
             return self._subject.failing(
@@ -84,8 +136,14 @@ class SourceChecks:
                 f"the host name {host!r} cannot be resolved: {reason}",
                 "Correct the source's host, add the name to DNS or /etc/hosts, or use an IP address.",
             )
-        addresses = dict.fromkeys(str(address[0]) for *_, address in found)
-        return self._subject.passing("name", f"{host} resolves to {', '.join(addresses)}")
+        return self._subject.passing("name", f"{host} resolves to {', '.join(sorted(self._addresses))}")
+
+    async def _resolve(self, host: str) -> frozenset[str]:
+        """Return the addresses of ``host``; raises OSError, of which TimeoutError has no text."""
+        loop = asyncio.get_running_loop()
+        async with asyncio.timeout(self._source.connect_timeout_s):
+            found = await loop.getaddrinfo(host, self._source.port, type=socket.SOCK_STREAM)
+        return frozenset(str(address[0]) for *_, address in found)
 
     async def _check_tcp(self) -> Finding:
         if self._source.streams == "auto":

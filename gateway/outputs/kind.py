@@ -6,6 +6,7 @@ is left out of that command.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
 from gateway.config.settings import OutputSettings
@@ -28,12 +29,16 @@ class Subscription(Protocol):
 
 
 class SubscriptionRequest(NamedTuple):
-    """What to subscribe to, and where. None means all sources or components, or the default."""
+    """What to subscribe to, and where. None means all sources or components, or the default.
+
+    ``config`` is a file with the configuration of the output's library, such as Zenoh's.
+    """
 
     source: str | None = None
     component: str | None = None
     prefix: str | None = None
     address: str | None = None
+    config: Path | None = None
 
 
 class DemoSide(NamedTuple):
@@ -64,6 +69,9 @@ class OutputKind:
 
     If it is None, the doctor checks that the output opens.
     """
+
+    leaves_host: Callable[[Any], bool] = lambda _settings: True
+    """Takes the settings; returns whether messages may leave this computer. The doctor needs it."""
 
     demo: Callable[[bool], DemoSide] | None = None
     """Builds the output for the demo. Takes whether to use the network. Raises OutputError."""

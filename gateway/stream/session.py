@@ -117,6 +117,11 @@ class Session:
         return self._protocol.state
 
     @property
+    def byte_order(self) -> str:
+        """The byte order of the server's frames, big or little; "" before the first frame with data."""
+        return self._protocol.byte_order or ""
+
+    @property
     def has_data(self) -> bool:
         """Whether the server sends frames, or reports that no measurement runs."""
         return self.protocol_state in {ProtocolState.STREAMING, ProtocolState.NO_MEASUREMENT}

@@ -3,10 +3,8 @@
 import asyncio
 import re
 import socket
-import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import pytest
 
@@ -16,69 +14,22 @@ from gateway.rtc3d.commands import Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests import networks, servers
-from tests.findings import Findings, lab, run_doctor
+from tests import networks
+from tests.diagnosed_servers import (
+    MARKERS_XML,
+    TOOLS_XML,
+    diagnose,
+    parameters,
+    replying,
+    streaming,
+    tools_frame,
+)
+from tests.findings import lab, run_doctor
 from tests.servers import Client, ScriptedServer, markers_frame, ok, packet
 
 MARKERS, TOOLS, ANALOG = ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.ANALOG
 FORCE, EVENT = ComponentType.FORCE, ComponentType.EVENT
 NAN = float("nan")
-
-MARKERS_XML = (
-    "<The_3D><Frequency>{}</Frequency><Markers><Marker id='1'><Label>hip</Label></Marker>"
-    "<Marker id='2'><Label>knee</Label></Marker></Markers></The_3D>"
-)
-TOOLS_XML = (
-    "<The_6D><Frequency>100</Frequency><Tools><Tool id='1'><Label>probe</Label></Tool></Tools></The_6D>"
-)
-
-
-def parameters(*sections: str) -> bytes:
-    return packet(2, f"<RT_Parameters Ver='1.00'>{''.join(sections)}</RT_Parameters>")
-
-
-async def diagnose(script: servers.Script, *streams: StreamSettings, **keys: Any) -> Findings:
-    """Return the findings for a scripted server."""
-    async with ScriptedServer(script) as server:
-        return await run_doctor(lab(server.port, *streams, **keys))
-
-
-def replying(xml: bytes, *frames: bytes, refused: str = "-") -> servers.Script:
-    """Return a server that refuses what matches ``refused``, accepts the rest, and sends frames once."""
-
-    async def script(client: Client) -> None:
-        def answer(command: str) -> bytes:
-            if re.match(refused, command):
-                return servers.error("err-unknown command")
-            if command.startswith("SendParameters"):
-                return xml
-            return ok(f"OK-{command}") + (b"".join(frames) if command.startswith("StreamFrames") else b"")
-
-        await client.commands(answer)
-
-    return script
-
-
-def streaming(xml: bytes, frame: Callable[[int], bytes], step: int = 10) -> servers.Script:
-    """Return a server that sends a frame every 10 ms, and whose clock advances ``step`` ms per frame."""
-
-    async def script(client: Client) -> None:
-        while not (command := await client.command()).startswith("StreamFrames"):
-            client.send(xml if command.startswith("SendParameters") else ok(f"OK-{command}"))
-        client.send(ok(f"OK-{command}"))
-        number = 0
-        while not client._writer.is_closing():
-            client.send(frame(number))
-            number += step
-            await asyncio.sleep(0.01)
-
-    return script
-
-
-def tools_frame(number: int, *xs: float) -> bytes:
-    items = b"".join(struct.pack(">8f", 1, 0, 0, 0, x, 0, 0, 0.1) for x in xs)
-    component = struct.pack(">IIiqI", 24 + len(items), 4, number, 1000 * number, len(xs)) + items
-    return packet(3, struct.pack(">I", 1) + component)
 
 
 async def test_a_healthy_server_passes_every_check() -> None:
@@ -87,6 +38,8 @@ async def test_a_healthy_server_passes_every_check() -> None:
     async with Simulator(scene) as simulator:
         findings = await run_doctor(lab(simulator.port, *streams))
     assert {each.result for each in findings.all if each.subject == "lab"} == {Result.PASSING}
+    assert [each.stream for each in findings.all_of("frames")] == ["3d 6d event", "analog force"]
+    assert {each.stream for each in findings.all_of("protocol")} == {""}
     texts = [(each.check, each.found) for each in findings.all if each.subject == "lab"]
     frames = [text for check, text in texts if check == "frames"]
     assert re.fullmatch(r"\d+ frames with 3d, 6d(, event)?; the largest message has \d+ bytes", frames[0])
@@ -280,7 +233,8 @@ async def test_malformed_frames_fail() -> None:
 
 async def test_a_component_in_the_parameters_but_not_in_the_frames_fails() -> None:
     xml = parameters(MARKERS_XML.format(100), TOOLS_XML)
-    findings = await diagnose(replying(xml, markers_frame(1, (1.0, 2.0, 3.0))))
+    stream = StreamSettings(components=(MARKERS, TOOLS))
+    findings = await diagnose(replying(xml, markers_frame(1, (1.0, 2.0, 3.0))), stream)
     assert findings.of("frames").found == (
         "the server's parameters list items of 6d, but no frame contains 6d"
     )
@@ -341,8 +295,9 @@ async def test_a_configured_lower_rate_passes(rate: Rate, text: str) -> None:
 async def test_constant_time_stamps_are_ignored() -> None:
     frame = markers_frame(7, (1.0, 2.0, 3.0))
     findings = await diagnose(streaming(parameters(MARKERS_XML.format(1)), lambda _number: frame))
-    # The server describes 1 Hz; by arrival times, the rate is about 100 Hz.
-    assert findings.of("rate").result is Result.PASSING
+    # The server announces 1 Hz; by arrival times, the rate is about 100 Hz.
+    assert findings.of("rate").result is Result.FAILING
+    assert "the server sends more frames than its parameters announce" in findings.of("rate").found
 
 
 async def test_time_stamps_that_are_not_in_microseconds_are_ignored() -> None:
@@ -351,7 +306,7 @@ async def test_time_stamps_that_are_not_in_microseconds_are_ignored() -> None:
         parameters(MARKERS_XML.format(900)), lambda number: markers_frame(number, (1, 2, 3)), step=1
     )
     findings = await diagnose(script)
-    # The server describes 900 Hz; by arrival times, the rate is about 100 Hz.
+    # The server announces 900 Hz; by arrival times, the rate is about 100 Hz.
     assert findings.of("rate").result is Result.FAILING
 
 

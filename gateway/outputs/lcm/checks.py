@@ -18,6 +18,8 @@ PAUSE_S: Final = 0.02
 _LARGEST_DATAGRAM: Final = 65_499
 """LCM splits larger messages into several datagrams."""
 
+_LOOPBACK: Final = {None, "", "127.0.0.1", "::1", "localhost"}
+
 _lcm: Final = Subject("lcm")
 
 
@@ -46,6 +48,19 @@ def _check_other_scheme(url: str, scheme: str) -> Finding:
     return _lcm.passing("route", f"{url} does not need multicast")
 
 
+def leaves_host(settings: LcmSettings) -> bool:
+    """Return whether messages may leave this computer."""
+    url = settings.effective_url
+    scheme = scheme_of(url)
+    if scheme in MULTICAST_SCHEMES:
+        return _ttl(url) != "0"
+    return scheme == "tcpq" and urlsplit(url).hostname not in _LOOPBACK
+
+
+def _ttl(url: str) -> str:
+    return parse_qs(urlsplit(url).query).get("ttl", ["0"])[0]
+
+
 def _check_route(url: str) -> Finding:
     problem = multicast_problem(url)
     if problem:
@@ -56,7 +71,7 @@ def _check_route(url: str) -> Finding:
     except OutputError as error:
         return _lcm.failing("route", str(error).partition("; ")[0], "Correct lcm.url.")
     address = urlsplit(url).netloc or "the default group"
-    ttl = parse_qs(urlsplit(url).query).get("ttl", ["0"])[0]
+    ttl = _ttl(url)
     if ttl == "0":
         return _lcm.passing("route", f"multicast to {address} works and stays on this computer (ttl=0)")
     return _lcm.passing("route", f"multicast to {address} works, with ttl={ttl}")

@@ -3,7 +3,7 @@
 from typing import Final
 
 from gateway.outputs.kind import DemoSide, OutputKind, Receive, Subscription
-from gateway.outputs.lcm.checks import CHECKS, check_lcm
+from gateway.outputs.lcm.checks import CHECKS, check_lcm, leaves_host
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
@@ -30,5 +30,6 @@ LCM: Final = OutputKind(
     subscribe=subscribe,
     checks=CHECKS,
     run_checks=check_lcm,
+    leaves_host=leaves_host,
     demo=_demo,
 )

@@ -7,8 +7,8 @@ already use the addresses. It connects to them instead.
 import json
 import re
 import time
-from collections.abc import Iterator, Sequence
-from typing import Any, Final
+from collections.abc import Sequence
+from typing import Final
 
 import zenoh
 
@@ -16,6 +16,7 @@ from gateway.config.secrets import mask_secrets_in_text
 from gateway.errors import ConfigError
 from gateway.findings import Finding, MessageLoad, Subject
 from gateway.messages.topics import zenoh_key
+from gateway.outputs.zenoh.command_session import command_config, endpoints, mode_of
 from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.settings import ZenohSettings
 
@@ -25,7 +26,8 @@ _ROUTER_REMEDY: Final = (
     "Start zenohd at that address, or correct connect/endpoints in zenoh.config. With TLS, check that all "
     "certificates come from one authority, have not expired and contain the address."
 )
-_ANY_ADDRESS: Final = re.compile(r"/(\[::\]|0\.0\.0\.0):")
+_LOCAL: Final = re.compile(r"unix|(tcp|tls|quic|udp|ws)/(127\.[\d.]+|\[::1\]|localhost):")
+"""The beginning of endpoints on this computer."""
 _POLL_S: Final = 0.05
 
 _zenoh: Final = Subject("zenoh")
@@ -39,12 +41,12 @@ def check_zenoh(
         config = zenoh_config(settings.config)
     except ConfigError as error:
         return _no_link(mask_secrets_in_text(str(error)), "Correct zenoh.config.")
-    mode = json.loads(config.get_json("mode")) or "peer"
-    connect = _endpoints(config, "connect", mode)
-    listen = [endpoint for endpoint in _endpoints(config, "listen", mode) if not endpoint.endswith(":0")]
+    mode = mode_of(config)
+    connect = endpoints(config, "connect")
+    listen = [endpoint for endpoint in endpoints(config, "listen") if not endpoint.endswith(":0")]
     keys = {source: zenoh_key(settings.prefix, source, "alive") for source in sources}
     try:
-        session = zenoh.open(_doctor_config(settings, mode, connect, listen, seconds))
+        session = zenoh.open(_doctor_config(settings, seconds))
     except zenoh.ZError as error:
         return _no_link(f"the session does not open: {zenoh_reason(error)}", _ROUTER_REMEDY)
     try:
@@ -67,20 +69,23 @@ def check_zenoh(
     return [_link(mode, routers, peers), _gateway(served, sources)]
 
 
-def _doctor_config(
-    settings: ZenohSettings, mode: str, connect: list[str], listen: list[str], seconds: float
-) -> zenoh.Config:
-    """Return the configuration of a session that also connects to ``listen`` instead of listening there."""
-    config = zenoh_config(settings.config)
-    config.insert_json5("listen/endpoints", "[]")
+def leaves_host(settings: ZenohSettings) -> bool:
+    """Return whether messages may leave this computer: to endpoints that are not on it, or by multicast."""
+    try:
+        config = zenoh_config(settings.config)
+    except ConfigError:
+        return True  # as with the defaults
+    used = endpoints(config, "connect") + ([] if mode_of(config) == "client" else endpoints(config, "listen"))
+    is_scouting = json.loads(config.get_json("scouting/multicast/enabled")) is not False
+    return is_scouting or not all(_LOCAL.match(endpoint) for endpoint in used)
+
+
+def _doctor_config(settings: ZenohSettings, seconds: float) -> zenoh.Config:
+    """Return the configuration of the doctor's session, which waits for ``seconds`` at most."""
+    config = command_config(settings.config)
     timeout_ms = str(round(1000 * seconds))
     for key in ("connect/timeout_ms", "scouting/timeout", "transport/unicast/open_timeout"):
         config.insert_json5(key, timeout_ms)
-    if mode != "client":
-        reachable = [_ANY_ADDRESS.sub("/127.0.0.1:", endpoint) for endpoint in listen]
-        config.insert_json5("mode", '"peer"')
-        config.insert_json5("connect/endpoints", json.dumps([*connect, *reachable]))
-        config.insert_json5("connect/exit_on_failure", "false")
     return config
 
 
@@ -89,25 +94,6 @@ def _no_link(found: str, remedy: str) -> list[Finding]:
         _zenoh.failing("link", found, remedy),
         _zenoh.not_tested("gateway", "it needs link, which failed"),
     ]
-
-
-def _endpoints(config: zenoh.Config, side: str, mode: str) -> list[str]:
-    """Return the configured endpoints for ``mode``; ``side`` is connect or listen."""
-    configured = json.loads(config.get_json(f"{side}/endpoints"))
-    if isinstance(configured, dict) and "locators" not in configured:
-        configured = configured.get(mode) or []
-    return list(_flat(configured))
-
-
-def _flat(endpoints: Any) -> Iterator[str]:
-    match endpoints:
-        case str():
-            yield endpoints
-        case {"locators": locators}:
-            yield from _flat(locators)
-        case list():
-            for endpoint in endpoints:
-                yield from _flat(endpoint)
 
 
 def _find_gateways(session: zenoh.Session, keys: dict[str, str], seconds: float) -> list[str]:

@@ -4,7 +4,7 @@ import socket
 from typing import Final
 
 from gateway.outputs.kind import DemoSide, OutputKind, Receive, Subscription
-from gateway.outputs.zenoh.checks import CHECKS, check_zenoh
+from gateway.outputs.zenoh.checks import CHECKS, check_zenoh, leaves_host
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_pattern, open_zenoh, subscribe
@@ -32,5 +32,6 @@ ZENOH: Final = OutputKind(
     subscribe=subscribe,
     checks=CHECKS,
     run_checks=check_zenoh,
+    leaves_host=leaves_host,
     demo=_demo,
 )

@@ -1,12 +1,14 @@
 """Subscribing to a gateway's messages on Zenoh, for ``echo``, the demo and tests."""
 
-from typing import Any
+import json
+from pathlib import Path
 
 import zenoh
 
 from gateway.errors import OutputError
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.kind import Receive, SubscriptionRequest
+from gateway.outputs.zenoh.command_session import command_config
 from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
 
@@ -16,23 +18,22 @@ def key_pattern(prefix: str, source: str | None, component: str | None) -> str:
     return zenoh_key(prefix, source or "*") + "/" + (component or "**")
 
 
-def open_zenoh(connect: str | None) -> zenoh.Session:
-    """Return an open session. Raises OutputError if it does not open.
+def open_zenoh(connect: str | None, config_file: Path | None = None) -> zenoh.Session:
+    """Return an open session. Raises OutputError if it does not open, ConfigError if Zenoh rejects the file.
 
     With ``connect``, an endpoint such as tcp/127.0.0.1:7447, the session is a client of that endpoint only.
-    Without it, the session is a peer that finds others by multicast, Zenoh's default.
+    Without it, the session is what ``config_file`` says, or a peer that finds others by multicast, Zenoh's
+    default. The file may be that of a running gateway.
     """
-    config: dict[str, Any] = {}
+    config = command_config(config_file) if config_file else zenoh_config({})
     if connect is not None:
-        config = {
-            "mode": "client",
-            "connect": {"endpoints": [connect]},
-            "scouting": {"multicast": {"enabled": False}},
-        }
+        config.insert_json5("mode", '"client"')
+        config.insert_json5("connect/endpoints", json.dumps([connect]))
+        config.insert_json5("scouting/multicast/enabled", "false")
     try:
-        return zenoh.open(zenoh_config(config))
+        return zenoh.open(config)
     except zenoh.ZError as error:
-        where = f" to {connect}" if connect else ""
+        where = f" to {connect}" if connect else f" with {config_file}" if config_file else ""
         raise OutputError(
             f"no Zenoh session{where}: {zenoh_reason(error)}; is the gateway or the router running there?",
             cause="not open",
@@ -62,4 +63,4 @@ class ZenohSubscriber:
 def subscribe(request: SubscriptionRequest, receive: Receive) -> ZenohSubscriber:
     """Subscribe with a new session; ``request.address`` is the endpoint to connect to. Raises OutputError."""
     keys = key_pattern(request.prefix or DEFAULT_ZENOH_PREFIX, request.source, request.component)
-    return ZenohSubscriber(open_zenoh(request.address), keys, receive, owns_session=True)
+    return ZenohSubscriber(open_zenoh(request.address, request.config), keys, receive, owns_session=True)

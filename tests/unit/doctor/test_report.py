@@ -41,6 +41,53 @@ def test_findings_are_printed_in_columns_below_their_subject() -> None:
     )
 
 
+def test_warnings_and_notes_are_counted_and_do_not_fail() -> None:
+    findings = (
+        LAB.warning("loss", "12 messages", "Look."),
+        LAB.note("rate", "no rate to compare with"),
+        LAB.note("frames", "no 6d", "Enable it."),
+    )
+    assert shown(*findings) == (
+        "lab\n"
+        "  warn  loss        12 messages\n"
+        "                    → Look.\n"
+        "  note  rate        no rate to compare with\n"
+        "  note  frames      no 6d\n"
+        "                    → Enable it.\n"
+        "0 ok, 0 failed, 0 not tested, 1 warning, 2 notes\n"
+    )
+    report = Report(Console(quiet=True))
+    for finding in findings:
+        report.add(finding)
+    assert report.is_ok
+    assert [each["result"] for each in json.loads(report.as_json())["findings"]] == [
+        "warning",
+        "note",
+        "note",
+    ]
+
+
+def test_two_streams_of_a_source_are_named_apart() -> None:
+    streams = (Subject("lab", "3d 6d"), Subject("lab", "analog"))
+    findings = [LAB.passing("TCP", "x"), *(stream.passing("frames", "y") for stream in streams)]
+    assert shown(*findings).splitlines()[:-1] == [
+        "lab",
+        "  ok    TCP         x",
+        "lab (3d 6d)",
+        "  ok    frames      y",
+        "lab (analog)",
+        "  ok    frames      y",
+    ]
+    report = Report(Console(quiet=True))
+    for finding in findings:
+        report.add(finding)
+    assert [each.get("stream") for each in json.loads(report.as_json())["findings"]] == [
+        None,
+        "3d 6d",
+        "analog",
+    ]
+
+
 def test_line_breaks_are_kept_and_long_words_are_not_split() -> None:
     path = "/etc/rtc3d-gateway/a-very-long-name-of-a-file.yaml:1:2:"
     text = shown(

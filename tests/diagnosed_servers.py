@@ -1,0 +1,82 @@
+"""Scripted servers for tests of the doctor, and the doctor's findings about them."""
+
+import asyncio
+import re
+import struct
+from collections.abc import Callable
+from typing import Any
+
+from gateway.config.settings import StreamSettings
+from tests import servers
+from tests.findings import Findings, lab, run_doctor
+from tests.servers import Client, ScriptedServer, ok, packet
+
+MARKERS_XML = (
+    "<The_3D><Frequency>{}</Frequency><Markers><Marker id='1'><Label>hip</Label></Marker>"
+    "<Marker id='2'><Label>knee</Label></Marker></Markers></The_3D>"
+)
+TOOLS_XML = (
+    "<The_6D><Frequency>100</Frequency><Tools><Tool id='1'><Label>probe</Label></Tool></Tools></The_6D>"
+)
+
+
+def parameters(*sections: str) -> bytes:
+    return packet(2, f"<RT_Parameters Ver='1.00'>{''.join(sections)}</RT_Parameters>")
+
+
+async def diagnose(script: servers.Script, *streams: StreamSettings, **keys: Any) -> Findings:
+    """Return the findings for a scripted server."""
+    async with ScriptedServer(script) as server:
+        return await run_doctor(lab(server.port, *streams, **keys))
+
+
+def replying(xml: bytes, *frames: bytes, refused: str = "-") -> servers.Script:
+    """Return a server that refuses what matches ``refused``, accepts the rest, and sends frames once."""
+
+    async def script(client: Client) -> None:
+        def answer(command: str) -> bytes:
+            if re.match(refused, command):
+                return servers.error("err-unknown command")
+            if command.startswith("SendParameters"):
+                return xml
+            return ok(f"OK-{command}") + (b"".join(frames) if command.startswith("StreamFrames") else b"")
+
+        await client.commands(answer)
+
+    return script
+
+
+def streaming(
+    xml: bytes,
+    frame: Callable[[int], bytes],
+    step: int = 10,
+    *,
+    stops_after: int | None = None,
+    refused: str = "-",
+) -> servers.Script:
+    """Return a server that sends a frame every 10 ms, and whose clock advances ``step`` ms per frame.
+
+    It refuses what matches ``refused``. After ``stops_after`` frames, it stays silent.
+    """
+
+    async def script(client: Client) -> None:
+        while not (command := await client.command()).startswith("StreamFrames"):
+            if re.match(refused, command):
+                client.send(servers.error("err-unknown command"))
+            else:
+                client.send(xml if command.startswith("SendParameters") else ok(f"OK-{command}"))
+        client.send(ok(f"OK-{command}"))
+        number = 0
+        while not client._writer.is_closing():
+            if stops_after is None or number < stops_after * step:
+                client.send(frame(number))
+            number += step
+            await asyncio.sleep(0.01)
+
+    return script
+
+
+def tools_frame(number: int, *xs: float) -> bytes:
+    items = b"".join(struct.pack(">8f", 1, 0, 0, 0, x, 0, 0, 0.1) for x in xs)
+    component = struct.pack(">IIiqI", 24 + len(items), 4, number, 1000 * number, len(xs)) + items
+    return packet(3, struct.pack(">I", 1) + component)
