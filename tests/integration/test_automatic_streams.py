@@ -277,16 +277,17 @@ async def test_other_rates_at_a_new_connection_are_planned_anew(
 
 
 async def test_other_rates_during_a_connection_are_planned_anew() -> None:
-    async with OneClientServer("serve", lab_scene(200, 200)) as server, run_gateway(server.port) as lab:
+    async with (
+        OneClientServer("serve", lab_scene(200, 200)) as server,
+        run_gateway(server.port, parameters_interval_s=0.5) as lab,
+    ):
         await lab.wait_for("analog", 50)
         server.change_scene(lab_scene())
-        lab.source.fan_out.on_items_changed()
         await lab.wait_until(lambda: components(lab) == ["3d 6d event", "analog force"])
         count = len(lab.messages("analog"))
         analog = (await lab.wait_for("analog", count + 300))[count + 50 :]
         assert steps(analog) == {1}
         server.change_scene(lab_scene(200, 200))
-        lab.source.fan_out.on_items_changed()
         await lab.wait_until(lambda: components(lab) == [EVERYTHING] and server.num_clients == 1)
         count = len(lab.messages("analog"))
         await lab.wait_for("analog", count + 50)
