@@ -21,8 +21,8 @@ def log_fields(**fields: str) -> Iterator[dict[str, str]]:
     """Add ``fields`` (names from FIELDS) to the records of the block and of tasks and callbacks it starts.
 
     The event loop runs a callback in the context in which it was registered. So all records of a
-    connection have the fields, without naming them in each call. The block gets all fields as a dict and may
-    change them, for its tasks and callbacks too.
+    connection have the fields, without naming them in each call. The block gets all fields as a dict. If it
+    changes them, the records of its tasks and callbacks change too.
     """
     all_fields = {**current_log_fields(), **fields}
     token = _fields.set(all_fields)
@@ -40,9 +40,9 @@ def current_log_fields() -> Mapping[str, str]:
 class FailureLog:
     """Logs the first of several failures in a row as WARNING, repeats as DEBUG, and recovery as INFO.
 
-    ``subject`` begins every message, for example "lab" or "lcm"; any object whose str
-    may change. Successes within ``hold_s`` after a failure
-    do not count as recovery, so intermittent failures are logged as one.
+    ``subject`` begins every message, for example "lab" or "lcm". It can be any object; its str may change.
+    Successes within ``hold_s`` after a failure do not count as recovery, so intermittent failures are logged
+    as one.
     """
 
     def __init__(self, logger: logging.Logger, subject: object, hold_s: float = 0.0) -> None:
@@ -76,9 +76,9 @@ class FailureLog:
             return
         now_s = monotonic()
         if now_s - self._last_s >= self._hold_s:
-            duration_s = now_s - self._first_s
+            count = "1 failure" if self._failures == 1 else f"{self._failures} failures"
             self._logger.info(
-                "%s: %s, after %.1f s and %d failures", self._subject, text, duration_s, self._failures
+                "%s: %s, after %.1f s and %s", self._subject, text, now_s - self._first_s, count
             )
             self._failures = 0
 

@@ -1,4 +1,4 @@
-"""What was lost on one route, by cause: counted in messages and frames, and logged at its begin and end."""
+"""Counts what is lost on one route, by cause, and logs when a loss begins and ends."""
 
 import logging
 import threading
@@ -103,7 +103,7 @@ class Losses:
         frames: int = 1,
         level: int = logging.WARNING,
     ) -> None:
-        """Count ``messages`` of ``frames``. ``text`` says what happened and what to do."""
+        """Count lost ``messages`` that belong to ``frames``. ``text`` says what happened and what to do."""
         now_s = self._monotonic()
         self.check()
         with self._lock:

@@ -73,7 +73,7 @@ class Source:
         self._announce_file = announce_file
         self._tasks: set[asyncio.Task[None]] = set()
         self._defects = DefectLog(logger, self.name)
-        # Names and units of another server do not hold here, not even until the first handshake.
+        # The names and units of the former server do not apply to another one, not even until its handshake.
         self._has_new_server = before is not None and (before.settings.host, before.settings.port) != (
             *(settings.host, settings.port),
         )
@@ -172,14 +172,6 @@ class Source:
         )
         return Supervisor(self.settings, stream, status, self._callbacks(status), listener)
 
-    def _on_state(self, status: StreamStatus, former: StreamState) -> None:
-        is_streaming = any(status.state is StreamState.STREAMING for status in self.statuses)
-        self.fan_out.show_streaming(is_streaming)
-        if former is StreamState.NO_MEASUREMENT and status.state is StreamState.STREAMING:
-            self._refresh.request()  # a new measurement may have other markers and tools
-
-    # Parameters.
-
     def _callbacks(self, status: StreamStatus) -> Callbacks:
         return Callbacks(
             publish=self.fan_out.publish,
@@ -189,6 +181,14 @@ class Source:
             on_file=lambda content: self._on_file(status, content),
             has_subscribers=self.fan_out.has_subscribers,
         )
+
+    def _on_state(self, status: StreamStatus, former: StreamState) -> None:
+        is_streaming = any(status.state is StreamState.STREAMING for status in self.statuses)
+        self.fan_out.show_streaming(is_streaming)
+        if former is StreamState.NO_MEASUREMENT and status.state is StreamState.STREAMING:
+            self._refresh.request()  # a new measurement may have other markers and tools
+
+    # Parameters.
 
     def _read_parameters(self, connection: Connection) -> Awaitable[ParsedParameters]:
         return self.queries.parameters.read_for_handshake(connection)

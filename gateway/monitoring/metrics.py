@@ -122,7 +122,7 @@ _LOSS_COUNTERS: Final[Mapping[str, Sequence[tuple[str, str, Callable[[Loss], int
     "stream": (
         (
             "stream_drops",
-            "Frames that arrived and lost a message before any output, and C3D files not stored, by cause.",
+            "Frames that lost a message before any output, and C3D files not stored, by cause.",
             lambda loss: loss.frames or loss.messages,
         ),
         (

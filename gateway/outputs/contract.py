@@ -194,8 +194,8 @@ class Output(ABC):
     def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
         """Publish the parameters of a source's server. Called for every connection and every change.
 
-        Returns a future if messages that are published from now on could overtake the parameters; it is done
-        when that is over.
+        Returns a future if messages that are published after this call could overtake the parameters. It is
+        done when they no longer can.
         """
         return None
 

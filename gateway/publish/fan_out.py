@@ -216,7 +216,7 @@ class FanOut:
         return _Plan(layout, wanted, plans, tools if self._tool_poses.is_used else [])
 
     def _check_item_counts(self, plan: _Plan, session: int) -> None:
-        """Log every component whose number of items has changed, and report it if that is news."""
+        """Log each change in a number of items, and call ``on_items_changed`` if it is within a session."""
         for component, num_items in plan.num_items.items():
             before, session_before = self._num_items.get(component, (num_items, session))
             self._num_items[component] = (num_items, session)

@@ -62,10 +62,10 @@ class ParameterCache:
         self.known: KnownParameters = KnownParameters(
             settings.name, announce, None if former is None else former.known
         )
-        # To servers that gave the newest parameters: there, or at the same time on another connection.
+        # On one of these, the server gave the newest parameters. The others share them.
         self._connections: list[Connection] = []
         self._refusing: Connection | None = None  # one of these, on which the server refused them later on
-        # By a handshake; None as result means that other handshakes have to ask themselves.
+        # The parameters that a handshake is reading. After the result None, other handshakes ask themselves.
         self._reading: asyncio.Future[ParsedParameters | None] | None = None
         # What the server answered about sections that the answer for all of them does not give, or for all
         # of them if that cannot be read. All of this is cleared when a connection begins.
@@ -127,22 +127,22 @@ class ParameterCache:
             packet = await connection.ask(command)
         except ServerError as error:
             self._refusal = _Refusal(self._requests.refused(command, error))
-            await self._lose(f"it refuses {command}: {error}")
+            await self._invalidate(f"it refuses {command}: {error}")
             raise
         except ReplyTimeoutError as error:
-            await self._lose(str(error))
+            await self._invalidate(str(error))
             raise
         try:
             answer = await self.known.take(packet.body, self._requests.session, announce_always=True)
         except ParametersError as error:
             self._keep_unreadable((), packet.body, error)
-            await self._lose(str(error))
+            await self._invalidate(str(error))
             raise
         self._connections.append(connection)
         self._problems.recovered("the server sends its parameters again")
         return answer.parsed
 
-    async def _lose(self, reason: str) -> None:
+    async def _invalidate(self, reason: str) -> None:
         """Make the former parameters void, unless the server still gives them on another connection."""
         if not self._is_current:
             await self.known.make_void(reason)

@@ -11,7 +11,7 @@ from gateway.config.settings import SourceSettings
 from gateway.log import DefectLog
 
 _GAP_WITHOUT_INTERVAL_S: Final = 10.0
-"""The shortest time between two readings that something caused, if ``parameters_interval_s`` is 0."""
+"""The shortest time between two requested readings if ``parameters_interval_s`` is 0."""
 
 logger = logging.getLogger(__name__)
 

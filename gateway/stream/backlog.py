@@ -13,25 +13,25 @@ from gateway.rtc3d.frames import Frame
 from gateway.stream.clock import ServerClock
 
 MAX_TOGETHER: Final = 4
-"""As many frames may be published together without being a backlog."""
+"""Up to this many frames that arrive together are published at once. More are a backlog."""
 
 _MAX_WAIT_S: Final = 0.005
 """The longest time between two frames, so that gaps and low rates do not delay a backlog."""
 
 _MAX_LATE_S: Final = 0.015
-"""How much of the time that the event loop was late is made up for by publishing frames together."""
+"""If the event loop calls too late, publishing frames together makes up for at most this much."""
 
 _IDLE_S: Final = 0.5
-"""After this time, a backlog does not continue an earlier one. A stream that comes in batches has many."""
+"""A backlog that begins within this time after another one continues its pace, as in a stream of batches."""
 
 _TURN_S: Final = 0.005
-"""How long one call may publish, except for what its last frames take."""
+"""How long one call publishes. The frames that it has begun by then may take longer."""
 
 _RESOLUTION_S: Final = 0.001
 """The event loop's timers have whole milliseconds, so what is due in the next one is published now."""
 
 _MAX_CHUNK: Final = 16
-"""How many frames are published between two looks at the time."""
+"""How many frames are published between two readings of the clock."""
 
 
 class Backlog:

@@ -31,7 +31,7 @@ class ChangeTasks:
     """Decides what the server of one session should send, and asks for it, until ``cancel``.
 
     Three facts decide: whether frames are wanted, how often their rate is to be halved, and which components
-    are wanted. One task brings the server to what they say now, so changes never meet. ``has_subscribers``
+    are wanted. One task brings the server to what they say now, so changes never overlap. ``has_subscribers``
     returns whether the stream's components may have subscribers.
     """
 

@@ -17,7 +17,7 @@ Publish = Callable[[Frame, Stamp, frozenset[ComponentType]], None]
 """Takes a frame, its stamp, and the types of the components to publish."""
 
 Skip = Callable[[Frame, Stamp, frozenset[ComponentType]], int]
-"""Takes the same for components that are not published; returns how many messages are lost thereby."""
+"""Takes the same for components that are not published; returns how many messages this loses."""
 
 _EVENTS: Final = frozenset({ComponentType.EVENT})
 

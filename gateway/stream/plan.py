@@ -20,7 +20,7 @@ class StreamPlan(NamedTuple):
     ``groups`` are the components of each connection; together they are all components. The first group is
     the slowest one. It also has the components without an announced rate and the events, which are sent
     with any frame. ``rates_hz`` are the announced rates of the groups, () if the server announces none.
-    ``limitation`` says what the plan costs because the server does not announce a rate; "" if nothing.
+    ``limitation`` says what the plan costs and why; "" if it costs nothing.
     """
 
     groups: tuple[Components, ...] = (WIRE_ORDER,)
@@ -67,11 +67,11 @@ def plan_streams(parameters: Parameters | None) -> StreamPlan:
         )
     fast = {component for group in groups[1:] for component in group}
     first = tuple(component for component in WIRE_ORDER if component not in fast)
-    silent = [component for component in described if component not in rates_hz]
+    unrated = [component for component in described if component not in rates_hz]
     return StreamPlan(
         (first, *groups[1:]),
         tuple(rates_hz[group[0]] for group in groups),
-        _no_rates(keys_text(silent)) if silent else "",
+        _no_rates(keys_text(unrated)) if unrated else "",
     )
 
 

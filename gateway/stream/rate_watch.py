@@ -22,7 +22,7 @@ _MIN_FRAMES: Final = 20
 _MEASUREMENTS: Final = 3
 _MEASUREMENTS_WITHOUT_CLOCK: Final = 10
 """How many measurements in a row must agree before a difference, or its end, is reported. Without a clock of
-the server, a backlog that is read after a stop of this process looks like a higher rate."""
+the server, frames that are read together after a stop of this process look like a higher rate."""
 
 AnnouncedRates = Mapping[ComponentType, float]
 """The rates that the server announces, in Hz."""
@@ -33,8 +33,9 @@ logger = logging.getLogger(__name__)
 class Arrivals(NamedTuple):
     """What has arrived in a session so far.
 
-    ``followed`` is a component type, ``num_followed`` the number of frames that begin with it, and
-    ``timestamp_us`` the newest time stamp of these frames. ``components`` are those of the newest frame.
+    ``followed`` is the component type whose time stamps are used, because servers may count the time of each
+    type separately. ``num_followed`` is the number of frames that begin with this type, ``timestamp_us`` the
+    newest time stamp of these frames. ``components`` are those of the newest frame.
     """
 
     num_frames: int

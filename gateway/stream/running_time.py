@@ -1,4 +1,4 @@
-"""The time during which this process runs: what the silence of a peer is measured by.
+"""Time-outs that count only the time during which this process runs.
 
 While the process is stopped (SIGSTOP, a busy host, a suspended virtual machine), what peers send waits in
 the sockets. When the process continues, the event loop calls its timers before it reads the sockets. So

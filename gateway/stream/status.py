@@ -23,10 +23,10 @@ MAX_LIMITATIONS: Final = 20
 """How many limitations of a connection are kept, and how many logged ones are remembered."""
 
 SKIPPED: Final = "skipped while behind"
-"""The cause of loss of late frames with ``backlog: latest``."""
+"""The cause under which late frames that ``backlog: latest`` skips are counted."""
 
 FRAME_REJECTED: Final = "frame rejected"
-"""The cause of loss of frames that contradict themselves."""
+"""The cause under which frames that contradict themselves are counted."""
 
 _CONNECTING: Final = (StreamState.CONNECTING, StreamState.HANDSHAKING)
 _RECEIVING: Final = (StreamState.STREAMING, StreamState.NO_MEASUREMENT)
@@ -68,10 +68,10 @@ class StreamStatus:
     ``last_frame_s`` is the same on the running clock (see ``gateway.stream.running_clock``), None before the
     first. ``connections`` counts the connections, ``tries`` the attempts to connect since the last completed
     handshake, ``reconnects`` all attempts except the first. ``restarts`` counts how often the server's time
-    or frame numbers started again within a connection. ``losses`` counts by cause what arrived and was not
-    published. ``limitations`` lists what the current connection lacks. ``unwanted_components`` are the
-    components of the newest frame if it had none of this stream's; ``unwanted_since_s`` is since when all
-    frames were like that, on the running clock. ``num_state_changes`` grows with every change of ``state``.
+    or frame numbers started again within a connection. ``losses`` counts by cause what was lost
+    before any output. ``limitations`` lists what the current connection lacks. ``unwanted_components`` are the
+    components of the newest frame if it had none of this stream's; ``unwanted_since_s`` is when the
+    first of these frames arrived, on the running clock. ``num_state_changes`` grows with every change of ``state``.
     """
 
     components: str
@@ -124,7 +124,7 @@ class StreamStatus:
         self._enter(Phase.CONNECTING, "connecting", server)
 
     def components_changed(self, components: str, name: str, *, on_open_connection: bool) -> None:
-        """Note the components that the stream has from now on, and the name that follows from them.
+        """Note the components that the stream has from now on, and its new name.
 
         Components that move to an open connection get a new session number there.
         """

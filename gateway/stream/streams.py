@@ -42,14 +42,14 @@ NewStream = Callable[[StreamSettings, Listener], Supervisor]
 
 
 class ConfiguredStreams(Listener):
-    """The streams of a configuration that lists them."""
+    """The streams that a configuration lists."""
 
     def __init__(self, settings: Sequence[StreamSettings], new_stream: NewStream) -> None:
         self._announced_hz: AnnouncedRates = {}
         self.streams: Sequence[Supervisor] = [new_stream(each, self) for each in settings]
         """The streams, in the order of the configuration."""
         self.known = self.streams
-        """The same."""
+        """The same as ``streams``: they never change."""
 
     async def run(self) -> None:
         """Run every stream until cancelled."""
@@ -119,11 +119,11 @@ class _Further:
 
     @property
     def is_running(self) -> bool:
-        """Whether it is to be connected."""
+        """Whether it should be connected."""
         return self.task is not None and not self.task.cancelling()
 
     def start(self, tasks: asyncio.TaskGroup) -> None:
-        """Connect, once the former connection is closed."""
+        """Connect as soon as the earlier connection is closed."""
         self.opened_s = _now_s()
         self.failures = self.waiting = self.quiet = 0
         self.task = tasks.create_task(self._run_after(self.task))

@@ -70,7 +70,7 @@ def backoff_delays_s(reconnect: ReconnectSettings) -> Iterator[float]:
 class Supervisor:
     """Runs the sessions of one stream, one after the other.
 
-    ``connect`` and ``read_clocks`` are passed on to each Session. ``listener`` is told of each connection.
+    ``connect`` and ``read_clocks`` are passed on to each Session. ``listener`` follows their connections.
     """
 
     def __init__(
@@ -159,8 +159,8 @@ class Supervisor:
                 delays_s = backoff_delays_s(reconnect)
             self.status.disconnected(error)
             self._listener.ended(self, error)
-            # An attempt that took long need not be followed by a long wait as well: a server that hangs, and
-            # is well again, would stay without a client.
+            # The time that the attempt took counts as waiting. Otherwise a server that hung for long and has
+            # recovered would wait for its client even longer.
             lasted_s = loop.time() - began_s
             await asyncio.sleep(max(next(delays_s) - lasted_s, next(backoff_delays_s(reconnect))))
             self.status.reconnecting()

@@ -64,7 +64,7 @@ def test_success_is_always_logged_and_ends_a_failure(caplog: pytest.LogCaptureFi
     failures.succeeded("streaming")
     assert levels(caplog) == [logging.INFO, logging.WARNING, logging.INFO, logging.INFO]
     assert caplog.messages[0] == caplog.messages[3] == "lab: streaming"
-    assert caplog.messages[2].startswith("lab: streaming, after ")
+    assert re.fullmatch(r"lab: streaming, after \d+\.\d s and 1 failure", caplog.messages[2])
 
 
 def test_a_failure_after_recovery_is_a_warning_again(caplog: pytest.LogCaptureFixture) -> None:
