@@ -27,12 +27,13 @@ def check_receive_buffer(subject: Subject, load_bytes_per_s: float, tcp_rmem: Pa
     holds_s = largest * _PAYLOAD_SHARE / load_bytes_per_s
     load = f"{load_bytes_per_s / 1e6:.2g} MB/s"
     if holds_s >= _STOP_S:
-        return subject.passing(CHECK, f"the kernel holds {min(holds_s, 60):.0f} s or more of {load}")
+        text = f"the kernel holds what the server sends in {min(holds_s, 60):.0f} s ({load})"
+        return subject.passing(CHECK, text)
     needed = _next_mebibyte(load_bytes_per_s * _STOP_S / _PAYLOAD_SHARE)
     return subject.failing(
         CHECK,
-        f"the kernel holds only {holds_s:.1f} s of {load}; "
-        "what the server sends in a longer stop of the gateway may be lost",
+        f"the kernel holds only what the server sends in {holds_s:.1f} s ({load}); "
+        "if the gateway stops for longer, frames may be lost",
         f'Run sysctl -w net.ipv4.tcp_rmem="{smallest} {initial} {needed}", and put '
         f"net.ipv4.tcp_rmem = {smallest} {initial} {needed} into /etc/sysctl.d/90-rtc3d.conf to keep it.",
     )

@@ -68,10 +68,10 @@ class StreamStatus:
     ``last_frame_s`` is the same on the running clock (see ``gateway.stream.running_clock``), None before the
     first. ``connections`` counts the connections, ``tries`` the attempts to connect since the last completed
     handshake, ``reconnects`` all attempts except the first. ``restarts`` counts how often the server's time
-    or frame numbers started again within a connection. ``losses`` counts by cause what was lost
-    before any output. ``limitations`` lists what the current connection lacks. ``unwanted_components`` are the
-    components of the newest frame if it had none of this stream's; ``unwanted_since_s`` is when the
-    first of these frames arrived, on the running clock. ``num_state_changes`` grows with every change of ``state``.
+    or frame numbers started again within a connection. ``losses`` counts by cause what was lost before any
+    output. ``limitations`` lists what the current connection lacks. ``unwanted_components`` are the
+    components of the newest frame if it had none of this stream's; ``unwanted_since_s`` is when the first
+    of these frames arrived, on the running clock. ``num_state_changes`` grows with every change of ``state``.
     """
 
     components: str

@@ -53,8 +53,8 @@ def multicast_problem(url: str) -> str:
 def receiving_url(url: str) -> str:
     """Return ``url`` with a receive buffer for bursts, unless it sets one or its scheme has none.
 
-    LCM's default is the kernel's, which holds about 100 messages. LCM writes a warning on stderr if the kernel
-    does not allow the size, so this asks for no more than that.
+    LCM's default is the kernel's, which holds about 100 messages. LCM writes a warning on stderr if the
+    kernel does not allow the size, so this asks for no more than that.
     """
     if scheme_of(url) not in MULTICAST_SCHEMES or "recv_buf_size" in url:
         return url
