@@ -31,7 +31,7 @@ class Publisher(Protocol):
         """Whether there may be a subscriber; always True if the output cannot know."""
 
     def publish(self, message: bytes) -> None:
-        """Send one message. Wait for a peer that is behind for at most some milliseconds, whatever it does.
+        """Send one message. Wait for a slow peer for some milliseconds at most.
 
         This wait is how back-pressure reaches the server: the session reads on only after ``publish``.
 

@@ -140,7 +140,7 @@ class Frame:
 def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
     """Split a type-3 packet's body into components (§7.1).
 
-    Components of unknown type are skipped by their size. Bytes behind the last component are ignored, as by
+    Components of unknown type are skipped by their size. Bytes after the last component are ignored, as by
     NDI's own code: some programs end every body in LF (field note 17). Raises FrameError if sizes and counts
     contradict each other or the body's length: then no part of the frame can be trusted.
     """

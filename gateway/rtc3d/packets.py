@@ -74,7 +74,7 @@ def encode_packet(packet_type: int, body: bytes = b"") -> bytes:
 def decode_text(body: bytes) -> str:
     """Return a type 0 or 1 body as text, without NULs and white space around it (field notes 8, 13).
 
-    A NUL ends the text; bytes behind it are ignored (field note 17). Bytes that are not ASCII are read as
+    A NUL ends the text; bytes after it are ignored (field note 17). Bytes that are not ASCII are read as
     Latin-1, so that any body can be shown.
     """
     return body.decode("latin-1").strip("\0 \t\r\n").partition("\0")[0].rstrip()

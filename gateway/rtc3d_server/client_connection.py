@@ -249,7 +249,7 @@ class ClientConnection(asyncio.Protocol):
 
 
 def _described(packet: Packet) -> str:
-    """Return a client's packet as text for the log: a command as it was sent, bytes behind it included."""
+    """Return a client's packet as text for the log: a command as it was sent, bytes after it included."""
     if packet.type == PacketType.COMMAND:
         return ascii(packet.body[:_MAX_LOGGED_BYTES].decode("latin-1"))
     return f"a packet of type {packet.type} with {len(packet.body)} bytes"

@@ -44,7 +44,7 @@ class Ingest:
         on_lateness: Callable[[int], None],
         on_restart: Callable[[], None],
     ) -> None:
-        self._skips_when_behind = stream.backlog == "latest"
+        self._skips_late_frames = stream.backlog == "latest"
         self._status = status
         self._publish = publish
         self._skip = skip
@@ -108,7 +108,7 @@ class Ingest:
             if not frame.layout.components:
                 continue
             stamp = self._stamp(frame, utime, steady_us)
-            if self._lag.behind and self._skips_when_behind and index < len(frames) - 1:
+            if self._lag.is_late and self._skips_late_frames and index < len(frames) - 1:
                 if newest is None:
                     newest = self._newest_components(frames)
                 self._publish_newest(frame, stamp, newest[index])
@@ -146,7 +146,7 @@ class Ingest:
         else:
             self._unwanted = ""
         if layout.num_extra_bytes:
-            self._status.add_limitation("bytes behind the last component of a frame are ignored")
+            self._status.add_limitation("bytes after the last component of a frame are ignored")
 
     def _stamp(self, frame: Frame, utime: int, steady_us: int) -> Stamp:
         frame_number, timestamp_us = frame.number_and_timestamp

@@ -6,7 +6,7 @@ from typing import Final
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate, StreamFrames
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 
-BEHIND_S: Final = 1.0
+LATE_S: Final = 1.0
 """How long frames must be late without interruption before a lower rate is requested."""
 
 FIRST_WAIT_S: Final = 10.0
@@ -52,7 +52,7 @@ def halved(rate: Rate | None, times: int) -> Rate | None:
 class LagControl:
     """Decides how often to halve the configured rate, from how late the frames are.
 
-    After BEHIND_S of late frames it halves the rate once more (a step down). After ``wait_s`` of frames in
+    After LATE_S of late frames it halves the rate once more (a step down). After ``wait_s`` of frames in
     time it undoes one halving (a step up), until the rate is as configured. A step up fails if a step down
     follows within ``wait_s``; then ``wait_s`` doubles, up to MAX_WAIT_S. If a step down follows later,
     ``wait_s`` returns to FIRST_WAIT_S. This avoids retrying the full rate on a link that carries half of it.
@@ -65,7 +65,7 @@ class LagControl:
         self._max_lag_s = max_lag_s
         self._max_halvings = max_halvings
         self.halvings = 0
-        self.behind = False
+        self.is_late = False
         """Whether the newest frame was late."""
         self.wait_s = FIRST_WAIT_S
         self._since_s: float | None = None  # since when frames are late, or in time, at the current rate
@@ -73,19 +73,19 @@ class LagControl:
 
     def observe(self, now_s: float, lag_s: float) -> bool:
         """Process the lag of one frame; return whether ``halvings`` changed."""
-        behind = lag_s > self._max_lag_s
-        if behind is not self.behind or self._since_s is None:
-            self.behind = behind
+        is_late = lag_s > self._max_lag_s
+        if is_late is not self.is_late or self._since_s is None:
+            self.is_late = is_late
             self._since_s = now_s
             return False
         held_s = now_s - self._since_s
-        if behind:
-            return held_s >= BEHIND_S and self._step_down(now_s)
+        if is_late:
+            return held_s >= LATE_S and self._step_down(now_s)
         return held_s >= self.wait_s and self.halvings > 0 and self._step_up(now_s)
 
     def restart(self) -> None:
         """Forget how late the previous frames were, because the next ones do not continue them."""
-        self.behind = False
+        self.is_late = False
         self._since_s = None
 
     def _step_down(self, now_s: float) -> bool:

@@ -1,4 +1,4 @@
-"""Zenoh's back-pressure: a put waits for a subscriber that is behind, but not long for one that stalls.
+"""Zenoh's back-pressure: a put waits for a slow subscriber, but not long for one that stalls.
 
 The subscribers are processes of their own, because all Zenoh sessions of one process share their threads.
 """

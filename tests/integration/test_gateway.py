@@ -53,7 +53,7 @@ async def test_every_component_of_the_simulator_is_published() -> None:
         assert gateway.status.rate == "AllFrames"
 
 
-async def test_bytes_behind_every_body_change_nothing_that_is_published() -> None:
+async def test_bytes_after_every_body_change_nothing_that_is_published() -> None:
     """Field note 17. The frames alternate between two layouts."""
 
     def extended(whole: bytes, extra: bytes) -> bytes:
@@ -76,7 +76,7 @@ async def test_bytes_behind_every_body_change_nothing_that_is_published() -> Non
         await gateway.wait_for("3d", 60)
         contents = [data[40:] for topic, data in gateway.output.messages if topic.path == ("3d",)]
         assert contents == [each[20:] for each in frames for _ in range(3)]
-        assert "bytes behind the last component of a frame are ignored" in gateway.status.limitations
+        assert "bytes after the last component of a frame are ignored" in gateway.status.limitations
         assert gateway.source.queries.parameters.known.newest is not None
 
 

@@ -167,7 +167,7 @@ async def test_the_recording_packet_gets_no_reply() -> None:
         assert connection.session.is_recording
 
 
-async def test_packets_in_three_sends_with_a_line_feed_behind_the_body_are_accepted() -> None:
+async def test_packets_in_three_sends_with_a_line_feed_after_the_body_are_accepted() -> None:
     """As the MATLAB toolbox for the Wave writes them (field note 17)."""
     event = struct.pack("<IIIiqI", 1, 48, EVENT, -1, 0, 1) + struct.pack("<iqiii", 1, 0, -1, -1, -1)
     async with Simulator(CountingScene()) as simulator, connected(simulator) as client:

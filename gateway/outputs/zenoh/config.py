@@ -20,7 +20,7 @@ _DEFAULTS: Final = {
     "transport": {
         # 16 MB of /dev/shm, and files left behind after a kill, for messages of a few kB.
         "shared_memory": {"enabled": False},
-        # How long, in µs, a put waits for a subscriber that is behind before Zenoh drops messages for it. The
+        # How long, in µs, a put waits for a slow subscriber before Zenoh drops messages for it. The
         # scheduler alone delays a subscriber by more than Zenoh's 1 ms. Once Zenoh drops, it does not wait
         # again until that subscriber has read something.
         "link": {"tx": {"queue": {"congestion_control": {"drop": {"wait_before_drop": 20_000}}}}},

@@ -28,7 +28,7 @@ class ZenohLink:
 class ZenohPublisher:
     """Sends the messages of one key.
 
-    If a subscriber is behind, ``publish`` waits for at most ``wait_before_drop`` of Zenoh's configuration
+    If a subscriber is too slow, ``publish`` waits for at most ``wait_before_drop`` of Zenoh's configuration
     (20 ms). After that, Zenoh drops messages for this subscriber, without waiting, until it reads again.
     """
 

@@ -119,7 +119,7 @@ def test_the_recording_control_of_wavefront_gets_no_reply(
 
 
 @pytest.mark.parametrize("extra", [b"\n", b"\0", b"\r\n\0"])
-def test_bytes_behind_the_recording_control_are_ignored(client: ScriptedClient, extra: bytes) -> None:
+def test_bytes_after_the_recording_control_are_ignored(client: ScriptedClient, extra: bytes) -> None:
     assert client.send(START_BIG + extra, DATA) == []
     assert client.session.is_recording
     assert client.send(START_LITTLE[:28] + bytes(4) + START_LITTLE[32:] + extra, DATA) == []

@@ -120,7 +120,7 @@ def test_frames_that_arrive_together_but_in_time_are_all_published(lab: Lab) -> 
     assert not lab.status.losses.report()
 
 
-def test_while_behind_the_newest_is_published_and_no_event_is_skipped(lab: Lab) -> None:
+def test_while_late_the_newest_is_published_and_no_event_is_skipped(lab: Lab) -> None:
     late = [frame(number, event=number == 602) for number in range(600, 605)]
     lab.receive(*late, late_us=200_000)
     if lab.backlog == "latest":
@@ -136,7 +136,7 @@ FORCE, TOOLS = ComponentType.FORCE, ComponentType.TOOLS
 
 
 @pytest.mark.parametrize("last", [(EMPTY,), (EMPTY, EMPTY), (frame_of(603, (FORCE, 603)),)])
-def test_while_behind_the_newest_frame_that_is_not_empty_is_published(last: tuple[Frame, ...]) -> None:
+def test_while_late_the_newest_frame_that_is_not_empty_is_published(last: tuple[Frame, ...]) -> None:
     lab = learned_lab("latest", "3d", "event")
     late = [frame(600), frame(601, event=True), frame(602)]
     lab.receive_at(BOOT_UTIME + 605 * PERIOD_US + 200_000, *late, *last)
@@ -144,7 +144,7 @@ def test_while_behind_the_newest_frame_that_is_not_empty_is_published(last: tupl
     assert amounts(lab.status.losses.report()) == {"skipped while behind": (2, 2)}
 
 
-def test_while_behind_the_newest_of_each_component_is_published() -> None:
+def test_while_late_the_newest_of_each_component_is_published() -> None:
     """Servers leave out components that are empty (field note 5)."""
     lab = learned_lab("latest")
     late = [
@@ -204,7 +204,7 @@ def test_lateness_before_a_restart_does_not_count_after_it(lab: Lab) -> None:
     restart_utime = BOOT_UTIME + 780 * PERIOD_US + 200_000
     lab.receive_at(restart_utime, frame(0), frame(1))
     assert lab.restarts == 1
-    assert [number for number, _ in lab.published][-2:] == [0, 1]  # not behind: nothing is skipped
+    assert [number for number, _ in lab.published][-2:] == [0, 1]  # not late: nothing is skipped
     for number in range(2, 2 + RATE_HZ * 9 // 10):
         lab.receive_at(restart_utime + number * PERIOD_US + 200_000, frame(number))
     assert lab.halvings == []
@@ -274,10 +274,10 @@ def test_unknown_components_are_counted_and_the_others_published(
     assert caplog.messages == ["lab (3d event): components of unknown type [99] are skipped"]
 
 
-def test_bytes_behind_the_last_component_are_a_limitation_once() -> None:
+def test_bytes_after_the_last_component_are_a_limitation_once() -> None:
     lab = Lab("all")
     extended = split_frame(frame(1).body + b"\n", "big")
     for each in (extended, frame(2), extended):
         lab.ingest.receive([each], BOOT_UTIME, 0)
     assert len(lab.published) == 3
-    assert lab.status.limitations == ["bytes behind the last component of a frame are ignored"]
+    assert lab.status.limitations == ["bytes after the last component of a frame are ignored"]

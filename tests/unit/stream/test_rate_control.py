@@ -193,7 +193,7 @@ def test_a_restart_forgets_that_frames_were_late() -> None:
     control = LagControl(max_lag_s=0.05)
     control.observe(0.0, 0.2)
     control.restart()
-    assert control.behind is False
+    assert control.is_late is False
     assert not control.observe(0.5, 0.2)
     assert not control.observe(1.25, 0.2)
     assert control.observe(1.5, 0.2)
