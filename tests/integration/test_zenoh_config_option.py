@@ -1,0 +1,140 @@
+"""--zenoh-config of ``echo``, ``params`` and ``doctor``: certificates of viewers and of the gateway."""
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.networks import free_port
+from tests.secure_zenoh import SecureRouter, make_certificates, run_gateway_with_simulator, run_secure_router
+from tests.waiting import wait_until
+
+
+@pytest.fixture(scope="module")
+def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_certificates(tmp_path_factory.mktemp("ours") / "tls")
+
+
+@pytest.fixture(scope="module")
+def router(tmp_path_factory: pytest.TempPathFactory, certificates: Path) -> Iterator[SecureRouter]:
+    """A router with access control, and a gateway that streams through it."""
+    folder = tmp_path_factory.mktemp("lab")
+    with run_secure_router(folder, certificates) as secure_router:
+        wait_until(lambda: "the session is open" in (folder / "gateway.log").read_text())
+        yield secure_router
+
+
+def run_command(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run rtc3d-gateway to its end."""
+    return subprocess.run(
+        [sys.executable, "-m", "gateway", *arguments], capture_output=True, text=True, timeout=60, check=False
+    )
+
+
+def test_echo_and_params_work_with_a_viewers_certificate(router: SecureRouter, tmp_path: Path) -> None:
+    file = tmp_path / "viewer.json5"
+    file.write_text(router.client("viewer"), encoding="utf-8")
+    echo = run_command(
+        "echo", "--zenoh-config", str(file), "--component", "3d", "--count", "2", "--seconds", "9"
+    )
+    assert (echo.returncode, echo.stderr) == (0, "")
+    assert len(echo.stdout.splitlines()) == 2
+    params = run_command("params", "3d", "--zenoh-config", str(file), "--json")
+    assert (params.returncode, params.stderr) == (0, "")
+    assert '"lab"' in params.stdout
+
+
+def test_connect_replaces_the_address_in_the_file(router: SecureRouter, tmp_path: Path) -> None:
+    file = tmp_path / "viewer.json5"
+    file.write_text(router.client("viewer", (f"tls/127.0.0.1:{router.port}", "tls/127.0.0.1:9")))
+    arguments = ("params", "3d", "--zenoh-config", str(file), "--timeout", "2")
+    assert run_command(*arguments).returncode == 3
+    assert run_command(*arguments, "--connect", f"tls/127.0.0.1:{router.port}").returncode == 0
+
+
+def test_a_file_that_zenoh_rejects_is_named(tmp_path: Path) -> None:
+    file = tmp_path / "viewer.json5"
+    file.write_text("{ mode: 7 }")
+    for command in ("echo", "params"):
+        result = run_command(command, "--zenoh-config", str(file))
+        assert result.returncode == 2
+        assert f"Zenoh does not accept the file {file}" in result.stderr
+        assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize("command", ["echo", "params"])
+def test_a_zenoh_file_is_not_for_lcm(command: str, tmp_path: Path) -> None:
+    result = run_command(command, "--lcm", "--zenoh-config", str(tmp_path))
+    assert result.returncode == 2
+    assert "--zenoh-config is for" in result.stderr
+
+
+def doctor(config: Path, *arguments: str) -> dict[str, dict[str, str]]:
+    """Return the doctor's findings about Zenoh, by check."""
+    result = run_command("doctor", "--config", str(config), "--no-connect", "--json", *arguments)
+    assert result.stderr == ""
+    findings = json.loads(result.stdout)["findings"]
+    return {each["check"]: each for each in findings if each["subject"] == "zenoh"}
+
+
+def test_the_doctor_works_with_the_gateways_and_with_a_viewers_certificate(
+    router: SecureRouter, tmp_path: Path
+) -> None:
+    """The gateway's certificate may publish only: a viewer's is needed to see the gateway."""
+    (tmp_path / "gateway.json5").write_text(router.client("gateway"), encoding="utf-8")
+    (tmp_path / "viewer.json5").write_text(router.client("viewer"), encoding="utf-8")
+    config = tmp_path / "gateway.yaml"
+    config.write_text(
+        "sources: [{name: lab, host: 127.0.0.1, port: 9}]\n"
+        "zenoh: {config: gateway.json5}\nlcm: {enabled: false}\nmetrics: {enabled: false}\n"
+    )
+    findings = doctor(config)
+    assert findings["link"]["found"] == "the session is open and connected to a router"
+    assert findings["gateway"]["result"] == "not tested"
+    findings = doctor(config, "--zenoh-config", str(tmp_path / "viewer.json5"))
+    assert findings["link"]["found"] == "the session is open and connected to a router"
+    assert findings["gateway"]["found"] == "a gateway serves lab"
+
+
+@pytest.mark.parametrize(("host", "name"), [("127.0.0.1", "router"), ("[::]", "gateway")])
+def test_the_commands_show_the_certificate_of_a_gateway_that_listens(
+    certificates: Path, tmp_path: Path, host: str, name: str
+) -> None:
+    """The gateway itself requires certificates and has rules; it has none for connections that it opens.
+
+    If it listens on all addresses, its certificate need not contain that of this computer.
+    """
+    port = free_port()
+    file = tmp_path / "zenoh.json5"
+    common = 'permission: "allow", key_exprs: ["mocap/**"]'
+    asked = '"declare_subscriber", "query", "declare_liveliness_subscriber", "liveliness_query"'
+    said = '"put", "declare_queryable", "reply", "liveliness_token"'
+    file.write_text(
+        f"""{{
+          mode: "peer", id: "abc1", listen: {{ endpoints: ["tls/{host}:{port}"] }},
+          scouting: {{ multicast: {{ enabled: false }} }},
+          transport: {{ link: {{ tls: {{
+            root_ca_certificate: "{certificates}/ca.crt", enable_mtls: true,
+            listen_private_key: "{certificates}/{name}.key", listen_certificate: "{certificates}/{name}.crt",
+          }} }} }},
+          access_control: {{ enabled: true, default_permission: "deny",
+            rules: [
+              {{ id: "asked", flows: ["ingress"], messages: [{asked}], {common} }},
+              {{ id: "said", flows: ["egress"], messages: [{said}], {common} }},
+            ],
+            subjects: [{{ id: "lab", cert_common_names: ["{name}"] }}],
+            policies: [{{ subjects: ["lab"], rules: ["asked", "said"] }}],
+          }},
+        }}""",
+        encoding="utf-8",
+    )
+    with run_gateway_with_simulator(tmp_path, "zenoh.json5") as log:
+        wait_until(lambda: "the session is open" in log.read_text())
+        findings = doctor(tmp_path / "gateway.yaml")
+        assert findings["link"]["found"] == "the session is open and connected to 0 routers and 1 peer"
+        assert findings["gateway"]["found"] == "a gateway serves lab"
+        params = run_command("params", "3d", "--zenoh-config", str(file))
+        assert (params.returncode, params.stderr) == (0, "")
