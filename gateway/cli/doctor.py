@@ -1,5 +1,6 @@
 """``rtc3d-gateway doctor``: find out why no data arrives."""
 
+import sys
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -10,6 +11,7 @@ from rich.console import Console
 from gateway.cli.options import ConfigOption, ServerOption, ZenohConfigOption, configuration_from_options
 from gateway.doctor.all_checks import run_checks, run_checks_without_settings
 from gateway.doctor.report import Report
+from gateway.doctor.source_checks import CONNECTION
 from gateway.errors import ConfigError
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
 
@@ -39,7 +41,15 @@ def doctor(
     set_up_log(LogLevel.ERROR, LogFormat.TEXT)  # warnings would repeat the findings
     report = Report(Console(quiet=as_json))
     uvloop.run(
-        _report_findings(report, config, server, seconds, connects=not no_connect, zenoh_config=zenoh_config)
+        _report_findings(
+            report,
+            config,
+            server,
+            seconds,
+            connects=not no_connect,
+            zenoh_config=zenoh_config,
+            as_json=as_json,
+        )
     )
     if as_json:
         print(report.as_json())
@@ -55,6 +65,7 @@ async def _report_findings(
     *,
     connects: bool,
     zenoh_config: Path | None,
+    as_json: bool,
 ) -> None:
     if config is None and server is None and _INSTALLED_CONFIG.exists():
         config = _INSTALLED_CONFIG
@@ -71,4 +82,6 @@ async def _report_findings(
         findings = run_checks(settings, origin, seconds, connects=connects, output_sections=sections)
         async for finding in findings:
             report.add(finding)
+            if as_json and finding.check == CONNECTION:  # the JSON comes too late to stop the doctor
+                print(f"{finding.subject}: {finding.found}", file=sys.stderr)
     report.end()

@@ -115,6 +115,8 @@ class ObservedStream:
         self._plans = plans
         self.plan = StreamPlan()
         """What the server's rates need, with ``streams: auto``."""
+        self.shares_connection = False
+        """Whether components of several rates share this connection because the server serves one only."""
 
     @property
     def silence_s(self) -> float:
@@ -134,6 +136,7 @@ class ObservedStream:
 
     async def use_one_connection(self, reason: str) -> None:
         """Request all components on this connection, as the gateway does if a further one fails."""
+        self.shares_connection = True
         plan = self.plan.on_one_connection(reason)
         self.status.add_limitation(plan.limitation)
         self._set_components(plan.groups[0])

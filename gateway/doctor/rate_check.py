@@ -43,18 +43,31 @@ def check_rate(subject: Subject, stream: ObservedStream, parameters: Parameters 
         is_fast = any(rates_hz[component] > _MAX_SHARE * expected_hz[component] for component in compared)
         return _too_fast(subject, stream, found) if is_fast else subject.passing("rate", found)
     if _is_limited_by_others(slow, rates_hz, expected_hz):
-        names = " and ".join(component.key for component in slow)
-        return subject.failing(
-            "rate",
-            found,
-            f"A stream is as fast as its slowest component. Move {names} to a stream of their own, or "
-            "configure a lower rate for this stream.",
-        )
+        return _limited_by_others(subject, stream, found, slow)
     return subject.failing(
         "rate",
         found,
         "The server or the network is too slow. Check the server's real-time processing rate and load, the "
         "cable and the switch, or configure a lower rate for the stream.",
+    )
+
+
+def _limited_by_others(
+    subject: Subject, stream: ObservedStream, found: str, slow: Sequence[ComponentType]
+) -> Finding:
+    names = " and ".join(component.key for component in slow)
+    if stream.shares_connection:
+        return subject.warning(
+            "rate",
+            f"{found}, because the server accepts one connection only",
+            f"If the full rate of {names} matters more than the other components, request nothing else: "
+            f"streams: [{{components: [{', '.join(component.key for component in slow)}]}}].",
+        )
+    return subject.failing(
+        "rate",
+        found,
+        f"A stream is as fast as its slowest component. Move {names} to a stream of their own, or "
+        "configure a lower rate for this stream.",
     )
 
 

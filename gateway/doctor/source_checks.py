@@ -31,6 +31,9 @@ CHECKS: Final = (
 )
 """The checks in order. If one of the first three fails, those after it are not made."""
 
+CONNECTION: Final = "connection"
+"""The check that announces a second connection to a server."""
+
 _PORTS: Final = f"{FIRST_PRINCIPLES_PORT} is First Principles, {WAVEFRONT_PORT} WaveFront"
 
 
@@ -106,7 +109,7 @@ class SourceChecks:
     def _second_connection(self) -> Finding:
         """Return a note that says what doctor is about to do (field note 21)."""
         return self._subject.note(
-            "connection",
+            CONNECTION,
             f"the running gateway is connected to {self._server}; doctor now opens further connections to it",
             "Some servers serve one client only, or fail with two. With --no-connect, doctor asks the "
             "running gateway instead.",

@@ -1,5 +1,7 @@
 """The doctor's findings about frames that stop, come too fast, in another byte order, or not at all."""
 
+import struct
+
 import pytest
 
 from gateway.config.settings import StreamSettings
@@ -8,9 +10,17 @@ from gateway.rtc3d.commands import Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.diagnosed_servers import MARKERS_XML, TOOLS_XML, diagnose, parameters, replying, streaming
+from tests.diagnosed_servers import (
+    MARKERS_XML,
+    TOOLS_XML,
+    diagnose,
+    parameters,
+    replying,
+    streaming,
+    tools_frame,
+)
 from tests.findings import lab, run_doctor
-from tests.servers import ScriptedServer, markers_frame, packet
+from tests.servers import Client, ScriptedServer, markers_frame, packet
 
 MARKERS, TOOLS = ComponentType.MARKERS, ComponentType.TOOLS
 HIP = (1.0, 2.0, 3.0)
@@ -19,6 +29,12 @@ NO_DATA = packet(4)
 
 def markers(number: int) -> bytes:
     return markers_frame(number, HIP)
+
+
+def markers_and_tools(number: int) -> bytes:
+    """Return a frame with both components. In a packet, they begin at byte 12."""
+    bodies = [frame[12:] for frame in (markers(number), tools_frame(number, 1.0))]
+    return packet(3, struct.pack(">I", 2) + b"".join(bodies))
 
 
 async def test_frames_that_stop_while_the_doctor_watches_fail() -> None:
@@ -123,3 +139,26 @@ async def test_frames_without_a_component_of_the_stream_fail() -> None:
     findings = await diagnose(streaming(parameters(), markers), StreamSettings(components=(TOOLS,)))
     assert findings.of("frames").result is Result.FAILING
     assert "frames arrived, but none has a component of stream 6d" in findings.of("frames").found
+
+
+async def test_components_that_share_the_only_connection_are_a_warning() -> None:
+    """``streams: auto`` cannot do better with a server that serves one client only (field note 21)."""
+    xml = parameters(MARKERS_XML.format(100), TOOLS_XML.replace("100", "200"))
+    script = streaming(xml, markers_and_tools)
+    is_first = iter([True])
+
+    async def serve_one(client: Client) -> None:
+        if next(is_first, False):
+            await script(client)
+        else:
+            client.cut()
+
+    findings = await diagnose(serve_one, streams="auto")
+    assert findings.of("rate").result is Result.WARNING
+    assert findings.of("rate").found == (
+        "3d 100 of 100, 6d 100 of 200 Hz, because the server accepts one connection only"
+    )
+    assert findings.of("rate").remedy == (
+        "If the full rate of 6d matters more than the other components, request nothing else: "
+        "streams: [{components: [6d]}]."
+    )

@@ -214,29 +214,47 @@ async def test_a_source_that_the_running_gateway_does_not_have_is_a_warning() ->
     )
 
 
-async def test_the_command_asks_the_gateway_that_serves_all_addresses() -> None:
-    """``--no-connect`` on the command line, and metrics.address as it is in containers."""
+async def command(metrics: MetricsSettings, *arguments: str) -> tuple[int | None, Findings, str]:
+    """Return exit status, findings and stderr of rtc3d-gateway doctor --json."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "gateway", "doctor", "--json", "--seconds", "0.3", *arguments),
+        stdout=asyncio.subprocess.PIPE,
+        stderr=asyncio.subprocess.PIPE,
+        env={
+            **os.environ,
+            "RTC3D_GATEWAY__ZENOH__ENABLED": "false",
+            "RTC3D_GATEWAY__LCM__URL": "memq://",
+            "RTC3D_GATEWAY__METRICS__ADDRESS": "0.0.0.0",  # noqa: S104
+            "RTC3D_GATEWAY__METRICS__PORT": str(metrics.port),
+        },
+    )
+    out, err = await process.communicate()
+    findings = [Finding(**each) for each in json.loads(out)["findings"]]
+    return process.returncode, Findings(findings), err.decode()
+
+
+async def test_the_command_opens_no_connection_if_asked_not_to() -> None:
+    """The gateway listens on all addresses, as in containers."""
     async with (
         ScriptedServer(stream_markers()) as server,
         running_gateway(lab(server.port)) as (gateway, metrics),
     ):
         await streaming_gateway(gateway)
-        process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "gateway", "doctor", "--server", f"127.0.0.1:{server.port}"),
-            *("--no-connect", "--json"),
-            stdout=asyncio.subprocess.PIPE,
-            env={
-                **os.environ,
-                "RTC3D_GATEWAY__ZENOH__ENABLED": "false",
-                "RTC3D_GATEWAY__LCM__URL": "memq://",
-                "RTC3D_GATEWAY__METRICS__ADDRESS": "0.0.0.0",  # noqa: S104
-                "RTC3D_GATEWAY__METRICS__PORT": str(metrics.port),
-            },
-        )
-        out, _ = await process.communicate()
+        status, findings, err = await command(metrics, "--server", f"127.0.0.1:{server.port}", "--no-connect")
     assert server.connections == 1
-    assert process.returncode == 0
-    report = json.loads(out)
-    findings = Findings([Finding(**each) for each in report["findings"]])
+    assert (status, err) == (0, "")
     assert findings.of("health", GATEWAY).result == "green"
     assert findings.of("stream", GATEWAY).found.startswith("lab (3d 6d analog force event): streaming")
+
+
+async def test_the_command_announces_a_second_connection_on_stderr_with_json() -> None:
+    async with (
+        ScriptedServer(stream_markers()) as server,
+        running_gateway(lab(server.port)) as (gateway, metrics),
+    ):
+        await streaming_gateway(gateway)
+        _, _, err = await command(metrics, "--server", f"127.0.0.1:{server.port}")
+    assert err == (
+        f"lab: the running gateway is connected to 127.0.0.1:{server.port}; doctor now opens further "
+        "connections to it\n"
+    )
