@@ -23,14 +23,15 @@ class Relay(asyncio.Protocol):
 
     def __init__(self, cuts: list[tuple[int, int, list[Any]]], ended: asyncio.Event) -> None:
         self.cuts, self.ended = cuts, ended
-        self.unread = bytes(16)  # fewer bytes precede the first component than the gateway's prefix has
+        self.lead = -cuts[0][0]  # the first message begins so many bytes before its packet
+        self.unread = bytes(self.lead)
 
     def connection_made(self, transport: Any) -> None:  # noqa: D102
         transport.write(b"\0\0\0\x1e\0\0\0\x01StreamFrames AllFrames")
 
     def data_received(self, data: bytes) -> None:  # noqa: D102
         data = self.unread + data
-        at, end = 16, len(data)
+        at, end = self.lead, len(data)
         while end - at >= 8 and end - at >= (size := int.from_bytes(data[at : at + 4])):
             if data[at + 7] == 3:
                 for first, last, sends in self.cuts:
@@ -38,7 +39,7 @@ class Relay(asyncio.Protocol):
                     for send in sends:
                         send(message)
             at += size
-        self.unread = data[at - 16 :]
+        self.unread = data[at - self.lead :]
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002, D102
         self.ended.set()

@@ -8,6 +8,7 @@ import pytest
 from benchmarks.subscribers import Received
 from benchmarks.workbench import GATEWAY, RELAY, Workbench
 from benchmarks.workloads import DENSE, Frames, cuts
+from gateway.messages.encode import CONTENT_OFFSET
 from gateway.rtc3d.components import ComponentType
 
 FRAMES = 200
@@ -46,6 +47,6 @@ def test_frames_are_numbered_and_stamped_in_every_component() -> None:
     for index in range(3):
         frame = bytes(frames.data[index * len(packet) : (index + 1) * len(packet)])
         for cut in cuts(packet):
-            content = frame[cut.first + 36 :] if cut.first + 36 >= 0 else b""
+            content = frame[cut.first + CONTENT_OFFSET :]
             assert int.from_bytes(content[:4]) == 7 + index
             assert int.from_bytes(content[4:12]) == 100 + index
