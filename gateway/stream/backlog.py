@@ -12,9 +12,6 @@ from typing import Final
 from gateway.rtc3d.frames import Frame
 from gateway.stream.clock import ServerClock
 
-MAX_TOGETHER: Final = 4
-"""Up to this many frames that arrive together are published at once. More are a backlog."""
-
 _MAX_WAIT_S: Final = 0.005
 """The longest time between two frames, so that gaps and low rates do not delay a backlog."""
 

@@ -34,7 +34,8 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.packets import Packet, decode_text
 from gateway.rtc3d.protocol_state import ProtocolState
-from gateway.stream.backlog import MAX_TOGETHER, Backlog
+from gateway.stream.backlog import Backlog
+from gateway.stream.paced_frames import PacedFrames
 from gateway.stream.running_clock import running_clock
 from gateway.stream.running_time import running_timeout
 from gateway.stream.status import StreamStatus
@@ -83,12 +84,11 @@ class Session:
         self._source = source
         self._only_events = set(stream.components) == {ComponentType.EVENT}
         self._status = status
-        self._on_frames = on_frames
-        self._publishes_all = stream.backlog == "all"
-        self._backlog = Backlog(on_frames, status.clock, stream.backlog_speed, read_clocks)
-        self._backlog_timer: asyncio.Handle | None = None  # set while frames wait
+        backlog = Backlog(on_frames, status.clock, stream.backlog_speed, read_clocks)
+        self._frames = PacedFrames(
+            on_frames, backlog if stream.backlog == "all" else None, self._set_reading, self._fail_by_defect
+        )
         self._is_reading_paused = False
-        self._caught_up_s = 0.0  # when a backlog was last published, on the running clock
         self._on_file = on_file
         self._connect = connect
         self._read_clocks = read_clocks
@@ -189,7 +189,7 @@ class Session:
         """
         since_s = self._running.time()
         while not reply.done():
-            since_s = max(since_s, self._caught_up_s)
+            since_s = max(since_s, self._frames.caught_up_s)
             wait_s = self._source.reply_timeout_s - (self._running.time() - since_s)
             if wait_s <= 0:
                 raise TimeoutError
@@ -212,7 +212,8 @@ class Session:
         """
         while True:
             self._check_open()
-            wait_s = self._source.stall_timeout_s - (self._running.time() - self._quiet_since_s)
+            quiet_since_s = max(self._quiet_since_s, self._frames.caught_up_s)
+            wait_s = self._source.stall_timeout_s - (self._running.time() - quiet_since_s)
             if wait_s <= 0:
                 self._check_stall()
                 await check_silence()
@@ -239,6 +240,9 @@ class Session:
             self._end(error)
             if self._transport is not None:
                 self._transport.abort()
+
+    def _fail_by_defect(self, defect: Exception) -> None:
+        self.fail(DefectError.of(defect))  # the supervisor logs it and connects again
 
     async def close(self) -> None:
         """Send Bye, and close the connection when the server does, or after 0.5 s.
@@ -273,8 +277,8 @@ class Session:
         """Process the bytes of one read. From here to the outputs there are only plain calls, no tasks."""
         try:
             self._receive(data)
-        except Exception as defect:  # noqa: BLE001 - the supervisor logs it and connects again
-            self.fail(DefectError.of(defect))
+        except Exception as defect:  # noqa: BLE001 - a defect ends only this session
+            self._fail_by_defect(defect)
 
     def _receive(self, data: bytes) -> None:
         utime, steady_us = self._read_clocks()
@@ -287,13 +291,7 @@ class Session:
         if frames:
             self._quiet_since_s = self._running.time()
             self._status.frames_read(self._quiet_since_s)
-            is_backlog = len(frames) > MAX_TOGETHER and self._publishes_all and self._error is None
-            if is_backlog or not self._backlog.is_empty:
-                self._backlog.add(frames, utime, steady_us)
-                if self._backlog_timer is None:
-                    self._publish_backlog()
-            else:
-                self._on_frames(frames, utime, steady_us)
+            self._frames.receive(frames, utime, steady_us)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """End the session, unless it has ended already: the connection is closed, by either side."""
@@ -301,26 +299,6 @@ class Session:
         reason = f"broke: {exc}" if exc else "was closed by the server"
         self.fail(ClosedError(f"the connection to {self.server} {reason}"))
         self._lost.set()
-
-    def _publish_backlog(self) -> None:
-        """Publish the part of the backlog that is due; read from the server again when nothing is left.
-
-        Meanwhile the data stays in the kernel, and TCP makes the server wait when the kernel's buffer is
-        full. So memory is limited, and the other sources get their turn.
-        """
-        self._backlog_timer = None
-        try:
-            wait_s = self._backlog.publish_due()
-        except Exception as defect:  # noqa: BLE001 - the supervisor logs it and connects again
-            self.fail(DefectError.of(defect))
-            return
-        # What follows has not been read yet, so silence and unanswered commands mean nothing.
-        self._caught_up_s = self._quiet_since_s = self._running.time()
-        if wait_s is None:
-            self._set_reading(True)
-        else:
-            self._set_reading(False)
-            self._backlog_timer = self._loop.call_later(wait_s, self._publish_backlog)
 
     def _set_reading(self, is_reading: bool) -> None:
         """Read from the server, or let the data wait in the kernel."""
@@ -408,7 +386,7 @@ class Session:
         self._state_changed.set()
         self._end_ask(error)
         if not isinstance(error, DefectError):  # which may be one in publishing
-            self._backlog.publish_all()
+            self._frames.finish()
         self._set_reading(True)
 
     def _flush(self) -> None:
