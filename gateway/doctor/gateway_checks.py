@@ -55,7 +55,10 @@ def _no_gateway(report: NoReport, *, connects: bool) -> Finding:
         )
     if connects:
         return _gateway.note(
-            "health", report.reason, "Doctor looks for itself only. It cannot tell what a gateway has lost."
+            "health",
+            report.reason,
+            "Doctor looks for itself only, with connections of its own to the servers. It cannot tell what a "
+            "gateway has lost.",
         )
     return _gateway.failing(
         "health",

@@ -1,4 +1,4 @@
-"""Checks of one source: host name, TCP, protocol, parameters, frames, rate, buffer, visibility."""
+"""Checks of one source: host name, TCP, protocol, parameters, frames, byte order, rate and so on."""
 
 import asyncio
 import contextlib

@@ -63,6 +63,11 @@ def test_a_file_that_zenoh_rejects_is_named(tmp_path: Path) -> None:
         assert result.returncode == 2
         assert f"Zenoh does not accept the file {file}" in result.stderr
         assert "Traceback" not in result.stderr
+    config = tmp_path / "gateway.yaml"
+    config.write_text("sources: [{name: lab, host: 127.0.0.1, port: 9}]\nmetrics: {enabled: false}\n")
+    link = doctor(config, "--zenoh-config", str(file))["link"]
+    assert link["found"].startswith(f"Zenoh does not accept the file {file}")
+    assert (link["result"], link["remedy"]) == ("red", "Correct this file.")
 
 
 @pytest.mark.parametrize("command", ["echo", "params"])

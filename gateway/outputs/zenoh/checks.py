@@ -8,6 +8,7 @@ import json
 import re
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Final
 
 import zenoh
@@ -40,7 +41,8 @@ def check_zenoh(
     try:
         config = zenoh_config(settings.config)
     except ConfigError as error:
-        return _no_link(mask_secrets_in_text(str(error)), "Correct zenoh.config.")
+        remedy = "Correct this file." if isinstance(settings.config, Path) else "Correct zenoh.config."
+        return _no_link(mask_secrets_in_text(str(error)), remedy)
     mode = mode_of(config)
     connect = endpoints(config, "connect")
     listen = [endpoint for endpoint in endpoints(config, "listen") if not endpoint.endswith(":0")]
