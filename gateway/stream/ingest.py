@@ -9,6 +9,7 @@ from gateway.rtc3d.commands import Frequency
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
 from gateway.stream.frame_numbers import FrameNumbers
+from gateway.stream.paced_frames import MAX_TOGETHER
 from gateway.stream.rate_control import MAX_HALVINGS, LagControl
 from gateway.stream.rate_watch import Arrivals
 from gateway.stream.status import FRAME_REJECTED, StreamStatus
@@ -90,7 +91,8 @@ class Ingest:
         ``utime`` is when they arrived, in µs since the Unix epoch; ``steady_us`` is the same moment on the
         steady clock (see HostClock). While frames are late, ``backlog: latest`` publishes the newest of each
         component and all events, and counts the rest as skipped. Usually that is the newest frame, but
-        servers leave out components that are empty (field note 5), or send empty frames.
+        servers leave out components that are empty (field note 5), or send empty frames. Without a clock of
+        the server, frames are late if more than MAX_TOGETHER arrive together.
         """
         status = self._status
         status.frames_received(len(frames), utime)
@@ -108,13 +110,17 @@ class Ingest:
             if not frame.layout.components:
                 continue
             stamp = self._stamp(frame, utime, steady_us)
-            if self._lag.is_late and self._skips_late_frames and index < len(frames) - 1:
+            if self._skips_late_frames and index < len(frames) - 1 and self._is_late(len(frames)):
                 if newest is None:
                     newest = self._newest_components(frames)
                 self._publish_newest(frame, stamp, newest[index])
             else:
                 self._publish(frame, stamp, self._wanted)
         status.components_received("" if has_wanted else self._unwanted)
+
+    def _is_late(self, num_together: int) -> bool:
+        """Return whether the frame that was stamped last is late; ``num_together`` arrived with it."""
+        return self._lag.is_late if self._clock.has_clock else num_together > MAX_TOGETHER
 
     def _newest_components(self, frames: list[Frame]) -> list[frozenset[ComponentType]]:
         """Return the wanted components of each frame that no later one of these frames has."""

@@ -8,7 +8,7 @@ from gateway.rtc3d.frames import Frame
 from gateway.stream.backlog import Backlog
 from gateway.stream.running_clock import running_clock
 
-_MAX_TOGETHER: Final = 4
+MAX_TOGETHER: Final = 4
 """Up to this many frames that arrive together are passed on at once. More are a backlog."""
 
 
@@ -40,7 +40,7 @@ class PacedFrames:
     def receive(self, frames: list[Frame], utime: int, steady_us: int) -> None:
         """Take frames that arrived together, oldest first; see Ingest.receive."""
         backlog = self._backlog
-        if backlog is None or (len(frames) <= _MAX_TOGETHER and backlog.is_empty):
+        if backlog is None or (len(frames) <= MAX_TOGETHER and backlog.is_empty):
             self._on_frames(frames, utime, steady_us)
             return
         backlog.add(frames, utime, steady_us)

@@ -158,6 +158,22 @@ def test_while_late_the_newest_of_each_component_is_published() -> None:
     assert amounts(lab.status.losses.report()) == {"skipped while behind": (4, 3)}
 
 
+def test_without_a_clock_a_long_batch_is_late() -> None:
+    """A server without time stamps: what arrives after a stop of the process is old, except the newest."""
+    lab = Lab("latest")
+    lab.receive_at(BOOT_UTIME, *(without_time(number) for number in range(4)))
+    assert [number for number, _ in lab.published] == [0, 1, 2, 3]
+    lab.receive_at(BOOT_UTIME + 2_000_000, *(without_time(number) for number in range(4, 404)))
+    assert [number for number, _ in lab.published] == [0, 1, 2, 3, 403]
+    assert amounts(lab.status.losses.report()) == {"skipped while behind": (399, 399)}
+
+
+def without_time(number: int) -> Frame:
+    """Return frame ``number`` with the time stamp 0."""
+    marker = np.zeros(1, ITEM_DTYPES[MARKERS])
+    return split_frame(encode_frame([encode_component(MARKERS, number, 0, marker)]), "big")
+
+
 def test_frames_that_stay_late_request_lower_rates(lab: Lab) -> None:
     for number in range(600, 600 + 2 * RATE_HZ + RATE_HZ // 10):
         lab.receive(frame(number), late_us=200_000 + 500 * (number - 600))
