@@ -57,14 +57,14 @@ def _no_gateway(report: NoReport, *, connects: bool) -> Finding:
         return _gateway.note(
             "health",
             report.reason,
-            "Doctor looks for itself only, with connections of its own to the servers. It cannot tell what a "
-            "gateway has lost.",
+            "The checks below open connections of their own to the servers. They cannot tell what a gateway "
+            "has lost.",
         )
     return _gateway.failing(
         "health",
         report.reason,
-        "Start the gateway, or check metrics in the configuration. Without --no-connect, doctor looks for "
-        "itself.",
+        "Start the gateway, or check metrics in the configuration. Without --no-connect, doctor connects "
+        "to the servers itself.",
     )
 
 

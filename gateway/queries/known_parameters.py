@@ -80,7 +80,8 @@ def unreadable(
     sections: Sections, xml: bytes, session: int, version: int, error: ParametersError
 ) -> ServerAnswer:
     """Return an answer from which nothing can be read, for peers that ask for it as it is."""
-    return ServerAnswer(sections, xml, ParsedParameters(Parameters(), (str(error),)), session, version, False)
+    parsed = ParsedParameters(Parameters(), (str(error),))
+    return ServerAnswer(sections, xml, parsed, session, version, is_readable=False)
 
 
 Announce = Callable[[ServerAnswer | None, int], Awaitable[None]]
@@ -158,7 +159,7 @@ class KnownParameters:
             return
         if reading.renamed:
             logger.warning(
-                "%s: markers or tools have other names on the server: %s; programs that use the names need "
+                "%s: markers or tools were renamed on the server: %s; programs that use the names need "
                 "the new ones (parameters_version %d)",
                 *(self._source, reading.renamed, self.version),
             )

@@ -136,7 +136,7 @@ class ChangeTasks:
         if self._components is not None:
             components, self._components = self._components, None
             self._requested_halvings = 0
-            await self._control.request_components(components)
+            await control.request_components(components)
         if self._halvings != self._requested_halvings:
             await self._change_rate()
         return True

@@ -22,7 +22,7 @@ class RunningClock:
     def time(self) -> float:
         """Return the seconds since the clock was made, without those during which the process was stopped."""
         since_tick_s = self._loop_time() - self._tick_s
-        return self._time_s + (min(_MAX_STEP_S, since_tick_s))
+        return self._time_s + min(_MAX_STEP_S, since_tick_s)
 
     def _tick(self) -> None:
         self._time_s = self.time()

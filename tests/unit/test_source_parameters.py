@@ -108,7 +108,7 @@ async def test_parameters_are_read_again_at_the_interval(
         await asyncio.sleep(100)
         assert lab.count(REQUEST) == 12
     [warning] = [record.message for record in caplog.records if record.levelno == logging.WARNING]
-    assert warning.startswith("lab: markers or tools have other names on the server: 6d 'Probe' to 'Head';")
+    assert warning.startswith("lab: markers or tools were renamed on the server: 6d 'Probe' to 'Head';")
 
 
 @pytest.mark.parametrize("answer", [refusing(REQUEST), silent_to(REQUEST)])
