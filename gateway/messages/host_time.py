@@ -80,7 +80,8 @@ class HostClock:
         direction = "forward" if change_us > 0 else "back"
         logger.log(
             level,
-            "the clock of this computer was set %s by %.3f s; utime and capture_utime follow; rates and lag do not change",
+            "the clock of this computer was set %s by %.3f s; utime and capture_utime follow; "
+            "rates and lag do not change",
             *(direction, abs(change_us) / 1e6),
         )
 

@@ -104,36 +104,20 @@ class RateWatch:
         ``reports_sharing``, a component that is slower than announced because of another one in the same
         stream is a difference, too.
         """
-        status = self._status
-        if self._session != status.session:
-            status.replace_limitation(self._reported.text, "")
-            self._session, self._reported = status.session, _NO_DIFFERENCE
-        conditions = (
-            status.session,
-            status.clock.has_clock,
-            status.restarts,
-            stream.components,
-            dict(announced_hz),
-            arrivals.followed,
-        )
-        is_measurable = (
-            status.state is StreamState.STREAMING
-            and is_full_rate
-            and arrivals.followed not in {None, ComponentType.EVENT}
-        )
+        self._forget_former_session()
+        conditions = self._conditions(stream, announced_hz, arrivals) if is_full_rate else None
         start = self._start
-        if not is_measurable or start is None or start.conditions != conditions:
-            self._start = _Start(now_s, arrivals, conditions) if is_measurable else None
+        if conditions is None or start is None or start.conditions != conditions:
+            self._start = None if conditions is None else _Start(now_s, arrivals, conditions)
             self._in_a_row = 0
             return
-        elapsed_s = now_s - start.time_s
         num_frames = arrivals.num_frames - start.arrivals.num_frames
         num_followed = arrivals.num_followed - start.arrivals.num_followed
-        if elapsed_s < _WINDOW_S or min(num_frames, num_followed) < _MIN_FRAMES:
+        if now_s - start.time_s < _WINDOW_S or min(num_frames, num_followed) < _MIN_FRAMES:
             return
         self._start = _Start(now_s, arrivals, conditions)
-        span_s = elapsed_s
-        if status.clock.has_clock:
+        span_s = now_s - start.time_s
+        if self._status.clock.has_clock:
             span_s = (arrivals.timestamp_us - start.arrivals.timestamp_us) / 1e6
             if span_s <= 0:
                 return  # the server's clock was set back
@@ -141,6 +125,27 @@ class RateWatch:
         if difference is None or (difference.kind is _Kind.SHARED and not reports_sharing):
             difference = _NO_DIFFERENCE
         self._note(difference)
+
+    def _forget_former_session(self) -> None:
+        if self._session != self._status.session:
+            self._status.replace_limitation(self._reported.text, "")
+            self._session, self._reported = self._status.session, _NO_DIFFERENCE
+
+    def _conditions(
+        self, stream: StreamSettings, announced_hz: AnnouncedRates, arrivals: Arrivals
+    ) -> tuple[object, ...] | None:
+        """Return what must not change during a measurement; None if there is nothing to measure."""
+        status = self._status
+        if status.state is not StreamState.STREAMING or arrivals.followed in {None, ComponentType.EVENT}:
+            return None
+        return (
+            status.session,
+            status.clock.has_clock,
+            status.restarts,
+            stream.components,
+            dict(announced_hz),
+            arrivals.followed,
+        )
 
     def _note(self, difference: RateDifference) -> None:
         self._in_a_row = self._in_a_row + 1 if difference.kind is self._newest_kind else 1
