@@ -171,7 +171,7 @@ async def test_a_gateway_that_does_not_run_is_a_note() -> None:
     assert findings.of("health", GATEWAY).found == (
         f"no gateway runs here: nothing listens on 127.0.0.1:{port}"
     )
-    assert "with connections of its own to the servers" in findings.of("health", GATEWAY).remedy
+    assert "connections of their own to the servers" in findings.of("health", GATEWAY).remedy
     assert findings.not_tested("stream", "output", "loss", subject=GATEWAY) == {
         "no running gateway could be asked"
     }
