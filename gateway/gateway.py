@@ -11,12 +11,12 @@ from gateway.messages.host_time import host_clock
 from gateway.outputs.contract import Command, Output, ServerParameters
 from gateway.outputs.registry import build_outputs
 from gateway.publish.fan_out import FanOut
+from gateway.publish.routes import OPENING_S
 from gateway.queries.service import SourceQueryService
 from gateway.queries.source_queries import SourceQueries
 from gateway.source import Source
 
 _STATUS_PERIOD_S: Final = 1.0
-_OPENING_TIMEOUT_S: Final = 2.0
 _SENDING_TIMEOUT_S: Final = 0.5
 _OPENING_POLL_S: Final = 0.02
 
@@ -90,7 +90,7 @@ class Gateway:
                 source.fan_out.end_losses()
 
     async def _wait_for_outputs(self, stop: asyncio.Event) -> None:
-        deadline_s = asyncio.get_running_loop().time() + _OPENING_TIMEOUT_S
+        deadline_s = asyncio.get_running_loop().time() + OPENING_S
         while asyncio.get_running_loop().time() < deadline_s and not stop.is_set():
             if all(output.health().connected for output in self._outputs):
                 return

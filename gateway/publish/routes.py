@@ -22,7 +22,7 @@ from gateway.rtc3d.frames import Frame
 _NOT_OPEN: Final = "not open"  # the cause in an OutputError
 
 OPENING_S: Final = 2.0
-"""How long a new output may take to open, as long as the gateway waits for its outputs at its start."""
+"""How long an output may take to open, before the gateway starts without it, or warns after a reload."""
 
 logger = logging.getLogger(__name__)
 

@@ -76,7 +76,7 @@ class Ingest:
     def arrivals(self) -> Arrivals:
         """What has arrived so far."""
         components = () if self._layout is None else self._layout.components
-        rejected = sum(loss.frames for loss in self._status.losses.report() if loss.cause == FRAME_REJECTED)
+        rejected = self._status.losses.frames(FRAME_REJECTED)
         return Arrivals(
             self._status.frames_in + rejected,
             self._followed_type,

@@ -55,16 +55,12 @@ def announced_rates_hz(parameters: Parameters) -> dict[ComponentType, float]:
 def plan_streams(parameters: Parameters | None) -> StreamPlan:
     """Return the plan for a server with these parameters; None if it gave none."""
     if parameters is None:
-        return StreamPlan((WIRE_ORDER,), (), _no_rates("its components"))
+        return StreamPlan(limitation=_no_rates("its components"))
     rates_hz = announced_rates_hz(parameters)
     described = [component for component in WIRE_ORDER if num_described_items(parameters, component)]
     groups = _groups(rates_hz)
     if not groups:
-        return (
-            StreamPlan()
-            if len(described) == 1
-            else StreamPlan((WIRE_ORDER,), (), _no_rates("its components"))
-        )
+        return StreamPlan(limitation="" if len(described) == 1 else _no_rates("its components"))
     fast = {component for group in groups[1:] for component in group}
     first = tuple(component for component in WIRE_ORDER if component not in fast)
     unrated = [component for component in described if component not in rates_hz]
