@@ -20,6 +20,9 @@ Publish = Callable[[Frame, Stamp, frozenset[ComponentType]], None]
 Skip = Callable[[Frame, Stamp, frozenset[ComponentType]], int]
 """Takes the same for components that are not published; returns how many messages this loses."""
 
+_LEARNING_US: Final = 3_000_000
+"""If there is no clock after this time, the server's time stamps are not those of one."""
+
 _EVENTS: Final = frozenset({ComponentType.EVENT})
 
 
@@ -60,7 +63,7 @@ class Ingest:
         self._numbers = None if isinstance(stream.rate, Frequency) else FrameNumbers()
         self._num_state_changes = status.num_state_changes
         self._lag = LagControl(source.max_lag_ms / 1000, MAX_HALVINGS if stream.adapt_rate else 1)
-        self._has_stamped = False  # a frame of this session
+        self._began_us: int | None = None  # when the first frame of this session arrived, on the steady clock
         self._num_skippable = 0  # how many components of the newest frame are wanted and no events
         self._unwanted = ""  # the components of the newest frame, if none of them is wanted
         self.want(stream.components)
@@ -91,8 +94,8 @@ class Ingest:
         ``utime`` is when they arrived, in µs since the Unix epoch; ``steady_us`` is the same moment on the
         steady clock (see HostClock). While frames are late, ``backlog: latest`` publishes the newest of each
         component and all events, and counts the rest as skipped. Usually that is the newest frame, but
-        servers leave out components that are empty (field note 5), or send empty frames. Without a clock of
-        the server, frames are late if more than MAX_TOGETHER arrive together.
+        servers leave out components that are empty (field note 5), or send empty frames. If the server's
+        time stamps are not those of a clock, frames are late if more than MAX_TOGETHER arrive together.
         """
         status = self._status
         status.frames_received(len(frames), utime)
@@ -110,7 +113,7 @@ class Ingest:
             if not frame.layout.components:
                 continue
             stamp = self._stamp(frame, utime, steady_us)
-            if self._skips_late_frames and index < len(frames) - 1 and self._is_late(len(frames)):
+            if self._skips_late_frames and index < len(frames) - 1 and self._is_late(len(frames), steady_us):
                 if newest is None:
                     newest = self._newest_components(frames)
                 self._publish_newest(frame, stamp, newest[index])
@@ -118,9 +121,12 @@ class Ingest:
                 self._publish(frame, stamp, self._wanted)
         status.components_received("" if has_wanted else self._unwanted)
 
-    def _is_late(self, num_together: int) -> bool:
+    def _is_late(self, num_together: int, steady_us: int) -> bool:
         """Return whether the frame that was stamped last is late; ``num_together`` arrived with it."""
-        return self._lag.is_late if self._clock.has_clock else num_together > MAX_TOGETHER
+        if self._clock.has_clock:
+            return self._lag.is_late
+        is_learning = self._began_us is None or steady_us - self._began_us < _LEARNING_US
+        return num_together > MAX_TOGETHER and not is_learning
 
     def _newest_components(self, frames: list[Frame]) -> list[frozenset[ComponentType]]:
         """Return the wanted components of each frame that no later one of these frames has."""
@@ -166,13 +172,14 @@ class Ingest:
                 self._numbers.interrupt()
             self._status.server_restarted()
             self._lag.restart()
-            if self._has_stamped:  # otherwise the handshake has just been done
+            if self._began_us is not None:  # otherwise the handshake has just been done
                 self._on_restart()
         elif clock.has_clock:
             self._status.lag_measured(lag_s)
             if self._lag.observe(steady_us * 1e-6, lag_s):
                 self._on_lateness(self._lag.halvings)
-        self._has_stamped = True
+        if self._began_us is None:
+            self._began_us = steady_us
         return Stamp(
             utime,
             capture_us + (utime - steady_us),
