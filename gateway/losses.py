@@ -174,6 +174,11 @@ class Losses:
         )
 
 
+def route_name(source: str, stream: str | None, output: str | None) -> str:
+    """Return the name of a route in texts: "lab (3d 6d)" for a stream, "lab to zenoh" for an output."""
+    return f"{source} to {output}" if output else f"{source} ({stream})"
+
+
 def last_minute_text(losses: Iterable[Loss]) -> str:
     """Return what was lost in the last minute; "" if nothing was.
 

@@ -9,6 +9,7 @@ from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.server_description import described_rate_hz
+from gateway.stream.plan import rate_text
 
 _MIN_SHARE: Final = 0.9
 _MAX_SHARE: Final = 1.1
@@ -88,12 +89,8 @@ def _too_fast(subject: Subject, stream: ObservedStream, found: str) -> Finding:
 
 def _rate_text(component: ComponentType, rates_hz: _Rates, expected_hz: _Rates) -> str:
     """Return a component's measured and expected rate, such as "3d 100 of 200"."""
-    expected = f" of {_number(expected_hz[component])}" if component in expected_hz else ""
-    return f"{component.key} {_number(rates_hz[component])}{expected}"
-
-
-def _number(rate_hz: float) -> str:
-    return f"{rate_hz:.1f}".removesuffix(".0")
+    expected = f" of {rate_text(expected_hz[component])}" if component in expected_hz else ""
+    return f"{component.key} {rate_text(rates_hz[component])}{expected}"
 
 
 def _is_limited_by_others(slow: Sequence[ComponentType], rates_hz: _Rates, expected_hz: _Rates) -> bool:

@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 from pydantic import BaseModel, ValidationError
 
 from gateway.config.settings import MetricsSettings
-from gateway.losses import counts_text
+from gateway.losses import counts_text, route_name
 from gateway.stream.state import StreamState
 
 _TIMEOUT_S: Final = 3.0
@@ -61,7 +61,7 @@ class RunningLoss(BaseModel):
     @property
     def found(self) -> str:
         """What was lost, where, and when."""
-        route = f"{self.source} to {self.output}" if self.output else f"{self.source} ({self.stream})"
+        route = route_name(self.source, self.stream, self.output)
         total = counts_text([(self.cause, self.messages, self.frames)])
         if not self.messages_last_minute:
             return f"{route}: lost since the start: {total}; nothing in the last minute"

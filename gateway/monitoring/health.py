@@ -7,7 +7,7 @@ from typing import Any, Final, NamedTuple
 
 from gateway.config.settings import StreamSettings
 from gateway.gateway import Gateway
-from gateway.losses import Loss, last_minute_text
+from gateway.losses import Loss, last_minute_text, route_name
 from gateway.monitoring.http_pages import Page
 from gateway.outputs.contract import Output
 from gateway.rtc3d.components import ComponentType
@@ -29,8 +29,8 @@ class _Route(NamedTuple):
 
     @property
     def name(self) -> str:
-        """The name in texts: "lab (3d 6d)" or "lab to zenoh"."""
-        return f"{self.source} to {self.output}" if self.output else f"{self.source} ({self.stream})"
+        """The name in texts."""
+        return route_name(self.source, self.stream, self.output)
 
 
 def health_page(gateway: Gateway) -> Page:
