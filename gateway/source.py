@@ -20,7 +20,7 @@ from gateway.queries.server_requests import StreamAccess
 from gateway.queries.source_queries import SourceQueries
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import ParsedParameters
-from gateway.stream.parameters import Connection
+from gateway.stream.parameters import UNANSWERED, Connection
 from gateway.stream.state import StreamState
 from gateway.stream.status import SessionNumbers, StreamStatus
 from gateway.stream.streams import AutomaticStreams, ConfiguredStreams
@@ -204,6 +204,8 @@ class Source:
                 self.parameters_version = version
                 for stream in self._streams.known:
                     stream.status.parameters_changed(version)
+                    if answer is not None:
+                        stream.status.replace_limitation(UNANSWERED, "")
                 self._streams.parameters_changed(parameters)
             self.fan_out.set_parameters(parameters)
 

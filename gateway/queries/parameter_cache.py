@@ -65,6 +65,7 @@ class ParameterCache:
         # On one of these, the server gave the newest parameters. The others share them.
         self._connections: list[Connection] = []
         self._refusing: Connection | None = None  # one of these, on which the server refused them later on
+        self._silent: list[Connection] = []  # without an answer in the handshake, and not asked since
         # The parameters that a handshake is reading. After the result None, other handshakes ask themselves.
         self._reading: asyncio.Future[ParsedParameters | None] | None = None
         # What the server answered about sections that the answer for all of them does not give, or for all
@@ -130,6 +131,7 @@ class ParameterCache:
             await self._invalidate(f"it refuses {command}: {error}")
             raise
         except ReplyTimeoutError as error:
+            self._silent = [*(each for each in self._silent if each.is_open), connection]
             await self._invalidate(str(error))
             raise
         try:
@@ -152,10 +154,12 @@ class ParameterCache:
     async def refresh(self) -> None:
         """Ask again for all parameters, over a connection on which the server gave them and did not refuse.
 
-        Without such a connection, do nothing. If there is no answer, the former parameters stay valid.
+        Without such a connection, ask once more where the server did not answer in the handshake: it may
+        have been busy for a moment. If there is no answer, the former parameters stay valid.
         """
-        for connection in self._connections:
-            if connection is not self._refusing and connection in self._requests.connections:
+        giving = [connection for connection in self._connections if connection is not self._refusing]
+        for connection in (*giving, *self._silent):
+            if connection in self._requests.connections:
                 with contextlib.suppress(QueryError):
                     await self._request_all(connection)
                 return
@@ -227,6 +231,7 @@ class ParameterCache:
         return await self._requests.share(("parameters", ()), lambda: self._send_request(connection))
 
     async def _send_request(self, connection: Connection) -> ServerAnswer:
+        self._silent = [each for each in self._silent if each is not connection]
         try:
             _, packet = await self._requests.send(SendParameters(), connection=connection)
         except QueryError as error:

@@ -4,12 +4,15 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from typing import Final, Protocol, TypeVar
 
-from gateway.rtc3d.commands import Command
+from gateway.rtc3d.commands import Command, SendParameters
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters_xml import ParsedParameters
 
 LONG_XML_BYTES: Final = 64 * 1024
 """Longer XML is processed in a thread: to parse 1 MiB of it, made to be slow, takes 4 s."""
+
+UNANSWERED: Final = f"the server did not answer {SendParameters()}"
+"""The limitation of a stream whose server was silent in the handshake, until it gives its parameters."""
 
 _Result = TypeVar("_Result")
 

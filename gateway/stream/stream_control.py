@@ -18,7 +18,7 @@ from gateway.rtc3d.commands import (
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import Parameters
-from gateway.stream.parameters import ReadParameters
+from gateway.stream.parameters import UNANSWERED, ReadParameters
 from gateway.stream.rate_control import halved, stream_requests
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
@@ -209,7 +209,7 @@ class StreamControl:
             self._status.add_limitation(f"the server refused {SendParameters()}: {error}")
         except ReplyTimeoutError:
             self._is_slow = True
-            self._status.add_limitation(f"the server did not answer {SendParameters()}")
+            self._status.add_limitation(UNANSWERED)
         except ParametersError as error:
             self._status.add_limitation(f"no parameters: {error}")
         else:

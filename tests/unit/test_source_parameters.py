@@ -51,6 +51,21 @@ async def test_parameters_are_published_with_every_connection(servers: Servers, 
         assert lab.parameters[1:] == [("lab", ServerParameters(XML[8:], 2, 1))]
 
 
+async def test_a_server_that_hung_in_the_handshake_is_asked_again(servers: Servers, spool: Spool) -> None:
+    lab = Lab(servers, spool)
+    lab.server.answer = silent_to(REQUEST)
+    async with running(lab):
+        await lab.connected()
+        lab.server.connection.send(NO_DATA)
+        [status] = lab.source.statuses
+        assert "the server did not answer SendParameters" in status.limitations
+        lab.server.answer = obliging
+        await asyncio.sleep(12)
+        assert status.parameters_version == 1
+        assert lab.parameters == [("lab", ServerParameters(XML[8:], 1, 1))]
+        assert "the server did not answer SendParameters" not in status.limitations
+
+
 async def test_one_request_per_connection_is_enough(servers: Servers, spool: Spool) -> None:
     sections = ("General", "The_3D", "The_6D", "Analog", "Force", "Events")
     whole = packet(2, in_root(*(f"<{section}/>" for section in sections)))
@@ -111,9 +126,9 @@ async def test_parameters_are_read_again_at_the_interval(
     assert warning.startswith("lab: markers or tools were renamed on the server: 6d 'Probe' to 'Head';")
 
 
-@pytest.mark.parametrize("answer", [refusing(REQUEST), silent_to(REQUEST)])
-async def test_a_server_that_gives_no_parameters_is_not_asked_again(
-    servers: Servers, spool: Spool, answer: Answer
+@pytest.mark.parametrize(("answer", "count"), [(refusing(REQUEST), 1), (silent_to(REQUEST), 2)])
+async def test_a_server_that_gives_no_parameters_is_not_asked_for_ever(
+    servers: Servers, spool: Spool, answer: Answer, count: int
 ) -> None:
     lab = Lab(servers, spool)
     lab.server.answer = answer
@@ -122,7 +137,7 @@ async def test_a_server_that_gives_no_parameters_is_not_asked_again(
         lab.server.connection.send(NO_DATA)
         lab.source.fan_out.on_items_changed()
         await asyncio.sleep(100)
-        assert lab.count(REQUEST) == 1
+        assert lab.count(REQUEST) == count
         assert lab.parameters == []
 
 

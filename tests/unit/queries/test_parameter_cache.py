@@ -254,6 +254,21 @@ async def test_the_parameters_are_not_read_again_where_the_server_does_not_give_
     assert source.server.commands == ["SendParameters"]
 
 
+async def test_a_server_that_was_silent_in_the_handshake_is_asked_once_more() -> None:
+    """It may have hung for a moment. Where it does not know SendParameters, once more is enough."""
+    source = FakeSource()
+    for later in (SILENCE, MM):
+        with pytest.raises(ReplyTimeoutError):
+            await source.connect(SILENCE)
+        source.server.replies["SendParameters"] = later
+        source.server.commands.clear()
+        await source.queries.parameters.refresh()
+        assert source.server.commands == ["SendParameters"]
+        await source.queries.parameters.refresh()
+    assert source.server.commands == ["SendParameters"] * 2  # those that it gives are read again
+    assert source.announced == [(MM, 1)]
+
+
 async def test_a_refusal_later_on_keeps_the_parameters_and_ends_the_reading(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
