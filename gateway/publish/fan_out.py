@@ -181,7 +181,7 @@ class FanOut:
     def skip(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> int:
         """Number the messages of these components like ``publish``, but publish nothing.
 
-        Returns how many messages are lost thereby. A message that pacing leaves out on every output is not.
+        Returns how many messages this loses. Messages that pacing leaves out on every output do not count.
         """
         plan = self._plan_of(frame, stamp, components)
         if not plan.components:

@@ -38,7 +38,7 @@ class FrameNumbers:
         self._gaps_in_a_row = 0
 
     def interrupt(self) -> None:
-        """Expect that the next frame does not continue the newest one, and learn the steps anew."""
+        """Expect that the next frame does not continue the newest one, and learn the steps again."""
         self._number = None
 
     def observe(self, number: int, timestamp_us: int) -> int:

@@ -236,7 +236,7 @@ class AutomaticStreams(Listener):
     # Changes of the plan.
 
     def parameters_changed(self, parameters: Parameters) -> None:
-        """Plan anew if the server announces other rates; it is still the same server."""
+        """Plan again if the server announces other rates; it is still the same server."""
         if self._first.session is None or not announced_rates_hz(parameters):
             return  # a server that no longer says its rates still has them
         if self._verdict is not None:
