@@ -43,7 +43,10 @@ def message_patterns(package: Path) -> dict[str, str]:
         for scope in _scopes(module):
             for call in _logging_calls(scope):
                 is_loss = isinstance(call.func, ast.Attribute) and call.func.attr in _LOSS_METHODS
-                arguments = call.args[1:] if is_loss else call.args
+                arguments = [
+                    *(call.args[1:] if is_loss else call.args),
+                    *(keyword.value for keyword in call.keywords if keyword.arg == "limitation"),
+                ]
                 texts = chain.from_iterable(
                     _texts(node, scope, module, list(modules.values())) for node in arguments
                 )
