@@ -21,7 +21,7 @@ class loss_t(object):
         """ LCM Type: string """
         self.messages = 0
         """
-        Messages that were not published on the output, or not at all.
+        Messages that were lost on the output, or before any output.
         LCM Type: int64_t
         """
 

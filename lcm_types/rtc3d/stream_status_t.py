@@ -77,7 +77,7 @@ class stream_status_t(object):
         """ LCM Type: rtc3d.clock_model_t """
         self.num_drops = 0
         """
-        What arrived and was published on no output, by cause.
+        What was lost before any output, by cause.
         LCM Type: int32_t
         """
 
