@@ -23,7 +23,10 @@ Skip = Callable[[Frame, Stamp, frozenset[ComponentType]], int]
 _LEARNING_US: Final = 3_000_000
 """If there is no clock after this time, the server's time stamps are not those of one."""
 
-_EVENTS: Final = frozenset({ComponentType.EVENT})
+_EVENT: Final = ComponentType.EVENT
+"""Saves looking it up for every frame, which would take 0.1 µs."""
+
+_EVENTS: Final = frozenset({_EVENT})
 
 
 class Ingest:
@@ -193,7 +196,7 @@ class Ingest:
     ) -> None:
         """Count the frames that the server's numbers prove to be missing."""
         first_type = frame.layout.first_component_type
-        if first_type is not self._followed_type or first_type is ComponentType.EVENT:
+        if first_type is not self._followed_type or first_type is _EVENT:
             numbers.interrupt()  # this frame has no number of the followed type
             return
         num_missing = numbers.observe(frame_number, timestamp_us)
@@ -209,7 +212,7 @@ class Ingest:
         the first after it if that was the event type.
         """
         followed = self._followed_type
-        if first_component_type is followed or followed is None or followed is ComponentType.EVENT:
+        if first_component_type is followed or followed is None or followed is _EVENT:
             self._followed_type = first_component_type
             self._frame_number = frame_number
             self._timestamp_us = timestamp_us

@@ -79,6 +79,7 @@ def test_messages_go_to_the_shared_object(shared: lcm.LCM) -> None:
     assert received == [("CHANNEL", b"message")]
 
 
+@pytest.mark.interpreted
 def test_opening_is_tried_again_after_a_second_and_logged_once(
     clock: SimpleNamespace, caplog: pytest.LogCaptureFixture
 ) -> None:
