@@ -97,6 +97,8 @@ class Session:
         self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
         self._error: LinkError | None = None  # why the session ended
+        self._rejection = ""  # of the newest frame that was rejected: why, and when on the running clock
+        self._rejected_s = 0.0
         self._ended = asyncio.Event()  # _error is set
         self._lost = asyncio.Event()  # the transport is closed
         self._ask_lock = asyncio.Lock()  # held while a command is pending
@@ -231,8 +233,17 @@ class Session:
         is_stopping = isinstance(self._protocol.pending_command, StopStreaming)
         if self._protocol.state is ProtocolState.STREAMING and not self._only_events and not is_stopping:
             text = f"no frame from {self.server} for {self._source.stall_timeout_s:g} s"
+            reason = f"{text} although a measurement runs"
+            if self.rejection:
+                text = reason = f"all frames from {self.server} are rejected: {self.rejection}"
             self._status.silent(text)
-            raise SilenceError(f"{text} although a measurement runs; connecting again")
+            raise SilenceError(f"{reason}; connecting again")
+
+    @property
+    def rejection(self) -> str:
+        """Why a frame was rejected within the last ``stall_timeout_s``; "" if none was."""
+        is_recent = self._running.time() - self._rejected_s < self._source.stall_timeout_s
+        return self._rejection if is_recent else ""
 
     def fail(self, error: LinkError) -> None:
         """End the session with ``error`` and drop the connection, unless it has ended already."""
@@ -320,7 +331,8 @@ class Session:
             case PossibleReply():
                 self._assume_reply_soon()
             case FrameRejected(frame_error, num_components):
-                self._status.frame_rejected(str(frame_error), self._num_lost(num_components))
+                self._rejection, self._rejected_s = str(frame_error), self._running.time()
+                self._status.frame_rejected(self._rejection, self._num_lost(num_components))
             case FileReceived(content):
                 self._on_file(content)
             case ByteOrderMismatch(byte_order):

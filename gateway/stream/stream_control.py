@@ -132,12 +132,15 @@ class StreamControl:
             raise SilenceError(f"{error}, and sends no frames; connecting again") from None
 
     async def _ask_again(self, requested: StreamFrames) -> None:
-        text = f"{self._session.server} accepted {requested} and sends neither frames nor No Data"
+        server, rejection = self._session.server, self._session.rejection
+        text = f"{server} accepted {requested} and sends neither frames nor No Data"
+        if rejection:
+            text = f"all frames from {server} are rejected: {rejection}"
         if self._asked_again:
             raise SilenceError(f"{text}, although the gateway asked again; connecting again")
         logger.info("%s: %s; asking again", self._status.name, text)
         if await self._request(requested) is not _Outcome.ACCEPTED:
-            raise RequestError(f"{self._session.server} no longer accepts {requested}; connecting again")
+            raise RequestError(f"{server} no longer accepts {requested}; connecting again")
         self._asked_again = True
 
     async def _request_any(self, forms: Sequence[StreamFrames]) -> None:

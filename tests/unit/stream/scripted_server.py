@@ -16,6 +16,9 @@ from tests.servers import markers_frame, ok, packet
 
 XML = packet(2, "<RT_Parameters Ver='1.00'><The_3D/></RT_Parameters>")
 
+BROKEN_FRAME = packet(3, struct.pack(">III", 1, 80, 1))
+"""A frame whose only component announces more bytes than follow."""
+
 Answer = Callable[[str], bytes | None]
 """Returns the packets that answer a command, or None to ignore it."""
 

@@ -19,6 +19,7 @@ from gateway.stream.status import StreamStatus
 from tests.losses import amounts
 from tests.servers import markers_frame, ok, packet
 from tests.unit.stream.scripted_server import (
+    BROKEN_FRAME,
     Connection,
     ScriptedServer,
     obliging,
@@ -263,6 +264,14 @@ async def test_silence_while_a_measurement_runs_ends_the_session(
         caplog.messages[-1]
         == "lab (3d): streaming → stalled: silence (no frame from 192.0.2.20:3020 for 3 s)"
     )
+
+
+async def test_frames_that_are_all_rejected_are_not_called_silence(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    asyncio.get_running_loop().call_later(2, lab.connection.send, BROKEN_FRAME)
+    with pytest.raises(SilenceError, match=r"all frames from 192\.0\.2\.20:3020 are rejected: component"):
+        await lab.session.monitor(lab.check_silence)
 
 
 async def test_each_frame_restarts_the_stall_timeout(lab: Lab) -> None:

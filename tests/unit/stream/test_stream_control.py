@@ -16,6 +16,7 @@ from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
 from tests.servers import error, markers_frame, ok, packet
 from tests.unit.stream.scripted_server import (
+    BROKEN_FRAME,
     XML,
     Answer,
     ScriptedServer,
@@ -274,6 +275,19 @@ async def test_frames_that_do_not_come_are_requested_again_then_the_connection_e
     assert asyncio.get_running_loop().time() - began_s == pytest.approx(6)
     assert lab.commands[2:] == ["StreamFrames AllFrames 3D"] * 2
     assert f"lab (3d): {text}; asking again" in caplog.messages
+
+
+async def test_frames_that_are_all_rejected_are_the_reason(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    lab = Lab()
+    await lab.start()
+    for delay_s in (2, 5):
+        asyncio.get_running_loop().call_later(delay_s, lambda: lab.server.connection.send(BROKEN_FRAME))
+    with pytest.raises(SilenceError) as caught:
+        await lab.session.monitor(lab.control.check_silence)
+    text = "all frames from 192.0.2.20:3020 are rejected: component 1 of 1"
+    assert str(caught.value).startswith(text)
+    assert any(text in message and message.endswith("asking again") for message in caplog.messages)
 
 
 async def test_frames_that_come_after_the_second_request_are_streaming() -> None:
