@@ -133,7 +133,7 @@ async def test_renamed_markers_and_tools_reach_everyone_before_their_frames(
     [warning] = [
         record.message
         for record in caplog.records
-        if record.levelno == logging.WARNING and "other names" in record.message
+        if record.levelno == logging.WARNING and "were renamed" in record.message
     ]
     assert "3d 'Marker 1' to 'Left Marker 1', 'Marker 2' to 'Left Marker 2'; 6d 'Tool 1' to" in warning
 
