@@ -17,7 +17,7 @@ from gateway.rtc3d.parameters import (
     Plate,
     Tool,
 )
-from gateway.stream.plan import StreamPlan, plan_streams
+from gateway.stream.plan import StreamPlan, announced_rates_hz, plan_streams
 
 MARKERS, TOOLS, ANALOG, FORCE, EVENT = (
     ComponentType.MARKERS,
@@ -104,3 +104,10 @@ def test_the_cost_for_several_rates() -> None:
     assert plan_streams(announcing(rates_hz)).on_one_connection("why").limitation == (
         "3d arrives at 59.9 Hz instead of 119.9 Hz, analog and force instead of 2000 Hz: why"
     )
+
+
+@pytest.mark.parametrize("not_a_rate", [0.0, -1.0, 1e-30, 1e30])
+def test_a_number_that_cannot_be_a_rate_is_none(not_a_rate: float) -> None:
+    parameters = announcing({MARKERS: not_a_rate, ANALOG: 2000})
+    assert announced_rates_hz(parameters) == {ANALOG: 2000}
+    assert plan_streams(parameters).groups == (WIRE_ORDER,)
