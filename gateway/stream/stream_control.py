@@ -159,8 +159,9 @@ class StreamControl:
             if not (self._is_slow and await self._session.wait_for_data(self._source.reply_timeout_s)):
                 raise self._request_error()
             self.accepted = self._requested = forms[-1]
-        if ignored and not has_answered:
-            # The server was not answering at all, so it may know the form that it seemed to ignore.
+        if ignored and (not has_answered or ignored[0].components != self.accepted.components):
+            # The server was not answering at all, or may have hung for a moment, so it may know the form that
+            # it seemed to ignore. Without names, components of other rates have to share this connection.
             await self._prefer(ignored[0])
 
     async def _prefer(self, form: StreamFrames) -> None:

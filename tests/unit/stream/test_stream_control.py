@@ -110,7 +110,7 @@ async def test_the_handshake_continues_after_refused_and_ignored_commands(
         logging.WARNING
     ] * 3
     assert lab.parameters == []
-    assert lab.commands[2:] == ["StreamFrames AllFrames 3D", "StreamFrames AllFrames"]
+    assert lab.commands[2:] == ["StreamFrames AllFrames 3D", "StreamFrames AllFrames"] * 2
     assert lab.status.rate == "AllFrames"
 
 
@@ -130,6 +130,24 @@ async def test_a_refused_request_is_repeated_in_simpler_forms() -> None:
     ]
     assert lab.status.rate == ""
     assert len(lab.status.limitations) == 3
+
+
+async def test_a_server_that_hung_is_asked_again_for_the_named_components() -> None:
+    """Without names, streams: auto would take it for a server that serves one rate only."""
+    named, unnamed = "StreamFrames AllFrames 3D", "StreamFrames AllFrames"
+    lab = Lab()
+    lab.server.answer = lambda command: None if lab.commands[2:] == [named] else obliging(command)
+    await lab.start()
+    assert lab.commands[2:] == [named, unnamed, named]
+    assert str(lab.control.accepted) == named
+
+
+async def test_a_server_that_does_not_know_names_keeps_the_form_without_them() -> None:
+    named, unnamed = "StreamFrames AllFrames 3D", "StreamFrames AllFrames"
+    lab = Lab(silent_to(named))
+    await lab.start()
+    assert lab.commands[2:] == [named, unnamed, named, unnamed]
+    assert str(lab.control.accepted) == unnamed
 
 
 async def test_a_server_that_refuses_every_form_ends_the_handshake() -> None:
@@ -175,6 +193,8 @@ async def test_a_request_without_an_answer_is_not_accepted_unless_data_comes() -
     assert lab.commands[2:] == [
         "StreamFrames AllFrames 3D",
         "StreamFrames AllFrames",
+        "StreamFrames FrequencyDivisor:1",
+        "StreamFrames AllFrames 3D",  # in case the server only hung
         "StreamFrames FrequencyDivisor:1",
     ]
     assert lab.status.rate == "FrequencyDivisor:1"
