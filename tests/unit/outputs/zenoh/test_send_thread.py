@@ -11,7 +11,7 @@ from gateway.outputs.zenoh.send_thread import SendThread
 @pytest.fixture
 def blocked() -> tuple[SendThread, threading.Event]:
     """A sender whose thread waits for the event."""
-    sender, go = SendThread("test"), threading.Event()
+    sender, go = SendThread("blocked"), threading.Event()
     began = threading.Event()
 
     def wait() -> None:
@@ -67,7 +67,8 @@ def test_after_close_no_call_is_begun(blocked: tuple[SendThread, threading.Event
     sender, go = blocked
     made: list[str] = []
     sender.submit(lambda: made.append("late"))
-    [thread] = [each for each in threading.enumerate() if each.name == "test"]
+    # The thread of an earlier test may still be ending; the newest is the last.
+    *_, thread = (each for each in threading.enumerate() if each.name == "blocked")
     sender.close()
     go.set()
     thread.join(10)
