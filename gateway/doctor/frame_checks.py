@@ -29,7 +29,7 @@ def check_frames(
 ) -> Finding:
     """Check that well-formed frames arrive until the end, with every component that the stream requested.
 
-    ``others_receive`` tells whether another stream of the source has received frames.
+    ``others_receive`` says whether another stream of the source has received frames.
     """
     is_partial = len(stream.settings.components) < len(ComponentType)
     of_stream = f" of stream {stream.component_keys}" if is_partial else ""

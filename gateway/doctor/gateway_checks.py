@@ -18,7 +18,7 @@ def check_gateway(
 ) -> Iterator[Finding]:
     """Yield findings about the running gateway, whose health page is at ``where``.
 
-    ``sources`` are the names of the configured sources. ``connects`` tells whether the doctor also connects
+    ``sources`` are the names of the configured sources. ``connects`` says whether the doctor also connects
     to the servers itself.
     """
     if isinstance(report, NoReport):

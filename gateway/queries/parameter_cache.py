@@ -194,7 +194,7 @@ class ParameterCache:
         part = await everything.part(sections) if sections else everything
         if part is not None:
             return part
-        # The answer for all sections lacks these, or is not well-formed: only the server can tell.
+        # The answer for all sections lacks these, or is not well-formed. So the server has to be asked.
         answer = self._answers.get(sections)
         if answer is not None and self._is_valid(answer, fresh=fresh):
             return answer

@@ -21,7 +21,7 @@ class ParameterRefresh:
 
     A server that plays a file in a loop causes a request with every pass. So requests within
     ``parameters_interval_s`` after a requested reading are served together at its end. ``last_read_s``
-    returns when the server last sent its parameters, whoever asked for them, on the event loop's clock.
+    returns when the server last sent its parameters, for whatever reason, on the event loop's clock.
     """
 
     def __init__(

@@ -350,7 +350,7 @@ class Session:
                 )  # fmt: skip
 
     def _num_lost(self, announced: int) -> int:
-        """Return how many messages a rejected frame would have had, as far as its component count tells."""
+        """Return how many messages a rejected frame would have had, according to its component count."""
         num_wanted = len(self._status.components.split())
         return min(announced, num_wanted) if 0 < announced <= len(ComponentType) else 1
 

@@ -1,4 +1,4 @@
-"""The demo on a busy machine, and how it tells lost, skipped and late messages apart."""
+"""The demo on a busy machine, and how it distinguishes lost, skipped and late messages."""
 
 import asyncio
 import io
