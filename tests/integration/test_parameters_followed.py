@@ -18,7 +18,7 @@ from gateway.simulator.faults.server_faults import Rename
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.integration.test_parameters_published import subscribe_with_history
-from tests.networks import free_endpoint, lcm_url, open_zenoh
+from tests.networks import lcm_url, open_zenoh
 from tests.queried_gateway import ParameterServer, query, run_gateway, wait_until_cached, zenoh_peer
 from tests.servers import ScriptedServer
 from tests.waiting import wait_until_async
@@ -82,14 +82,6 @@ def listeners(router: str, url: str) -> Iterator[tuple[Listener, Listener]]:
     finally:
         subscriber.close()
         session.close()
-
-
-@pytest.fixture
-def router() -> Iterator[str]:
-    endpoint = free_endpoint()
-    session = open_zenoh("router", listen=endpoint)
-    yield endpoint
-    session.close()
 
 
 async def late_parameters(router: str) -> bytes:

@@ -93,14 +93,6 @@ def url() -> str:
 
 
 @pytest.fixture
-def router() -> Iterator[str]:
-    endpoint = free_endpoint()
-    session = open_zenoh("router", listen=endpoint)
-    yield endpoint
-    session.close()
-
-
-@pytest.fixture
 def subscribers(router: str, url: str) -> Iterator[Subscribers]:
     session = open_zenoh("client", connect=router)
     subscribers = Subscribers(session, url)
