@@ -110,7 +110,7 @@ def _expected_rates_hz(stream: ObservedStream, parameters: Parameters | None) ->
     rates_hz = {
         component: rate
         for component in stream.observed
-        if parameters and (rate := described_rate_hz(parameters, component)) is not None and rate > 0
+        if parameters and (rate := described_rate_hz(parameters, component)) is not None
     }
     match stream.settings.rate:
         case Frequency(hz):

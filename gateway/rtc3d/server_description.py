@@ -1,14 +1,26 @@
 """What a server's parameters (§6) say about one component: its rate, its items and their labels."""
 
+from typing import Final
+
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
+
+_MIN_HZ: Final = 0.01
+_MAX_HZ: Final = 1e6
+"""Numbers outside this range are not rates. Time stamps are whole µs (§7.1)."""
 
 
 def described_rate_hz(parameters: Parameters, component: ComponentType) -> float | None:
     """Return the rate at which the server samples ``component``, in Hz; None if the parameters lack it.
 
-    For analog and force, this is the highest rate of a channel or plate.
+    For analog and force, this is the highest rate of a channel or plate. A number that cannot be a rate, such
+    as 0 for "not measured", counts as none.
     """
+    rate_hz = _described_number(parameters, component)
+    return rate_hz if rate_hz is not None and _MIN_HZ <= rate_hz <= _MAX_HZ else None
+
+
+def _described_number(parameters: Parameters, component: ComponentType) -> float | None:
     match component:
         case ComponentType.MARKERS:
             return parameters.markers.frequency_hz if parameters.markers else None
@@ -16,10 +28,10 @@ def described_rate_hz(parameters: Parameters, component: ComponentType) -> float
             return parameters.tools.frequency_hz if parameters.tools else None
         case ComponentType.ANALOG:
             channels = parameters.analog.channels if parameters.analog else ()
-            return max((channel.frequency_hz or 0 for channel in channels), default=0) or None
+            return max((channel.frequency_hz or 0 for channel in channels), default=None)
         case ComponentType.FORCE:
             plates = parameters.force.plates if parameters.force else ()
-            return max((plate.frequency_hz or 0 for plate in plates), default=0) or None
+            return max((plate.frequency_hz or 0 for plate in plates), default=None)
         case _:
             return None
 

@@ -10,10 +10,6 @@ from gateway.rtc3d.server_description import described_rate_hz, num_described_it
 _SAME_RATE: Final = 1.01
 """Rates within this factor are one rate: servers round the rates in their parameters."""
 
-_MIN_HZ: Final = 0.01
-_MAX_HZ: Final = 1e6
-"""Numbers outside this range are not rates. Time stamps are whole µs (§7.1)."""
-
 Components = tuple[ComponentType, ...]
 """Components in WIRE_ORDER."""
 
@@ -46,16 +42,12 @@ class StreamPlan(NamedTuple):
 
 
 def announced_rates_hz(parameters: Parameters) -> dict[ComponentType, float]:
-    """Return the rates that a server announces for the components that it has items of.
-
-    A number that cannot be a rate, such as 0 for "not measured", counts as none.
-    """
+    """Return the rates that a server announces for the components that it has items of."""
     return {
         component: rate_hz
         for component in WIRE_ORDER
         if num_described_items(parameters, component)
         and (rate_hz := described_rate_hz(parameters, component)) is not None
-        and _MIN_HZ <= rate_hz <= _MAX_HZ
     }
 
 

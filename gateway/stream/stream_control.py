@@ -18,6 +18,7 @@ from gateway.rtc3d.commands import (
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.server_description import described_rate_hz
 from gateway.stream.parameters import UNANSWERED, ReadParameters
 from gateway.stream.rate_control import halved, stream_requests
 from gateway.stream.session import Session
@@ -80,8 +81,8 @@ class StreamControl:
         if self._source.byte_order == "little":
             await self._ask_optional(SetByteOrder("little"))
         parameters = await self._fetch_parameters()
-        if parameters is not None and parameters.markers is not None:
-            self._frequency_hz = parameters.markers.frequency_hz
+        if parameters is not None:
+            self._frequency_hz = described_rate_hz(parameters, ComponentType.MARKERS)
         await self.request_components(self._choose_components(parameters))
         self._status.handshake_done(self._session.protocol_state, self._session.server, str(self.accepted))
 

@@ -132,6 +132,18 @@ async def test_a_refused_request_is_repeated_in_simpler_forms() -> None:
     assert len(lab.status.limitations) == 3
 
 
+@pytest.mark.parametrize("not_a_rate", ["0", "1e30", "inf"])
+async def test_no_divisor_follows_from_a_number_that_cannot_be_a_rate(not_a_rate: str) -> None:
+    def answer(command: str) -> bytes | None:
+        if command.startswith("SendParameters"):
+            return packet(2, RATE_XML[8:].decode().replace("200", not_a_rate))
+        return ok("ok") if command == "StreamFrames" else refusing("StreamFrames")(command)
+
+    lab = Lab(answer, rate={"frequency_hz": 50})
+    await lab.start()
+    assert lab.commands[-3:] == ["StreamFrames Frequency:50 3D", "StreamFrames Frequency:50", "StreamFrames"]
+
+
 async def test_a_server_that_hung_is_asked_again_for_the_named_components() -> None:
     """Without names, streams: auto would take it for a server that serves one rate only."""
     named, unnamed = "StreamFrames AllFrames 3D", "StreamFrames AllFrames"
