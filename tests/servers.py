@@ -53,6 +53,10 @@ class Client:
     def send(self, data: bytes) -> None:
         self._writer.write(data)
 
+    async def drain(self) -> None:
+        """Wait until the client has taken most of what was sent; raises ConnectionError if it disconnects."""
+        await self._writer.drain()
+
     async def commands(self, answer: Callable[[str], bytes | None]) -> None:
         """Send what ``answer`` returns for each command, until the client disconnects."""
         while True:

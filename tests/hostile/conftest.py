@@ -1,0 +1,49 @@
+"""The healthy source of all tests in this folder, and a table of their figures at the end of the run."""
+
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+
+from tests.gateway_process import simulator
+from tests.hostile.gateway_under_attack import (
+    HEALTHY_SCENE,
+    GatewayUnderAttack,
+    Report,
+    RunningGateway,
+    run_gateway,
+)
+
+_reports: Final[dict[str, Report]] = {}
+
+
+@pytest.fixture(scope="session")
+def healthy_server() -> Iterator[int]:
+    """The port of the healthy server, a process of its own."""
+    with simulator(*HEALTHY_SCENE) as (port, _):
+        yield port
+
+
+@pytest.fixture
+def gateway_under_attack(
+    tmp_path: Path, healthy_server: int, request: pytest.FixtureRequest
+) -> GatewayUnderAttack:
+    """Run a gateway with the healthy source and attackers; see gateway_under_attack.py."""
+
+    @asynccontextmanager
+    async def run(*arguments: Any, **options: Any) -> AsyncIterator[RunningGateway]:
+        async with partial(run_gateway, tmp_path, healthy_server)(*arguments, **options) as gateway:
+            yield gateway
+        _reports[request.node.nodeid.rpartition("/")[2]] = gateway.report
+
+    return run
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    if _reports:
+        terminalreporter.section("the healthy source during attacks")
+        for name, report in _reports.items():
+            terminalreporter.write_line(f"{name}: {report}")
