@@ -1,6 +1,8 @@
 """Scripted RT servers, for the deviations in the field notes that the simulator does not have."""
 
 import asyncio
+import contextlib
+import socket
 import struct
 from collections.abc import Awaitable, Callable
 from types import TracebackType
@@ -64,9 +66,19 @@ class Client:
             if reply is not None:
                 self.send(reply)
 
+    def end(self) -> None:
+        """Send the end of the stream, and leave the other direction open."""
+        self._writer.write_eof()
+
     def cut(self) -> None:
         """Abort the connection."""
         self._writer.transport.abort()
+
+    def reset(self) -> None:
+        """Abort the connection with a RST."""
+        linger = struct.pack("ii", 1, 0)
+        self._writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, linger)
+        self.cut()
 
 
 class ScriptedServer:
@@ -76,7 +88,7 @@ class ScriptedServer:
         self._script = script
         self.port = port
         self.connections = 0
-        self._writers: set[asyncio.StreamWriter] = set()
+        self._scripts: dict[asyncio.Task[None], asyncio.StreamWriter] = {}
 
     async def __aenter__(self) -> Self:
         self._server = await asyncio.start_server(self._serve, "127.0.0.1", self.port)
@@ -87,17 +99,18 @@ class ScriptedServer:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._server.close()
-        for writer in self._writers:
+        for task, writer in self._scripts.items():
             writer.transport.abort()
+            task.cancel()
         await self._server.wait_closed()
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self.connections += 1
-        self._writers.add(writer)
-        try:
+        task = asyncio.current_task()
+        assert task is not None
+        self._scripts[task] = writer
+        # asyncio would log a task that ends as cancelled.
+        with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError, asyncio.CancelledError):
             await self._script(Client(reader, writer))
-        except (asyncio.IncompleteReadError, ConnectionError):
-            pass
-        finally:
-            writer.close()
-            self._writers.discard(writer)
+        writer.close()
+        del self._scripts[task]

@@ -25,12 +25,13 @@ import asyncio
 import contextlib
 import json
 import os
+import re
 import signal
 import sys
 import time
 from asyncio.subprocess import DEVNULL, PIPE, Process
-from collections import deque
-from collections.abc import AsyncIterator, Callable, Mapping
+from collections import defaultdict, deque
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -83,6 +84,8 @@ class Report:
     """Whether the gateway had ended before SIGTERM."""
     stop_s: float
     log: str = field(repr=False)
+    sources: Sequence[str]
+    """The names of the attackers."""
 
     @property
     def longest_silence_s(self) -> dict[str, float]:
@@ -105,8 +108,8 @@ class Report:
 
     @property
     def log_lines_per_minute(self) -> int:
-        """The largest number of lines logged in a minute."""
-        return log_lines_per_minute(self.log)
+        """The largest number of lines logged in a minute about one source, or about none."""
+        return log_lines_per_minute(self.log, self.sources)
 
     def problems(self) -> list[str]:
         """Return what the attack did to others, in sentences."""
@@ -130,7 +133,7 @@ class Report:
         elif self.stop_s > MAX_STOP_S:
             found.append(f"the gateway took {self.stop_s:.1f} s to stop")
         if self.log_lines_per_minute > MAX_LOG_LINES_PER_MINUTE:
-            found.append(f"{self.log_lines_per_minute} lines were logged in a minute")
+            found.append(f"{self.log_lines_per_minute} lines about one source were logged in a minute")
         return found
 
     def check(self) -> None:
@@ -179,17 +182,23 @@ def _total(arrivals: Mapping[str, Any], what: str) -> float:
     return sum(float(report[what]) for output in ("zenoh", "lcm") for report in arrivals[output].values())
 
 
-def log_lines_per_minute(log: str) -> int:
-    """Return the largest number of lines within 60 s; lines without a time have that of the line before."""
-    recent: deque[float] = deque()
-    worst, time_s = 0, 0.0
+def log_lines_per_minute(log: str, sources: Sequence[str]) -> int:
+    """Return the largest number of lines within 60 s about one source, or about none.
+
+    A line without a time, as of a traceback, belongs to the line before.
+    """
+    recent: defaultdict[str, deque[float]] = defaultdict(deque)
+    worst, time_s, source = 0, 0.0, ""
     for line in log.splitlines():
+        words = re.split(r"[ :]", line[23:].lstrip(), maxsplit=2)
         with contextlib.suppress(ValueError):
             time_s = datetime.strptime(line[:23], "%Y-%m-%d %H:%M:%S,%f").timestamp()  # noqa: DTZ007 - local
-        recent.append(time_s)
-        while recent[0] < time_s - 60:
-            recent.popleft()
-        worst = max(worst, len(recent))
+            source = words[1] if len(words) > 1 and words[1] in sources else ""
+        times = recent[source]
+        times.append(time_s)
+        while times[0] < time_s - 60:
+            times.popleft()
+        worst = max(worst, len(times))
     return worst
 
 
@@ -327,7 +336,14 @@ async def run_gateway(
         rss_after_kib = gateway.rss_kib()
         exit_status, ended_early, stop_s = await gateway.stop()
         gateway.report = Report(
-            arrivals, rss_before_kib, rss_after_kib, exit_status, ended_early, stop_s, gateway.log
+            arrivals,
+            rss_before_kib,
+            rss_after_kib,
+            exit_status,
+            ended_early,
+            stop_s,
+            gateway.log,
+            tuple(attackers or ()),
         )
     finally:
         await gateway.kill()

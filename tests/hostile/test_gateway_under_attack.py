@@ -40,8 +40,10 @@ async def test_the_end_of_the_gateway_is_noticed(gateway_under_attack: GatewayUn
     assert any("during the attack" in problem for problem in gateway.report.problems())
 
 
-def test_lines_of_the_log_are_counted_in_the_worst_minute() -> None:
-    quiet = [f"2026-01-02 03:{minute:02}:30,000 INFO quiet" for minute in range(10, 20)]
-    burst = [f"2026-01-02 03:20:{second:02},500 ERROR burst\nTraceback" for second in range(30)]
-    assert log_lines_per_minute("\n".join(quiet)) == 2  # 60 s apart
-    assert log_lines_per_minute("\n".join([*quiet, *burst])) == 61
+def test_lines_of_the_log_are_counted_in_the_worst_minute_and_by_source() -> None:
+    quiet = [f"2026-01-02 03:{minute:02}:30,000 INFO stopping" for minute in range(10, 20)]
+    burst = [f"2026-01-02 03:20:{second:02},500 ERROR one: defect\nTraceback" for second in range(30)]
+    other = [f"2026-01-02 03:20:{second:02},600 INFO two (3d): connected" for second in range(50)]
+    assert log_lines_per_minute("\n".join(quiet), ()) == 2  # 60 s apart
+    assert log_lines_per_minute("\n".join([*quiet, *burst, *other]), ("one", "two")) == 60
+    assert log_lines_per_minute("\n".join([*quiet, *burst, *other]), ()) == 110
