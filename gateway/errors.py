@@ -25,6 +25,8 @@
 A message says what happened, to which server or file, and what to do.
 """
 
+from gateway.safe_text import safe_text
+
 
 class GatewayError(Exception):
     """Base of all errors that this package raises on purpose."""
@@ -102,7 +104,7 @@ class DefectError(LinkError):
     def of(defect: Exception) -> "DefectError":
         """Return the error for an exception that nobody expected."""
         error = DefectError(
-            f"defect in the gateway: {type(defect).__name__}: {defect}; connecting again; "
+            f"defect in the gateway: {type(defect).__name__}: {safe_text(str(defect))}; connecting again; "
             "report this with the log"
         )
         error.__cause__ = defect

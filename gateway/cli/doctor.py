@@ -13,6 +13,7 @@ from gateway.doctor.all_checks import run_checks, run_checks_without_settings
 from gateway.doctor.report import Report
 from gateway.doctor.source_checks import CONNECTION
 from gateway.errors import ConfigError
+from gateway.safe_text import safe_lines
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
 
 _INSTALLED_CONFIG: Final = Path("/etc/rtc3d-gateway/gateway.yaml")
@@ -83,5 +84,5 @@ async def _report_findings(
         async for finding in findings:
             report.add(finding)
             if as_json and finding.check == CONNECTION:  # the JSON comes too late to stop the doctor
-                print(f"{finding.subject}: {finding.found}", file=sys.stderr)
+                print(safe_lines(f"{finding.subject}: {finding.found}"), file=sys.stderr)
     report.end()

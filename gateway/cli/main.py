@@ -19,6 +19,7 @@ from gateway.cli.params import params
 from gateway.cli.run import run
 from gateway.cli.simulate import simulate
 from gateway.errors import ConfigError, GatewayError
+from gateway.safe_text import safe_lines
 
 app = typer.Typer(
     name="rtc3d-gateway",
@@ -47,7 +48,7 @@ def main() -> NoReturn:
 
 
 def _exit(text: str, status: int) -> NoReturn:
-    print(text, file=sys.stderr)
+    print(safe_lines(text), file=sys.stderr)
     sys.exit(status)
 
 

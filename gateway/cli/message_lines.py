@@ -1,12 +1,14 @@
 """One line of text or JSON for each message that a gateway publishes."""
 
 import json
-from typing import Any
+from typing import Any, Final
 
-from gateway.cli.terminal_text import printable
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode, to_json
 from gateway.messages.summary import summarise, summarise_xml
+from gateway.safe_text import safe_json, safe_text
+
+_MAX_LINE_CHARACTERS: Final = 4000
 
 
 def json_line(name: str, message: bytes) -> str:
@@ -21,7 +23,7 @@ def json_line(name: str, message: bytes) -> str:
                 fields = json_object
             case _:
                 fields = {"error": str(error)}
-    return json.dumps({"key": name} | fields)
+    return safe_json(json.dumps({"key": name} | fields))
 
 
 def text_line(name: str, message: bytes) -> str:
@@ -36,7 +38,7 @@ def text_line(name: str, message: bytes) -> str:
                 line = f"{name} " + ", ".join(f"{key} {value}" for key, value in json_object.items())
             case _:
                 line = f"{name}: {error}"
-    return printable(line)
+    return safe_text(line, _MAX_LINE_CHARACTERS)
 
 
 def _xml_or_json(message: bytes) -> bytes | dict[str, Any] | None:

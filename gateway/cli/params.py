@@ -12,6 +12,7 @@ from gateway.cli.params_zenoh import query_zenoh
 from gateway.outputs.lcm.settings import effective_lcm_url
 from gateway.outputs.zenoh.subscriber import open_zenoh
 from gateway.rtc3d.parameters import SECTIONS
+from gateway.safe_text import safe_lines
 
 EXIT_STATUSES: Final = {"no-gateway": 3, "no-connection": 4, "timeout": 5}
 """Exit status by the code of the first problem; 1 for every other code."""
@@ -77,6 +78,6 @@ def params(
         )
     problems += write_replies(replies, "json" if as_json else "xml" if as_xml else "table", sys.stdout)
     for problem in problems:
-        print(problem, file=sys.stderr)
+        print(safe_lines(str(problem)), file=sys.stderr)
     if problems:
         raise typer.Exit(EXIT_STATUSES.get(problems[0].code, 1))

@@ -10,11 +10,11 @@ from rich.text import Text
 
 from gateway.cli.params_query import ParametersReply
 from gateway.cli.params_tables import tables
-from gateway.cli.terminal_text import printable
 from gateway.errors import ParametersError, QueryError
 from gateway.queries.answers import parameters_json
 from gateway.rtc3d.parameters import SECTIONS, Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.safe_text import safe_json, safe_text
 
 OutputFormat = Literal["table", "json", "xml"]
 
@@ -82,7 +82,7 @@ def _write_json(by_source: dict[str, _SourceParameters], out: BinaryIO) -> None:
         }
         for source, merged in by_source.items()
     }
-    out.write(json.dumps(values, indent=2, ensure_ascii=False).encode() + b"\n")
+    out.write(safe_json(json.dumps(values, indent=2, ensure_ascii=False)).encode() + b"\n")
 
 
 def _write_tables(by_source: dict[str, _SourceParameters], out: TextIO) -> None:
@@ -91,4 +91,4 @@ def _write_tables(by_source: dict[str, _SourceParameters], out: TextIO) -> None:
         for table in tables(source, merged.parameters):
             console.print(table)
         if merged.age_s is not None:
-            console.print(Text(printable(f"{source}: parameters are {merged.age_s:.1f} s old")))
+            console.print(Text(safe_text(f"{source}: parameters are {merged.age_s:.1f} s old")))

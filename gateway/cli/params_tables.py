@@ -6,7 +6,6 @@ from typing import Any, Final
 from rich.table import Table
 from rich.text import Text
 
-from gateway.cli.terminal_text import printable
 from gateway.rtc3d.parameters import (
     EventParameter,
     General,
@@ -19,6 +18,7 @@ from gateway.rtc3d.parameters import (
     Plate,
     Point,
 )
+from gateway.safe_text import safe_text
 
 _Rows = Sequence[Sequence[object]]
 
@@ -43,7 +43,7 @@ def _cell(value: object) -> str:
     """Return a value as text for a table: "" for None, one line per item of a tuple."""
     if isinstance(value, tuple):
         return "\n".join(map(_cell, value))
-    return printable(f"{value:g}" if isinstance(value, float) else "" if value is None else str(value))
+    return safe_text(f"{value:g}" if isinstance(value, float) else "" if value is None else str(value))
 
 
 def _table(title: str, headings: Sequence[str], rows: _Rows) -> Table:

@@ -8,6 +8,7 @@ from rich.console import Console
 from rich.text import Text
 
 from gateway.findings import Finding, Result
+from gateway.safe_text import safe_json, safe_lines
 
 _MARKS: Final = {
     Result.PASSING: ("ok", "bold green"),
@@ -78,14 +79,14 @@ class Report:
             }
             for finding in self.findings
         ]
-        return json.dumps({"ok": self.is_ok, "findings": findings}, indent=2, ensure_ascii=False)
+        return safe_json(json.dumps({"ok": self.is_ok, "findings": findings}, indent=2, ensure_ascii=False))
 
     def _wrapped(self, text: str) -> list[str]:
         """Wrap ``text`` into lines. Paths and addresses are not split, so that they can be copied."""
         width = max(20, min(self._console.width, _MAX_WIDTH) - len(_INDENT) - 2)
         return [
             line
-            for paragraph in text.splitlines()
+            for paragraph in safe_lines(text).split("\n")
             for line in textwrap.wrap(paragraph, width, break_long_words=False, break_on_hyphens=False)
         ]
 

@@ -17,6 +17,7 @@ from gateway.errors import ConnectError, LinkError, PacketError
 from gateway.findings import Finding, MessageLoad, Result, Subject
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 from gateway.rtc3d.parameters import Parameters
+from gateway.safe_text import quoted
 
 CHECKS: Final = (
     "name",
@@ -196,11 +197,10 @@ class SourceChecks:
 
     def _protocol_failure(self, stream: ObservedStream, error: LinkError) -> Finding:
         if isinstance(error.__cause__, PacketError):
-            first_bytes = error.__cause__.first_bytes.decode("latin-1")
-            text = "".join(letter if letter.isprintable() else "·" for letter in first_bytes)
+            first_bytes = quoted(error.__cause__.first_bytes.decode("latin-1"), 60)
             return self._subject.failing(
                 "protocol",
-                f"the program at {self._server} is not an RT server; its first bytes are {text!r}",
+                f"the program at {self._server} is not an RT server; its first bytes are {first_bytes}",
                 f"Correct the source's host and port: {_PORTS}.",
             )
         if stream.session.is_open and not stream.status.bytes_in:

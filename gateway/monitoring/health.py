@@ -11,6 +11,7 @@ from gateway.losses import Loss, last_minute_text, route_name
 from gateway.monitoring.http_pages import Page
 from gateway.outputs.contract import Output
 from gateway.rtc3d.components import ComponentType
+from gateway.safe_text import safe_json
 from gateway.source import Source
 from gateway.stream.running_clock import running_clock
 from gateway.stream.state import StreamState
@@ -60,7 +61,9 @@ def health_page(gateway: Gateway) -> Page:
         "losses": [loss for route in routes for loss in _losses_json(route)],
     }
     status = HTTPStatus.SERVICE_UNAVAILABLE if problems else HTTPStatus.OK
-    return Page(status, "application/json", json.dumps(body, ensure_ascii=False, indent=2).encode() + b"\n")
+    return Page(
+        status, "application/json", safe_json(json.dumps(body, ensure_ascii=False, indent=2)).encode() + b"\n"
+    )
 
 
 def unusable_frames(status: StreamStatus, max_age_s: float) -> str:

@@ -9,6 +9,7 @@ from gateway.errors import QueryError
 from gateway.outputs.contract import KeyPath
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ComponentType
 from gateway.rtc3d.parameters import SECTIONS
+from gateway.safe_text import quoted
 
 SCHEMA_TYPES: Final = tuple(name for name in vars(rtc3d) if name.endswith("_t"))
 """The message types, and the types they contain."""
@@ -24,8 +25,6 @@ _OPTIONS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     "recording": {"set": ("start", "stop")},
 }
 """The options of each kind of question, with the values that each accepts."""
-
-_MAX_QUOTED: Final = 60  # characters of a peer's text in an error message
 
 
 class Question(NamedTuple):
@@ -109,12 +108,10 @@ def _check_options(options: Mapping[str, str], kinds: Iterable[str]) -> None:
         if name not in accepted:
             known = ", ".join(f"{option}={'|'.join(values)}" for option, values in accepted.items())
             raise QueryError(
-                f"unknown option {_quoted(name)} of {', '.join(kinds)}; accepted: {known or 'none'}"
+                f"unknown option {quoted(name)} of {', '.join(kinds)}; accepted: {known or 'none'}"
             )
         if value not in accepted[name]:
-            raise QueryError(
-                f"{name}={_quoted(value)} is not accepted; accepted: {', '.join(accepted[name])}"
-            )
+            raise QueryError(f"{name}={quoted(value)} is not accepted; accepted: {', '.join(accepted[name])}")
 
 
 def _kind_and_name(path: KeyPath, components: Collection[ComponentType]) -> tuple[str, str]:
@@ -138,15 +135,10 @@ def _kind_and_name(path: KeyPath, components: Collection[ComponentType]) -> tupl
             return "schema", name.removeprefix("rtc3d.")
         case ("schema", *_):
             raise QueryError(f"unknown type; accepted: {', '.join(SCHEMA_TYPES)}")
-    raise QueryError(f"unknown key {_quoted('/'.join(path))}; accepted: {accepted_keys(components)}")
+    raise QueryError(f"unknown key {quoted('/'.join(path))}; accepted: {accepted_keys(components)}")
 
 
 def check_sections(sections: Iterable[str]) -> None:
     """Raise QueryError if one of ``sections`` does not exist (§6)."""
     if unknown := set(sections) - set(SECTIONS):
-        raise QueryError(f"unknown section {_quoted(min(unknown))}; accepted: {', '.join(SECTIONS)}")
-
-
-def _quoted(text: str) -> str:
-    """Return text of a peer, quoted, printable and bounded, for an error message."""
-    return ascii(text if len(text) <= _MAX_QUOTED else text[:_MAX_QUOTED] + "…")
+        raise QueryError(f"unknown section {quoted(min(unknown))}; accepted: {', '.join(SECTIONS)}")

@@ -28,6 +28,7 @@ from gateway.rtc3d.packets import (
 )
 from gateway.rtc3d.protocol_state import ProtocolInput, ProtocolState, next_state
 from gateway.rtc3d.reply_matcher import Match, ReplyMatcher
+from gateway.safe_text import safe_text
 
 _MAX_ERROR_BYTES: Final = 300  # of a server's error text, which goes into logs and status messages
 _UNUSED_PARAMETER: Final = -1  # of an event (§7.7)
@@ -286,7 +287,7 @@ class ClientProtocol:
         if packet.type == PacketType.ERROR:
             if isinstance(command, StreamFrames):
                 self._apply(ProtocolInput.REQUEST_REFUSED)
-            text = decode_text(packet.body[:_MAX_ERROR_BYTES]) or "no reason given"
+            text = safe_text(decode_text(packet.body[:_MAX_ERROR_BYTES])) or "no reason given"
             events.append(Refused(command, ServerError(text)))
             return
         if isinstance(command, SetByteOrder):

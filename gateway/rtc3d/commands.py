@@ -9,6 +9,7 @@ from gateway.errors import CommandError
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.packets import decode_text
 from gateway.rtc3d.parameters import SECTIONS
+from gateway.safe_text import quoted
 
 # "Event" is an alias that some clients use.
 _COMPONENT_BY_WORD: Final = {component.command_word: component for component in WIRE_ORDER} | {
@@ -275,5 +276,5 @@ def _parse_names(
 
 
 def _quote(word: str) -> str:
-    """Return a client's word for an error text: quoted, shortened and printable."""
-    return repr(word if len(word) <= 40 else word[:40] + "…").encode("ascii", "replace").decode()
+    """Return a client's word for an error text, which is ASCII."""
+    return quoted(word).encode("ascii", "replace").decode()

@@ -4,11 +4,10 @@ from dataclasses import replace
 from typing import Final
 
 from gateway.rtc3d.parameters import SECTIONS, Parameters, Parameters3D, Parameters6D, without_statistics
+from gateway.safe_text import quoted
 
 _MAX_NAMED: Final = 3
 """How many items with a new name are listed for each section; the others are counted."""
-
-_MAX_LABEL_CHARACTERS: Final = 40
 
 
 def differ_in_statistics_only(before: bytes, after: bytes) -> bool:
@@ -42,7 +41,7 @@ def describe_renames(before: Parameters, after: Parameters) -> str:
     texts = []
     for section in ("3d", "6d"):
         labels = zip(_labels(before, section), _labels(after, section), strict=False)
-        renamed = [f"{_quote(old)} to {_quote(new)}" for old, new in labels if old != new]
+        renamed = [f"{quoted(old)} to {quoted(new)}" for old, new in labels if old != new]
         if renamed:
             rest = f" and {len(renamed) - _MAX_NAMED} more" if len(renamed) > _MAX_NAMED else ""
             texts.append(f"{section} {', '.join(renamed[:_MAX_NAMED])}{rest}")
@@ -72,8 +71,3 @@ def _without_labels(parameters: Parameters) -> Parameters:
         tools = tuple(replace(tool, label="") for tool in parameters.tools.tools)
         parameters = replace(parameters, tools=replace(parameters.tools, tools=tools))
     return parameters
-
-
-def _quote(label: str) -> str:
-    """Return a server's text quoted, shortened, and with control characters escaped."""
-    return repr(label[:_MAX_LABEL_CHARACTERS]) + ("…" if len(label) > _MAX_LABEL_CHARACTERS else "")

@@ -11,6 +11,7 @@ from lxml import etree
 from gateway.errors import ParametersError
 from gateway.rtc3d.parameters import SECTIONS, Parameters
 from gateway.rtc3d.parameters_layout import LAYOUT, PARENT_TAGS, ROOT, TAGS
+from gateway.safe_text import quoted, safe_text
 
 MAX_XML_BYTES: Final = 1024 * 1024
 """Larger documents are not parsed. This is enough for about 8000 markers; parsing takes seconds at worst."""
@@ -20,7 +21,7 @@ _PADDING: Final = b"\0 \t\r\n"
 """Bytes at both ends of an XML reply that are ignored (field note 9)."""
 _SECTION_TAGS: Final = {field.name: field.path for field in LAYOUT[Parameters]}
 _MAX_NOTE_CHARACTERS: Final = 200
-_MAX_QUOTED_CHARACTERS: Final = 60
+_MAX_QUOTED_BYTES: Final = 60
 
 # Each stray end tag makes libxml2 close one element too many. Once it closes the root, it drops the rest.
 # This many extra roots around a malformed document prevent that (libxml2 allows a depth of 256).
@@ -115,8 +116,9 @@ def _parse_tree(body: bytes, notes: list[str]) -> etree._Element:
     if root is not None:
         _copy_elements(root, tree, repair=bool(errors) or not is_parameters)
     if not is_parameters and len(tree) == 0:
+        begin = body[: _MAX_QUOTED_BYTES + 1].decode("latin-1")
         raise ParametersError(
-            f"the server's XML has no parameters but begins with {_quote(body.decode('latin-1'))}; "
+            f"the server's XML has no parameters but begins with {quoted(begin, _MAX_QUOTED_BYTES)}; "
             "check host and port, and that this is an RTC3D server"
         )
     return tree
@@ -219,7 +221,7 @@ def _number(element: etree._Element, text: str, kind: type, notes: list[str]) ->
         pass
     if len(notes) < MAX_RECOVERED:  # getpath is slow among many siblings
         path = element.getroottree().getpath(element).removeprefix(f"/{ROOT}/")
-        _note(notes, f"{path} {_quote(text)} is not a number")
+        _note(notes, f"{path} {quoted(text)} is not a number")
     return None
 
 
@@ -268,11 +270,6 @@ def _xml_text(text: str) -> str:
     return _NOT_XML.sub("", text)
 
 
-def _quote(text: str) -> str:
-    """Return a server's text for use in an error text: quoted, shortened and printable."""
-    return ascii(text[:_MAX_QUOTED_CHARACTERS]) + ("…" if len(text) > _MAX_QUOTED_CHARACTERS else "")
-
-
 def _note(notes: list[str], note: str) -> None:
     if len(notes) < MAX_RECOVERED:
-        notes.append(note[:_MAX_NOTE_CHARACTERS])
+        notes.append(safe_text(note, _MAX_NOTE_CHARACTERS))

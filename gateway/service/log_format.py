@@ -11,6 +11,7 @@ from typing import Final
 
 from gateway.errors import ConfigError
 from gateway.log import FIELDS, current_log_fields
+from gateway.safe_text import safe_lines
 
 
 class LogFormat(StrEnum):
@@ -80,7 +81,7 @@ def _handler_for(log_format: LogFormat) -> logging.Handler:
     handler.setFormatter(
         JsonFormatter()
         if log_format is LogFormat.JSON
-        else logging.Formatter("%(asctime)s %(levelname)s %(message)s")
+        else _LineFormatter("%(asctime)s %(levelname)s %(message)s")
     )
     return handler
 
@@ -98,6 +99,18 @@ def _fields(record: logging.LogRecord) -> dict[str, str]:
     return {name: value for name in FIELDS if (value := getattr(record, name, None))}
 
 
+class _LineFormatter(logging.Formatter):
+    """Formats a record as text in which control characters are escaped.
+
+    Further lines, of a traceback or of the problems in a configuration, are indented, so that no text from a
+    network can pass for a record of its own.
+    """
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return the text, without a line end."""
+        return safe_lines(super().format(record)).replace("\n", "\n  ")
+
+
 class JsonFormatter(logging.Formatter):
     """Formats a record as one line of JSON.
 
@@ -109,12 +122,12 @@ class JsonFormatter(logging.Formatter):
         fields = {
             "time": datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds"),
             "level": record.levelname.lower(),
-            "message": record.getMessage(),
+            "message": safe_lines(record.getMessage()),
             "logger": record.name,
             **_fields(record),
         }
         if record.exc_info:
-            fields["exception"] = self.formatException(record.exc_info)
+            fields["exception"] = safe_lines(self.formatException(record.exc_info))
         return json.dumps(fields, ensure_ascii=False)
 
 
@@ -139,7 +152,7 @@ class JournalHandler(logging.Handler):
         """Send one record."""
         try:
             self._send(
-                message=self.format(record),
+                message=safe_lines(self.format(record)),
                 priority=_JOURNAL_PRIORITIES.get(record.levelno, 6),
                 syslog_identifier=_SYSLOG_IDENTIFIER,
                 logger=record.name,

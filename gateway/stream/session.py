@@ -34,6 +34,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.packets import Packet, decode_text
 from gateway.rtc3d.protocol_state import ProtocolState
+from gateway.safe_text import safe_text
 from gateway.stream.backlog import Backlog
 from gateway.stream.paced_frames import PacedFrames
 from gateway.stream.running_clock import running_clock
@@ -345,8 +346,8 @@ class Session:
                 self.fail(closed)
             case UnexpectedPacket(packet):
                 logger.debug(
-                    "%s: unexpected packet of type %d: %.200s",
-                    self._source.name, packet.type, decode_text(packet.body[:200]),
+                    "%s: unexpected packet of type %d: %s",
+                    self._source.name, packet.type, safe_text(decode_text(packet.body[:200])),
                 )  # fmt: skip
 
     def _num_lost(self, announced: int) -> int:

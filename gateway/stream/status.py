@@ -13,6 +13,7 @@ from gateway.log import DefectLog, FailureLog
 from gateway.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.protocol_state import ProtocolState
+from gateway.safe_text import safe_text
 from gateway.stream.clock import ServerClock
 from gateway.stream.state import Phase, StreamState, stream_state
 
@@ -254,6 +255,7 @@ class StreamStatus:
 
         Each text is logged as WARNING once, and as DEBUG if a later connection has the same limitation.
         """
+        text = safe_text(text)  # it may quote the server
         if not self._list_limitation(text):
             return
         if text in self._logged_limitations:
@@ -278,7 +280,7 @@ class StreamStatus:
 
     def record_error(self, text: str) -> None:
         """Keep ``text``, cut to MAX_ERROR_LENGTH, as the last error, with the time."""
-        self.last_error = text[:MAX_ERROR_LENGTH]
+        self.last_error = safe_text(text, MAX_ERROR_LENGTH)
         self.last_error_utime = now_utime()
         self.last_error_s = time.monotonic()
 

@@ -124,7 +124,7 @@ async def test_the_first_bytes_of_another_protocol_are_quoted() -> None:
         findings = await run_doctor(lab(server.port))
     assert findings.of("protocol").found == (
         f"the program at 127.0.0.1:{server.port} is not an RT server; "
-        "its first bytes are 'HTTP/1.1 400 Bad Request····'"
+        r"its first bytes are 'HTTP/1.1 400 Bad Request\r\n\r\n'"
     )
     assert findings.of("protocol").remedy == (
         "Correct the source's host and port: 3020 is First Principles, 3030 WaveFront."

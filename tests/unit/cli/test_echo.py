@@ -84,7 +84,7 @@ def reply(error: str = "") -> bytes:
         (
             "MOCAP_LAB_PARAMETERS_REPLY",
             reply("the server is \x1b[31maway"),
-            "MOCAP_LAB_PARAMETERS_REPLY reply 7 to 'viewer': the server is \N{REPLACEMENT CHARACTER}[31maway",
+            "MOCAP_LAB_PARAMETERS_REPLY reply 7 to 'viewer': the server is \\x1b[31maway",
         ),
     ],
 )

@@ -136,7 +136,7 @@ def test_parameters_with_entities() -> None:
     )
 
 
-@pytest.mark.parametrize(("length", "ending"), [(60, "'"), (61, "'…")])
+@pytest.mark.parametrize(("length", "ending"), [(60, "'"), (61, "…'")])
 def test_xml_without_parameters_is_shown_up_to_60_characters(length: int, ending: str) -> None:
     assert parameters_error(b"x" * length) == (
         f"the server's XML has no parameters but begins with '{'x' * 60}{ending}; "

@@ -52,7 +52,7 @@ def test_names_are_short_and_printable() -> None:
     text = describe_renames(
         scene("A"), Parameters(markers=Parameters3D(markers=(Marker("1", "\n\x1b" * 99),)))
     )
-    assert text == "3d 'A' to '" + r"\n\x1b" * 20 + "'…"
+    assert text == "3d 'A' to '" + r"\n\x1b" * 20 + "…'"
     assert "'Ä'" in describe_renames(scene("A"), scene("Ä"))
 
 

@@ -240,7 +240,7 @@ class TestRealServers:
         parameters, recovered = parse_parameters(xml)
         assert parameters == Parameters(general=General())
         assert len(recovered) == 1
-        assert recovered[0].startswith(f"General/Server/Port '{number[:60]}'")
+        assert recovered[0].startswith(f"General/Server/Port '{number[:40]}")
 
     def test_an_unreadable_coordinate_or_matrix_cell_is_nan(self) -> None:
         xml = in_root(

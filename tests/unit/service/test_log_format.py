@@ -90,6 +90,18 @@ def test_json_writes_one_object_per_line_with_the_fields(capsys: pytest.CaptureF
     }
 
 
+@pytest.mark.parametrize("log_format", [LogFormat.TEXT, LogFormat.JSON])
+def test_text_from_a_network_cannot_forge_a_line(
+    log_format: LogFormat, capsys: pytest.CaptureFixture[str]
+) -> None:
+    set_up(LogLevel.INFO, log_format)
+    LOGGER.warning("%s", "\x1b[2J\u202e\x9b\udc80\n2026-01-01 00:00:00,000 ERROR forged" + "x" * 100_000)
+    shown = capsys.readouterr().err
+    assert r"\x1b[2J\u202e\x9b\udc80" in shown.replace("\\\\", "\\")
+    assert len(shown) < 30_000
+    assert [line[:1] for line in shown.splitlines()[1:]] == ([" "] if log_format is LogFormat.TEXT else [])
+
+
 def test_json_includes_the_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     set_up(LogLevel.INFO, LogFormat.JSON)
     try:
