@@ -3,7 +3,7 @@
 import logging
 import os
 import sys
-from typing import NoReturn
+from typing import Final, NoReturn
 
 import uvloop
 
@@ -17,6 +17,10 @@ from gateway.cli.options import (
 from gateway.service.daemon import serve
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
 
+_SWITCH_INTERVAL_S: Final = 0.0005
+"""How long a thread that runs Python keeps the event loop waiting for its lock. Every message to an output
+releases that lock once, so that the default of 5 ms would add up to more than the time between two frames."""
+
 
 def run(
     config: ConfigOption = None,
@@ -26,6 +30,7 @@ def run(
 ) -> None:
     """Run the gateway until Ctrl-C or SIGTERM. SIGHUP reloads the configuration."""
     set_up_log(log_level, log_format)
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     uvloop.run(serve(lambda: configuration_from_options(config, server).settings))
     _exit_at_once()
 

@@ -1,5 +1,6 @@
 """Observation of one stream: rates, message sizes, and which markers and tools are in view."""
 
+import asyncio
 from collections.abc import Sequence
 from typing import Final
 
@@ -14,7 +15,7 @@ from gateway.rtc3d.components import WIRE_ORDER, Component, ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
-from gateway.stream.parameters import Connection, process_xml
+from gateway.stream.parameters import Connection
 from gateway.stream.plan import StreamPlan, plan_streams
 from gateway.stream.running_clock import running_clock
 from gateway.stream.session import Session
@@ -144,7 +145,7 @@ class ObservedStream:
 
     async def _read_parameters(self, connection: Connection) -> ParsedParameters:
         packet = await connection.ask(SendParameters())
-        self.parsed = await process_xml(packet.body, parse_parameters)
+        self.parsed = await asyncio.to_thread(parse_parameters, packet.body)
         return self.parsed
 
     @property

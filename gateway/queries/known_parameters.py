@@ -16,8 +16,13 @@ from gateway.rtc3d.parameters_changes import (
     differ_in_statistics_only,
     statistics_xml,
 )
-from gateway.rtc3d.parameters_xml import ParsedParameters, extract_sections, parse_parameters
-from gateway.stream.parameters import process_xml
+from gateway.rtc3d.parameters_xml import (
+    MAX_XML_BYTES,
+    ParsedParameters,
+    extract_sections,
+    parse_parameters,
+)
+from gateway.stream.parameters import XmlThread
 
 Sections = tuple[str, ...]
 """The parameter sections of a query, as in SECTIONS; () for all."""
@@ -61,15 +66,15 @@ class ServerAnswer:
             return None
         return parameters_json(self.parsed.parameters, self.sections[0] if len(self.sections) == 1 else "")
 
-    async def part(self, sections: Sections) -> "ServerAnswer | None":
-        """Return the answer for some sections, taken from this one.
+    async def part(self, sections: Sections, xml_thread: XmlThread) -> "ServerAnswer | None":
+        """Return the answer for some sections, taken from this one in ``xml_thread``.
 
         Returns None if this answer lacks one of them, or if it is not well-formed. Then only the server
         itself can answer.
         """
         if sections in self._single_sections:
             return self._single_sections[sections]
-        xml = await process_xml(self.xml, lambda whole: extract_sections(whole, sections))
+        xml = await xml_thread.process(self.xml, lambda whole: extract_sections(whole, sections))
         answer = None if xml is None else replace(self, sections=sections, xml=xml)
         if len(sections) == 1:
             self._single_sections[sections] = answer
@@ -79,9 +84,12 @@ class ServerAnswer:
 def unreadable(
     sections: Sections, xml: bytes, session: int, version: int, error: ParametersError
 ) -> ServerAnswer:
-    """Return an answer from which nothing can be read, for peers that ask for it as it is."""
+    """Return an answer from which nothing can be read, for peers that ask for it as it is.
+
+    Of XML that is too long to be parsed, it keeps the beginning.
+    """
     parsed = ParsedParameters(Parameters(), (str(error),))
-    return ServerAnswer(sections, xml, parsed, session, version, is_readable=False)
+    return ServerAnswer(sections, xml[:MAX_XML_BYTES], parsed, session, version, is_readable=False)
 
 
 Announce = Callable[[ServerAnswer | None, int], Awaitable[None]]
@@ -94,12 +102,20 @@ Publishes them, and then marks the frames that follow with the version.
 class KnownParameters:
     """The newest parameters of one source's server.
 
-    The version grows by one whenever they mean something else than before, and when they become void.
+    ``xml_thread`` parses them. The version grows by one whenever they mean something else than before, and
+    when they become void.
     ``former`` are those of the source before a reload, which are continued.
     """
 
-    def __init__(self, source: str, announce: Announce, former: "KnownParameters | None" = None) -> None:
+    def __init__(
+        self,
+        source: str,
+        xml_thread: XmlThread,
+        announce: Announce,
+        former: "KnownParameters | None" = None,
+    ) -> None:
         self._source = source
+        self._xml_thread = xml_thread
         self._announce = announce
         self._lock = asyncio.Lock()  # for one change at a time
         self.newest: ServerAnswer | None = None if former is None else former.newest
@@ -119,7 +135,7 @@ class KnownParameters:
         """
         async with self._lock:
             before = self.newest
-            reading = await process_xml(xml, lambda xml: _read(xml, before))
+            reading = await self._xml_thread.process(xml, lambda xml: _read(xml, before))
             if reading.is_changed:
                 self.version += 1
                 self._log_change(reading, is_first=before is None)
@@ -180,7 +196,7 @@ class _Reading(NamedTuple):
 
 
 def _read(xml: bytes, before: ServerAnswer | None) -> _Reading:
-    """Parse XML and compare it with the former answer. It may run in a thread."""
+    """Parse XML and compare it with the former answer. It runs in a thread."""
     if before is None:
         return _Reading(parse_parameters(xml), True)
     old = before.parsed

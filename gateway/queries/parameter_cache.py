@@ -31,7 +31,7 @@ from gateway.queries.known_parameters import (
 from gateway.queries.server_requests import ServerRequests
 from gateway.rtc3d.commands import SendParameters
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
-from gateway.stream.parameters import Connection, process_xml
+from gateway.stream.parameters import Connection, XmlThread
 
 logger = logging.getLogger(__name__)
 
@@ -47,6 +47,7 @@ class _Refusal:
 class ParameterCache:
     """The answers to SendParameters. ``known`` has the newest for all sections; ``announce`` gets changes.
 
+    ``xml_thread`` processes all XML of the source.
     ``former`` is the cache of the source before a reload.
     """
 
@@ -59,8 +60,9 @@ class ParameterCache:
     ) -> None:
         self._settings = settings
         self._requests = requests
+        self.xml_thread: XmlThread = XmlThread(settings.name)
         self.known: KnownParameters = KnownParameters(
-            settings.name, announce, None if former is None else former.known
+            settings.name, self.xml_thread, announce, None if former is None else former.known
         )
         # On one of these, the server gave the newest parameters. The others share them.
         self._connections: list[Connection] = []
@@ -187,11 +189,11 @@ class ParameterCache:
         newest = self.known.newest
         if newest is None or not sections:
             return newest
-        return await newest.part(sections) or self._answers.get(sections)
+        return await newest.part(sections, self.xml_thread) or self._answers.get(sections)
 
     async def _get(self, sections: Sections, *, fresh: bool) -> ServerAnswer:
         everything = await self._get_all(fresh=fresh)
-        part = await everything.part(sections) if sections else everything
+        part = await everything.part(sections, self.xml_thread) if sections else everything
         if part is not None:
             return part
         # The answer for all sections lacks these, or is not well-formed. So the server has to be asked.
@@ -286,9 +288,10 @@ class ParameterCache:
     async def _parse(self, sections: Sections, xml: bytes) -> ServerAnswer:
         session, version = self._requests.session, self.known.version
         try:
-            return ServerAnswer(sections, xml, await process_xml(xml, parse_parameters), session, version)
+            parsed = await self.xml_thread.process(xml, parse_parameters)
         except ParametersError as error:
             return self._keep_unreadable(sections, xml, error)
+        return ServerAnswer(sections, xml, parsed, session, version)
 
     def _keep_unreadable(self, sections: Sections, xml: bytes, error: ParametersError) -> ServerAnswer:
         session, version = self._requests.session, self.known.version

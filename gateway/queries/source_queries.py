@@ -23,7 +23,6 @@ from gateway.rtc3d.commands import SendCurrentFrame
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, Component, ComponentType
 from gateway.rtc3d.frames import detect_byte_order, split_frame
 from gateway.rtc3d.packets import PacketType
-from gateway.stream.parameters import process_xml
 from gateway.stream.state import StreamState
 
 
@@ -110,7 +109,7 @@ class SourceQueries:
                 "the server's XML cannot be read; ask without format=json to see it as received",
                 code="unreadable",
             )
-        payload = await process_xml(cached.xml, lambda _xml: cached.json)
+        payload = await self.parameters.xml_thread.process(cached.xml, lambda _xml: cached.json)
         if payload is None:
             raise QueryError(f"the server's answer has no section {question.name}", code="nothing-yet")
         return Answer(payload, JSON, attachment | {"recovered": list(cached.parsed.recovered)})

@@ -2,7 +2,8 @@
 
 import math
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Iterable, Iterator
+from itertools import islice
 from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
@@ -14,7 +15,11 @@ from gateway.rtc3d.parameters_layout import LAYOUT, PARENT_TAGS, ROOT, TAGS
 from gateway.safe_text import quoted, safe_text
 
 MAX_XML_BYTES: Final = 1024 * 1024
-"""Larger documents are not parsed. This is enough for about 8000 markers; parsing takes seconds at worst."""
+"""Larger documents are not parsed. This is enough for about 8000 markers; parsing takes 1.4 s at worst."""
+MAX_ITEMS: Final = 20_000
+"""The highest number of markers, tools, channels, plates and the like in one list."""
+MAX_TEXT_CHARACTERS: Final = 1000
+"""Longer texts are cut: labels go into log messages and into the names of topics."""
 MAX_RECOVERED: Final = 20
 """The highest number of entries in ``ParsedParameters.recovered``."""
 _PADDING: Final = b"\0 \t\r\n"
@@ -36,6 +41,8 @@ _NUMERIC_REFERENCES: Final = {
     b"&quot;": b"&#34;",
     b"&apos;": b"&#39;",
 }
+_SECTION_ENDS: Final = (b">", b" ", b"/", b"\t", b"\r", b"\n")
+"""What follows the name of an element."""
 _NOT_XML: Final = re.compile("[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
@@ -53,7 +60,8 @@ def parse_parameters(xml: bytes) -> ParsedParameters:
     be absent, NULs at the end and white space around texts are dropped, and the case of tags is ignored.
     A field that is absent or cannot be read gets its default; a cell of a calibration matrix gets NaN. XML
     that is not well-formed, such as the specification's own examples in §6.5 and §6.6, is repaired as a
-    human would read it. ``recovered`` has a line for each fault, up to MAX_RECOVERED.
+    human would read it. ``recovered`` has a line for each fault, up to MAX_RECOVERED. Items after the first
+    MAX_ITEMS of a list, and texts after MAX_TEXT_CHARACTERS, are left out.
 
     Raises ParametersError, and nothing else, if the XML has no parameters, declares entities, or is larger
     than MAX_XML_BYTES.
@@ -96,6 +104,21 @@ def extract_sections(xml: bytes, sections: Collection[str]) -> bytes | None:
     return etree.tostring(root)
 
 
+def named_sections(xml: bytes) -> frozenset[str]:
+    """Return the sections (keys of SECTIONS) whose elements seem to be in an XML reply, without parsing it.
+
+    It takes some milliseconds at worst. In damaged or hostile XML, the answer may be wrong.
+    """
+    begin = xml[:MAX_XML_BYTES].lower()
+    return frozenset(
+        key
+        for key, section in SECTIONS.items()
+        if any(
+            b"<%b%b" % (_SECTION_TAGS[section.field].lower().encode(), end) in begin for end in _SECTION_ENDS
+        )
+    )
+
+
 def _parse_tree(body: bytes, notes: list[str]) -> etree._Element:
     """Return the elements of §6 in ``body`` as a tree below RT_Parameters; raises ParametersError."""
     encoding = None  # the declared encoding, otherwise UTF-8
@@ -133,7 +156,7 @@ def _is_utf8(body: bytes) -> bool:
 
 
 def _parse(body: bytes, encoding: str | None) -> tuple[etree._Element | None, list[str]]:
-    """Return the root element (None if there is none) and a line for each error in the XML."""
+    """Return the root element (None if there is none) and a line for each error, up to MAX_RECOVERED."""
     parser = etree.XMLParser(
         encoding=encoding,
         recover=True,
@@ -148,7 +171,7 @@ def _parse(body: bytes, encoding: str | None) -> tuple[etree._Element | None, li
         root = etree.fromstring(body, parser)
     except etree.XMLSyntaxError:
         root = None
-    errors = parser.error_log.filter_from_errors()
+    errors = islice(parser.error_log.filter_from_errors(), MAX_RECOVERED)
     return root, [f"line {error.line}: {error.message.strip()}" for error in errors]
 
 
@@ -195,18 +218,36 @@ def _value(element: etree._Element, path: str, kind: type, notes: list[str]) -> 
     """Return the value at ``path`` below ``element``; None if it is absent or cannot be read."""
     head, star, rest = path.partition("*")
     if star:
-        items = (_value(item, rest.removeprefix("/"), kind, notes) for item in element.iterfind(head))
+        found_items = element.iterfind(head)
+        if kind in LAYOUT:
+            found_items = _first_items(found_items, head, notes)
+        items = (_value(item, rest.removeprefix("/"), kind, notes) for item in found_items)
         # Only a number can be None here; NaN takes its place in the row.
         return tuple(math.nan if item is None else item for item in items)
     if path == "@id":
-        return element.get("id", "").strip()
+        return _cut(element.get("id", "").strip(), notes)
     found = element.find(path) if path else element
     if found is None:
         return None
     if kind in LAYOUT:
         return _read(kind, found, notes)
     text = (found.text or "").strip()
-    return (text or None) if kind is str else _number(found, text, kind, notes)
+    return (_cut(text, notes) or None) if kind is str else _number(found, text, kind, notes)
+
+
+def _first_items(items: Iterable[etree._Element], path: str, notes: list[str]) -> Iterator[etree._Element]:
+    """Yield the first MAX_ITEMS of ``items``, which are at ``path``; note if there are more."""
+    for number, item in enumerate(items):
+        if number == MAX_ITEMS:
+            _note(notes, f"more than {MAX_ITEMS} elements {path}: the others are left out")
+            return
+        yield item
+
+
+def _cut(text: str, notes: list[str]) -> str:
+    if len(text) > MAX_TEXT_CHARACTERS:
+        _note(notes, f"a text of {len(text)} characters is cut to {MAX_TEXT_CHARACTERS}")
+    return text[:MAX_TEXT_CHARACTERS]
 
 
 def _number(element: etree._Element, text: str, kind: type, notes: list[str]) -> Any:

@@ -18,7 +18,6 @@ from collections import deque
 from enum import Enum
 from typing import Final
 
-from gateway.errors import ParametersError
 from gateway.rtc3d.commands import (
     Bye,
     Command,
@@ -31,8 +30,8 @@ from gateway.rtc3d.commands import (
     Version,
 )
 from gateway.rtc3d.packets import Packet, PacketType, decode_text
-from gateway.rtc3d.parameters import SECTIONS, sections_of
-from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.rtc3d.parameters import SECTIONS
+from gateway.rtc3d.parameters_xml import named_sections
 
 ANSWERING_TYPES: Final[dict[type[Command], frozenset[PacketType]]] = {
     Version: frozenset({PacketType.COMMAND}),
@@ -160,19 +159,12 @@ class ReplyMatcher:
         if not outstanding:
             # Accept any sections: some servers always send all of them, some leave sections out.
             return pending[0] if pending else None
-        sections = _sections_in(packet.body)
+        sections = named_sections(packet.body)
         return max((*outstanding, *pending), key=lambda command: _similarity(sections, command))
 
 
 def _verb(command: Command) -> str:
     return str(command).split()[0].lower()
-
-
-def _sections_in(xml: bytes) -> frozenset[str]:
-    try:
-        return sections_of(parse_parameters(xml).parameters)
-    except ParametersError:
-        return frozenset()
 
 
 def _similarity(received: frozenset[str], command: SendParameters) -> int:

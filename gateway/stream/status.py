@@ -23,6 +23,9 @@ MAX_ERROR_LENGTH: Final = 500
 MAX_LIMITATIONS: Final = 20
 """How many limitations of a connection are kept, and how many logged ones are remembered."""
 
+_MAX_REPAIRS: Final = 3
+"""How many repairs of the parameters are logged; the others are counted."""
+
 SKIPPED: Final = "skipped while behind"
 """The cause under which late frames that ``backlog: latest`` skips are counted."""
 
@@ -245,6 +248,14 @@ class StreamStatus:
     def parameters_changed(self, version: int) -> None:
         """Note the version of the server's parameters; the frames after this belong to it."""
         self.parameters_version = version
+
+    def parameters_repaired(self, repairs: Sequence[str]) -> None:
+        """Log what was repaired in the server's parameters, once for each text."""
+        rest = f"; and {len(repairs) - _MAX_REPAIRS} more" if len(repairs) > _MAX_REPAIRS else ""
+        text = f"parameters repaired: {'; '.join(repairs[:_MAX_REPAIRS])}{rest}"
+        if text not in self._logged_limitations:
+            self._logged_limitations.append(text)
+            logger.info("%s: %s", self.name, text)
 
     def rate_agreed(self, rate: str) -> None:
         """Note the rate at which the server streams; empty for its default, or while it does not stream."""

@@ -218,8 +218,8 @@ class StreamControl:
         except ParametersError as error:
             self._status.add_limitation(f"no parameters: {error}")
         else:
-            for text in parsed.recovered:
-                logger.info("%s: parameters repaired: %s", self._source.name, text)
+            if parsed.recovered:
+                self._status.parameters_repaired(parsed.recovered)
             return parsed.parameters
         return None
 

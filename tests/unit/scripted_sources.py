@@ -10,6 +10,7 @@ import pytest
 
 from gateway.config.settings import SourceSettings
 from gateway.stream.supervisor import Supervisor
+from gateway.worker_thread import WorkerThread
 from tests.unit.stream.scripted_server import ScriptedServer
 from tests.unit.stream.virtual_time import read_clocks
 
@@ -29,10 +30,30 @@ class Servers:
 
 def use_scripted_servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
     """Connect the supervisors of all sources to scripted servers from now on, in the loop's time."""
+    make_calls_of_worker_threads_at_once(monkeypatch)
     servers = Servers()
     supervisor = functools.partial(Supervisor, connect=servers.connect, read_clocks=read_clocks)
     monkeypatch.setattr("gateway.source.Supervisor", supervisor)
     return servers
+
+
+def make_calls_of_worker_threads_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the calls of every WorkerThread at once, without a thread."""
+
+    def submit(_thread: WorkerThread, call: Callable[[], Any]) -> Future[Any]:
+        future: Future[Any] = Future()
+        _make(future, call)
+        return future
+
+    monkeypatch.setattr(WorkerThread, "submit", submit)
+
+
+def _make(future: Future[Any], call: Callable[[], Any]) -> None:
+    if future.set_running_or_notify_cancel():
+        try:
+            future.set_result(call())
+        except Exception as error:  # noqa: BLE001 - the task that waits for the future gets it
+            future.set_exception(error)
 
 
 class SlowThreads(ThreadPoolExecutor):
@@ -63,8 +84,4 @@ class SlowThreads(ThreadPoolExecutor):
         """Make the calls that wait."""
         waiting, self._waiting = self._waiting, []
         for future, call in waiting:
-            if future.set_running_or_notify_cancel():
-                try:
-                    future.set_result(call())
-                except Exception as error:  # noqa: BLE001 - the task that waits for the future gets it
-                    future.set_exception(error)
+            _make(future, call)

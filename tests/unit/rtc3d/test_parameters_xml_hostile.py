@@ -7,7 +7,14 @@ import pytest
 
 from gateway.errors import ParametersError
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
-from gateway.rtc3d.parameters_xml import MAX_RECOVERED, MAX_XML_BYTES, parse_parameters
+from gateway.rtc3d.parameters_xml import (
+    MAX_ITEMS,
+    MAX_RECOVERED,
+    MAX_TEXT_CHARACTERS,
+    MAX_XML_BYTES,
+    named_sections,
+    parse_parameters,
+)
 from tests.spec_parameters import in_root, markers_of
 
 
@@ -85,3 +92,28 @@ class TestHostileXml:
         assert parameters.markers is not None
         assert parameters.markers.unit == "mm"
         assert recovered
+
+    def test_the_number_of_items_is_bounded(self) -> None:
+        xml = in_root(f"<The_3D><Markers>{'<Marker/>' * (MAX_ITEMS + 1)}</Markers></The_3D>")
+        parameters, recovered = parse_parameters(xml)
+        assert parameters.markers is not None
+        assert len(parameters.markers.markers) == MAX_ITEMS
+        assert recovered == (f"more than {MAX_ITEMS} elements Markers/Marker: the others are left out",)
+
+    def test_texts_are_cut(self) -> None:
+        long = "x" * (MAX_TEXT_CHARACTERS + 1)
+        marker = f"<Marker id='{long}'><Label>{long}</Label></Marker>"
+        parameters, recovered = parse_parameters(in_root(f"<The_3D><Markers>{marker}</Markers></The_3D>"))
+        assert parameters.markers is not None
+        [found] = parameters.markers.markers
+        assert (found.id, found.label) == (long[:-1], long[:-1])
+        assert recovered == 2 * (f"a text of {len(long)} characters is cut to {MAX_TEXT_CHARACTERS}",)
+
+
+class TestNamedSections:
+    def test_the_sections_of_a_reply_are_found_without_parsing_it(self) -> None:
+        xml = in_root("<The_3D><Markers/></The_3D><FORCE\n><AnalogChannels/></FORCE><Events/>")
+        assert named_sections(xml) == {"3d", "force", "events"}
+
+    def test_other_bytes_have_no_sections(self) -> None:
+        assert named_sections(b"<Generals><Event><The_6D" + b"<" * MAX_XML_BYTES + b"<Force>") == frozenset()

@@ -109,17 +109,20 @@ async def test_bytes_after_the_end_change_no_state() -> None:
     assert lab.status.state is state
 
 
-async def test_each_repair_of_the_parameters_is_logged(caplog: pytest.LogCaptureFixture) -> None:
-    xml = "<RT_Parameters><The_3D><Frequency>fast</Frequency><Unit>m</The_3D></RT_Parameters>"
+async def test_repairs_of_the_parameters_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
+    cells = "<The_3D><Frequency>fast</Frequency></The_3D>" * 2 + "<The_6D><Frequency>x</Frequency></The_6D>"
+    xml = f"<RT_Parameters>{cells}<The_3D><Unit>m</The_3D></RT_Parameters>"
     repairs = parse_parameters(xml.encode()).recovered
     lab = test_stream_control.Lab(
         lambda command: packet(2, xml) if command == "SendParameters" else obliging(command)
     )
     await lab.start()
-    assert len(repairs) > 1
-    assert logged(caplog, "stream_control") == [
-        f"INFO lab: parameters repaired: {repair}" for repair in repairs
-    ]
+    assert len(repairs) > 3
+    texts = "; ".join(repairs[:3])
+    expected = f"INFO lab (3d): parameters repaired: {texts}; and {len(repairs) - 3} more"
+    assert [line for line in logged(caplog, "status") if "repaired" in line] == [expected]
+    lab.status.parameters_repaired(repairs)
+    assert [line for line in logged(caplog, "status") if "repaired" in line] == [expected]
 
 
 async def test_a_server_that_refuses_every_form_is_named_with_what_to_check() -> None:

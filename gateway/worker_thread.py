@@ -1,0 +1,68 @@
+"""A thread for calls that may take long or block. The program does not wait for it when it ends."""
+
+import asyncio
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future
+from typing import Any, Final, TypeVar
+
+_IDLE_S: Final = 1.0
+"""The thread ends when it has had nothing to do for this long. The next call starts another one."""
+
+_Result = TypeVar("_Result")
+
+
+class WorkerThread:
+    """Makes calls one after the other in its own thread, which exists only while there are calls.
+
+    A concurrent.futures.ThreadPoolExecutor does not fit: Python waits for its threads at exit, so a disk that
+    does not respond would delay the end of the gateway. The queue is not bounded: the caller has to know how
+    much it submits.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
+        self._changed = threading.Condition()
+        self._is_running = False
+
+    def submit(self, call: Callable[[], _Result]) -> Future[_Result]:
+        """Queue ``call``; the returned future has its result or exception. It can be cancelled before."""
+        done: Future[_Result] = Future()
+        with self._changed:
+            self._calls.append((done, call))
+            if self._is_running:
+                self._changed.notify()
+            else:
+                threading.Thread(target=self._run, name=self._name, daemon=True).start()
+                self._is_running = True
+        return done
+
+    async def run(self, call: Callable[[], _Result]) -> _Result:
+        """Return the result of ``call``, or raise its exception."""
+        return await asyncio.wrap_future(self.submit(call))
+
+    def cancel_waiting(self) -> None:
+        """Cancel the calls that have not begun."""
+        with self._changed:
+            waiting, self._calls = self._calls, deque()
+        for done, _ in waiting:
+            done.cancel()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: bool(self._calls), _IDLE_S)
+                if not self._calls:
+                    self._is_running = False
+                    return
+                done, call = self._calls.popleft()
+            with contextlib.suppress(CancelledError):
+                if done.set_running_or_notify_cancel():
+                    try:
+                        done.set_result(call())
+                    except BaseException as error:  # noqa: BLE001 - whoever waits for the future gets it
+                        done.set_exception(error)
+            del done, call  # or they would stay in memory until the next call

@@ -1,0 +1,60 @@
+"""WorkerThread: a thread that the end of the program does not wait for."""
+
+import subprocess
+import sys
+import threading
+from functools import partial
+
+import pytest
+
+from gateway.worker_thread import WorkerThread
+
+
+async def test_calls_are_made_in_their_order_in_another_thread() -> None:
+    worker = WorkerThread("test")
+    made: list[tuple[int, str]] = []
+    for number in range(100):
+        worker.submit(partial(lambda number: made.append((number, threading.current_thread().name)), number))
+    assert await worker.run(lambda: len(made)) == 100
+    assert made == [(number, "test") for number in range(100)]
+
+
+async def test_the_exception_of_a_call_is_raised_and_later_calls_are_made() -> None:
+    worker = WorkerThread("test")
+    with pytest.raises(ZeroDivisionError):
+        await worker.run(lambda: 1 // 0)
+    assert await worker.run(lambda: "later") == "later"
+
+
+async def test_waiting_calls_can_be_cancelled() -> None:
+    worker, begun, released = WorkerThread("test"), threading.Event(), threading.Event()
+
+    def wait() -> None:
+        begun.set()
+        released.wait()
+
+    first = worker.submit(wait)
+    begun.wait()
+    second = worker.submit(lambda: None)
+    worker.cancel_waiting()
+    assert second.cancelled()
+    assert not first.done()
+    released.set()
+    assert await worker.run(lambda: "later") == "later"
+
+
+async def test_an_idle_thread_ends_and_the_next_call_starts_another(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("gateway.worker_thread._IDLE_S", 0.0)
+    worker = WorkerThread("test")
+    first = await worker.run(threading.current_thread)
+    first.join(10)
+    assert not first.is_alive()
+    assert await worker.run(threading.current_thread) is not first
+
+
+def test_the_program_ends_while_a_call_blocks() -> None:
+    code = (
+        "import threading; from gateway.worker_thread import WorkerThread\n"
+        "WorkerThread('test').submit(threading.Event().wait)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=30)
