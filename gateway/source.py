@@ -185,6 +185,8 @@ class Source:
     def _on_state(self, status: StreamStatus, former: StreamState) -> None:
         is_streaming = any(status.state is StreamState.STREAMING for status in self.statuses)
         self.fan_out.show_streaming(is_streaming)
+        if status.state is StreamState.WAITING:
+            self.fan_out.forget_layouts()
         if former is StreamState.NO_MEASUREMENT and status.state is StreamState.STREAMING:
             self._refresh.request()  # a new measurement may have other markers and tools
 

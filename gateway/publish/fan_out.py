@@ -1,6 +1,5 @@
 """Publishing one source's frames on every output."""
 
-import logging
 from collections.abc import Callable, Collection, Sequence
 from functools import lru_cache
 from typing import Final
@@ -9,16 +8,15 @@ from gateway.messages.encode import MESSAGE_TYPES, encode_content, has_lcm_form,
 from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import Output
 from gateway.outputs.status import OutputStatus
+from gateway.publish.item_counts import ItemCounts
 from gateway.publish.routes import ComponentRoute, FrameRoute, OutputRoute
 from gateway.publish.tool_poses import ToolPoses
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
 from gateway.rtc3d.parameters import Parameters
 
-_MAX_PLANS: Final = 256
+_MAX_PLANS: Final = 64
 """How many plans are cached. The server determines the layouts: each number of events is another one."""
-
-logger = logging.getLogger(__name__)
 
 
 class _Component:
@@ -73,7 +71,7 @@ class _Plan:
         self.wanted = wanted
         self.components = components
         self.tool_indices = tool_indices
-        self.num_items = {
+        self.num_items: dict[ComponentType, int] = {
             component.type: component.num_items
             for component in layout.components
             if component.type in wanted and component.type is not ComponentType.EVENT
@@ -88,7 +86,7 @@ class FanOut:
     under the same number, except for those with a maximum rate (ComponentRoute).
 
     It calls ``on_items_changed``, which may be assigned later, when the number of markers, tools, channels
-    or plates changes within a session.
+    or plates changes within a session. ``forget_layouts`` belongs to the end of a connection.
     """
 
     def __init__(
@@ -107,7 +105,7 @@ class FanOut:
         self._tool_poses = ToolPoses()
         self._plan_for = lru_cache(_MAX_PLANS)(self._new_plan)
         self._plan: _Plan | None = None  # of the previous frame
-        self._num_items: dict[ComponentType, tuple[int, int]] = {}  # with the session
+        self._item_counts = ItemCounts(source)
         self._is_streaming = False
         self.set_outputs(outputs)
 
@@ -123,8 +121,7 @@ class FanOut:
         self._routes = [open_routes.get(output) or self._open_route(output) for output in outputs]
         self._frame_routes = [route.frame_route for route in self._routes if route.frame_route is not None]
         self._tool_poses.set_routes([route for route in self._routes if route.output.has_tool_poses])
-        self._plan_for.cache_clear()
-        self._plan = None
+        self.forget_layouts()
 
     def _open_route(self, output: Output) -> OutputRoute:
         route = OutputRoute(self._source, output, self.frames, self._last_routes.get(output.name))
@@ -175,8 +172,8 @@ class FanOut:
             message = component.next_message(frame, stamp)
             for route in component.routes:
                 route.publish(message, stamp)
-        for index in plan.tool_indices:
-            self._tool_poses.publish(frame, index, stamp)
+        if plan.tool_indices:
+            self._tool_poses.publish(frame, plan.tool_indices, stamp)
 
     def skip(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> int:
         """Number the messages of these components like ``publish``, but publish nothing.
@@ -187,7 +184,7 @@ class FanOut:
         if not plan.components:
             return 0
         self._frame_sequence += 1
-        num_lost = sum(self._tool_poses.skip(frame, index) for index in plan.tool_indices)
+        num_lost = self._tool_poses.skip(frame, plan.tool_indices)
         for component in plan.components:
             message = component.next_message(frame, stamp)
             is_lost = [route.skip(message, stamp) for route in component.routes]
@@ -198,7 +195,8 @@ class FanOut:
         plan = self._plan
         if plan is None or plan.layout is not frame.layout or plan.wanted is not wanted:
             self._plan = plan = self._plan_for(frame.layout, wanted)
-            self._check_item_counts(plan, stamp.session)
+            if self._item_counts.update(plan.num_items, stamp.session):
+                self.on_items_changed()
         return plan
 
     def _new_plan(self, layout: FrameLayout, wanted: frozenset[ComponentType]) -> _Plan:
@@ -215,18 +213,10 @@ class FanOut:
         tools = [index for index, component in indexed if component.type is ComponentType.TOOLS]
         return _Plan(layout, wanted, plans, tools if self._tool_poses.is_used else [])
 
-    def _check_item_counts(self, plan: _Plan, session: int) -> None:
-        """Log each change in a number of items, and call ``on_items_changed`` if it is within a session."""
-        for component, num_items in plan.num_items.items():
-            before, session_before = self._num_items.get(component, (num_items, session))
-            self._num_items[component] = (num_items, session)
-            if before != num_items:
-                logger.info(
-                    "%s: number of items in %s changed from %d to %d",
-                    *(self._source, component.key, before, num_items),
-                )
-                if session == session_before:  # otherwise the handshake has just been done
-                    self.on_items_changed()
+    def forget_layouts(self) -> None:
+        """Forget how to publish earlier frames, because the connection that sent them has ended."""
+        self._plan_for.cache_clear()
+        self._plan = None
 
     def has_subscribers(self, components: Collection[ComponentType]) -> bool:
         """Return whether any output may have a subscriber to any of ``components``."""
@@ -247,6 +237,7 @@ class FanOut:
         """Log the end of each period in which messages were lost. Called once a second."""
         for route in self._routes:
             route.losses.check()
+        self._item_counts.check()
 
     def end_losses(self) -> None:
         """Log what was lost and is not logged yet, because the gateway stops."""

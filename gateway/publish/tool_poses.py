@@ -73,9 +73,12 @@ class ToolPoses:
         self._unit = "mm" if parameters.markers is None else parameters.markers.unit
         self._unit_m = metres_per_unit(self._unit)
 
-    def publish(self, frame: Frame, index: int, stamp: Stamp) -> None:
-        """Publish the pose of each tool in the frame's component at ``index``, if there are subscribers."""
-        num_tools = frame.layout.components[index].num_items
+    def publish(self, frame: Frame, indices: Sequence[int], stamp: Stamp) -> None:
+        """Publish the pose of each tool in the frame's components at ``indices``, if there are subscribers.
+
+        Usually that is one component.
+        """
+        num_tools = _num_tools(frame, indices)
         if self._unit_m is None:
             # Publish nothing: a robot that waits is better than one that moves by a guessed unit.
             self._count_loss(
@@ -84,7 +87,7 @@ class ToolPoses:
                 "set it to mm or m in the server",
                 num_tools,
             )
-            self.skip(frame, index)
+            self.skip(frame, indices)
             return
         if num_tools > _MAX_TOOLS:
             self._count_loss(
@@ -94,18 +97,23 @@ class ToolPoses:
             )
             return
         # Topics stay open when a frame has fewer tools: the number may go up and down.
-        if num_tools > len(self._tools):
-            self._open_topics(num_tools)
+        most_tools = max(frame.layout.components[index].num_items for index in indices)
+        if most_tools > len(self._tools):
+            self._open_topics(most_tools)
         if any(tool.is_wanted for tool in self._tools):
-            self._send(frame.component(index), stamp, self._unit_m)
+            for index in indices:
+                self._send(frame.component(index), stamp, self._unit_m)
 
-    def skip(self, frame: Frame, index: int) -> int:
+    def skip(self, frame: Frame, indices: Sequence[int]) -> int:
         """Use up the numbers of the poses that ``publish`` would publish; return how many poses that are."""
-        num_tools = frame.layout.components[index].num_items
-        wanted = [tool.name for tool in self._tools[:num_tools] if tool.is_wanted]
-        for name in wanted:
-            self._sequences[name] += 1
-        return len(wanted)
+        num_skipped = 0
+        for index in indices if _num_tools(frame, indices) <= _MAX_TOOLS else ():
+            num_tools = frame.layout.components[index].num_items
+            wanted = [tool.name for tool in self._tools[:num_tools] if tool.is_wanted]
+            for name in wanted:
+                self._sequences[name] += 1
+            num_skipped += len(wanted)
+        return num_skipped
 
     def _send(self, component: Component, stamp: Stamp, unit_m: float) -> None:
         tools = self._tools[: component.num_items]
@@ -124,10 +132,9 @@ class ToolPoses:
             output_route.losses.lost(cause, text, messages=num_tools)
 
     def _open_topics(self, num_tools: int) -> None:
-        """Open topics for ``num_tools`` tools. A name that had a topic before continues counting."""
-        self._close_topics()
-        names: set[str] = set()
-        for index in range(num_tools):
+        """Open what is missing of ``num_tools`` topics. A name that had a topic before continues counting."""
+        names = {tool.name for tool in self._tools}
+        for index in range(len(self._tools), num_tools):
             label = self._labels[index].strip() if index < len(self._labels) else ""
             name = unique_name(label or f"tool {index + 1}", names, MAX_LABEL_LENGTH)
             names.add(name)
@@ -142,3 +149,7 @@ class ToolPoses:
         for tool in self._tools:
             tool.set_routes(())
         self._tools.clear()
+
+
+def _num_tools(frame: Frame, indices: Sequence[int]) -> int:
+    return sum(frame.layout.components[index].num_items for index in indices)

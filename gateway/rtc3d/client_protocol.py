@@ -16,7 +16,7 @@ from gateway.rtc3d.commands import (
 )
 from gateway.rtc3d.components import LONG_EVENT, ByteOrder, ComponentType, encode_component
 from gateway.rtc3d.frame_reader import FrameReader
-from gateway.rtc3d.frames import Frame, announced_components, detect_byte_order, encode_frame, split_frame
+from gateway.rtc3d.frames import Frame, announced_components, detect_byte_order, encode_frame
 from gateway.rtc3d.packets import (
     DEFAULT_MAX_C3D_BYTES,
     DEFAULT_MAX_PACKET_BYTES,
@@ -234,9 +234,10 @@ class ClientProtocol:
         if self._frame_reader is not None:
             return self._frame_reader.read(body)
         byte_order = detect_byte_order(body, self._agreed_byte_order)
-        frame = split_frame(body, byte_order)
-        if frame.layout.components or frame.unknown_types:
-            self._frame_reader = FrameReader(byte_order)
+        reader = FrameReader(byte_order)
+        frame = reader.read(body)
+        if frame.layout.fields:
+            self._frame_reader = reader
             if byte_order != self._agreed_byte_order:
                 events.append(ByteOrderMismatch(byte_order))
         return frame

@@ -2,7 +2,6 @@
 
 import struct
 from collections.abc import Iterable, Iterator
-from functools import lru_cache
 from typing import Final, NamedTuple
 
 from gateway.errors import FrameError
@@ -22,7 +21,10 @@ _SIZE_AND_TYPE_BYTES: Final = 8
 _COUNT: Final = {"big": struct.Struct(">I"), "little": struct.Struct("<I")}
 _COUNT_BYTES: Final = 4
 _ITEM_BYTES: Final = {int(component): (component, dtype.itemsize) for component, dtype in ITEM_DTYPES.items()}
-_MAX_CACHED_LAYOUTS: Final = 256
+
+MAX_COMPONENTS: Final = 64
+"""A frame with more is rejected before its components are read: there are five types, and each is usually in
+a frame once."""
 
 
 class ComponentLayout(NamedTuple):
@@ -49,8 +51,7 @@ class FrameLayout:
 
     ``components`` are the components of known type in the order of the frame, ``unknown_types`` the types
     of the others, which are skipped. ``num_extra_bytes`` bytes follow the last component. Callers may
-    compare layouts with ``is`` for speed: ``split_frame`` returns the same object for equal layouts while
-    it is cached.
+    compare layouts with ``is`` for speed: a FrameReader returns the same object for equal layouts.
     """
 
     def __init__(
@@ -77,9 +78,6 @@ def _content_spans(fields: tuple[LayoutField, ...]) -> Iterator[tuple[int, int]]
         if field.component is not None:
             yield start + _SIZE_AND_TYPE_BYTES, end
         start = end
-
-
-_layout = lru_cache(_MAX_CACHED_LAYOUTS)(FrameLayout)
 
 
 class Frame:
@@ -141,13 +139,25 @@ def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
     """Split a type-3 packet's body into components (§7.1).
 
     Components of unknown type are skipped by their size. Bytes after the last component are ignored, as by
-    NDI's own code: some programs end every body in LF (field note 17). Raises FrameError if sizes and counts
-    contradict each other or the body's length: then no part of the frame can be trusted.
+    NDI's own code: some programs end every body in LF (field note 17). Raises FrameError if there are more
+    than MAX_COMPONENTS, or if sizes and counts contradict each other or the body's length: then no part of
+    the frame can be trusted.
+    """
+    fields, num_extra_bytes = frame_fields(body, byte_order)
+    return Frame(FrameLayout(byte_order, fields, num_extra_bytes), body)
+
+
+def frame_fields(body: bytes, byte_order: ByteOrder) -> tuple[tuple[LayoutField, ...], int]:
+    """Return the fields of a frame's layout, and how many bytes follow them.
+
+    Raises FrameError as ``split_frame`` does.
     """
     total = len(body)
     if total < _COUNT_BYTES:
         raise FrameError(f"data frame of {total} bytes: too short for its component count")
     (component_count,) = _COUNT[byte_order].unpack_from(body)
+    if component_count > MAX_COMPONENTS:
+        raise FrameError(f"data frame announces {component_count} components, more than {MAX_COMPONENTS}")
     fields: list[LayoutField] = []
     start = _COUNT_BYTES
     for index in range(component_count):
@@ -168,7 +178,7 @@ def split_frame(body: bytes, byte_order: ByteOrder) -> Frame:
             )
         fields.append(LayoutField(size, type_number, _component_layout(type_number, size, count)))
         start = end
-    return Frame(_layout(byte_order, tuple(fields), total - start), body)
+    return tuple(fields), total - start
 
 
 def _component_layout(type_number: int, size: int, count: int) -> ComponentLayout | None:

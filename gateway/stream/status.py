@@ -20,6 +20,9 @@ from gateway.stream.state import Phase, StreamState, stream_state
 MAX_ERROR_LENGTH: Final = 500
 """Longer error texts are cut: they may quote a server, and every status message contains the last one."""
 
+MAX_UNKNOWN_TYPES: Final = 8
+"""How many types that §7.2 does not define are listed for a connection."""
+
 MAX_LIMITATIONS: Final = 20
 """How many limitations of a connection are kept, and how many logged ones are remembered."""
 
@@ -108,6 +111,8 @@ class StreamStatus:
     _phase: Phase = field(default=Phase.WAITING, init=False)
     _failures: FailureLog = field(init=False)
     _defects: DefectLog = field(init=False)
+    _unknown_types: set[int] = field(default_factory=set, init=False)  # of this connection, those listed
+    _unknown_text: str = field(default="", init=False)
     _logged_limitations: deque[str] = field(default_factory=lambda: deque(maxlen=MAX_LIMITATIONS), init=False)
 
     def __post_init__(self) -> None:
@@ -141,6 +146,7 @@ class StreamStatus:
         self.session = self.sessions.next_after(self.session)
         self.connections += 1
         self.limitations.clear()
+        self._unknown_types.clear()
         self.byte_order = self.rate = ""
         self._enter(Phase.HANDSHAKING, "connected", server)
 
@@ -235,9 +241,21 @@ class StreamStatus:
 
     def unknown_components_skipped(self, types: Sequence[int]) -> None:
         """Count components of one frame whose types §7.2 does not define."""
-        text = f"components of unknown type {sorted(set(types))} are skipped"
-        self.losses.lost("unknown component", text, messages=len(types))
-        self._list_limitation(text)
+        if not self._unknown_types.issuperset(types):
+            self._remember_unknown(types)
+        self.losses.lost("unknown component", self._unknown_text, messages=len(types))
+
+    def _remember_unknown(self, types: Sequence[int]) -> None:
+        """List up to MAX_UNKNOWN_TYPES as a limitation; the server determines how many types there are."""
+        new = sorted(set(types) - self._unknown_types)
+        num_listed = MAX_UNKNOWN_TYPES - len(self._unknown_types)
+        self._unknown_types.update(new[:num_listed])
+        others = " and others" if len(new) > num_listed else ""
+        former = self._unknown_text
+        self._unknown_text = f"components of unknown type {sorted(self._unknown_types)}{others} are skipped"
+        if former in self.limitations:
+            self.limitations.remove(former)
+        self._list_limitation(self._unknown_text)
 
     def file_lost(self, text: str) -> None:
         """Count a C3D file that the server sent and that is not stored."""

@@ -271,5 +271,6 @@ def test_earlier_frames_do_not_change_how_a_frame_is_read(
             assert expected is None
         else:
             assert expected is not None
-            assert read.layout is expected.layout
+            assert read.layout.fields == expected.layout.fields
+            assert read.layout.num_extra_bytes == expected.layout.num_extra_bytes
             assert read.components == expected.components

@@ -210,7 +210,7 @@ def test_a_changed_number_of_markers_is_reported_once() -> None:
 
 
 def test_a_changed_number_of_markers_is_logged(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "gateway.publish.fan_out")
+    caplog.set_level(logging.INFO, "gateway.publish.item_counts")
     fan_out = FanOut("lab", [])
     for num_markers in (2, 3):
         fan_out.publish(markers_frame(1, timestamp_us=0, num_markers=num_markers), STAMP, ALL)
@@ -238,8 +238,10 @@ def test_the_number_of_remembered_layouts_is_bounded(memory: MemoryOutput) -> No
     fan_out = FanOut("lab", [memory])
     for num_events in range(300):
         fan_out.publish(events_frame(num_events), STAMP, ALL)
-    assert fan_out._plan_for.cache_info().currsize == 256
+    assert fan_out._plan_for.cache_info().currsize == 64
     assert len(memory.messages) == 300
+    fan_out.forget_layouts()
+    assert fan_out._plan_for.cache_info().currsize == 0
 
 
 def test_a_component_has_subscribers_if_one_output_has_one() -> None:

@@ -176,3 +176,25 @@ def test_without_parameters_poses_are_converted_from_millimetres() -> None:
     publish_tools(FanOut("lab", [output]), 1)
     [pose] = output.poses("tool 1")
     assert pose.position_m == pytest.approx((0.1, 0.2, 0.3))
+
+
+def test_the_tools_of_all_6d_components_of_a_frame_count() -> None:
+    """So one frame costs no more poses than one with the largest number of tools."""
+    output = ToyOutput("toy", "tool 1", has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
+    component = tools_frame(*[IN_VIEW] * 100).body[4:]
+    for count, published in ((2, 2), (3, 2)):
+        fan_out.publish(split_frame(count.to_bytes(4, "big") + component * count, "big"), STAMP, ALL)
+        assert len(output.poses("tool 1")) == published
+    [loss] = fan_out.outputs[0][1].losses
+    assert (loss.cause, loss.messages) == ("too many tools", 300)
+
+
+def test_topics_stay_open_when_tools_are_added() -> None:
+    output = ToyOutput("toy", "tool 1", has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
+    publish_tools(fan_out, 1)
+    before = set(output.tool_names())
+    publish_tools(fan_out, 3)
+    assert before == {"tool 1"}
+    assert sorted(output.tool_names()) == ["tool 1", "tool 2", "tool 3"]

@@ -1,6 +1,7 @@
 """Frames that repeat the layout of an earlier frame, and frames that only appear to."""
 
 import struct
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -23,12 +24,14 @@ def reader_after(*bodies: bytes, order: ByteOrder = "big") -> FrameReader:
 
 
 @bodies_of_both_orders
-def test_the_first_and_the_second_frame_of_a_layout_are_read_alike(body: bytes, order: ByteOrder) -> None:
+def test_all_frames_of_a_layout_are_read_alike_and_share_it(body: bytes, order: ByteOrder) -> None:
     reader = FrameReader(order)
     expected = split_frame(body, order)
-    for _ in range(2):
+    layout = reader.read(body).layout
+    for _ in range(3):
         read = reader.read(bytes(bytearray(body)))
-        assert read.layout is expected.layout
+        assert read.layout is layout
+        assert read.layout.fields == expected.layout.fields
         assert read.components == expected.components
         assert read.unknown_types == expected.unknown_types
 
@@ -37,8 +40,9 @@ def test_frames_of_one_layout_may_differ_in_number_time_and_items() -> None:
     wire = bytearray(MARKERS.wire["big"])
     wire[8:20] = struct.pack(">iq", -7, 2**40)
     wire[24:] = bytes(len(wire) - 24)
-    read = reader_after(MARKERS_FRAME).read(frame("big", bytes(wire)))
-    assert read.layout is split_frame(MARKERS_FRAME, "big").layout
+    reader = reader_after(MARKERS_FRAME, MARKERS_FRAME)
+    read = reader.read(frame("big", bytes(wire)))
+    assert read.layout is reader.read(MARKERS_FRAME).layout
     assert read.number_and_timestamp == (-7, 2**40)
     assert read.contents == (bytes(wire[8:]),)
 
@@ -49,7 +53,7 @@ def test_a_frame_that_differs_in_anything_else_does_not_have_the_layout(offset: 
     body = bytearray(MARKERS_FRAME)
     body[offset] ^= 2
     with pytest.raises(FrameError):
-        reader_after(MARKERS_FRAME).read(bytes(body))
+        reader_after(MARKERS_FRAME, MARKERS_FRAME).read(bytes(body))
 
 
 @pytest.mark.parametrize("order", ["big", "little"])
@@ -58,14 +62,14 @@ def test_frames_with_and_without_extra_bytes_are_read_alike(order: ByteOrder) ->
     reader = FrameReader(order)
     for body in [*bodies, *bodies, *reversed(bodies)]:
         read = reader.read(bytes(bytearray(body)))
-        assert read.layout is split_frame(body, order).layout
+        assert read.layout.fields == split_frame(body, order).layout.fields
         assert read.components == split_frame(FULL_FRAME[order], order).components
         assert read.layout.num_extra_bytes == len(body) - len(FULL_FRAME[order])
 
 
 def test_the_extra_bytes_of_frames_with_one_layout_may_differ() -> None:
-    read = reader_after(MARKERS_FRAME + b"\n").read(MARKERS_FRAME + b"\0")
-    assert read.layout is split_frame(MARKERS_FRAME + b"\n", "big").layout
+    reader = reader_after(MARKERS_FRAME + b"\n", MARKERS_FRAME + b"\n")
+    assert reader.read(MARKERS_FRAME + b"\0").layout is reader.read(MARKERS_FRAME + b"\n").layout
 
 
 def test_two_layouts_of_the_same_size_are_distinguished() -> None:
@@ -74,8 +78,12 @@ def test_two_layouts_of_the_same_size_are_distinguished() -> None:
         for kind, count in ((ComponentType.MARKERS, 2), (ComponentType.TOOLS, 1))
     ]
     reader = FrameReader("big")
-    read = [reader.read(body).layout for body in bodies * 2]
-    assert read == [split_frame(body, "big").layout for body in bodies * 2]
+    read = [reader.read(body).layout for body in bodies * 3]
+    assert [layout.fields for layout in read] == [
+        split_frame(body, "big").layout.fields for body in bodies * 3
+    ]
+    assert read == read[:2] * 3
+    assert read[0] is not read[1]
 
 
 def test_any_number_of_layouts_can_be_read() -> None:
@@ -102,5 +110,22 @@ def test_the_number_of_remembered_layouts_is_bounded() -> None:
     reader = FrameReader("big")
     for count in range(100):
         markers = np.zeros(count, ITEM_DTYPES[ComponentType.MARKERS])
-        reader.read(frame("big", encode_component(ComponentType.MARKERS, 1, 1, markers)))
-        assert len(reader._templates) <= 32
+        for _ in range(3):
+            reader.read(frame("big", encode_component(ComponentType.MARKERS, 1, 1, markers)))
+        assert len(reader._templates) <= len(reader._layouts) <= 64
+
+
+def test_layouts_of_one_connection_are_not_those_of_another() -> None:
+    """So they are forgotten with the connection."""
+    first, second = (reader_after(MARKERS_FRAME).read(MARKERS_FRAME).layout for _ in range(2))
+    assert first is not second
+
+
+def test_a_layout_of_large_components_takes_little_memory() -> None:
+    body = frame("big", *[encode_component(ComponentType.ANALOG, 1, 1, np.zeros(60_000, ">f4"))] * 64)
+    reader = FrameReader("big")
+    tracemalloc.start()
+    for _ in range(3):
+        reader.read(body)
+    assert tracemalloc.get_traced_memory()[1] < 100_000
+    tracemalloc.stop()

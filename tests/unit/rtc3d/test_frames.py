@@ -5,7 +5,7 @@ import pytest
 
 from gateway.rtc3d.components import LONG_EVENT, SHORT_EVENT, ComponentType, encode_component
 from gateway.rtc3d.frames import detect_byte_order, encode_frame, split_frame
-from tests.unit.rtc3d.wire import bodies_of_both_orders, frame, only_component
+from tests.unit.rtc3d.wire import frame, only_component
 from tests.vectors import (
     ANALOG,
     EMPTY_FRAME,
@@ -95,8 +95,3 @@ def test_the_frame_that_controls_wavefronts_recording_is_split_and_encoded(
 
     events = np.array([(event_id, 0, -1, -1, -1)], LONG_EVENT)
     assert encode_frame([encode_component(ComponentType.EVENT, -1, 0, events, order)], order) == body
-
-
-@bodies_of_both_orders
-def test_frames_with_equal_layouts_share_one_layout_object(body: bytes, order: ByteOrder) -> None:
-    assert split_frame(body, order).layout is split_frame(bytes(bytearray(body)), order).layout

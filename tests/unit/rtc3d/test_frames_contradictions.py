@@ -186,3 +186,13 @@ def test_if_neither_order_makes_sense_the_error_is_that_of_the_expected_one(
     with pytest.raises(FrameError) as of_search:
         detect_byte_order(FULL_FRAME[order][:-1], order)
     assert str(of_search.value) == str(of_split.value)
+
+
+@both_orders
+@pytest.mark.parametrize("count", [65, 2_000_000, 0xFFFFFFFF])
+def test_a_frame_with_more_than_64_components_is_rejected_before_they_are_read(
+    count: int, order: ByteOrder
+) -> None:
+    unknown = (8).to_bytes(4, order) + (99).to_bytes(4, order)
+    assert_rejected(frame(order, unknown * min(count, 2_000_000), count=count), order, count, 64)
+    assert len(split_frame(frame(order, *[unknown] * 64), order).unknown_types) == 64

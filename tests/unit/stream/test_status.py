@@ -177,6 +177,18 @@ def test_every_frame_that_is_lost_is_counted_by_its_cause() -> None:
     assert status.limitations == ["components of unknown type [7, 9] are skipped"]
 
 
+def test_the_listed_types_of_unknown_components_are_bounded_and_one_limitation() -> None:
+    status = StreamStatus("3d")
+    status.add_limitation("another one\x1b")
+    for first in range(100, 200, 5):
+        status.unknown_components_skipped(tuple(range(first, first + 5)))
+    text = "components of unknown type [100, 101, 102, 103, 104, 105, 106, 107] and others are skipped"
+    assert status.limitations == [r"another one\x1b", text]
+    status.connected(SERVER)
+    status.unknown_components_skipped((6,))
+    assert status.limitations == ["components of unknown type [6] are skipped"]
+
+
 def test_repeated_events_are_added_up() -> None:
     status = StreamStatus("3d")
     for count in (3, 4):
