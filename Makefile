@@ -155,7 +155,7 @@ fuzz: .venv/installed
 			-max_total_time=$(FUZZ_SECONDS) -print_final_stats=1 -verbosity=0); \
 	done
 
-# Random faults for SOAK_MINUTES, then a report; not part of the check.
+# Random faults and attacks for SOAK_MINUTES, then a report; not part of the check.
 SOAK_MINUTES ?= 30
 
 soak: build/compiled/complete
