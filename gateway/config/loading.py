@@ -9,13 +9,12 @@ from typing import Any, Final, NamedTuple, TypeVar
 from pydantic import ValidationError
 
 from gateway.config.environment import VARIABLE_PREFIX, apply_overrides, variable_name
+from gateway.config.files import read_file
 from gateway.config.secrets import MASK, file_key_for, find_secrets, is_secret_key, mask_secrets_in_text
 from gateway.config.section import UNKNOWN_KEY, Section
 from gateway.config.settings import OutputSettings, Settings
 from gateway.config.yaml_document import Document, Location, Position, line_and_column_after, read_yaml
 from gateway.errors import ConfigError
-
-MAX_FILE_BYTES: Final = 1024 * 1024
 
 AnySection = TypeVar("AnySection", bound=Section)
 
@@ -96,14 +95,11 @@ def _read_file(path: Path, section: type[Section], example: str) -> Document:
 
 def _text_of(path: Path, example: str) -> str:
     try:
-        with path.open("rb") as file:
-            data = file.read(MAX_FILE_BYTES + 1)
+        data = read_file(path)
     except OSError as error:
         raise ConfigError(
             f"{path}: cannot be read: {error.strerror}; name a YAML file such as {example}"
         ) from error
-    if len(data) > MAX_FILE_BYTES:
-        raise ConfigError(f"{path}: too large; the limit is {MAX_FILE_BYTES} bytes")
     try:
         return data.decode("utf-8-sig")  # some editors begin a file with a byte order mark
     except UnicodeDecodeError as error:
@@ -114,33 +110,40 @@ def _text_of(path: Path, example: str) -> str:
 
 _Mistake = tuple[Position, ConfigError]
 
+_MAX_MISTAKES: Final = 50
+"""How many mistakes an error lists; nobody reads more, and at a reload each is a line in the log."""
+
 
 def _in_order(mistakes: list[_Mistake]) -> ConfigError:
-    """Return all mistakes as one error: those of the file by line, then those of variables."""
+    """Return the first mistakes as one error: those of the file by line, then those of variables."""
     ordered = sorted(mistakes, key=lambda mistake: (mistake[0].line == 0, *mistake[0], str(mistake[1])))
-    return ConfigError("\n".join(str(error) for _, error in ordered))
+    lines = [str(error) for _, error in ordered[:_MAX_MISTAKES]]
+    if len(ordered) > _MAX_MISTAKES:
+        lines.append(f"and {len(ordered) - _MAX_MISTAKES} more mistakes; correct these first")
+    return ConfigError("\n".join(lines))
 
 
 def _explained(document: Document, error: ValidationError) -> list[_Mistake]:
     """Return the mistakes in a validation error, each with its position."""
     mistakes = []
+    variables = [
+        (location, position.origin)
+        for location, position in document.positions.items()
+        if position.origin.startswith(VARIABLE_PREFIX)
+    ]
     for details in error.errors(include_url=False):
         location, text = details["loc"], details["msg"]
         position = document.key_positions.get(location) if details["type"] == UNKNOWN_KEY else None
         position = position or document.nearest_position(location)
         if position.line:
-            text += _variables_in(document, location)
+            text += _those_in(variables, location)
         mistakes.append((position, position.error(location, text)))
     return mistakes
 
 
-def _variables_in(document: Document, location: Location) -> str:
+def _those_in(variables: list[tuple[Location, str]], location: Location) -> str:
     """Return a hint that names the variables that set parts of the value; one may have the mistake."""
-    names = {
-        position.origin
-        for other, position in document.positions.items()
-        if other[: len(location)] == location and position.origin.startswith(VARIABLE_PREFIX)
-    }
+    names = {name for place, name in variables if place[: len(location)] == location}
     return f" (a part of it is from {', '.join(sorted(names))})" if names else ""
 
 

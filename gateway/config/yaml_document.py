@@ -12,7 +12,7 @@ import yaml
 from gateway.config.section import describe
 from gateway.errors import ConfigError
 
-MAX_VALUES: Final = 10_000
+MAX_VALUES: Final = 5_000
 """The maximum number of values in a text. Values that an alias repeats count again."""
 
 MAX_DEPTH: Final = 32
@@ -53,15 +53,23 @@ class Position(NamedTuple):
 
 
 class _Loader(yaml.SafeLoader):
-    """A SafeLoader that limits nesting to MAX_DEPTH, because deep recursion would overflow the stack."""
+    """A SafeLoader that limits nesting to MAX_DEPTH and nodes to what MAX_VALUES values and their keys need.
+
+    Deep recursion would overflow the stack. PyYAML takes 10 s for a MiB of very short values.
+    """
 
     _depth = 0
+    _nodes = 0
 
     def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
         self._depth += 1
         if self._depth > MAX_DEPTH:
             mark = parent.start_mark if parent else None
             raise yaml.composer.ComposerError(None, None, f"found more than {MAX_DEPTH} levels", mark)
+        self._nodes += 1
+        if self._nodes > 2 * MAX_VALUES:
+            mark = parent.start_mark if parent else None
+            raise yaml.composer.ComposerError(None, None, f"found more than {MAX_VALUES} values", mark)
         node = super().compose_node(parent, index)
         self._depth -= 1
         return node

@@ -1,23 +1,34 @@
-"""A minimal HTTP/1.1 server for monitoring: GET only, small requests, one per connection.
+"""A minimal HTTP/1.1 server for monitoring: GET and HEAD, small requests, one per connection.
 
 Pages are built in the event loop, so their counters are consistent with each other. Clients are
-untrusted: size, duration and number of requests are bounded.
+untrusted: size, duration and number of connections are bounded, and so is how often a page is built.
 """
 
 import asyncio
 import contextlib
+import logging
+import math
+import time
 from collections.abc import Callable, Mapping
 from http import HTTPStatus
 from typing import Final, NamedTuple
 
+logger = logging.getLogger(__name__)
+
 MAX_REQUEST_BYTES: Final = 8192
 """The size limit of a request's head; a connection that exceeds it is closed."""
 
-MAX_CONNECTIONS: Final = 16
-"""How many connections may be open; further ones are closed without an answer."""
+MAX_CONNECTIONS: Final = 128
+"""How many connections may be open; one more disconnects the oldest, which has had the most time."""
 
 REQUEST_TIMEOUT_S: Final = 5.0
 """How long a connection may last."""
+
+MAX_PAGE_AGE_S: Final = 0.1
+"""How long a page is served again: building it takes the event loop some ms, however many clients ask."""
+
+_MAX_DISCARDED_BYTES: Final = 65536
+"""How much to read after the request, such as the body of a POST; more is reset."""
 
 
 class Page(NamedTuple):
@@ -34,7 +45,12 @@ class HttpPages:
     def __init__(self, pages: Mapping[str, Callable[[], Page]]) -> None:
         self._pages = pages
         self._server: asyncio.Server | None = None
+        self._built: dict[str, tuple[float, Page]] = {}
+        """The newest page of each path, and when it was built, on the monotonic clock in s."""
+        self._defective: set[str] = set()
+        """The paths whose defect is in the log."""
         self._connections: dict[asyncio.Task[None], asyncio.WriteTransport] = {}
+        """The open connections, oldest first."""
 
     async def start(self, address: str, port: int) -> None:
         """Listen; raises OSError if the address or the port cannot be bound."""
@@ -51,9 +67,11 @@ class HttpPages:
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         task = asyncio.current_task()
-        if task is None or len(self._connections) >= MAX_CONNECTIONS:
-            writer.transport.abort()
+        if task is None:
             return
+        if len(self._connections) >= MAX_CONNECTIONS:
+            oldest = next(iter(self._connections))
+            self._connections.pop(oldest).abort()
         self._connections[task] = writer.transport
         try:
             # The client caused these errors; an operator of the gateway can do nothing about them.
@@ -62,39 +80,63 @@ class HttpPages:
             ):
                 async with asyncio.timeout(REQUEST_TIMEOUT_S):
                     head = await reader.readuntil(b"\r\n\r\n")
-                    writer.write(_encode(self._respond(head)))
+                    writer.write(self._response(head))
                     await writer.drain()
-                    writer.close()
-                    await writer.wait_closed()
+                    writer.write_eof()
+                    # If bytes are unread, closing resets the connection, and the client may lose the page.
+                    discarded = 0
+                    while discarded < _MAX_DISCARDED_BYTES and (data := await reader.read(4096)):
+                        discarded += len(data)
         finally:
             writer.transport.abort()
-            del self._connections[task]
+            self._connections.pop(task, None)
+
+    def _response(self, head: bytes) -> bytes:
+        method = head.partition(b" ")[0]
+        page = self._respond(head)
+        return _head(page) + (b"" if method == b"HEAD" else page.body)
 
     def _respond(self, head: bytes) -> Page:
         request = head.split(b"\r\n", 1)[0].decode("latin-1").split(" ")
         if len(request) != 3 or not request[2].startswith("HTTP/1."):
             return _error_page(HTTPStatus.BAD_REQUEST)
         method, target, _ = request
-        page = self._pages.get(target.partition("?")[0])
-        if page is None:
+        path = target.partition("?")[0]
+        if path not in self._pages:
             paths = "".join(f"{path}\n" for path in self._pages)
             return Page(HTTPStatus.NOT_FOUND, "text/plain; charset=utf-8", f"Pages:\n{paths}".encode())
-        if method != "GET":
+        if method not in {"GET", "HEAD"}:
             return _error_page(HTTPStatus.METHOD_NOT_ALLOWED)
-        return page()
+        return self._page(path)
+
+    def _page(self, path: str) -> Page:
+        """Return the page, built at most MAX_PAGE_AGE_S ago."""
+        now_s = time.monotonic()
+        built_s, page = self._built.get(path, (-math.inf, None))
+        if page is None or now_s - built_s > MAX_PAGE_AGE_S:
+            try:
+                page = self._pages[path]()
+            except Exception:
+                if path not in self._defective:  # clients could fill the log
+                    logger.exception(
+                        "metrics: defect in the gateway: no page %s; report this with the log", path
+                    )
+                self._defective.add(path)
+                page = _error_page(HTTPStatus.INTERNAL_SERVER_ERROR, "see the log")
+            self._built[path] = now_s, page
+        return page
 
 
-def _error_page(status: HTTPStatus) -> Page:
-    return Page(status, "text/plain; charset=utf-8", f"{status.phrase}; only GET is served\n".encode())
+def _error_page(status: HTTPStatus, reason: str = "only GET and HEAD are served") -> Page:
+    return Page(status, "text/plain; charset=utf-8", f"{status.phrase}; {reason}\n".encode())
 
 
-def _encode(page: Page) -> bytes:
-    head = (
+def _head(page: Page) -> bytes:
+    return (
         f"HTTP/1.1 {page.status} {page.status.phrase}\r\n"
         f"Content-Type: {page.content_type}\r\n"
         f"Content-Length: {len(page.body)}\r\n"
-        "Allow: GET\r\n"
+        "Allow: GET, HEAD\r\n"
         "Cache-Control: no-store\r\n"
         "Connection: close\r\n\r\n"
-    )
-    return head.encode() + page.body
+    ).encode()

@@ -7,6 +7,7 @@ from typing import Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from gateway.config.files import check_is_file
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ITEM_DTYPES, MISSING, MISSING_RELIABILITY, ComponentType, Items
 from gateway.rtc3d.parameters import (
@@ -101,8 +102,14 @@ def _read(path: Path) -> Any:
         import ezc3d  # noqa: PLC0415 - an optional extra
     except ImportError as error:
         raise TakeError(f"{path} cannot be played without ezc3d; install it: {_INSTALL}") from error
-    if not path.is_file():  # ezc3d never returns if it reads a folder
-        raise TakeError(f"{path} is not a file; give the path of a C3D file")
+    try:
+        check_is_file(path)
+        with path.open("rb") as file:
+            # Byte 2 of every C3D file is 0x50. ezc3d never returns from a folder or from GBs of zeros.
+            if file.read(2)[1:] != b"\x50":
+                raise TakeError(f"{path} is not a C3D file; choose another file")
+    except OSError as error:
+        raise TakeError(f"{path} cannot be read: {error.strerror}; give the path of a C3D file") from error
     try:
         return ezc3d.c3d(str(path), extract_forceplat_data=True)
     except Exception as error:  # noqa: BLE001 - the C++ library does not document its errors

@@ -8,13 +8,23 @@ from typing import Any, Final
 
 import zenoh
 
+from gateway.config.files import read_file
 from gateway.config.secrets import mask_secrets_in_text
+from gateway.config.yaml_document import line_and_column_after
 from gateway.errors import ConfigError
 
 _ZENOH_MESSAGE: Final = re.compile(
     r'Message \{ msg: "((?:[^"\\]|\\.)*)", location: Some\(Location \{ line: (\d+), column: (\d+)'
 )
 """The Rust debug text by which Zenoh reports a value in a file that it cannot use."""
+
+_MAX_DEPTH: Final = 64
+"""The maximum number of nested brackets in a file: Zenoh's parser overflows the stack at a few thousand."""
+
+_JSON5_TOKEN: Final = re.compile(
+    r"""(?P<skipped>"(?:\\.|[^"\\])*"|'(?:\\.|[^'\\])*'|//[^\n]*|/\*.*?\*/)|(?P<open>[\[{])|(?P<close>[]}])""",
+    re.DOTALL,
+)
 
 _DEFAULTS: Final = {
     "transport": {
@@ -40,11 +50,26 @@ def zenoh_config(config: Path | Mapping[str, Any]) -> zenoh.Config:
     """
     try:
         if isinstance(config, Path):
-            return zenoh.Config.from_file(str(config))
+            return read_zenoh_config(config)
         return zenoh.Config.from_json5(json.dumps(_merged(_DEFAULTS, config)))
-    except (zenoh.ZError, TypeError, ValueError) as error:
+    except (OSError, zenoh.ZError, TypeError, ValueError) as error:
         where = f"file {config}" if isinstance(config, Path) else "inline zenoh.config"
         raise ConfigError(f"Zenoh does not accept the {where}: {zenoh_reason(error)}") from error
+
+
+def read_zenoh_config(path: Path) -> zenoh.Config:
+    """Return Zenoh's configuration from a file.
+
+    Raises OSError if the file cannot be read; ZError, TypeError or ValueError if Zenoh cannot use it.
+    """
+    text = read_file(path).decode("utf-8", "replace")  # Zenoh reports what is not UTF-8
+    depth = 0
+    for token in _JSON5_TOKEN.finditer(text):
+        depth += (token.lastgroup == "open") - (token.lastgroup == "close")
+        if depth > _MAX_DEPTH:
+            line, column = line_and_column_after(text[: token.start()])
+            raise ValueError(f"line {line}, column {column}: found more than {_MAX_DEPTH} nested brackets")
+    return zenoh.Config.from_file(str(path))
 
 
 def _merged(defaults: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
@@ -60,7 +85,7 @@ def _merged(defaults: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, 
 
 def zenoh_reason(error: Exception) -> str:
     """Return the text of Zenoh's error on one line, without source locations and without secrets."""
-    text = str(error)
+    text = (error.strerror if isinstance(error, OSError) else None) or str(error)
     if message := _ZENOH_MESSAGE.search(text):
         text = f"line {message[2]}, column {message[3]}: " + re.sub(r"\\(.)", r"\1", message[1])
     text = re.sub(r"\s+at \S+\.rs:\d+\.?", "", text)

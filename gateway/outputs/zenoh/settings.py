@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, PlainValidator, ValidationInfo
 from gateway.config.section import describe, expects, validation_error
 from gateway.config.settings import OutputSettings
 from gateway.config.values import MaxRates, Switch
-from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.outputs.zenoh.config import read_zenoh_config, zenoh_reason
 
 DEFAULT_ZENOH_PREFIX: Final = "mocap"
 
@@ -49,7 +49,7 @@ def _zenoh_config(value: object, info: ValidationInfo) -> Path | dict[str, Any]:
             if folder is None:
                 return Path(value)
             path = folder / value
-            _ask_zenoh(lambda: zenoh.Config.from_file(path), f"the file {path}")
+            _ask_zenoh(lambda: read_zenoh_config(path), f"the file {path}")
             return path
     raise validation_error(
         f"found {describe(value)}; expected a JSON5 file's path or a mapping with Zenoh's own keys"
@@ -59,7 +59,7 @@ def _zenoh_config(value: object, info: ValidationInfo) -> Path | dict[str, Any]:
 def _ask_zenoh(read: Callable[[], object], what: str) -> None:
     try:
         read()
-    except (zenoh.ZError, TypeError, ValueError) as error:
+    except (OSError, zenoh.ZError, TypeError, ValueError) as error:
         raise validation_error(f"Zenoh refuses {what}: {zenoh_reason(error)}") from None
 
 
