@@ -15,6 +15,7 @@ from gateway.publish.routes import OPENING_S
 from gateway.queries.service import SourceQueryService
 from gateway.queries.source_queries import SourceQueries
 from gateway.source import Source
+from gateway.worker_thread import WorkerThread
 
 _STATUS_PERIOD_S: Final = 1.0
 _SENDING_TIMEOUT_S: Final = 0.5
@@ -212,7 +213,7 @@ class Gateway:
 
 async def _close(output: Output) -> None:
     await output.stop_queries()
-    await asyncio.to_thread(output.close)
+    await WorkerThread(f"close {output.name}").run(output.close)
 
 
 def _switch_tool_poses(outputs: Sequence[Output], wanted: Sequence[Output]) -> list[str]:

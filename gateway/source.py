@@ -4,6 +4,7 @@ import asyncio
 import logging
 import math
 from collections.abc import Awaitable, Callable, Coroutine, Sequence
+from functools import partial
 from typing import Any, Final
 
 from gateway.c3d_spool import Spool
@@ -25,6 +26,7 @@ from gateway.stream.state import StreamState
 from gateway.stream.status import SessionNumbers, StreamStatus
 from gateway.stream.streams import AutomaticStreams, ConfiguredStreams
 from gateway.stream.supervisor import Callbacks, Listener, Supervisor, component_keys, stream_name
+from gateway.worker_thread import WorkerThread
 
 _MAX_UNSTORED_FILES: Final = 4
 """How many C3D files may wait in memory to be stored; further ones are dropped and logged."""
@@ -78,6 +80,8 @@ class Source:
             *(settings.host, settings.port),
         )
         self._num_unstored_files = 0
+        self._storing = WorkerThread(f"c3d-store-{self.name}")
+        self._reading = WorkerThread(f"c3d-read-{self.name}")
         self.sequence: int = 0 if before is None else before.sequence
         """The sequence number of the newest status and clock messages."""
         self._newest_status: bytes = self._encoded_status()
@@ -238,7 +242,7 @@ class Source:
 
     async def _store_file(self, status: StreamStatus, content: bytes) -> None:
         try:
-            path = await asyncio.to_thread(self.spool.store, self.name, content)
+            path = await self._storing.run(partial(self.spool.store, self.name, content))
         except SpoolError as error:
             status.file_lost(str(error))
             return
@@ -248,11 +252,11 @@ class Source:
         self._announce_file(self.name, {"name": path.name, "bytes": len(content)})
 
     async def _last_c3d(self) -> Answer:
-        path = await asyncio.to_thread(self.spool.newest, self.name)
+        path = await self._reading.run(partial(self.spool.newest, self.name))
         if path is None:
             raise QueryError(f"source {self.name!r} has sent no C3D file so far", code="nothing-yet")
         try:
-            content = await asyncio.to_thread(path.read_bytes)
+            content = await self._reading.run(path.read_bytes)
         except OSError as error:
             raise QueryError(f"{path.name} cannot be read: {error.strerror}", code="nothing-yet") from error
         return Answer(content, C3D, {"name": path.name, "bytes": len(content)})

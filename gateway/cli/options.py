@@ -2,15 +2,19 @@
 
 import os
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Final
 
 import typer
+from pydantic import TypeAdapter, ValidationError
 
 from gateway.config.environment import VARIABLE_PREFIX
 from gateway.config.loading import Configuration, read, read_server
+from gateway.config.values import Host
 from gateway.outputs.registry import settings_type
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
 from gateway.service.log_format import LogFormat, LogLevel
+
+_HOST: Final[TypeAdapter[str]] = TypeAdapter(Host)
 
 ConfigOption = Annotated[
     Path | None,
@@ -65,6 +69,14 @@ UrlOption = Annotated[
 PrefixOption = Annotated[
     str | None, typer.Option(help="The gateway's prefix; the default is mocap on Zenoh, MOCAP on LCM.")
 ]
+
+
+def checked_host(host: str) -> str:
+    """Return ``host``; raise BadParameter if it is neither a host name nor an IP address."""
+    try:
+        return _HOST.validate_python(host)
+    except ValidationError as error:
+        raise typer.BadParameter(error.errors(include_url=False)[0]["msg"]) from None
 
 
 def configuration_from_options(config: Path | None, server: str | None) -> Configuration:

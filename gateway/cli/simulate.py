@@ -19,6 +19,7 @@ from gateway.cli.options import (
     PlatesOption,
     RateOption,
     ToolsOption,
+    checked_host,
 )
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
@@ -36,7 +37,7 @@ def _list_faults(wanted: bool) -> None:
 
 def simulate(
     context: typer.Context,
-    host: Annotated[str, typer.Option(help="The address to listen on.")] = "127.0.0.1",
+    host: Annotated[str, typer.Option(callback=checked_host, help="The address to listen on.")] = "127.0.0.1",
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="The port to listen on; 0 picks a free one.")
     ] = FIRST_PRINCIPLES_PORT,

@@ -138,7 +138,7 @@ class SourceSettings(Section):
     """The delays between connection attempts."""
 
     connect_timeout_s: Seconds = 5.0
-    """How long a connection attempt may take."""
+    """How long a connection attempt may take, the look-up of the name included."""
 
     reply_timeout_s: Seconds = 2.0
     """How long the server may take to answer a command."""

@@ -15,9 +15,28 @@ _COMPONENT_KEYS: Final = [component.key for component in WIRE_ORDER]
 
 
 def _host(text: str) -> str:
-    is_name = len(text) <= 253 and re.fullmatch(r"[\w-]{1,63}(\.[\w-]{1,63})*\.?", text)
-    if not is_name or re.fullmatch("[0-9.]+", text):
-        ipaddress.ip_address(text)  # raises ValueError
+    """Return ``text`` if it is an IP address, or a name that can be sent to a name server (RFC 1035, IDNA).
+
+    A name whose last label is a number would be an address to the resolver, for example 127.1 or 0x7f.1.
+    Such short forms are refused, because they are usually mistakes.
+    """
+    if "%" in text:
+        return _scoped_address(text)
+    if re.fullmatch(r"[\w-]+(\.[\w-]+)*\.?", text):
+        encoded = text.encode("idna").decode()  # UnicodeError, a ValueError: a label is empty or too long
+        last_label = encoded.rstrip(".").rpartition(".")[2]
+        if len(encoded) <= 253 and not re.fullmatch("[0-9]+|0[xX][0-9a-fA-F]*", last_label):
+            return text
+    ipaddress.ip_address(text)  # raises ValueError
+    return text
+
+
+def _scoped_address(text: str) -> str:
+    """Return an IPv6 address with its scope, the name or number of a network interface: fe80::1%eth0."""
+    _, _, scope = text.partition("%")
+    ipaddress.IPv6Address(text)
+    if not re.fullmatch(r"[!-$&-.0-~]{1,15}", scope):  # what Linux accepts: 15 bytes, without / and spaces
+        raise ValueError
     return text
 
 

@@ -1,7 +1,7 @@
 """All checks, layer by layer, so that a fault is found before its consequences."""
 
-import asyncio
 from collections.abc import AsyncIterator, Iterator, Mapping
+from functools import partial
 
 from gateway.config.settings import OutputSettings, Settings
 from gateway.doctor.clock_check import check_clock
@@ -13,6 +13,7 @@ from gateway.doctor.source_checks import CHECKS, SourceChecks
 from gateway.errors import ConfigError
 from gateway.findings import Finding, MessageLoad, Subject
 from gateway.outputs.registry import OUTPUTS
+from gateway.worker_thread import WorkerThread
 
 _configuration = Subject("configuration")
 
@@ -46,7 +47,8 @@ async def run_checks(
             yield finding
         loads += checks.message_loads
     for name, section in {**settings.outputs, **(output_sections or {})}.items():
-        for finding in await asyncio.to_thread(check_output, OUTPUTS[name], section, names, loads, seconds):
+        check = partial(check_output, OUTPUTS[name], section, names, loads, seconds)
+        for finding in await WorkerThread(name).run(check):
             yield finding
     leaving = [name for name in enabled if OUTPUTS[name].leaves_host(settings.outputs[name])]
     yield check_clock(leaving)

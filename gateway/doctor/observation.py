@@ -1,6 +1,5 @@
 """Observation of one stream: rates, message sizes, and which markers and tools are in view."""
 
-import asyncio
 from collections.abc import Sequence
 from typing import Final
 
@@ -22,6 +21,7 @@ from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
 from gateway.stream.supervisor import component_keys, stream_name
+from gateway.worker_thread import WorkerThread
 
 COMPONENTS_WITH_VISIBILITY: Final = (ComponentType.MARKERS, ComponentType.TOOLS)
 """The components whose items can be out of view."""
@@ -145,7 +145,7 @@ class ObservedStream:
 
     async def _read_parameters(self, connection: Connection) -> ParsedParameters:
         packet = await connection.ask(SendParameters())
-        self.parsed = await asyncio.to_thread(parse_parameters, packet.body)
+        self.parsed = await WorkerThread("xml").run(lambda: parse_parameters(packet.body))
         return self.parsed
 
     @property

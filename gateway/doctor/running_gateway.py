@@ -10,6 +10,7 @@ from pydantic import BaseModel, ValidationError
 from gateway.config.settings import MetricsSettings
 from gateway.losses import counts_text, route_name
 from gateway.stream.state import StreamState
+from gateway.worker_thread import WorkerThread
 
 _TIMEOUT_S: Final = 3.0
 _MAX_PAGE_BYTES: Final = 4 << 20
@@ -106,7 +107,7 @@ async def read_health(metrics: MetricsSettings) -> HealthReport | NoReport:
     where = address_text(metrics)
     try:
         async with asyncio.timeout(2 * _TIMEOUT_S):  # includes looking up a host name
-            page = await asyncio.to_thread(_get, _host(metrics), metrics.port)
+            page = await WorkerThread("health page").run(lambda: _get(_host(metrics), metrics.port))
     except ConnectionRefusedError:
         return NoReport(f"no gateway runs here: nothing listens on {where}", False)
     except TimeoutError:

@@ -2,8 +2,6 @@
 
 import asyncio
 import contextlib
-import ipaddress
-import socket
 from collections.abc import AsyncIterator, Iterator
 from typing import Final
 
@@ -18,6 +16,7 @@ from gateway.findings import Finding, MessageLoad, Result, Subject
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 from gateway.rtc3d.parameters import Parameters
 from gateway.safe_text import quoted
+from gateway.stream.names import is_address, look_up
 
 CHECKS: Final = (
     "name",
@@ -124,11 +123,7 @@ class SourceChecks:
 
     async def _check_name(self) -> Finding:
         host = self._source.host
-        try:
-            ipaddress.ip_address(host)
-        except ValueError:
-            pass
-        else:
+        if is_address(host):
             self._addresses = frozenset([host])
             return self._subject.passing("name", f"{host} is an IP address")
         try:
@@ -144,10 +139,8 @@ class SourceChecks:
 
     async def _resolve(self, host: str) -> frozenset[str]:
         """Return the addresses of ``host``; raises OSError, of which TimeoutError has no text."""
-        loop = asyncio.get_running_loop()
         async with asyncio.timeout(self._source.connect_timeout_s):
-            found = await loop.getaddrinfo(host, self._source.port, type=socket.SOCK_STREAM)
-        return frozenset(str(address[0]) for *_, address in found)
+            return frozenset(await look_up(host))
 
     async def _check_tcp(self) -> Finding:
         if self._source.streams == "auto":

@@ -9,7 +9,7 @@ import contextlib
 import logging
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from http import HTTPStatus
 from typing import Final, NamedTuple
 
@@ -52,9 +52,9 @@ class HttpPages:
         self._connections: dict[asyncio.Task[None], asyncio.WriteTransport] = {}
         """The open connections, oldest first."""
 
-    async def start(self, address: str, port: int) -> None:
-        """Listen; raises OSError if the address or the port cannot be bound."""
-        self._server = await asyncio.start_server(self._serve, address, port, limit=MAX_REQUEST_BYTES)
+    async def start(self, addresses: Sequence[str], port: int) -> None:
+        """Listen on IP addresses; raises OSError if one of them or the port cannot be bound."""
+        self._server = await asyncio.start_server(self._serve, addresses, port, limit=MAX_REQUEST_BYTES)
 
     async def close(self) -> None:
         """Stop listening and close all connections."""

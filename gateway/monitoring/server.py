@@ -1,6 +1,9 @@
 """The monitoring server of a gateway: /metrics for Prometheus, /healthz for health checks."""
 
+import asyncio
 import logging
+from collections.abc import Sequence
+from typing import Final
 
 from gateway.config.settings import MetricsSettings
 from gateway.gateway import Gateway
@@ -8,6 +11,9 @@ from gateway.monitoring.health import health_page
 from gateway.monitoring.http_pages import HttpPages
 from gateway.monitoring.loop_delay import LoopDelay
 from gateway.monitoring.metrics import metrics_page, metrics_registry
+from gateway.stream.names import is_address, look_up
+
+_LOOK_UP_TIMEOUT_S: Final = 5.0
 
 logger = logging.getLogger(__name__)
 
@@ -18,19 +24,43 @@ class MonitoringServer:
     def __init__(self, settings: MetricsSettings, gateway: Gateway) -> None:
         self._settings = settings
         self._loop_delay = LoopDelay()
+        self._look_up: asyncio.Task[None] | None = None
         registry = metrics_registry(gateway, self._loop_delay)
         self._pages = HttpPages(
             {"/metrics": lambda: metrics_page(registry), "/healthz": lambda: health_page(gateway)}
         )
 
     async def start(self) -> None:
-        """Listen if the settings enable it. If the port cannot be bound, log a warning and continue."""
+        """Listen if the settings enable it. If the port cannot be bound, log a warning and continue.
+
+        A host name is looked up in the background, so that a name server that does not answer delays nothing.
+        """
         if not self._settings.enabled:
             return
-        address, port = self._settings.address, self._settings.port
         self._loop_delay.start()
+        address = self._settings.address
+        if is_address(address):
+            await self._listen([address])
+        else:
+            self._look_up = asyncio.create_task(self._look_up_and_listen(address))
+
+    async def _look_up_and_listen(self, name: str) -> None:
         try:
-            await self._pages.start(address, port)
+            async with asyncio.timeout(_LOOK_UP_TIMEOUT_S):
+                addresses = await look_up(name)
+        except OSError as error:  # TimeoutError has no text
+            logger.warning(
+                "metrics: the host name %s cannot be resolved: %s; continuing without /metrics and /healthz: "
+                "check the name server (DNS), or set metrics.address to an IP address, and restart",
+                *(name, error.strerror or f"no answer within {_LOOK_UP_TIMEOUT_S:g} s"),
+            )
+        else:
+            await self._listen(addresses)
+
+    async def _listen(self, addresses: Sequence[str]) -> None:
+        address, port = self._settings.address, self._settings.port
+        try:
+            await self._pages.start(addresses, port)
         except OSError as error:
             logger.warning(
                 "metrics: cannot listen on %s, port %d: %s; continuing without /metrics and /healthz: "
@@ -44,4 +74,6 @@ class MonitoringServer:
     async def close(self) -> None:
         """Stop listening."""
         self._loop_delay.close()
+        if self._look_up is not None:
+            self._look_up.cancel()
         await self._pages.close()

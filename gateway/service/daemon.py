@@ -12,6 +12,7 @@ from gateway.gateway import Gateway
 from gateway.monitoring.server import MonitoringServer
 from gateway.monitoring.status_line import status_lines
 from gateway.service.systemd import SystemdNotifier
+from gateway.worker_thread import WorkerThread
 
 logger = logging.getLogger(__name__)
 
@@ -102,7 +103,7 @@ class Daemon:
     async def _reload(self) -> None:
         try:
             # in a thread, because reading a file could delay frames
-            settings = await asyncio.to_thread(self._load)
+            settings = await WorkerThread("load").run(self._load)
             metrics_before = self._gateway.settings.metrics
             changes = await self._gateway.reload(settings)
             if settings.metrics != metrics_before:

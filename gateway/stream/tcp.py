@@ -1,12 +1,15 @@
 """Opens TCP connections to RT servers, and explains failures."""
 
 import asyncio
+import contextlib
 import socket
 from collections.abc import Awaitable, Callable
 from typing import Any, Final
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import ConnectError
+from gateway.stream.names import look_up
+from gateway.stream.running_clock import running_clock
 from gateway.stream.running_time import running_timeout
 
 Connect = Callable[[SourceSettings, Any], Awaitable[asyncio.Transport]]
@@ -33,26 +36,56 @@ def set_socket_options(connection: socket.socket) -> None:
 async def open_connection(source: SourceSettings, protocol: Any) -> asyncio.Transport:
     """Connect ``protocol`` to the source's server and return the transport.
 
+    If the host name has several addresses, they are tried in turn, and each gets an equal share of the time
+    that is left of ``connect_timeout_s``, so that one that does not answer does not hide the others.
     Raises ConnectError with the reason and what to check.
     """
+    clock = running_clock()
+    end_s = clock.time() + source.connect_timeout_s
+    addresses = await _addresses(source)
+    *others, last = addresses
+    for number, address in enumerate(others):
+        with contextlib.suppress(ConnectError):
+            share_s = (end_s - clock.time()) / (len(addresses) - number)
+            return await _connect(source, protocol, address, share_s)
+    return await _connect(source, protocol, last, end_s - clock.time())
+
+
+async def _addresses(source: SourceSettings) -> list[str]:
+    """Return the addresses of the source's host. Raises ConnectError if they are not found in time."""
+    try:
+        async with running_timeout(source.connect_timeout_s):
+            return await look_up(source.host)
+    except TimeoutError:
+        raise ConnectError(
+            f"host name {source.host!r} was not resolved within {source.connect_timeout_s:g} s; "
+            "check the name server (DNS), or use an IP address in sources.host"
+        ) from None
+    except socket.gaierror as error:
+        raise ConnectError(
+            f"host name {source.host!r} is not known ({error.strerror}); check sources.host and DNS"
+        ) from error
+    except OSError as error:
+        raise ConnectError(
+            f"host name {source.host!r} cannot be resolved: {error.strerror or error}; "
+            "check the name server (DNS), or use an IP address in sources.host"
+        ) from error
+
+
+async def _connect(
+    source: SourceSettings, protocol: Any, address: str, timeout_s: float
+) -> asyncio.Transport:
     server = f"{source.host}:{source.port}"
     loop = asyncio.get_running_loop()
     try:
-        async with running_timeout(source.connect_timeout_s):
-            # uvloop cannot cancel a look-up: it logs a late failure as an error, and the next look-up waits
-            # for it. So a thread looks the name up first; create_connection then does so again.
-            await asyncio.to_thread(socket.getaddrinfo, source.host, source.port)
-            transport, _ = await loop.create_connection(lambda: protocol, source.host, source.port)
+        async with running_timeout(timeout_s):
+            transport, _ = await loop.create_connection(lambda: protocol, address, source.port)
             return transport
     except TimeoutError:
         raise ConnectError(
             f"no answer from {server} within {source.connect_timeout_s:g} s; "
             "is the computer on and reachable, and its firewall open for this port?"
         ) from None
-    except socket.gaierror as error:
-        raise ConnectError(
-            f"host name {source.host!r} is not known ({error.strerror}); check sources.host and DNS"
-        ) from error
     except ConnectionRefusedError as error:
         raise ConnectError(
             f"connection refused by {server}; is the RT server running, and is this its port?"

@@ -272,12 +272,15 @@ class RunningGateway:
             configuration[section] = {**configuration.get(section, {}), **values}
         self.config.write_text(yaml.safe_dump(configuration))
 
-    async def start(self, environ: Mapping[str, str]) -> None:
+    async def start(self, environ: Mapping[str, str], before_command: Sequence[str] = ()) -> None:
         """Start the gateway and the recorder, and wait until frames arrive."""
         environment = {**os.environ, **environ}
         with self._log.open("wb") as log:
             self.process = await asyncio.create_subprocess_exec(
-                *(*PROGRAM, "run", "--config", str(self.config)), env=environment, stdin=DEVNULL, stderr=log
+                *(*before_command, *PROGRAM, "run", "--config", str(self.config)),
+                env=environment,
+                stdin=DEVNULL,
+                stderr=log,
             )
         self._recorder = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "tests.hostile.recorder", "healthy", self.zenoh_endpoint, self.lcm_url),
@@ -320,16 +323,18 @@ async def run_gateway(
     attackers: Mapping[str, Source] | None = None,
     settings: Mapping[str, Any] | None = None,
     environ: Mapping[str, str] | None = None,
+    before_command: Sequence[str] = (),
 ) -> AsyncIterator[RunningGateway]:
     """Run a gateway until the end of the block, and set its ``report``.
 
     ``attackers`` are sources by name. ``settings`` are merged into the sections of the configuration, such as
-    {"lcm": {"url": "tcpq://127.0.0.1:7700"}}. ``environ`` is added to the environment.
+    {"lcm": {"url": "tcpq://127.0.0.1:7700"}}. ``environ`` is added to the environment. ``before_command``
+    stands before the command of the gateway, such as that of ``dead_name_server``; it must exec the gateway.
     """
     gateway = RunningGateway(folder, healthy_port, free_port())
     gateway.write_config(attackers or {}, settings or {})
     try:
-        await gateway.start(environ or {})
+        await gateway.start(environ or {}, before_command)
         rss_before_kib = gateway.rss_kib()
         yield gateway
         arrivals = await gateway.all_arrivals()

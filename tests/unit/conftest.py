@@ -33,6 +33,6 @@ async def servers(monkeypatch: pytest.MonkeyPatch) -> Servers:
 
 
 @pytest.fixture
-async def threads() -> SlowThreads:
-    """Make the calls of asyncio.to_thread without threads."""
-    return SlowThreads()
+async def threads(servers: Servers) -> SlowThreads:
+    """The threads that stand for those of ``call_in_thread``."""
+    return servers.threads

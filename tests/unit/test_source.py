@@ -22,7 +22,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.source import Source
 from tests.servers import packet
 from tests.toy_output import ToyOutput, ToyPublisher
-from tests.unit.scripted_sources import Servers, SlowThreads
+from tests.unit.scripted_sources import Servers
 from tests.unit.stream.scripted_server import ScriptedServer
 from tests.unit.stream.virtual_time import settle, until
 
@@ -54,7 +54,7 @@ class Lab:
         **settings: Any,
     ) -> None:
         self.server: ScriptedServer = servers[HOST]
-        self.threads = SlowThreads()
+        self.threads = servers.threads
         self.output = output or ToyOutput()
         self.parameters: list[tuple[str, ServerParameters]] = []
         self.files: list[tuple[str, dict[str, Any]]] = []

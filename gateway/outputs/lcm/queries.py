@@ -25,6 +25,7 @@ from gateway.outputs.lcm.connection import open_lcm, scheme_of, send_problem
 from gateway.outputs.lcm.sender import RETRY_S, LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.thread_sender import LcmThreadSender, new_sender
+from gateway.worker_thread import WorkerThread
 
 MAX_PENDING: Final = 64
 """The maximum number of requests in progress. Further ones are dropped and counted."""
@@ -252,7 +253,7 @@ class LcmQueries:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
         if self._thread.is_alive():
-            await asyncio.to_thread(self._thread.join, _JOIN_S)
+            await WorkerThread("join lcm-requests").run(lambda: self._thread.join(_JOIN_S))
         if self._shared is not None:
             for subscription in self._subscriptions.values():
                 self._shared.unsubscribe(subscription)

@@ -37,6 +37,15 @@ def test_server_option_is_a_configuration(server: str, host: str, port: int) -> 
     assert (source.name, source.host, source.port) == ("lab", host, port)
 
 
+@pytest.mark.parametrize("host", ["a..b", "x" * 64, "lab\0", "127.1"])
+@pytest.mark.parametrize("command", [("simulate", "--host"), ("run", "--server")])
+def test_a_host_that_cannot_be_looked_up_is_an_error(command: tuple[str, str], host: str) -> None:
+    result = CliRunner().invoke(app, [*command, host])
+    assert result.exit_code == 2 or isinstance(result.exception, ConfigError)
+    text = " ".join(result.output.replace("│", " ").split()) or str(result.exception)
+    assert "expected a host name or an IP address" in text
+
+
 @pytest.mark.parametrize("server", ["lab:0", "lab:x", "lab:65536", "[::1]:70000"])
 def test_port_must_be_a_number_in_range(server: str) -> None:
     with pytest.raises(typer.BadParameter, match="the port must be a number from 1 to 65535"):

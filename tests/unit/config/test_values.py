@@ -59,7 +59,19 @@ def test_a_switch_must_be_true_or_false(value: object) -> None:
 
 @pytest.mark.parametrize(
     "host",
-    ["lab", "ndi-3.example.org.", "192.0.2.20", "2001:db8::1", "fe80::1%eth0", "rt_server", "bücher.example"],
+    [
+        "lab",
+        "ndi-3.example.org.",
+        "192.0.2.20",
+        "2001:db8::1",
+        "fe80::1%eth0",
+        "fe80::1%2",
+        "rt_server",
+        "bücher.example",
+        "3d.lab",
+        "a" * 63,
+        ".".join(["a" * 63] * 3 + ["a" * 61]),  # 253 characters
+    ],
 )
 def test_host_names_and_addresses_are_accepted(host: str) -> None:
     assert SourceSettings.model_validate(source(host=host)).host == host
@@ -77,7 +89,26 @@ def test_host_names_and_addresses_are_accepted(host: str) -> None:
         "a..b",
         "a" * 64,
         "lab\n",
+        "lab\0",
+        "lab\x1b[31m",
+        "lab\udc80",
         "a." * 127,
+        "ü" * 63,  # a label of more than 63 characters in IDNA
+        ".".join(["ü" * 50] * 5),  # a name of more than 253 in IDNA
+        ".lab",
+        "lab..",
+        "127.1",  # what the resolver takes for numbers
+        "2130706433",
+        "0x7f.1",
+        "127.0.0.0x1",
+        "0177.0.0.1",
+        "１２７.０.０.１",
+        "fe80::1%",
+        "fe80::1%eth 0",
+        "fe80::1%eth0\n",
+        "fe80::1%eth0%1",
+        "fe80::1%an-interface-with-a-long-name",
+        "192.0.2.20%eth0",
     ],
 )
 def test_invalid_hosts_are_refused(host: str) -> None:

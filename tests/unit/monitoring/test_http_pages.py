@@ -48,7 +48,7 @@ class Site:
 @pytest_asyncio.fixture
 async def site() -> AsyncIterator[Site]:
     site = Site()
-    await site.pages.start("127.0.0.1", site.port)
+    await site.pages.start(["127.0.0.1"], site.port)
     yield site
     await site.pages.close()
 
@@ -181,10 +181,10 @@ async def test_closing_disconnects_clients_and_frees_the_port(site: Site) -> Non
         assert await reader.read() == b""
     writer.close()
     again = HttpPages({})
-    await again.start("127.0.0.1", site.port)
+    await again.start(["127.0.0.1"], site.port)
     await again.close()
 
 
 async def test_a_port_in_use_raises(site: Site) -> None:
     with pytest.raises(OSError, match="address already in use"):
-        await HttpPages({}).start("127.0.0.1", site.port)
+        await HttpPages({}).start(["127.0.0.1"], site.port)

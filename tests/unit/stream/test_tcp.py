@@ -3,9 +3,8 @@
 import asyncio
 import errno
 import socket
-import threading
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
 import pytest
@@ -15,6 +14,18 @@ from gateway.config.settings import SourceSettings
 from gateway.errors import ConnectError
 from gateway.stream.tcp import open_connection, set_socket_options
 from tests.networks import free_port
+from tests.unit.stream.resolver import Resolver
+
+
+@contextmanager
+def full_server() -> Iterator[int]:
+    """Listen on a port of 127.0.0.1 that answers no further connection; yield the port."""
+    with socket.create_server(("127.0.0.1", 0), backlog=0) as server, ExitStack() as clients:
+        for _ in range(3):
+            client = clients.enter_context(socket.socket())
+            client.setblocking(False)
+            client.connect_ex(server.getsockname())
+        yield server.getsockname()[1]
 
 
 def source(**settings: Any) -> SourceSettings:
@@ -25,15 +36,6 @@ def error_of(settings: SourceSettings) -> str:
     with pytest.raises(ConnectError) as caught:
         uvloop.run(open_connection(settings, asyncio.Protocol()))
     return str(caught.value)
-
-
-@pytest.fixture
-def answer_to_lookups(monkeypatch: pytest.MonkeyPatch) -> Iterator[threading.Event]:
-    """Make every name look-up wait for this event."""
-    answer = threading.Event()
-    monkeypatch.setattr(socket, "getaddrinfo", lambda *_: answer.wait(60))
-    yield answer
-    answer.set()
 
 
 def test_the_protocol_gets_the_connection_and_the_transport_is_returned() -> None:
@@ -63,58 +65,77 @@ def test_the_error_of_a_port_without_a_server() -> None:
     )
 
 
-def test_the_error_of_an_unknown_host_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(*_: object) -> None:
-        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
-
-    monkeypatch.setattr(socket, "getaddrinfo", fail)
+def test_the_error_of_an_unknown_host_name(resolver: Resolver) -> None:
+    resolver.error = socket.gaierror(socket.EAI_NONAME, "Name or service not known")
     assert error_of(source(host="labb", port=3020)) == (
         "host name 'labb' is not known (Name or service not known); check sources.host and DNS"
     )
 
 
-def test_the_error_of_a_time_out(answer_to_lookups: threading.Event) -> None:
-    async def connect() -> str:
-        with pytest.raises(ConnectError) as caught:
-            await open_connection(source(host="lab-pc", port=3020, connect_timeout_s=0.1), asyncio.Protocol())
-        answer_to_lookups.set()
-        return str(caught.value)
-
-    assert uvloop.run(connect()) == (
-        "no answer from lab-pc:3020 within 0.1 s; "
-        "is the computer on and reachable, and its firewall open for this port?"
+def test_the_error_of_a_name_server_that_does_not_answer(resolver: Resolver) -> None:
+    resolver.answers.clear()
+    assert error_of(source(host="dead-pc", port=3020, connect_timeout_s=0.1)) == (
+        "host name 'dead-pc' was not resolved within 0.1 s; "
+        "check the name server (DNS), or use an IP address in sources.host"
     )
 
 
-@pytest.mark.parametrize(
-    ("error", "reason"),
-    [
-        (OSError(errno.ENETUNREACH, "Network is unreachable"), "Network is unreachable"),
-        (OSError("no text of the system"), "no text of the system"),
-    ],
-)
-def test_the_error_of_any_other_failure_of_the_network(
-    error: OSError, reason: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object) -> None:
-        raise error
+def test_the_error_of_a_resolver_that_fails(resolver: Resolver) -> None:
+    resolver.error = OSError(errno.EMFILE, "Too many open files")
+    assert error_of(source(host="lab-pc", port=3020)) == (
+        "host name 'lab-pc' cannot be resolved: Too many open files; "
+        "check the name server (DNS), or use an IP address in sources.host"
+    )
 
-    monkeypatch.setattr(socket, "getaddrinfo", fail)
+
+@pytest.mark.netns
+def test_the_error_of_a_server_that_does_not_answer() -> None:
+    with full_server() as port:
+        assert error_of(source(host="127.0.0.1", port=port, connect_timeout_s=0.1)) == (
+            f"no answer from 127.0.0.1:{port} within 0.1 s; "
+            "is the computer on and reachable, and its firewall open for this port?"
+        )
+
+
+@pytest.mark.netns
+def test_the_error_of_any_other_failure_of_the_network() -> None:
     assert error_of(source(host="192.0.2.20", port=3020)) == (
-        f"no connection to 192.0.2.20:3020: {reason}; check address, cable and routing"
+        "no connection to 192.0.2.20:3020: Network is unreachable; check address, cable and routing"
     )
 
 
-def test_the_host_and_the_port_are_looked_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[tuple[object, ...]] = []
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "::ffff:127.0.0.1", "fe80::1%lo"])
+def test_a_number_is_not_looked_up(host: str, resolver: Resolver) -> None:
+    resolver.error = AssertionError("looked up")
+    error_of(source(host=host, port=free_port(), connect_timeout_s=0.1))
+    assert resolver.names == []
 
-    def look_up(*arguments: object) -> None:
-        asked.append(arguments)
-        raise socket.gaierror(socket.EAI_NONAME, "no")
 
-    monkeypatch.setattr(socket, "getaddrinfo", look_up)
-    error_of(source(host="lab-pc", port=3030))
-    assert asked == [("lab-pc", 3030)]
+def test_the_addresses_of_a_name_are_tried_in_turn(resolver: Resolver) -> None:
+    async def connect(port: int) -> str:
+        settings = source(host="lab-pc", port=port, connect_timeout_s=20)
+        transport = await open_connection(settings, asyncio.Protocol())
+        address: str = transport.get_extra_info("peername")[0]
+        transport.close()
+        return address
+
+    resolver.addresses = ["127.0.0.2", "127.0.0.3", "127.0.0.4"]
+    with socket.create_server(("127.0.0.3", 0)) as server:
+        assert uvloop.run(connect(server.getsockname()[1])) == "127.0.0.3"
+    assert resolver.names == ["lab-pc"]
+
+
+def test_an_address_that_does_not_answer_leaves_time_for_the_next(resolver: Resolver) -> None:
+    async def connect(port: int) -> str:
+        settings = source(host="lab-pc", port=port, connect_timeout_s=0.4)
+        transport = await open_connection(settings, asyncio.Protocol())
+        address: str = transport.get_extra_info("peername")[0]
+        transport.close()
+        return address
+
+    resolver.addresses = ["127.0.0.1", "127.0.0.3"]
+    with full_server() as port, socket.create_server(("127.0.0.3", port)):
+        assert uvloop.run(connect(port)) == "127.0.0.3"
 
 
 def test_the_kernel_holds_seconds_of_frames_while_the_process_stands_still() -> None:

@@ -1,0 +1,23 @@
+"""A name server that never answers, for one program in a network namespace (marker netns)."""
+
+import contextlib
+import socket
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Final
+
+_ADDRESS: Final = ("127.0.0.53", 53)
+_USE_FILE: Final = 'mount --bind "$1" /etc/resolv.conf && shift && exec "$@"'
+
+
+@contextlib.contextmanager
+def dead_name_server(folder: Path) -> Iterator[tuple[str, ...]]:
+    """Run the server; yield what to put before a command whose names it should resolve.
+
+    The command gets a file /etc/resolv.conf of its own, in a mount namespace.
+    """
+    file = folder / "resolv.conf"
+    file.write_text(f"nameserver {_ADDRESS[0]}\n")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
+        server.bind(_ADDRESS)
+        yield ("unshare", "--mount", "sh", "-c", _USE_FILE, "with-resolv-conf", str(file))
