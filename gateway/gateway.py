@@ -5,7 +5,7 @@ import logging
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any, Final
 
-from gateway.c3d_spool import Spool
+from gateway.c3d_files.spool import Spool
 from gateway.config.settings import Settings, SourceSettings, SpoolSettings
 from gateway.messages.host_time import host_clock
 from gateway.outputs.contract import Command, Output, ServerParameters

@@ -3,14 +3,14 @@
 import asyncio
 import logging
 import math
-from collections.abc import Awaitable, Callable, Coroutine, Sequence
-from functools import partial
-from typing import Any, Final
+from collections.abc import Awaitable, Callable, Sequence
+from typing import Any
 
-from gateway.c3d_spool import Spool
+from gateway.c3d_files.receiving import SourceFiles
+from gateway.c3d_files.spool import Spool, StoredFile
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.errors import LinkError, QueryError, SpoolError
-from gateway.log import DefectLog, log_fields
+from gateway.errors import LinkError, QueryError
+from gateway.log import DefectLog, FailureLog, log_fields
 from gateway.outputs.contract import Answer, ServerParameters
 from gateway.outputs.encodings import C3D
 from gateway.publish.fan_out import FanOut
@@ -26,10 +26,6 @@ from gateway.stream.state import StreamState
 from gateway.stream.status import SessionNumbers, StreamStatus
 from gateway.stream.streams import AutomaticStreams, ConfiguredStreams
 from gateway.stream.supervisor import Callbacks, Listener, Supervisor, component_keys, stream_name
-from gateway.worker_thread import WorkerThread
-
-_MAX_UNSTORED_FILES: Final = 4
-"""How many C3D files may wait in memory to be stored; further ones are dropped and logged."""
 
 logger = logging.getLogger(__name__)
 
@@ -65,6 +61,8 @@ class Source:
         """The numbers of the connections."""
         self.parameters_version: int = 0 if before is None else before.parameters_version
         """The version of the server's parameters; 0 before the first."""
+        self._files = SourceFiles(settings.name, lambda: self.spool, self._on_stored)
+        self._spool_problems = FailureLog(logger, settings.name)
         self._streams: ConfiguredStreams | AutomaticStreams = (
             AutomaticStreams(settings.stall_timeout_s, self._new_stream)
             if settings.streams == "auto"
@@ -73,15 +71,11 @@ class Source:
         self.queries = self._new_queries(before)
         self._publish_parameters = publish_parameters
         self._announce_file = announce_file
-        self._tasks: set[asyncio.Task[None]] = set()
         self._defects = DefectLog(logger, self.name)
         # The names and units of the former server do not apply to another one, not even until its handshake.
         self._has_new_server = before is not None and (before.settings.host, before.settings.port) != (
             *(settings.host, settings.port),
         )
-        self._num_unstored_files = 0
-        self._storing = WorkerThread(f"c3d-store-{self.name}")
-        self._reading = WorkerThread(f"c3d-read-{self.name}")
         self.sequence: int = 0 if before is None else before.sequence
         """The sequence number of the newest status and clock messages."""
         self._newest_status: bytes = self._encoded_status()
@@ -130,8 +124,7 @@ class Source:
                 tasks.create_task(self._refresh.run())
                 await self._streams.run()
         finally:
-            for task in self._tasks:
-                task.cancel()
+            await self._files.finish()
             for stream in self._streams.known:
                 stream.status.losses.close()
 
@@ -141,6 +134,7 @@ class Source:
         """Check the streams, and publish the status and the clock of this source. Called once a second."""
         self.sequence += 1
         self._streams.check()
+        self._files.check()
         for stream in self.streams:
             stream.frame_rate.update(stream.status.frames_in)
         self._newest_status = self._encoded_status()
@@ -182,7 +176,7 @@ class Source:
             skip=self.fan_out.skip,
             read_parameters=self._read_parameters,
             on_restart=self._refresh.request,
-            on_file=lambda content: self._on_file(status, content),
+            files=self._files.receiver(lambda error: status.file_lost(str(error))),
             has_subscribers=self.fan_out.has_subscribers,
         )
 
@@ -215,51 +209,42 @@ class Source:
                 self._streams.parameters_changed(parameters)
             self.fan_out.set_parameters(parameters)
 
-    def _start_task(self, work: Coroutine[Any, Any, None]) -> None:
-        task = asyncio.create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._end_task)
-
-    def _end_task(self, task: asyncio.Task[None]) -> None:
-        self._tasks.discard(task)
-        if task.cancelled():
-            return
-        defect = task.exception()
-        if defect is not None:
-            self._defects.log(defect)
-
     # C3D files and recordings.
 
-    def _on_file(self, status: StreamStatus, content: bytes) -> None:
-        if self._num_unstored_files >= _MAX_UNSTORED_FILES:
-            status.file_lost(
-                f"a C3D file of {len(content)} bytes is dropped: {self._num_unstored_files} earlier files "
-                "are still being written; is the disk slow, or the server faulty?"
-            )
-            return
-        self._num_unstored_files += 1
-        self._start_task(self._store_file(status, content))
-
-    async def _store_file(self, status: StreamStatus, content: bytes) -> None:
+    def _on_stored(self, stored: StoredFile) -> None:
         try:
-            path = await self._storing.run(partial(self.spool.store, self.name, content))
-        except SpoolError as error:
-            status.file_lost(str(error))
-            return
-        finally:
-            self._num_unstored_files -= 1
-        logger.info("%s: the server sent a C3D file of %d bytes, kept as %s", self.name, len(content), path)
-        self._announce_file(self.name, {"name": path.name, "bytes": len(content)})
+            self._report_stored(stored)
+        except Exception as defect:  # noqa: BLE001 - a defect in an output must not stop the streams
+            self._defects.log(defect)
+
+    def _report_stored(self, stored: StoredFile) -> None:
+        """Log and announce a file. It is there, even if old ones could not be deleted."""
+        deleted = f"; deleted the oldest ({len(stored.deleted)})"
+        logger.info(
+            "%s: the server sent a C3D file of %d bytes, kept as %s%s",
+            *(self.name, stored.num_bytes, stored.path, deleted if stored.deleted else ""),
+        )
+        if stored.problem:
+            self._spool_problems.failed(f"old C3D files are not deleted: {stored.problem}")
+        else:
+            self._spool_problems.recovered("old C3D files can be deleted again")
+        self._announce_file(self.name, {"name": stored.path.name, "bytes": stored.num_bytes})
 
     async def _last_c3d(self) -> Answer:
-        path = await self._reading.run(partial(self.spool.newest, self.name))
-        if path is None:
-            raise QueryError(f"source {self.name!r} has sent no C3D file so far", code="nothing-yet")
+        spool, timeout_s = self.spool, self.settings.query_timeout_s
         try:
-            content = await self._reading.run(path.read_bytes)
+            async with asyncio.timeout(timeout_s):
+                newest = await spool.reader.run(lambda: spool.read_newest(self.name))
+        except TimeoutError:
+            text = f"the disk of the gateway did not give the file within {timeout_s:g} s"
+            raise QueryError(text, code="timeout") from None
         except OSError as error:
-            raise QueryError(f"{path.name} cannot be read: {error.strerror}", code="nothing-yet") from error
-        return Answer(content, C3D, {"name": path.name, "bytes": len(content)})
+            text = f"the newest C3D file of source {self.name!r} cannot be read: {error.strerror}"
+            raise QueryError(text, code="nothing-yet") from error
+        if newest is None:
+            raise QueryError(f"source {self.name!r} has sent no C3D file so far", code="nothing-yet")
+        name, content = newest
+        return Answer(content, C3D, {"name": name, "bytes": len(content)})
 
     def _record(self, start: bool) -> bool:
         for stream in self.streams:

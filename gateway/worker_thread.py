@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
@@ -27,6 +28,7 @@ class WorkerThread:
         self._calls: deque[tuple[Future[Any], Callable[[], Any]]] = deque()
         self._changed = threading.Condition()
         self._is_running = False
+        self._began_s: float | None = None  # the present call, on the monotonic clock
 
     def submit(self, call: Callable[[], _Result]) -> Future[_Result]:
         """Queue ``call``; the returned future has its result or exception. It can be cancelled before."""
@@ -44,12 +46,11 @@ class WorkerThread:
         """Return the result of ``call``, or raise its exception."""
         return await asyncio.wrap_future(self.submit(call))
 
-    def cancel_waiting(self) -> None:
-        """Cancel the calls that have not begun."""
-        with self._changed:
-            waiting, self._calls = self._calls, deque()
-        for done, _ in waiting:
-            done.cancel()
+    @property
+    def call_age_s(self) -> float:
+        """How long the present call takes already; 0.0 if there is none."""
+        began_s = self._began_s
+        return 0.0 if began_s is None else time.monotonic() - began_s
 
     def _run(self) -> None:
         while True:
@@ -61,8 +62,10 @@ class WorkerThread:
                 done, call = self._calls.popleft()
             with contextlib.suppress(CancelledError):
                 if done.set_running_or_notify_cancel():
+                    self._began_s = time.monotonic()
                     try:
                         done.set_result(call())
                     except BaseException as error:  # noqa: BLE001 - whoever waits for the future gets it
                         done.set_exception(error)
+            self._began_s = None
             del done, call  # or they would stay in memory until the next call

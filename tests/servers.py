@@ -14,6 +14,11 @@ def packet(packet_type: int, body: bytes | str = b"") -> bytes:
     return struct.pack(">II", 8 + len(data), packet_type) + data
 
 
+def c3d_file(content: bytes = b"", num_bytes: int = 1024) -> bytes:
+    """Return a file that begins like a C3D file, and ends with ``content``."""
+    return b"\x02\x50" + bytes(num_bytes - 2 - len(content)) + content
+
+
 def ok(text: str) -> bytes:
     return packet(1, text)
 

@@ -214,10 +214,10 @@ class SpoolSettings(Section):
     """The folder. null means c3d in the state directory of the service, or of the user without systemd."""
 
     max_files: FileLimit = 100
-    """The maximum number of files. The oldest are deleted first."""
+    """The maximum number of files of each source. Its oldest are deleted first."""
 
     max_bytes: ByteLimit = 1024 * 1024 * 1024
-    """The maximum total size of the files. The oldest are deleted first."""
+    """The maximum total size of the files of each source. Its oldest are deleted first."""
 
     @property
     def effective(self) -> dict[str, Effective]:

@@ -14,6 +14,7 @@ from gateway.rtc3d.components import WIRE_ORDER, Component, ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
+from gateway.stream.files import IgnoredFiles
 from gateway.stream.parameters import Connection
 from gateway.stream.plan import StreamPlan, plan_streams
 from gateway.stream.running_clock import running_clock
@@ -109,7 +110,7 @@ class ObservedStream:
         self.status = StreamStatus(self.component_keys, name=stream_name(source, stream.components))
         self.parsed: ParsedParameters | None = None
         self.observed: dict[ComponentType, ObservedComponent] = {}
-        self.session = Session(source, stream, self.status, self._on_frames, lambda _content: None)
+        self.session = Session(source, stream, self.status, self._on_frames, IgnoredFiles())
         self.control = StreamControl(
             source, stream, self.status, self.session, self._read_parameters, self._planned_components
         )

@@ -20,6 +20,7 @@ from gateway.rtc3d.frames import Frame, announced_components, detect_byte_order,
 from gateway.rtc3d.packets import (
     DEFAULT_MAX_C3D_BYTES,
     DEFAULT_MAX_PACKET_BYTES,
+    FilePiece,
     Packet,
     PacketReader,
     PacketType,
@@ -68,12 +69,6 @@ class FrameRejected(NamedTuple):
     num_components: int
 
 
-class FileReceived(NamedTuple):
-    """A complete C3D file arrived (packet type 5)."""
-
-    content: bytes
-
-
 class UnexpectedPacket(NamedTuple):
     """A packet that answers no command: a duplicate or late reply, or a type that §4.2 does not define."""
 
@@ -97,7 +92,7 @@ ProtocolEvent = (
     | Refused
     | PossibleReply
     | FrameRejected
-    | FileReceived
+    | FilePiece
     | UnexpectedPacket
     | ByteOrderMismatch
     | StreamCorrupted
@@ -264,10 +259,8 @@ class ClientProtocol:
                 self._on_xml(packet, events)
             case PacketType.NO_DATA:
                 self._on_no_data(packet, events)
-            case PacketType.C3D:
-                events.append(FileReceived(packet.body))
             case _:
-                events.append(UnexpectedPacket(packet))
+                events.append(packet if isinstance(packet, FilePiece) else UnexpectedPacket(packet))
 
     def _on_text(self, packet: Packet, events: list[ProtocolEvent]) -> None:
         match = self._replies.match_text(packet)

@@ -55,6 +55,33 @@ class Packet:
         return f"Packet({self.type}, {self.body!r})"
 
 
+class FilePiece(Packet):
+    """A piece of a complete C3D file (type 5), as it arrives: ``body`` is that from byte ``offset`` on.
+
+    The file has ``file_bytes`` in total. An empty file is one empty piece.
+    """
+
+    __slots__ = ("file_bytes", "offset")
+
+    def __init__(self, body: bytes, offset: int, file_bytes: int) -> None:
+        super().__init__(_C3D, body)
+        self.offset = offset
+        self.file_bytes = file_bytes
+
+    @property
+    def is_first(self) -> bool:
+        """Whether the file begins with this piece."""
+        return self.offset == 0
+
+    @property
+    def is_last(self) -> bool:
+        """Whether the file is complete with this piece."""
+        return self.offset + len(self.body) == self.file_bytes
+
+    def __repr__(self) -> str:
+        return f"FilePiece({self.body!r}, {self.offset}, {self.file_bytes})"
+
+
 def encode_packet(packet_type: int, body: bytes = b"") -> bytes:
     """Return the packet's bytes: big-endian size (body + 8) and type, then ``body`` (§4.1).
 
@@ -85,7 +112,7 @@ class PacketReader:
 
     ``max_c3d_bytes`` limits the size field of a complete C3D file (type 5), ``max_packet_bytes`` that of
     every other packet. The reader allocates memory for the bytes that have arrived, never for the size
-    that a header claims.
+    that a header claims. It does not collect C3D files, but returns a FilePiece for each piece that arrives.
     """
 
     def __init__(
@@ -98,16 +125,18 @@ class PacketReader:
         self._offset = 0  # of the next packet in the stream
         self._partial = bytearray()
         self._partial_goal = 0  # the length that _partial needs before a packet, or its header, is complete
+        self._file_bytes = 0  # the length of the C3D file that is arriving
+        self._missing_file_bytes = 0  # of that file
         self.error: PacketError | None = None
         """Set when a size field is below 8 or above its limit; the stream then has no further packets."""
 
     @property
     def buffered_bytes(self) -> int:
-        """The number of bytes held of an incomplete packet."""
+        """The number of bytes held of an incomplete packet; of a C3D file, those of an incomplete header."""
         return len(self._partial)
 
     def feed(self, data: bytes) -> list[Packet]:
-        """Take the next bytes of the stream and return the packets that they complete, in order.
+        """Take the next bytes; return the packets that they complete and the pieces of files, in order.
 
         Never raises: check ``error`` after handling the packets. Once it is set, further bytes are ignored.
         """
@@ -115,7 +144,10 @@ class PacketReader:
             return []
         packets: list[Packet] = []
         used = 0
-        if self._partial:
+        if self._missing_file_bytes:
+            used = self._take_file_piece(data, 0, packets)
+            self._offset += used
+        elif self._partial:
             # Copy only what completes the packet; a read can contain a hundred more, which are cut in place.
             # If even the header is incomplete, copy the whole read: an error quotes the bytes after a header.
             missing = self._partial_goal - len(self._partial)
@@ -129,6 +161,16 @@ class PacketReader:
         if used < len(data):
             self._cut(data, used, packets)
         return packets
+
+    def _take_file_piece(self, data: bytes, start: int, packets: list[Packet]) -> int:
+        """Append a piece of a C3D file that is in ``data`` from ``start`` on; return where it ends."""
+        piece = data[start : start + self._missing_file_bytes]
+        # A whole read is not copied, because it is its own slice. A piece without content says nothing,
+        # unless the file is empty.
+        if piece or not self._file_bytes:
+            packets.append(FilePiece(piece, self._file_bytes - self._missing_file_bytes, self._file_bytes))
+        self._missing_file_bytes -= len(piece)
+        return start + len(piece)
 
     def _cut(self, data: bytes, first: int, packets: list[Packet]) -> None:
         """Append the complete packets in ``data`` from offset ``first``; keep the rest in ``_partial``."""
@@ -146,6 +188,10 @@ class PacketReader:
                 self.error = _size_error(size, packet_type, offset, limit, begin)
                 return
             end = start + size
+            if packet_type == _C3D:
+                self._file_bytes = self._missing_file_bytes = size - PACKET_HEADER_BYTES
+                start = self._take_file_piece(data, start + PACKET_HEADER_BYTES, packets)
+                continue
             if end > available:
                 self._partial_goal = size
                 break

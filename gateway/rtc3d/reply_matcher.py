@@ -52,6 +52,9 @@ _ACKNOWLEDGED: Final = re.compile(rf"(?:ok\W*)?{_VERBS}")
 _REFUSED: Final = re.compile(rf"\b{_VERBS}")
 """A command anywhere in the text of an error."""
 
+_MAX_TEXT_BYTES: Final = 1000
+"""How much of a reply's text is read. A server may send one of the size of the largest packet."""
+
 _MAX_REMEMBERED: Final = 8
 """The maximum number of outstanding commands, and of answered commands, that are remembered."""
 
@@ -131,7 +134,7 @@ class ReplyMatcher:
 
     def _candidates(self, packet: Packet) -> list[Command]:
         """Return the unanswered commands that a text may answer, oldest first."""
-        text = decode_text(packet.body).lower()
+        text = decode_text(packet.body[:_MAX_TEXT_BYTES]).lower()
         unanswered = [*self._outstanding, *([] if self.pending is None else [self.pending])]
         echoed = [command for command in (*unanswered, *self._answered) if str(command).lower() in text]
         if echoed:

@@ -21,7 +21,6 @@ from gateway.rtc3d.client_protocol import (
     Answered,
     ByteOrderMismatch,
     ClientProtocol,
-    FileReceived,
     FrameRejected,
     PossibleReply,
     ProtocolEvent,
@@ -32,10 +31,11 @@ from gateway.rtc3d.client_protocol import (
 from gateway.rtc3d.commands import Bye, Command, StopStreaming
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
-from gateway.rtc3d.packets import Packet, decode_text
+from gateway.rtc3d.packets import FilePiece, Packet, decode_text
 from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.safe_text import safe_text
 from gateway.stream.backlog import Backlog
+from gateway.stream.files import FileReceiver
 from gateway.stream.paced_frames import PacedFrames
 from gateway.stream.running_clock import running_clock
 from gateway.stream.running_time import running_timeout
@@ -54,16 +54,13 @@ OnFrames = Callable[[list[Frame], int, int], None]
 ReadClocks = Callable[[], tuple[int, int]]
 """Returns the time in µs since the Unix epoch and on a steady clock, as ``HostClock.read`` does."""
 
-OnFile = Callable[[bytes], None]
-"""Takes a complete C3D file."""
-
 logger = logging.getLogger(__name__)
 
 
 class Session:
     """One connection of one stream: ``connect``, then ``ask`` and ``monitor``, then ``close``.
 
-    The event loop calls ``on_frames`` and ``on_file``, which must not block. ``connect`` opens the
+    The event loop calls ``on_frames`` and ``files``, which must not block. ``connect`` opens the
     connection, ``read_clocks`` dates what arrives. Time-outs count only the time during which this process
     runs, so a stop of the process is not the server's silence.
 
@@ -77,7 +74,7 @@ class Session:
         stream: StreamSettings,
         status: StreamStatus,
         on_frames: OnFrames,
-        on_file: OnFile,
+        files: FileReceiver,
         connect: Connect = open_connection,
         read_clocks: ReadClocks = host_clock.read,
     ) -> None:
@@ -90,7 +87,7 @@ class Session:
             on_frames, backlog if stream.backlog == "all" else None, self._set_reading, self._fail_by_defect
         )
         self._is_reading_paused = False
-        self._on_file = on_file
+        self._files = files
         self._connect = connect
         self._read_clocks = read_clocks
         self._running = running_clock()
@@ -334,8 +331,9 @@ class Session:
             case FrameRejected(frame_error, num_components):
                 self._rejection, self._rejected_s = str(frame_error), self._running.time()
                 self._status.frame_rejected(self._rejection, self._num_lost(num_components))
-            case FileReceived(content):
-                self._on_file(content)
+            case FilePiece():
+                if self._error is None:
+                    self._files.receive(event)
             case ByteOrderMismatch(byte_order):
                 self._status.add_limitation(
                     f"the server sends {byte_order}-endian frames, not the byte order agreed"
@@ -398,6 +396,7 @@ class Session:
         self._ended.set()
         self._state_changed.set()
         self._end_ask(error)
+        self._files.interrupt(str(error))
         if not isinstance(error, DefectError):  # which may be one in publishing
             self._frames.finish()
         self._set_reading(True)

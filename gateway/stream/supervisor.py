@@ -14,10 +14,11 @@ from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.stream.change_tasks import ChangeTasks
+from gateway.stream.files import FileReceiver
 from gateway.stream.ingest import Ingest, Publish, Skip
 from gateway.stream.parameters import ReadParameters
 from gateway.stream.rate_watch import AnnouncedRates, RateWatch
-from gateway.stream.session import OnFile, ReadClocks, Session
+from gateway.stream.session import ReadClocks, Session
 from gateway.stream.state import StreamState
 from gateway.stream.status import FrameRate, StreamStatus
 from gateway.stream.stream_control import StreamControl
@@ -37,8 +38,8 @@ class Callbacks(NamedTuple):
     """Returns the server's parameters for each handshake."""
     on_restart: Callable[[], None]
     """Called when the server's frame numbers or time stamps start again within a connection."""
-    on_file: OnFile
-    """Takes a complete C3D file."""
+    files: FileReceiver
+    """Takes the C3D files."""
     has_subscribers: Callable[[Collection[ComponentType]], bool]
     """Returns whether any of these components may have subscribers."""
 
@@ -190,7 +191,7 @@ class Supervisor:
             self.settings,
             self.status,
             ingest.receive,
-            self._callbacks.on_file,
+            self._callbacks.files,
             self._connect,
             self._read_clocks,
         )

@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.stream.files import IgnoredFiles
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.tcp import Connect, open_connection
@@ -32,7 +33,7 @@ exec "$@"
 def session_to(port: int, connect: Connect = open_connection) -> Session:
     source = SourceSettings(name="lab", host="127.0.0.1", port=port)
     return Session(
-        source, StreamSettings(), StreamStatus("3d"), lambda *_: None, lambda _: None, connect=connect
+        source, StreamSettings(), StreamStatus("3d"), lambda *_: None, IgnoredFiles(), connect=connect
     )
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import os
 import threading
 from collections.abc import Mapping
 from pathlib import Path
@@ -9,8 +10,6 @@ from pathlib import Path
 import pytest
 import zenoh
 
-from gateway.c3d_spool import Spool
-from gateway.errors import QueryError
 from gateway.outputs.contract import Answer, KeyPath, ServerParameters
 from gateway.outputs.zenoh import queries as zenoh_queries
 from gateway.outputs.zenoh.queries import ZenohQueries
@@ -19,7 +18,7 @@ from gateway.queries.source_queries import SourceQueries
 from tests.losses import amounts
 from tests.networks import free_endpoint, open_zenoh
 from tests.queried_gateway import gateway_with_server, output_queries, query, run_gateway, zenoh_peer
-from tests.servers import packet
+from tests.servers import c3d_file, packet
 from tests.waiting import wait_until_async
 
 
@@ -132,7 +131,7 @@ async def test_a_file_that_cannot_be_stored_is_logged_and_the_stream_continues(
 ) -> None:
     (tmp_path / "spool").write_text("a file in place of the folder")
     async with gateway_with_server(spool=tmp_path / "spool") as (server, _, _, peer):
-        server.send(packet(5, b"content"))
+        server.send(packet(5, c3d_file()))
         await wait_until_async(lambda: "cannot be stored in" in caplog.text)
         assert (await query(peer, "mocap/lab/c3d")).code == "nothing-yet"
         assert (await query(peer, "mocap/lab/parameters?fresh=true")).payload == server.xml
@@ -142,34 +141,26 @@ async def test_a_file_that_cannot_be_stored_is_logged_and_the_stream_continues(
 async def test_files_that_arrive_faster_than_the_disk_writes_are_dropped_and_logged(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    disk, store = threading.Event(), Spool.store
+    disk, fsync = threading.Event(), os.fsync
 
-    def slow(spool: Spool, source: str, content: bytes) -> Path:
+    def slow(descriptor: int) -> None:
         disk.wait(20)
-        return store(spool, source, content)
+        fsync(descriptor)
 
-    monkeypatch.setattr(Spool, "store", slow)
+    monkeypatch.setattr(os, "fsync", slow)
     try:
         async with gateway_with_server(spool=tmp_path) as (server, _, gateway, _):
             for number in range(6):
-                server.send(packet(5, b"content %d" % number))
+                server.send(packet(5, c3d_file(b"content %d" % number)))
             [status] = gateway.sources[0].statuses
             await wait_until_async(lambda: amounts(status.losses.report()) == {"C3D file": (2, 0)})
             assert caplog.text.count("4 earlier files are still being written") == 1
             disk.set()
             await wait_until_async(lambda: len(list(tmp_path.glob("*.c3d"))) == 4)
-            server.send(packet(5, b"a later one"))
+            server.send(packet(5, c3d_file(b"a later one")))
             await wait_until_async(lambda: len(list(tmp_path.glob("*.c3d"))) == 5)
     finally:
         disk.set()
-
-
-async def test_a_deleted_file_is_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async with gateway_with_server(spool=tmp_path) as (_, _, gateway, _):
-        [source] = gateway.sources
-        monkeypatch.setattr(Spool, "newest", lambda _spool, _source: tmp_path / "gone.c3d")
-        with pytest.raises(QueryError, match=r"gone\.c3d cannot be read: No such file or directory"):
-            await source._last_c3d()
 
 
 async def test_a_gateway_runs_and_stops_while_zenoh_is_not_open() -> None:

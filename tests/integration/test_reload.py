@@ -34,7 +34,7 @@ from gateway.simulator.synthetic import SyntheticScene
 from tests.configurations import make_settings
 from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
 from tests.queried_gateway import ParameterServer, query, query_all, zenoh_peer
-from tests.servers import Client, ScriptedServer, ok, packet
+from tests.servers import Client, ScriptedServer, c3d_file, ok, packet
 from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
@@ -323,7 +323,7 @@ async def test_files_are_stored_in_the_new_folder(tmp_path: Path) -> None:
             changed = builder.settings({"lab": server.port}, spool=SpoolSettings(directory=str(after)))
             await wait_until_async(lambda: clients)
             assert await gateway.reload(changed) == ["spool changed"]
-            clients[0].send(packet(5, b"a file"))
+            clients[0].send(packet(5, c3d_file(b"a file")))
             await wait_until_async(lambda: after.exists() and list(after.glob("lab-*.c3d")))
             assert not before.exists()
             assert len(clients) == 1

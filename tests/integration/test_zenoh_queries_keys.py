@@ -22,7 +22,7 @@ from tests.queried_gateway import (
     run_gateway,
     zenoh_peer,
 )
-from tests.servers import ScriptedServer, markers_frame, packet
+from tests.servers import ScriptedServer, c3d_file, markers_frame, packet
 from tests.waiting import wait_until_async
 
 
@@ -165,7 +165,7 @@ async def test_a_decoder_from_a_queried_schema_reads_a_queried_frame(tmp_path: P
 
 
 async def test_a_c3d_file_is_stored_announced_and_answered(tmp_path: Path) -> None:
-    content = bytes(range(256)) * 1000
+    content, second = c3d_file(bytes(range(256)) * 1000, 300_000), c3d_file(b"the second")
     async with gateway_with_server(spool=tmp_path) as (server, _, _, peer):
         reply = await query(peer, "mocap/lab/c3d")
         assert (reply.code, reply.error) == ("nothing-yet", "source 'lab' has sent no C3D file so far")
@@ -181,9 +181,9 @@ async def test_a_c3d_file_is_stored_announced_and_answered(tmp_path: Path) -> No
         assert reply.payload == content
         assert reply.attachment == description
         assert (tmp_path / description["name"]).read_bytes() == content
-        server.send(packet(5, b"the second"))
+        server.send(packet(5, second))
         await wait_until_async(lambda: len(announced) == 2)
-        assert (await query(peer, "mocap/*/c3d")).payload == b"the second"
+        assert (await query(peer, "mocap/*/c3d")).payload == second
 
 
 async def test_recording_control_is_off_by_default_and_the_error_says_how_to_switch_it_on() -> None:

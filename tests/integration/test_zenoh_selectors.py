@@ -19,7 +19,7 @@ from tests.queried_gateway import (
     wait_until_cached,
     zenoh_peer,
 )
-from tests.servers import ScriptedServer, packet
+from tests.servers import ScriptedServer, c3d_file, packet
 from tests.waiting import wait_until_async
 
 
@@ -78,7 +78,7 @@ async def test_a_wildcard_is_answered_by_every_key_that_has_an_answer() -> None:
 async def test_a_wildcard_does_not_select_files_and_recording(tmp_path: Path) -> None:
     async with gateway_with_server(spool=tmp_path, remote_control=True) as (server, _, gateway, peer):
         await wait_until_async(lambda: gateway.sources[0].fan_out.newest(ComponentType.MARKERS, "zenoh"))
-        server.send(packet(5, b"a file"))
+        server.send(packet(5, c3d_file(b"a file")))
         await wait_until_async(lambda: list(tmp_path.glob("*.c3d")))
         keys = [reply.key for reply in await query_all(peer, "mocap/**")]
         expected = ["parameters", *(f"parameters/{section}" for section in SECTIONS), "3d", "status"]

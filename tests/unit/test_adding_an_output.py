@@ -32,10 +32,12 @@ from gateway.outputs.registry import OUTPUTS, settings_type
 from gateway.outputs.status import OutputHealth
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
+from gateway.rtc3d.packets import FilePiece
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.example_output import EXAMPLE, UNREACHABLE, ExampleOutput, ExampleSettings, ExampleSubscription
+from tests.servers import c3d_file
 from tests.waiting import wait_until_async
 
 OFF = {"zenoh": {"enabled": False}, "lcm": {"enabled": False}, "metrics": {"enabled": False}}
@@ -326,13 +328,14 @@ async def test_it_receives_parameters_and_announcements_of_files(tmp_path: Path)
         source, parameters = lab.output.parameters[0]
         assert (source, parameters.session) == ("lab", 1)
         assert b"<The_3D>" in parameters.xml
-        lab.source._on_file(lab.source.statuses[0], b"a take")
+        content = c3d_file(b"a take")
+        lab.source._files.receiver(print).receive(FilePiece(content, 0, len(content)))
         await wait_until_async(lambda: lab.output.files)
         stop.set()
         await task
     [(source, description)] = lab.output.files
     assert source == "lab"
-    assert description["bytes"] == 6
+    assert description["bytes"] == len(content)
 
 
 # Queries -------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from gateway.c3d_spool import Spool
+from gateway.c3d_files.spool import Spool
 from gateway.stream.state import StreamState
 from tests.servers import error, ok, packet
 from tests.spec_parameters import in_root

@@ -19,7 +19,7 @@ from gateway.outputs.memory import MemoryOutput
 from gateway.outputs.registry import OUTPUTS, settings_type
 from gateway.rtc3d.components import ComponentType
 from tests.example_output import EXAMPLE, UNREACHABLE, ExampleOutput, ExampleSettings, ExampleSubscription
-from tests.servers import packet
+from tests.servers import c3d_file, packet
 from tests.unit.scripted_sources import Servers, SlowThreads
 from tests.unit.stream.scripted_server import XML
 from tests.unit.stream.virtual_time import settle, until
@@ -206,13 +206,13 @@ async def test_parameters_and_files_reach_every_output(servers: Servers, tmp_pat
     spool = SpoolSettings(directory=str(tmp_path))
     async with running(settings(other="elsewhere", spool=spool)) as (gateway, _):
         await connected(gateway)
-        servers["lab"].connection.send(packet(5, b"a file"))
+        servers["lab"].connection.send(packet(5, c3d_file(b"a file")))
         await settle()
         for index in (0, 1):
             assert [(name, each.xml) for name, each in example(gateway, index).parameters] == [
                 ("lab", XML[8:])
             ]
-            assert [(name, each["bytes"]) for name, each in example(gateway, index).files] == [("lab", 6)]
+            assert [(name, each["bytes"]) for name, each in example(gateway, index).files] == [("lab", 1024)]
 
 
 # Reloading outputs ---------------------------------------------------------------------------
@@ -397,7 +397,7 @@ async def test_a_changed_spool_is_used_by_running_sources(servers: Servers, tmp_
     async with running(settings(spool=before)) as (gateway, _):
         await connected(gateway)
         assert await gateway.reload(settings(spool=after)) == ["spool changed"]
-        servers["lab"].connection.send(packet(5, b"a file"))
+        servers["lab"].connection.send(packet(5, c3d_file(b"a file")))
         await settle()
         assert gateway.sources[0].spool.newest("lab") is not None
         assert await gateway.reload(settings("lab", "new", spool=after)) == ["source new added"]

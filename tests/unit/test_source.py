@@ -3,15 +3,16 @@
 import asyncio
 import logging
 from collections.abc import AsyncIterator, Mapping
+from concurrent.futures import Future
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from gateway.c3d_spool import Spool
+from gateway.c3d_files.spool import Spool
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.errors import QueryError, SpoolError
+from gateway.errors import QueryError
 from gateway.log import current_log_fields
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
@@ -20,7 +21,8 @@ from gateway.publish.fan_out import FanOut
 from gateway.queries.questions import Question
 from gateway.rtc3d.components import ComponentType
 from gateway.source import Source
-from tests.servers import packet
+from gateway.worker_thread import WorkerThread
+from tests.servers import c3d_file, packet
 from tests.toy_output import ToyOutput, ToyPublisher
 from tests.unit.scripted_sources import Servers
 from tests.unit.stream.scripted_server import ScriptedServer
@@ -32,13 +34,6 @@ TWO_STREAMS = (
     StreamSettings(components=(ComponentType.MARKERS,)),
     StreamSettings(components=(ComponentType.ANALOG,)),
 )
-
-
-class BrokenSpool(Spool):
-    """A folder on a disk that is full."""
-
-    def store(self, source: str, content: bytes) -> Path:
-        raise SpoolError(f"{len(content)} bytes from {source} cannot be kept; check the disk")
 
 
 class Lab:
@@ -54,7 +49,6 @@ class Lab:
         **settings: Any,
     ) -> None:
         self.server: ScriptedServer = servers[HOST]
-        self.threads = servers.threads
         self.output = output or ToyOutput()
         self.parameters: list[tuple[str, ServerParameters]] = []
         self.files: list[tuple[str, dict[str, Any]]] = []
@@ -202,99 +196,134 @@ async def test_a_source_that_replaces_another_continues_its_numbers(servers: Ser
 # Tasks ---------------------------------------------------------------------------------------
 
 
-async def test_background_tasks_end_with_the_source(servers: Servers, spool: Spool) -> None:
-    others = asyncio.all_tasks()
-    lab = Lab(servers, spool)
-    async with running(lab):
-        await lab.connected()
-        lab.threads.is_slow = True
-        lab.server.connection.send(packet(5, b"a file"))
-        await settle()
-        assert lab.threads.num_waiting == 1
-    await settle()
-    assert asyncio.all_tasks() - others == set()
-
-
 # C3D files -----------------------------------------------------------------------------------
 
 
-async def test_a_file_is_stored_and_announced(servers: Servers, spool: Spool, tmp_path: Path) -> None:
-    lab = Lab(servers, spool)
+async def test_a_file_is_stored_and_announced(
+    servers: Servers, spool: Spool, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    lab, content = Lab(servers, spool), c3d_file(b"a file", 600)
     async with running(lab):
         await lab.connected()
-        lab.server.connection.send(packet(5, b"a file"))
+        lab.server.connection.send(packet(5, content))
         await settle()
         [(source, description)] = lab.files
-        assert (source, description["bytes"]) == ("lab", 6)
+        assert (source, description["bytes"]) == ("lab", 600)
         answer = await lab.source.queries.answer(Question("c3d"))
-        assert (answer.payload, answer.attachment) == (b"a file", description)
-    assert spool.newest("lab") == tmp_path / description["name"]
+        assert (answer.payload, answer.attachment) == (content, description)
+    path = tmp_path / description["name"]
+    assert spool.newest("lab") == path
+    assert f"lab: the server sent a C3D file of 600 bytes, kept as {path}" in caplog.messages
 
 
-async def test_at_most_four_files_wait_for_the_disk(
-    servers: Servers, spool: Spool, caplog: pytest.LogCaptureFixture
-) -> None:
-    lab = Lab(servers, spool)
-    async with running(lab):
-        await lab.connected()
-        lab.threads.is_slow = True
-        for number in range(5):
-            lab.server.connection.send(packet(5, bytes(number + 1)))
-            await settle()
-        [record] = [record for record in caplog.records if record.levelno == logging.ERROR]
-        assert record.message == (
-            f"{STREAM}: a C3D file of 5 bytes is dropped: 4 earlier files are still being written; "
-            "is the disk slow, or the server faulty?"
-        )
-        lab.threads.is_slow = False
-        lab.threads.finish()
-        await settle()
-        assert [description["bytes"] for _, description in lab.files] == [1, 2, 3, 4]
-        lab.server.connection.send(packet(5, bytes(6)))  # there is room again
-        await settle()
-        assert lab.files[-1][1]["bytes"] == 6
-
-
-async def test_files_that_cannot_be_stored_are_logged_and_make_room_for_others(
+async def test_the_files_that_a_new_one_displaces_are_logged_with_it(
     servers: Servers, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO)
-    lab = Lab(servers, BrokenSpool(tmp_path, max_files=10, max_bytes=1000))
+    lab = Lab(servers, Spool(tmp_path, max_files=1, max_bytes=1000))
+    async with running(lab):
+        await lab.connected()
+        for _ in range(2):
+            lab.server.connection.send(packet(5, c3d_file(b"", 600)))
+            await settle()
+    path = tmp_path / lab.files[1][1]["name"]
+    [line] = [message for message in caplog.messages if path.name in message]
+    assert line.endswith(f"kept as {path}; deleted the oldest (1)")
+
+
+async def test_a_file_is_announced_although_an_old_one_cannot_be_deleted(
+    servers: Servers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    lab = Lab(servers, Spool(tmp_path, max_files=1, max_bytes=1000))
+
+    def refuse(_path: Path, **_options: bool) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    async with running(lab):
+        await lab.connected()
+        with monkeypatch.context() as disk:
+            disk.setattr(Path, "unlink", refuse)
+            for _ in range(3):
+                lab.server.connection.send(packet(5, c3d_file(b"", 600)))
+                await settle()
+        assert len(lab.files) == 3
+        lab.server.connection.send(packet(5, c3d_file(b"", 600)))
+        await settle()
+    warnings = [record.message for record in caplog.records if record.levelno == logging.WARNING]
+    [warning] = [text for text in warnings if "C3D" in text]
+    assert warning.startswith(f"lab: old C3D files are not deleted: {tmp_path}/lab-")
+    assert warning.endswith(" cannot be deleted: Operation not permitted")
+    assert any("old C3D files can be deleted again" in message for message in caplog.messages)
+
+
+async def test_files_that_cannot_be_stored_are_logged_once(
+    servers: Servers, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
+    (tmp_path / "c3d").write_text("a file in place of the folder")
+    lab = Lab(servers, Spool(tmp_path / "c3d", max_files=10, max_bytes=1000))
     async with running(lab):
         await lab.connected()
         for _ in range(6):
-            lab.server.connection.send(packet(5, b"a file"))
+            lab.server.connection.send(packet(5, c3d_file(b"", 600)))
             await settle()
     errors = [record.message for record in caplog.records if record.levelno == logging.ERROR]
-    assert errors == [f"{STREAM}: 6 bytes from lab cannot be kept; check the disk"]
+    assert errors == [
+        f"{STREAM}: a C3D file of 600 bytes from lab cannot be stored in {tmp_path / 'c3d'}: File exists; "
+        "check spool.directory and the space on it"
+    ]
     [end] = [message for message in caplog.messages if "lost within" in message]
     assert end.endswith(" s: 6 messages (C3D file)")
     assert lab.files == []
 
 
-async def test_a_missing_file_is_an_error_for_the_peer(
-    servers: Servers, spool: Spool, tmp_path: Path
+async def test_a_file_that_breaks_off_with_the_connection_is_logged(
+    servers: Servers, spool: Spool, caplog: pytest.LogCaptureFixture
 ) -> None:
     lab = Lab(servers, spool)
+    async with running(lab):
+        await lab.connected()
+        lab.server.connection.send(packet(5, c3d_file(b"", 600))[:-1])
+        lab.server.connection.end()
+        await settle()
+    assert spool.newest("lab") is None
+    [error] = [record.message for record in caplog.records if record.levelno == logging.ERROR]
+    assert error.startswith(f"{STREAM}: a C3D file of 600 bytes from lab broke off after 599 bytes: the conn")
+
+
+async def test_a_missing_file_is_an_error_for_the_peer(
+    servers: Servers, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab = Lab(servers, Spool(tmp_path, max_files=10, max_bytes=1000))
     with pytest.raises(QueryError, match="has sent no C3D file so far") as caught:
         await lab.source.queries.answer(Question("c3d"))
     assert caught.value.code == "nothing-yet"
-    (tmp_path / "lab-20260102T030405.000006Z.c3d").mkdir()
-    with pytest.raises(QueryError, match=r"lab-.*\.c3d cannot be read") as caught:
+    monkeypatch.setattr(Spool, "newest", lambda _spool, _source: tmp_path / "gone.c3d")
+    with pytest.raises(QueryError, match=r"of source 'lab' cannot be read: No such file") as caught:
         await lab.source.queries.answer(Question("c3d"))
     assert caught.value.code == "nothing-yet"
 
 
-async def test_a_defect_in_a_task_of_the_source_is_an_error_and_streams_continue(
+async def test_a_disk_that_does_not_give_the_file_is_an_error_for_the_peer(
+    servers: Servers, spool: Spool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab = Lab(servers, spool)
+    monkeypatch.setattr(WorkerThread, "submit", lambda _thread, _call: Future())
+    with pytest.raises(QueryError, match="did not give the file within 4 s") as caught:
+        await lab.source.queries.answer(Question("c3d"))
+    assert caught.value.code == "timeout"
+
+
+async def test_a_defect_in_announcing_a_file_is_an_error_and_streams_continue(
     servers: Servers, spool: Spool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     lab = Lab(servers, spool)
     monkeypatch.setattr(lab, "files", None)  # what takes the description of a file raises AttributeError
     async with running(lab):
         await lab.connected()
-        lab.server.connection.send(packet(5, b"a file"))
-        await settle()
-        lab.threads.finish()
+        lab.server.connection.send(packet(5, c3d_file(b"", 600)))
         await settle()
         assert len(lab.server.connections) == 1
     [error] = [record for record in caplog.records if record.levelno == logging.ERROR]

@@ -5,7 +5,7 @@ import logging
 
 import pytest
 
-from gateway.c3d_spool import Spool
+from gateway.c3d_files.spool import Spool
 from gateway.config.settings import StreamSettings
 from gateway.errors import QueryError
 from gateway.outputs.contract import ServerParameters

@@ -8,6 +8,7 @@ from functools import partial
 import pytest
 
 from gateway.worker_thread import WorkerThread
+from tests.waiting import wait_until_async
 
 
 async def test_calls_are_made_in_their_order_in_another_thread() -> None:
@@ -26,21 +27,22 @@ async def test_the_exception_of_a_call_is_raised_and_later_calls_are_made() -> N
     assert await worker.run(lambda: "later") == "later"
 
 
-async def test_waiting_calls_can_be_cancelled() -> None:
+async def test_the_age_of_a_call_is_that_of_the_one_in_progress() -> None:
     worker, begun, released = WorkerThread("test"), threading.Event(), threading.Event()
 
     def wait() -> None:
         begun.set()
         released.wait()
 
-    first = worker.submit(wait)
+    assert worker.call_age_s == 0
+    call = worker.submit(wait)
     begun.wait()
-    second = worker.submit(lambda: None)
-    worker.cancel_waiting()
-    assert second.cancelled()
-    assert not first.done()
+    age_s = worker.call_age_s
+    assert 0 < age_s <= worker.call_age_s
     released.set()
-    assert await worker.run(lambda: "later") == "later"
+    call.result()
+    await worker.run(lambda: None)
+    await wait_until_async(lambda: worker.call_age_s == 0)
 
 
 async def test_an_idle_thread_ends_and_the_next_call_starts_another(monkeypatch: pytest.MonkeyPatch) -> None:

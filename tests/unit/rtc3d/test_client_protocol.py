@@ -5,7 +5,6 @@ import pytest
 from gateway.errors import ClosedError, LinkError
 from gateway.rtc3d.client_protocol import (
     ClientProtocol,
-    FileReceived,
     StreamCorrupted,
     UnexpectedPacket,
 )
@@ -103,8 +102,15 @@ def test_any_answer_to_bye_or_none_leaves_the_connection_closing(reply: bytes) -
     assert protocol.state is ProtocolState.CLOSING
 
 
-def test_a_c3d_file_is_returned_as_one_event() -> None:
-    assert ClientProtocol().receive(packet(5, b"C3D")) == ([], [FileReceived(b"C3D")])
+def test_a_c3d_file_is_returned_in_the_pieces_in_which_it_arrives() -> None:
+    protocol, file = ClientProtocol(), packet(5, b"C3D")
+    frames, pieces = protocol.receive(FRAME + file[:10])
+    later_frames, later_pieces = protocol.receive(file[10:] + FRAME)
+    assert [len(frames), len(later_frames)] == [1, 1]
+    assert [repr(piece) for piece in pieces + later_pieces] == [
+        "FilePiece(b'C3', 0, 3)",
+        "FilePiece(b'D', 2, 3)",
+    ]
 
 
 def test_a_packet_of_unknown_type_is_unexpected() -> None:

@@ -6,6 +6,7 @@ from gateway.errors import PacketError
 from gateway.rtc3d.packets import (
     DEFAULT_MAX_C3D_BYTES,
     DEFAULT_MAX_PACKET_BYTES,
+    FilePiece,
     Packet,
     PacketReader,
     PacketType,
@@ -57,7 +58,9 @@ def test_each_packet_is_read_as_documented(vector: PacketVector) -> None:
     assert reader.error is None
 
 
-@each_packet
+@pytest.mark.parametrize(
+    "vector", [each for each in PACKETS if each.type != 5], ids=lambda vector: vector.name
+)
 def test_each_packet_is_read_byte_by_byte(vector: PacketVector) -> None:
     reader = PacketReader()
     for count, byte in enumerate(vector.packet[:-1], start=1):
@@ -130,6 +133,41 @@ def test_a_c3d_file_has_its_own_limit(size: int) -> None:
     reader = limited_reader()
     assert reader.feed(header(size, 5) + bytes(size - 8)) == [Packet(5, bytes(size - 8))]
     assert reader.error is None
+
+
+def test_a_c3d_file_is_not_collected() -> None:
+    reader, wire = limited_reader(), header(108, 5) + bytes(range(100)) + header(8, 4)
+    pieces = []
+    for start in range(0, len(wire), 30):
+        pieces += reader.feed(wire[start : start + 30])
+        assert reader.buffered_bytes <= 8
+    *pieces, after = pieces
+    assert after == Packet(4, b"")
+    assert all(isinstance(piece, FilePiece) for piece in pieces)
+    found = [(piece.offset, len(piece.body)) for piece in pieces if isinstance(piece, FilePiece)]
+    assert found == [(0, 22), (22, 30), (52, 30), (82, 18)]
+    assert b"".join(piece.body for piece in pieces) == bytes(range(100))
+
+
+def test_an_empty_c3d_file_is_one_empty_piece() -> None:
+    [piece, after] = limited_reader().feed(header(8, 5) + header(8, 4))
+    assert isinstance(piece, FilePiece)
+    assert (piece.body, piece.is_first, piece.is_last) == (b"", True, True)
+    assert after == Packet(4, b"")
+
+
+def test_a_whole_read_of_a_file_is_not_copied() -> None:
+    reader, read = PacketReader(), bytes(1000)
+    reader.feed(header(10_008, 5))
+    [piece] = reader.feed(read)
+    assert piece.body is read
+
+
+def test_the_offset_of_an_error_behind_a_file_counts_its_pieces() -> None:
+    reader = limited_reader()
+    for data in (header(28, 5) + bytes(5), bytes(15), header(7, 3)):
+        reader.feed(data)
+    assert error_of(reader).offset == 28
 
 
 @pytest.mark.parametrize("size", [7, C3D_LIMIT + 1])

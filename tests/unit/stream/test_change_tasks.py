@@ -9,6 +9,7 @@ import pytest
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import DefectError, RequestError
 from gateway.stream.change_tasks import DEMAND_POLL_S, MAX_RESUMES, ChangeTasks
+from gateway.stream.files import IgnoredFiles
 from gateway.stream.session import Session
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
@@ -36,7 +37,7 @@ class Lab:
         self.has_defect = False
         source, settings = SourceSettings(name="lab", host="192.0.2.20"), StreamSettings(**stream)
         self.session = Session(
-            source, settings, self.status, lambda *_: None, lambda _: None, self.server.connect
+            source, settings, self.status, lambda *_: None, IgnoredFiles(), self.server.connect
         )
         self._control = StreamControl(source, settings, self.status, self.session, read_parameters)
         self.adaptation = ChangeTasks(

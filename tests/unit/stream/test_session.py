@@ -18,6 +18,7 @@ from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from tests.losses import amounts
 from tests.servers import markers_frame, ok, packet
+from tests.unit.stream.collected_files import CollectedFiles
 from tests.unit.stream.scripted_server import (
     BROKEN_FRAME,
     Connection,
@@ -43,14 +44,14 @@ class Lab:
         self.server = ScriptedServer()
         self.status = StreamStatus("3d", name="lab (3d)")
         self.frames: list[tuple[int, float]] = []
-        self.files: list[bytes] = []
+        self.files = CollectedFiles()
         self.checks_s: list[float] = []
         self.session = Session(
             SourceSettings(name="lab", host="192.0.2.20", **settings),
             StreamSettings.model_validate({"components": components}),
             self.status,
             self._on_frames,
-            self.files.append,
+            self.files,
             self.server.connect,
             read_clocks,
         )
@@ -210,10 +211,24 @@ async def test_a_rejected_frame_is_counted_and_the_next_is_passed_on(
     assert any(record.levelname == "WARNING" for record in caplog.records)
 
 
-async def test_a_c3d_file_is_passed_on(lab: Lab) -> None:
+async def test_a_c3d_file_is_passed_on_in_pieces(lab: Lab) -> None:
     await lab.streaming()
-    lab.connection.send(packet(5, b"content"))
-    assert lab.files == [b"content"]
+    file = packet(5, b"content")
+    lab.connection.send(file[:11])
+    lab.connection.send(file[11:])
+    assert lab.files.pieces == [b"con", b"tent"]
+    assert lab.files.interruptions == []
+
+
+async def test_the_end_of_the_session_interrupts_a_file_and_later_pieces_are_ignored(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send(packet(5, b"content")[:-1])
+    closing = asyncio.create_task(lab.session.close())
+    await settle()
+    assert lab.files.interruptions == ["the connection to 192.0.2.20:3020 was closed by the gateway"]
+    lab.connection.send(b"t" + packet(5, b"another"))
+    assert lab.files.pieces == [b"conten"]
+    await closing
 
 
 # --- the connection

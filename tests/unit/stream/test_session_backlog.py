@@ -9,6 +9,7 @@ from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import DefectError, ReplyTimeoutError, SilenceError
 from gateway.rtc3d.commands import StreamFrames, Version
 from gateway.rtc3d.frames import Frame
+from gateway.stream.files import IgnoredFiles
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from tests.servers import packet
@@ -28,7 +29,7 @@ class Lab:
             StreamSettings.model_validate({"components": ["3d"], **stream}),
             self.status,
             self._on_frames,
-            lambda _content: None,
+            IgnoredFiles(),
             self.server.connect,
             read_clocks,
         )

@@ -9,6 +9,7 @@ import pytest
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import LinkError, RequestError, SilenceError
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
+from gateway.stream.files import IgnoredFiles
 from gateway.stream.parameters import Connection
 from gateway.stream.session import Session
 from gateway.stream.state import StreamState
@@ -46,7 +47,7 @@ class Lab:
             settings,
             self.status,
             lambda *_: None,
-            lambda _: None,
+            IgnoredFiles(),
             self.server.connect,
             read_clocks,
         )

@@ -19,6 +19,7 @@ from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from gateway.stream.supervisor import Callbacks, Listener, Supervisor, backoff_delays_s
 from tests.servers import packet
+from tests.unit.stream.collected_files import CollectedFiles
 from tests.unit.stream.scripted_server import ScriptedServer, read_parameters, refusing, silent_to
 from tests.unit.stream.virtual_time import read_clocks, settle, until
 
@@ -40,7 +41,7 @@ class Lab:
         self.server = ScriptedServer()
         self.status = StreamStatus("3d", name="lab (3d)")
         self.published: list[tuple[Frame, Stamp]] = []
-        self.files: list[bytes] = []
+        self.files = CollectedFiles()
         self.has_subscribers = True
         self.has_defect = False
         self.restarts = self.connected = 0
@@ -57,7 +58,7 @@ class Lab:
                 skip=lambda *_: 0,
                 read_parameters=read_parameters,
                 on_restart=self._on_restart,
-                on_file=self.files.append,
+                files=self.files,
                 has_subscribers=self._has_subscribers,
             ),
             _Listener(lambda: self._on_connected()),  # noqa: PLW0108 - tests replace the method
@@ -315,7 +316,7 @@ async def test_files_and_restarts_of_the_server_are_passed_on() -> None:
         lab.server.connection.send_frames(1000)
         lab.server.connection.send_frames(1)
         lab.server.connection.send(packet(5, b"C3D"))
-    assert (lab.restarts, lab.files) == (1, [b"C3D"])
+    assert (lab.restarts, lab.files.pieces) == (1, [b"C3D"])
 
 
 async def test_frames_that_stay_late_halve_the_rate() -> None:

@@ -1,0 +1,242 @@
+"""The way of C3D files from streams to the disk, with real threads and a real folder."""
+
+import asyncio
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from gateway.c3d_files import receiving
+from gateway.c3d_files.receiving import FileReceiver, SourceFiles
+from gateway.c3d_files.spool import Spool, StoredFile
+from gateway.rtc3d.packets import FilePiece
+from tests.servers import c3d_file
+from tests.waiting import wait_until_async
+
+FILE = c3d_file(b"the end", 2000)
+
+
+class Lab:
+    """The files of a source. ``stored`` and ``lost`` are what was reported."""
+
+    def __init__(self, folder: Path, *, max_bytes: int = 10_000, max_queued_bytes: int = 1_000_000) -> None:
+        self.spool = Spool(folder, 100, max_bytes, max_queued_bytes)
+        self.stored: list[StoredFile] = []
+        self.lost: list[str] = []
+        self.files = SourceFiles("lab", lambda: self.spool, self.stored.append)
+        self.receiver = self.new_receiver()
+
+    def new_receiver(self) -> FileReceiver:
+        return self.files.receiver(lambda error: self.lost.append(str(error)))
+
+    def send(self, content: bytes, receiver: FileReceiver | None = None, piece_bytes: int = 300) -> None:
+        """Send a whole file in pieces."""
+        for start in range(0, len(content) or 1, piece_bytes):
+            piece = FilePiece(content[start : start + piece_bytes], start, len(content))
+            (receiver or self.receiver).receive(piece)
+
+    def begin(self, content: bytes, num_bytes: int) -> None:
+        """Send the first bytes of a file."""
+        self.receiver.receive(FilePiece(content[:num_bytes], 0, len(content)))
+
+    async def ended(self, count: int) -> None:
+        await wait_until_async(lambda: len(self.stored) + len(self.lost) == count)
+        await self.files._thread.run(lambda: None)  # lost files are deleted
+
+    @property
+    def contents(self) -> list[bytes]:
+        return [path.read_bytes() for path in sorted(self.spool.directory.iterdir())]
+
+
+@pytest.fixture
+def disk(monkeypatch: pytest.MonkeyPatch) -> "Disk":
+    return Disk(monkeypatch)
+
+
+class Disk:
+    """Stops every write until ``respond``, as a hung disk does."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self._responds = threading.Event()
+        write = os.write
+
+        def hang(descriptor: int, data: memoryview) -> int:
+            self._responds.wait()
+            return write(descriptor, data)
+
+        self.hang: Callable[[], None] = lambda: monkeypatch.setattr(os, "write", hang)
+
+    def respond(self) -> None:
+        self._responds.set()
+
+
+@pytest.mark.parametrize("piece_bytes", [1, 2, 3, 511, 5000])
+async def test_a_file_is_stored_whatever_its_pieces(tmp_path: Path, piece_bytes: int) -> None:
+    lab = Lab(tmp_path)
+    lab.send(FILE, piece_bytes=piece_bytes)
+    await lab.ended(1)
+    assert lab.contents == [FILE]
+    assert [stored.num_bytes for stored in lab.stored] == [len(FILE)]
+    assert lab.spool.memory.held_bytes == 0
+
+
+async def test_files_of_two_streams_may_arrive_at_the_same_time(tmp_path: Path) -> None:
+    lab = Lab(tmp_path)
+    other, content = lab.new_receiver(), c3d_file(b"another", 3000)
+    lab.begin(FILE, 1000)
+    lab.send(content, other)
+    lab.receiver.receive(FilePiece(FILE[1000:], 1000, len(FILE)))
+    await lab.ended(2)
+    assert sorted(lab.contents) == sorted([FILE, content])
+
+
+@pytest.mark.parametrize(
+    ("content", "text"),
+    [
+        (b"", "a C3D file of 0 bytes is refused: it is empty"),
+        (b"P", "a C3D file of 1 bytes is refused: it has 1 bytes, and the header of a C3D file has 512"),
+        (bytes(5000), "a C3D file of 5000 bytes is refused: its first bytes are not those of a C3D file"),
+        (c3d_file(b"", 10_001), "a C3D file of 10001 bytes from lab is not stored: spool.max_bytes is 10000"),
+    ],
+)
+async def test_other_files_are_refused_and_skipped(tmp_path: Path, content: bytes, text: str) -> None:
+    lab = Lab(tmp_path)
+    for piece_bytes in (1, 5000):
+        lab.send(content, piece_bytes=piece_bytes)
+    assert lab.lost == [text, text]
+    lab.send(FILE)
+    await lab.ended(3)
+    assert lab.contents == [FILE]
+
+
+async def test_a_file_that_breaks_off_is_deleted(tmp_path: Path) -> None:
+    lab = Lab(tmp_path)
+    lab.begin(FILE, 1000)
+    lab.receiver.interrupt("the connection broke")
+    lab.receiver.interrupt("again")
+    assert lab.lost == ["a C3D file of 2000 bytes from lab broke off after 1000 bytes: the connection broke"]
+    await lab.ended(1)
+    assert lab.contents == []
+    lab.send(FILE)  # of the next connection
+    await lab.ended(2)
+    assert lab.contents == [FILE]
+
+
+async def test_the_end_of_a_connection_between_files_loses_nothing(tmp_path: Path) -> None:
+    lab = Lab(tmp_path)
+    lab.send(FILE)
+    lab.receiver.interrupt("closed")
+    await lab.ended(1)
+    assert lab.contents == [FILE]
+
+
+async def test_a_file_that_cannot_be_written_is_lost_once_and_later_ones_are_stored(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lab = Lab(tmp_path)
+
+    def fail(_descriptor: int, _data: memoryview) -> int:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as full:
+        full.setattr(os, "write", fail)
+        lab.send(FILE)
+        await lab.ended(1)
+    assert lab.lost == [
+        f"a C3D file of 2000 bytes from lab cannot be stored in {tmp_path}: No space left on device; "
+        "check spool.directory and the space on it"
+    ]
+    assert lab.spool.memory.held_bytes == 0
+    lab.send(FILE)
+    await lab.ended(2)
+    assert lab.contents == [FILE]
+
+
+async def test_a_disk_that_hangs_takes_no_more_memory_than_its_share(tmp_path: Path, disk: Disk) -> None:
+    lab = Lab(tmp_path, max_queued_bytes=10_000)
+    disk.hang()
+    lab.send(c3d_file(b"", 9000), piece_bytes=500)
+    [lost] = lab.lost
+    assert lost.startswith("a C3D file of 9000 bytes from lab is dropped: 0 MiB of C3D files are waiting")
+    assert lab.spool.memory.held_bytes <= 700  # the piece that is being written
+    disk.respond()
+    await lab.ended(1)
+    assert lab.contents == []
+    lab.send(FILE)
+    await lab.ended(2)
+    assert lab.contents == [FILE]
+
+
+async def test_at_most_four_files_wait_for_the_disk(tmp_path: Path, disk: Disk) -> None:
+    lab = Lab(tmp_path)
+    disk.hang()
+    for _ in range(6):
+        lab.send(FILE)
+    assert lab.lost == 2 * [
+        "a C3D file of 2000 bytes is dropped: 4 earlier files are still being written; "
+        "is the disk slow, or the server faulty?"
+    ]
+    disk.respond()
+    await lab.ended(6)
+    assert lab.contents == 4 * [FILE]
+
+
+async def test_the_files_that_wait_for_a_disk_that_does_not_respond_are_given_up(
+    tmp_path: Path, disk: Disk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(receiving, "_MAX_DISK_S", 0.0)
+    lab = Lab(tmp_path)
+    lab.files.check()
+    disk.hang()
+    lab.send(FILE)
+    lab.begin(FILE, 1000)
+    await wait_until_async(lambda: lab.files._thread.call_age_s > 0)
+    lab.files.check()
+    silent = f"the disk of {tmp_path} does not respond"
+    assert lab.lost == 2 * [
+        f"a C3D file of 2000 bytes from lab is dropped: {silent}; check it, and whether it is mounted"
+    ]
+    lab.receiver.receive(FilePiece(FILE[1000:], 1000, len(FILE)))
+    lab.send(FILE)
+    assert lab.lost[2:] == [f"a C3D file of 2000 bytes is dropped: {silent}"]
+    assert lab.spool.memory.held_bytes <= 500
+    disk.respond()
+    await lab.ended(3)
+    assert lab.contents == []
+    await wait_until_async(lambda: lab.files._thread.call_age_s == 0)
+    lab.files.check()
+    lab.send(FILE)
+    await lab.ended(4)
+    assert lab.contents == [FILE]
+
+
+async def test_a_flood_of_files_is_limited(tmp_path: Path) -> None:
+    lab = Lab(tmp_path)
+    for number in range(receiving._MAX_FILES_AT_ONCE + 2):
+        lab.send(FILE)
+        await lab.ended(number + 1)
+    assert len(lab.stored) == receiving._MAX_FILES_AT_ONCE
+    assert lab.lost == 2 * [
+        "a C3D file of 2000 bytes is dropped: lab sends more than one file in 3 s; is the server faulty?"
+    ]
+    lab.files._allowed_s -= 3.0
+    for _ in range(2):
+        lab.send(FILE)
+    await lab.ended(receiving._MAX_FILES_AT_ONCE + 4)
+    assert len(lab.stored) == receiving._MAX_FILES_AT_ONCE + 1
+
+
+async def test_the_end_of_a_source_waits_for_the_disk_but_not_long(tmp_path: Path, disk: Disk) -> None:
+    lab = Lab(tmp_path)
+    lab.send(FILE)
+    await lab.files.finish()
+    assert lab.contents == [FILE]
+    assert len(lab.stored) == 1
+    disk.hang()
+    lab.send(FILE)
+    async with asyncio.timeout(20):
+        await lab.files.finish()
+    disk.respond()
+    await lab.ended(2)
