@@ -122,6 +122,29 @@ async def test_the_watchdog_restarts_a_hung_service(service: Service) -> None:
     assert "Fatal Python error: Aborted" in log  # and the traceback shows where it hung
 
 
+async def test_the_limits_are_in_force(service: Service) -> None:
+    machine = service.machine
+    async with simulator() as server:
+        service.configure({"lab": server.port})
+        await service.start()
+        await service.wait_for_status("lab: streaming")
+    pid = await service.main_pid()
+    limits = (await machine.run("cat", f"/proc/{pid}/limits")).text
+    assert re.search(r"Max open files +8192 +8192 ", limits)
+    assert (await machine.run("cat", f"/proc/{pid}/oom_score_adj")).text == "-500\n"
+    assert await machine.show("MemoryHigh") == str(1536 * 2**20)
+    assert await machine.show("MemoryMax") == str(2 * 2**30)
+    assert await machine.show("TasksMax") == "1024"
+    assert "time-sync.target" in (await machine.show("After")).split()
+    assert "time-sync.target" not in (await machine.show("Wants")).split()
+    # Which controllers version 2 of cgroups has depends on the outer machine.
+    folder = f"/sys/fs/cgroup{await machine.show('ControlGroup')}"
+    controllers = (await machine.run("cat", f"{folder}/cgroup.controllers")).text.split()
+    expected = {"memory": ("memory.max", str(2 * 2**30)), "pids": ("pids.max", "1024")}
+    for file, value in (expected[name] for name in controllers if name in expected):
+        assert (await machine.run("cat", f"{folder}/{file}")).text.strip() == value
+
+
 class Received:
     """The session and sequence numbers of each source's markers, as a Zenoh subscriber received them."""
 
