@@ -4,6 +4,8 @@ import itertools
 import json
 import socket
 import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, Final
 
 import zenoh
@@ -56,3 +58,39 @@ def remove_multicast_route() -> None:
 def add_multicast_route() -> None:
     """Restore the multicast route of the network namespace."""
     subprocess.run(["ip", "route", "replace", *_MULTICAST], check=True)
+
+
+@contextmanager
+def lan_interface(address: str) -> Iterator[int]:
+    """Give the network namespace a LAN with one more computer, and multicast to it.
+
+    ``address`` is this computer's, with /24; the other one has 254 at the end. Yields the process id of the
+    other computer's network namespace, for ``nsenter``.
+    """
+    other = address.rpartition(".")[0] + ".254"
+    with subprocess.Popen(
+        ["unshare", "--net", "sh", "-c", "echo ready; exec cat"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    ) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        inside = ["nsenter", "--net", "--target", str(process.pid)]
+        commands = [
+            ["ip", "link", "add", "lan", "type", "veth", "peer", "lan", "netns", str(process.pid)],
+            ["ip", "address", "add", f"{address}/24", "dev", "lan"],
+            ["ip", "link", "set", "lan", "up"],
+            ["ip", "route", "replace", "224.0.0.0/4", "dev", "lan"],
+            [*inside, "ip", "address", "add", f"{other}/24", "dev", "lan"],
+            [*inside, "ip", "link", "set", "lan", "up"],
+            [*inside, "ip", "link", "set", "lo", "up"],
+            [*inside, "ip", "route", "replace", "224.0.0.0/4", "dev", "lan"],
+        ]
+        try:
+            for command in commands:
+                subprocess.run(command, check=True)
+            yield process.pid
+        finally:
+            subprocess.run(["ip", "link", "del", "lan"], check=False)
+            add_multicast_route()
+            process.kill()

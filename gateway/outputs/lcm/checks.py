@@ -1,4 +1,4 @@
-"""The doctor's checks of LCM: the multicast route, and the size of a subscriber's receive buffer."""
+"""The doctor's checks of LCM: the multicast route, who can send requests, and the receive buffer."""
 
 import socket
 from collections.abc import Sequence
@@ -7,10 +7,16 @@ from urllib.parse import parse_qs, urlsplit
 
 from gateway.errors import OutputError
 from gateway.findings import Finding, MessageLoad, Subject
-from gateway.outputs.lcm.connection import MULTICAST_SCHEMES, multicast_problem, open_lcm, scheme_of
+from gateway.outputs.lcm.connection import (
+    MULTICAST_SCHEMES,
+    multicast_interface,
+    multicast_problem,
+    open_lcm,
+    scheme_of,
+)
 from gateway.outputs.lcm.settings import LcmSettings
 
-CHECKS: Final = ("route", "buffers")
+CHECKS: Final = ("route", "requests", "buffers")
 
 PAUSE_S: Final = 0.02
 """The longest time that a subscriber may pause without losing a message."""
@@ -32,9 +38,10 @@ def check_lcm(
     if scheme not in MULTICAST_SCHEMES:
         return [
             _check_other_scheme(url, scheme),
+            _check_requests(settings),
             _lcm.not_tested("buffers", f"{scheme} does not need a receive buffer"),
         ]
-    return [_check_route(url), _check_buffers(url, loads)]
+    return [_check_route(url), _check_requests(settings), _check_buffers(url, loads)]
 
 
 def _check_other_scheme(url: str, scheme: str) -> Finding:
@@ -75,6 +82,28 @@ def _check_route(url: str) -> Finding:
     if ttl == "0":
         return _lcm.passing("route", f"multicast to {address} works and stays on this computer (ttl=0)")
     return _lcm.passing("route", f"multicast to {address} works, with ttl={ttl}")
+
+
+def _check_requests(settings: LcmSettings) -> Finding:
+    """Check whether other computers can send requests. The ttl of the gateway's URL does not prevent it."""
+    if not settings.queries:
+        return _lcm.passing("requests", "lcm.queries is false: the gateway receives nothing on LCM")
+    url = settings.effective_queries_url
+    try:
+        interface = multicast_interface(url)
+    except OSError:
+        return _lcm.not_tested("requests", "it needs route, which failed")
+    if interface is None:
+        return _lcm.passing("requests", f"{url} does not use multicast")
+    if interface == "lo":
+        return _lcm.passing("requests", "multicast uses the loopback interface only")
+    return _lcm.warning(
+        "requests",
+        f"the gateway joins multicast on the network interface {interface}; requests from other "
+        "computers arrive unless a firewall drops them, also with ttl=0, which limits only sending",
+        "On a network that others use, set lcm.queries to false, or install the firewall rule in "
+        "docs/how-to/secure.md.",
+    )
 
 
 def _check_buffers(url: str, loads: Sequence[MessageLoad]) -> Finding:

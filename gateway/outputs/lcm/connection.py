@@ -1,7 +1,11 @@
 """Opening LCM, and explaining failures to open and to send."""
 
+import errno
 import ipaddress
+import os
 import socket
+import struct
+import sys
 from pathlib import Path
 from typing import Final
 from urllib.parse import urlsplit
@@ -16,6 +20,14 @@ DEFAULT_PORT: Final = 7667
 
 MULTICAST_SCHEMES: Final = ("udpm", "mpudpm")
 _RECEIVE_BUFFER_BYTES: Final = 4 * 1024 * 1024
+_ROUTE_REQUEST: Final = struct.Struct("=IHHIIBBBBBBBBIHH4s")
+"""The structures nlmsghdr, rtmsg, and rtattr with an IPv4 address."""
+
+_RTM_GETROUTE: Final = 26
+_RTA_DST: Final = 1
+_RTA_OIF: Final = 4
+_NLMSG_ERROR: Final = struct.pack("=H", 2)
+
 _RMEM_MAX: Final = Path("/proc/sys/net/core/rmem_max")
 
 BLOCKING_SCHEMES: Final = ("tcpq", "file")
@@ -24,7 +36,49 @@ BLOCKING_SCHEMES: Final = ("tcpq", "file")
 
 def scheme_of(url: str) -> str:
     """Return the scheme of an LCM URL, which selects how LCM sends: udpm, tcpq, …"""
-    return urlsplit(url).scheme
+    return url.partition("://")[0]
+
+
+def multicast_interface(url: str) -> str | None:
+    """Return the name of the network interface on which LCM joins the group of a multicast URL.
+
+    Returns None if the URL is of another kind, or if LCM itself would reject it. Raises OSError if there is
+    no such interface.
+    """
+    destination = _multicast_destination(url)
+    if destination is None:
+        return None
+    # rtnetlink(7): a request for the route to an address, whose reply has the interface. The local address of
+    # a connected socket does not show it: a route through lo can use the address of another interface.
+    request = _ROUTE_REQUEST.pack(
+        *(_ROUTE_REQUEST.size, _RTM_GETROUTE, 1, 0, 0),
+        *(socket.AF_INET, 32, 0, 0, 0, 0, 0, 0, 0),
+        *(8, _RTA_DST, ipaddress.IPv4Address(destination[0]).packed),
+    )
+    with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, socket.NETLINK_ROUTE) as kernel:
+        kernel.send(request)
+        reply = kernel.recv(65536)
+    if reply[4:6] == _NLMSG_ERROR:
+        number = -int.from_bytes(reply[16:20], sys.byteorder, signed=True)
+        raise OSError(number, os.strerror(number))
+    attribute = _ROUTE_REQUEST.size - 8
+    while attribute + 8 <= len(reply):
+        length, kind, index = struct.unpack_from("=HHI", reply, attribute)
+        if kind == _RTA_OIF:
+            return socket.if_indextoname(index)
+        attribute += (max(length, 4) + 3) & ~3
+    raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+
+
+def _multicast_destination(url: str) -> tuple[str, int] | None:
+    """Return group and port; None if this is no multicast URL, or one that LCM itself rejects."""
+    if scheme_of(url) not in MULTICAST_SCHEMES:
+        return None
+    try:
+        parts = urlsplit(url)
+        return str(ipaddress.IPv4Address(parts.hostname or DEFAULT_GROUP)), parts.port or DEFAULT_PORT
+    except ValueError:
+        return None
 
 
 def multicast_problem(url: str) -> str:
@@ -32,16 +86,12 @@ def multicast_problem(url: str) -> str:
 
     LCM itself only prints the reason to stderr and raises RuntimeError without it.
     """
-    parts = urlsplit(url)
-    if parts.scheme not in MULTICAST_SCHEMES:
+    destination = _multicast_destination(url)
+    if destination is None:
         return ""
     try:
-        group, port = str(ipaddress.IPv4Address(parts.hostname or DEFAULT_GROUP)), parts.port or DEFAULT_PORT
-    except ValueError:
-        return ""  # not an address: LCM itself rejects it
-    try:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-            probe.connect((group, port))
+            probe.connect(destination)
     except OSError as error:
         return (
             f"no multicast to {url}: {error}; bring a network interface up, or give it a multicast route: "

@@ -34,7 +34,7 @@ class LcmOutput(Output):
         self._sender = new_sender(settings.effective_url, shared, self._on_open)
 
     def _on_open(self) -> None:
-        if self._queries is not None:
+        if self._queries is not None and self.settings.queries:
             self._queries.start()
 
     def start(self) -> None:
@@ -88,9 +88,10 @@ class LcmOutput(Output):
             self._queries.publish_parameters(source, parameters)
 
     def serve_queries(self, service: QueryService) -> None:
-        """Answer ``parameters_request_t`` for every announced source."""
+        """Publish parameters and, with ``lcm.queries``, answer ``parameters_request_t`` for each source."""
         loop = asyncio.get_running_loop()
-        self._queries = LcmQueries(self.settings, service, loop, self._sender, self._shared)
+        shared = self._shared if self.settings.queries else None
+        self._queries = LcmQueries(self.settings, service, loop, self._sender, shared)
 
     async def stop_queries(self) -> None:
         """Stop receiving requests. Pending requests get no reply."""

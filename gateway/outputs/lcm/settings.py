@@ -24,6 +24,9 @@ def _lcm_url(text: str) -> str:
     scheme, separator, rest = text.partition("://")
     if scheme not in LCM_SCHEMES or not separator or not text.isprintable() or " " in text:
         raise ValueError
+    if len(text) > 1000:
+        raise ValueError
+    urlsplit(text)  # raises ValueError
     if "@" in rest.partition("/")[0]:  # LCM has no passwords, and logs the whole URL
         raise ValueError
     return text
@@ -58,8 +61,8 @@ def lcm_queries_url(url: str) -> str:
     gateway would receive its own messages, which more than doubles the CPU time for LCM. The other schemes
     deliver only messages on subscribed channels.
     """
-    parts = urlsplit(url)
     try:
+        parts = urlsplit(url)
         port = parts.port or DEFAULT_PORT
     except ValueError:  # LCM itself rejects it
         return url
@@ -81,6 +84,9 @@ class LcmSettings(OutputSettings):
 
     url: LcmUrl | None = None
     """Where to publish; null means $LCM_DEFAULT_URL, else LCM's default URL, which stays on this host."""
+
+    queries: Switch = True
+    """Whether to receive and answer requests; anyone whose datagrams reach this computer can send them."""
 
     queries_url: LcmUrl | None = None
     """The URL of requests and replies; null means url, with the next port if url begins with udpm."""

@@ -137,7 +137,7 @@ MISTAKES: list[tuple[str, str, str]] = [
         "LCM__ULR",
         "memq://",
         "LCM__ULR: lcm.ulr: unknown key (did you mean 'url'?); known keys: enabled, prefix, url, "
-        "queries_url, max_rate_hz, tool_poses",
+        "queries, queries_url, max_rate_hz, tool_poses",
     ),
     ("LMC__URL", "memq://", "LMC__URL: lmc: unknown key (did you mean 'lcm'?); known keys: sources, "),
     ("SOURCES__0__PORT", "abc", "SOURCES__0__PORT: sources[0].port: found 'abc'; expected a whole number"),

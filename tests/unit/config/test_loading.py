@@ -231,7 +231,7 @@ sources:
 """
     assert refused(file, text) == [
         "lab.yaml:1:7: lcm.enable: unknown key (did you mean 'enabled'?); "
-        "known keys: enabled, prefix, url, queries_url, max_rate_hz, tool_poses",
+        "known keys: enabled, prefix, url, queries, queries_url, max_rate_hz, tool_poses",
         "lab.yaml:2:17: zenoh.prefix: found '/mocap'; expected a Zenoh key of at most 128 characters, "
         "such as mocap or site/mocap, without spaces, * $ # ?, and without a leading, trailing or double /",
         "lab.yaml:4:5: sources[0].name: missing; this key is required",

@@ -147,8 +147,8 @@ def test_all_mistakes_are_reported_together() -> None:
         "max_packet_bytes, max_c3d_bytes, "
         "query_timeout_s, fresh_interval_s, parameters_interval_s, remote_control",
         "sources.1.host": "missing; this key is required",
-        "lcm": "found nothing; expected a mapping with any of the keys enabled, prefix, url, queries_url, "
-        "max_rate_hz, tool_poses",
+        "lcm": "found nothing; expected a mapping with any of the keys enabled, prefix, url, queries, "
+        "queries_url, max_rate_hz, tool_poses",
         "zenho": "unknown key (did you mean 'zenoh'?); known keys: sources, spool, metrics, zenoh, lcm",
     }
 

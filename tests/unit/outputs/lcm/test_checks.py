@@ -1,19 +1,21 @@
 """The doctor's findings about LCM, word for word."""
 
+from typing import Any
+
 import pytest
 
 from gateway.findings import Finding, MessageLoad, Result
 from gateway.outputs.lcm import checks
 from gateway.outputs.lcm.checks import charged_bytes, check_lcm
 from gateway.outputs.lcm.settings import LcmSettings
-from tests.networks import lcm_url
+from tests.networks import add_multicast_route, lan_interface, lcm_url, remove_multicast_route
 
 LOADS = (MessageLoad(rate_hz=100.0, largest_bytes=8000), MessageLoad(rate_hz=50.0, largest_bytes=1000))
 URL = "udpm://239.255.76.67:7667?ttl=0"
 
 
 def found(url: str, *loads: MessageLoad) -> tuple[Finding, Finding]:
-    route, buffers = check_lcm(LcmSettings(url=url), ("lab",), loads, 0.1)
+    route, _, buffers = check_lcm(LcmSettings(url=url), ("lab",), loads, 0.1)
     return route, buffers
 
 
@@ -135,3 +137,40 @@ class TestBuffers:
         assert found(URL)[1] == Finding(
             "lcm", "buffers", Result.NOT_TESTED, "no frames arrived, so the sizes of messages are unknown"
         )
+
+
+def requests(**settings: Any) -> Finding:
+    _, finding, _ = check_lcm(LcmSettings(**settings), ("lab",), (), 0.1)
+    return finding
+
+
+@pytest.mark.netns
+def test_requests_on_the_loopback_interface_pass() -> None:
+    assert requests(url=URL) == Finding(
+        "lcm", "requests", Result.PASSING, "multicast uses the loopback interface only"
+    )
+    assert requests(url="memq://").found == "memq:// does not use multicast"
+
+
+@pytest.mark.netns
+@pytest.mark.parametrize("ttl", [0, 1])
+def test_requests_that_may_come_from_the_network_are_a_warning(ttl: int) -> None:
+    url = f"udpm://239.255.76.67:7667?ttl={ttl}"
+    with lan_interface("192.0.2.7"):
+        finding = requests(url=url)
+        assert requests(url=url, queries=False) == Finding(
+            "lcm", "requests", Result.PASSING, "lcm.queries is false: the gateway receives nothing on LCM"
+        )
+    assert finding.result is Result.WARNING
+    assert "on the network interface lan; requests from other" in finding.found
+    assert "set lcm.queries to false" in finding.remedy
+
+
+@pytest.mark.netns
+def test_requests_are_not_tested_without_a_route() -> None:
+    remove_multicast_route()
+    try:
+        finding = requests(url=URL)
+    finally:
+        add_multicast_route()
+    assert finding == Finding("lcm", "requests", Result.NOT_TESTED, "it needs route, which failed")
