@@ -28,7 +28,7 @@ from tests.lcm_relay import LcmRelay
 from tests.networks import free_endpoint, lcm_url, zenoh_keys
 from tests.waiting import wait_until_async
 
-RETURNS_WITHIN_S = 10
+RETURNS_WITHIN_S = 5
 NUM_MESSAGES = 12_000
 LARGE_MESSAGE = bytes(20_000)
 """All messages together are larger than every buffer on the way."""
@@ -40,12 +40,12 @@ PATIENT = {
         "link": {
             "tx": {
                 "lease": HOUR_MS,
-                "queue": {"congestion_control": {"block": {"wait_before_close": 15_000_000}}},
+                "queue": {"congestion_control": {"block": {"wait_before_close": 7_000_000}}},
             }
         },
     }
 }
-"""Keys with which Zenoh keeps a stalled link for 15 s (given in µs) instead of 5 s: past RETURNS_WITHIN_S."""
+"""Keys with which Zenoh keeps a stalled link for 7 s (given in µs) instead of 5 s: past RETURNS_WITHIN_S."""
 
 
 class StalledPeer(NamedTuple):

@@ -80,10 +80,10 @@ def test_a_step_changes_time_stamps_and_nothing_else(tmp_path: Path, offset_s: f
         gateway_process(tmp_path, port, clock.environ, streams=[stream], max_lag_ms=400) as gateway,
     ):
         gateway.wait_for_clock()
-        gateway.wait_for_frames(2 * RATE_HZ)
+        gateway.wait_for_frames(RATE_HZ // 2)
         assert "set " not in gateway.log
         clock.set(offset_s)
-        gateway.wait_for_frames(4 * RATE_HZ)
+        gateway.wait_for_frames(2 * RATE_HZ)
         wait_until(lambda: "the clock of this computer was set" in gateway.log)
 
         [stream_status] = gateway.statuses[-1].streams
@@ -99,5 +99,5 @@ def test_a_step_changes_time_stamps_and_nothing_else(tmp_path: Path, offset_s: f
             offsets_s = capture_offsets_s(gateway, component)[RATE_HZ:]
             followed = [abs(each - offset_s) < 0.1 for each in offsets_s]
             assert followed == sorted(followed), "the capture time follows once, and for good"
-            assert followed.count(True) >= 4 * RATE_HZ - 10
+            assert followed.count(True) >= 2 * RATE_HZ - 10
             assert all(abs(each) < 0.1 for each, has in zip(offsets_s, followed, strict=True) if not has)

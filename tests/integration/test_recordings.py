@@ -151,13 +151,13 @@ async def test_every_value_that_arrives_is_the_one_in_the_file(
         assert (expected["3d"] == 0xFFFFFFFF).any()
 
 
-async def test_nothing_is_lost_in_ten_seconds_with_analog_at_2000_hz() -> None:
+async def test_nothing_is_lost_in_five_seconds_with_analog_at_2000_hz() -> None:
     scene = SyntheticScene(markers=55, tools=6, analog=69, plates=2, rate_hz=200, analog_rate_hz=2000)
     async with lab(scene, OTHERS, ANALOG) as running:
-        await running.until(lambda: running.simulator.components_sent["analog"] >= 20_000)
+        await running.until(lambda: running.simulator.components_sent["analog"] >= 10_000)
         running.simulator.stop_measurement()
         sent = running.simulator.components_sent
-        assert sent["3d"] >= 1990
+        assert sent["3d"] >= 990
 
         def all_received() -> bool:
             return all(

@@ -26,8 +26,8 @@ pytestmark = pytest.mark.netns
 
 COMPONENTS: Final = ("3d", "6d", "analog", "force", "event")
 STOP_S: Final = 1.0
-STEADY_FRAMES: Final = 600
-"""Frames before the stop: 3 s, in which the gateway learns the server's clock."""
+STEADY_FRAMES: Final = 400
+"""Frames before the stop: 2 s, in which the gateway learns the server's clock."""
 
 
 class Received:
@@ -91,7 +91,7 @@ async def test_missing_frames_are_the_gaps_and_the_count_in_the_status(tmp_path:
                 await asyncio.sleep(STOP_S)
                 process.send_signal(signal.SIGCONT)
                 await wait_until_async(
-                    lambda: received.messages["lcm/3d"][-1].frame_number > STEADY_FRAMES + 400
+                    lambda: received.messages["lcm/3d"][-1].frame_number > STEADY_FRAMES + 300
                 )
                 simulator.stop_measurement()
                 sent = simulator.components_sent

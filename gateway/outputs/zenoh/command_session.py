@@ -28,7 +28,8 @@ def command_config(given: Path | Mapping[str, Any]) -> zenoh.Config:
     mode = mode_of(config)
     config.insert_json5("access_control", '{"enabled": false, "default_permission": "allow"}')
     if json.loads(config.get_json("id")):  # two sessions with one id do not connect
-        config.insert_json5("id", json.dumps(secrets.token_hex(15)))
+        # Zenoh rejects an id that begins with 0.
+        config.insert_json5("id", json.dumps(f"1{secrets.token_hex(15)}"))
     if mode != "client":
         connect = endpoints(config, "connect")
         reachable = [_ANY_ADDRESS.sub("/127.0.0.1:", endpoint) for endpoint in listen]
