@@ -21,8 +21,9 @@ SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 demo: .venv/installed
 	$(BIN)/rtc3d-gateway demo
 
+# Without MAKEFLAGS, a make that a test runs does not look for the job slots of this one.
 test: .venv/installed
-	SYSTEM_PYTHON=$(SYSTEM_PYTHON) tests/with-netns $(BIN)/pytest $(ARGS)
+	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) tests/with-netns $(BIN)/pytest $(ARGS)
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.
@@ -32,9 +33,12 @@ COMPILED_TESTS := tests/packaging/test_compiled.py tests/contract tests/property
     tests/integration/test_faults.py::test_data_flows_again_after_several_faults_at_once
 
 test-compiled: build/compiled/complete
-	$(COMPILED) RTC3D_COMPILED=1 tests/with-netns $(BIN)/pytest -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
+	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 tests/with-netns $(BIN)/pytest -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
 
-check: lint types contracts generated docs wheelhouse test test-compiled
+# Two parts at a time. Each run of pytest has a network namespace of its own, so they do not disturb each other.
+check: .venv/installed
+	$(MAKE) --jobs=2 --output-sync=target --no-print-directory lint types contracts generated docs wheelhouse compiled
+	$(MAKE) --jobs=2 --output-sync=target --no-print-directory test test-compiled
 
 lint: .venv/installed
 	$(BIN)/ruff format --check
