@@ -31,6 +31,7 @@ from gateway.rtc3d.protocol_state import ProtocolInput, ProtocolState, next_stat
 from gateway.rtc3d.reply_matcher import Match, ReplyMatcher
 from gateway.safe_text import safe_text
 
+_ALL_PACKETS: Final = 0x7FFFFFFF
 _MAX_ERROR_BYTES: Final = 300  # of a server's error text, which goes into logs and status messages
 _UNUSED_PARAMETER: Final = -1  # of an event (§7.7)
 
@@ -180,16 +181,24 @@ class ClientProtocol:
         """Enter the state CLOSED, whichever side closed the connection."""
         self._apply(ProtocolInput.CONNECTION_ENDED)
 
-    def receive(self, data: bytes) -> tuple[list[Frame], list[ProtocolEvent]]:
+    @property
+    def has_more(self) -> bool:
+        """Whether ``receive`` has not processed all bytes yet, because of ``max_packets``."""
+        return self._packet_reader.has_more
+
+    def receive(
+        self, data: bytes, max_packets: int = _ALL_PACKETS
+    ) -> tuple[list[Frame], list[ProtocolEvent]]:
         """Take bytes from the server; return the frames and the other events that they complete.
 
+        Processes at most ``max_packets``. While ``has_more``, call it again, with b"" or with the next bytes.
         Each list is in the order of arrival, but the order between frames and events is lost. Handle the
         events first, so that a ByteOrderMismatch is reported before the first frame is used. ``state`` is
         the state after all of them. StreamCorrupted is always the last event. Never raises.
         """
         frames: list[Frame] = []
         events: list[ProtocolEvent] = []
-        for packet in self._packet_reader.feed(data):
+        for packet in self._packet_reader.feed(data, max_packets):
             if packet.is_data_frame:
                 self._on_data(packet, frames, events)
             else:

@@ -12,6 +12,7 @@ DEFAULT_MAX_PACKET_BYTES: Final = 16 * 1024 * 1024
 DEFAULT_MAX_C3D_BYTES: Final = 256 * 1024 * 1024
 _MAX_SIZE: Final = 0xFFFFFFFF
 _MAX_BEGIN_BYTES: Final = 60  # of PacketError.begin
+_ALL: Final = 0x7FFFFFFF  # more packets than fit into memory
 
 
 class PacketType(IntEnum):
@@ -127,6 +128,8 @@ class PacketReader:
         self._partial_goal = 0  # the length that _partial needs before a packet, or its header, is complete
         self._file_bytes = 0  # the length of the C3D file that is arriving
         self._missing_file_bytes = 0  # of that file
+        self._rest = b""  # the read that ``feed`` did not finish, from _rest_start on
+        self._rest_start = 0
         self.error: PacketError | None = None
         """Set when a size field is below 8 or above its limit; the stream then has no further packets."""
 
@@ -135,16 +138,24 @@ class PacketReader:
         """The number of bytes held of an incomplete packet; of a C3D file, those of an incomplete header."""
         return len(self._partial)
 
-    def feed(self, data: bytes) -> list[Packet]:
+    @property
+    def has_more(self) -> bool:
+        """Whether ``feed`` has not looked at all bytes yet, because it returned as many packets as wanted."""
+        return bool(self._rest)
+
+    def feed(self, data: bytes, max_packets: int = _ALL) -> list[Packet]:
         """Take the next bytes; return the packets that they complete and the pieces of files, in order.
 
+        Returns at most ``max_packets``. While ``has_more``, call it again, with b"" or with the next bytes.
         Never raises: check ``error`` after handling the packets. Once it is set, further bytes are ignored.
         """
         if self.error is not None:
             return []
         packets: list[Packet] = []
         used = 0
-        if self._missing_file_bytes:
+        if self._rest:
+            data, used, self._rest = self._rest + data, self._rest_start, b""
+        elif self._missing_file_bytes:
             used = self._take_file_piece(data, 0, packets)
             self._offset += used
         elif self._partial:
@@ -157,9 +168,9 @@ class PacketReader:
                 return []
             completed = bytes(self._partial)
             self._partial.clear()
-            self._cut(completed, 0, packets)
+            self._cut(completed, 0, packets, max_packets)
         if used < len(data):
-            self._cut(data, used, packets)
+            self._cut(data, used, packets, max_packets)
         return packets
 
     def _take_file_piece(self, data: bytes, start: int, packets: list[Packet]) -> int:
@@ -172,14 +183,21 @@ class PacketReader:
         self._missing_file_bytes -= len(piece)
         return start + len(piece)
 
-    def _cut(self, data: bytes, first: int, packets: list[Packet]) -> None:
-        """Append the complete packets in ``data`` from offset ``first``; keep the rest in ``_partial``."""
+    def _cut(self, data: bytes, first: int, packets: list[Packet], max_packets: int) -> None:
+        """Append the complete packets in ``data`` from offset ``first``; keep the rest in ``_partial``.
+
+        If there are more than ``max_packets``, keep the others in ``_rest``.
+        """
         available = len(data)
         start = first
         # Struct's methods return Any. Annotated as int, compiled code compares and slices with C integers.
         size: int
         packet_type: int
         while available - start >= PACKET_HEADER_BYTES:
+            if len(packets) >= max_packets:
+                self._rest, self._rest_start = data, start
+                self._offset += start - first
+                return
             size, packet_type = _unpack_header(data, start)
             limit = self._max_c3d_bytes if packet_type == _C3D else self._max_packet_bytes
             if not PACKET_HEADER_BYTES <= size <= limit:

@@ -21,14 +21,16 @@ _MAX_LATE_S: Final = 0.015
 _IDLE_S: Final = 0.5
 """A backlog that begins within this time after another one continues its pace, as in a stream of batches."""
 
-_TURN_S: Final = 0.005
-"""How long one call publishes. The frames that it has begun by then may take longer."""
+_TURN_S: Final = 0.002
+"""How long one call publishes; then other sources have their turn. A chunk that it has begun is finished."""
 
 _RESOLUTION_S: Final = 0.001
 """The event loop's timers have whole milliseconds, so what is due in the next one is published now."""
 
 _MAX_CHUNK: Final = 16
-"""How many frames are published between two readings of the clock."""
+_MAX_CHUNK_WITHOUT_PACE: Final = 64
+_MAX_CHUNK_COMPONENTS: Final = 320
+"""How many frames, and components, are published between two readings of the clock."""
 
 
 class Backlog:
@@ -36,7 +38,8 @@ class Backlog:
 
     ``publish`` takes frames and when they arrived, as Ingest.receive does. ``speed`` is the pace as a
     multiple of the stream's own, according to the server's time stamps while they are those of a ``clock``.
-    Without a clock, every frame is due at once. ``read_clocks`` does the same as HostClock.read.
+    Without a clock, or if ``speed`` is None, every frame is due at once; a call of ``publish_due`` still
+    takes a limited time. ``read_clocks`` does the same as HostClock.read.
 
     The session stops reading while frames wait, so the number of frames is limited by the size of one read.
     """
@@ -45,7 +48,7 @@ class Backlog:
         self,
         publish: Callable[[list[Frame], int, int], None],
         clock: ServerClock,
-        speed: float,
+        speed: float | None,
         read_clocks: Callable[[], tuple[int, int]],
     ) -> None:
         self._publish = publish
@@ -67,7 +70,8 @@ class Backlog:
     def add(self, frames: list[Frame], utime: int, steady_us: int) -> None:
         """Take frames that arrived together, oldest first; see Ingest.receive. Publishes nothing yet."""
         if self._frames:
-            self._frames = self._frames[self._next :] + frames
+            del self._frames[: self._next]
+            self._frames += frames
         else:
             self._frames = frames
             now_s = steady_us * 1e-6
@@ -91,10 +95,14 @@ class Backlog:
             now_s = self._now_s()
         return 0.0 if self._frames else None
 
-    def publish_all(self) -> None:
-        """Publish everything that waits, at once."""
-        if self._frames:
-            self._publish_until(len(self._frames))
+    def hurry(self) -> None:
+        """From now on, every frame is due at once."""
+        self._speed = None
+
+    def clear(self) -> None:
+        """Drop what waits."""
+        self._frames = []
+        self._next = 0
 
     def _now_s(self) -> float:
         return self._read_clocks()[1] * 1e-6
@@ -102,15 +110,21 @@ class Backlog:
     def _end_of_due(self, now_s: float) -> int:
         """Return the index after the last of the next frames that is due; plan when the one after it is."""
         at = self._next
-        last = min(len(self._frames), at + _MAX_CHUNK)
-        if not self._clock.has_clock:
-            return last
-        while at < last and self._due_s < now_s + _RESOLUTION_S:
-            self._due_s += self._wait_s(self._frames[at])
+        speed = self._speed
+        has_pace = speed is not None and self._clock.has_clock
+        last = min(len(self._frames), at + (_MAX_CHUNK if has_pace else _MAX_CHUNK_WITHOUT_PACE))
+        num_components = 0
+        while at < last and num_components < _MAX_CHUNK_COMPONENTS:
+            frame = self._frames[at]
+            if speed is not None and has_pace:
+                if self._due_s >= now_s + _RESOLUTION_S:
+                    break
+                self._due_s += self._wait_s(frame, speed)
+            num_components += len(frame.layout.fields)
             at += 1
         return at
 
-    def _wait_s(self, frame: Frame) -> float:
+    def _wait_s(self, frame: Frame, speed: float) -> float:
         """Return how long to wait after ``frame`` was due: as long as after the one before it."""
         if frame.layout.first_component_type is None:
             return 0.0
@@ -119,13 +133,12 @@ class Backlog:
         self._timestamp_us = timestamp_us
         if before_us is None or timestamp_us <= before_us:
             return 0.0
-        return min((timestamp_us - before_us) / (1e6 * self._speed), _MAX_WAIT_S)
+        return min((timestamp_us - before_us) / (1e6 * speed), _MAX_WAIT_S)
 
     def _publish_until(self, end: int) -> None:
         frames = self._frames[self._next : end]
         if end == len(self._frames):
-            self._frames = []
-            self._next = 0
+            self.clear()
         else:
             self._next = end
         self._publish(frames, self._utime, self._arrival_us)

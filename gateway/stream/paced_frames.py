@@ -17,14 +17,14 @@ class PacedFrames:
 
     While a backlog waits, it stops reading from the server with ``set_reading``. So the data stays in the
     kernel, and TCP makes the server wait when the kernel's buffer is full: memory is limited, and the other
-    sources get their turn. ``backlog`` passes frames on to ``on_frames``; without it, no frame ever waits.
-    ``on_defect`` takes what ``on_frames`` raises while a backlog is passed on.
+    sources get their turn. ``backlog`` passes frames on to ``on_frames``; ``on_defect`` takes what
+    ``on_frames`` raises meanwhile.
     """
 
     def __init__(
         self,
         on_frames: Callable[[list[Frame], int, int], None],
-        backlog: Backlog | None,
+        backlog: Backlog,
         set_reading: Callable[[bool], None],
         on_defect: Callable[[Exception], None],
     ) -> None:
@@ -40,29 +40,44 @@ class PacedFrames:
     def receive(self, frames: list[Frame], utime: int, steady_us: int) -> None:
         """Take frames that arrived together, oldest first; see Ingest.receive."""
         backlog = self._backlog
-        if backlog is None or (len(frames) <= MAX_TOGETHER and backlog.is_empty):
+        if len(frames) <= MAX_TOGETHER and backlog.is_empty:
             self._on_frames(frames, utime, steady_us)
             return
         backlog.add(frames, utime, steady_us)
         if self._timer is None:
-            self._pass_on(backlog)
+            self._pass_on()
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether no frames wait."""
+        return self._backlog.is_empty
 
     def finish(self) -> None:
-        """Pass on everything that waits, and whatever comes after it, at once: the session has ended."""
-        backlog, self._backlog = self._backlog, None
-        if backlog is not None:
-            backlog.publish_all()
+        """Pass on what waits, and what comes after it, without a pace: the session has ended."""
+        self._backlog.hurry()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._pass_on()
 
-    def _pass_on(self, backlog: Backlog) -> None:
+    def drop(self) -> None:
+        """Drop what waits, because passing it on has failed."""
+        self._backlog.clear()
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        self._set_reading(True)
+
+    def _pass_on(self) -> None:
         """Pass on the part of the backlog that is due; read from the server again when nothing is left."""
         self._timer = None
         try:
-            wait_s = backlog.publish_due()
+            wait_s = self._backlog.publish_due()
         except Exception as defect:  # noqa: BLE001 - the session reports it
+            self.drop()
             self._on_defect(defect)
             return
         # What follows has not been read yet, so silence and unanswered commands mean nothing.
         self.caught_up_s = self._running.time()
         self._set_reading(wait_s is None)
         if wait_s is not None:
-            self._timer = self._running.loop.call_later(wait_s, self._pass_on, backlog)
+            self._timer = self._running.loop.call_later(wait_s, self._pass_on)

@@ -37,6 +37,7 @@ from gateway.safe_text import safe_text
 from gateway.stream.backlog import Backlog
 from gateway.stream.files import FileReceiver
 from gateway.stream.paced_frames import PacedFrames
+from gateway.stream.reading import Reading
 from gateway.stream.running_clock import running_clock
 from gateway.stream.running_time import running_timeout
 from gateway.stream.status import StreamStatus
@@ -44,6 +45,12 @@ from gateway.stream.tcp import Connect, open_connection, set_socket_options
 
 _BYE_S: Final = 0.5
 """How long a server may take to close after Bye; some never do (field note 10)."""
+
+_TURN_US: Final = 2000
+"""How long one read is processed; then other sources have their turn. Publishing its frames adds to it."""
+
+_MAX_PACKETS: Final = 64
+"""How many packets are processed between two readings of the clock."""
 
 _FURTHER_REPLY_S: Final = 0.3
 """How soon a slow server's next reply follows a late one. The replies that it owes leave it together."""
@@ -82,11 +89,10 @@ class Session:
         self._source = source
         self._only_events = set(stream.components) == {ComponentType.EVENT}
         self._status = status
-        backlog = Backlog(on_frames, status.clock, stream.backlog_speed, read_clocks)
-        self._frames = PacedFrames(
-            on_frames, backlog if stream.backlog == "all" else None, self._set_reading, self._fail_by_defect
-        )
-        self._is_reading_paused = False
+        speed = stream.backlog_speed if stream.backlog == "all" else None
+        backlog = Backlog(on_frames, status.clock, speed, read_clocks)
+        self._frames = PacedFrames(on_frames, backlog, self._set_reading, self._fail_by_defect)
+        self._reading = Reading(self._process)
         self._files = files
         self._connect = connect
         self._read_clocks = read_clocks
@@ -130,6 +136,7 @@ class Session:
         """Connect to the server. Raises ConnectError with the reason and what to check."""
         self._status.connecting(self.server)
         self._transport = await self._connect(self._source, self)
+        self._reading.begin(self._transport)
         self._quiet_since_s = self._running.time()
         self._status.connected(self.server)
 
@@ -271,6 +278,8 @@ class Session:
                 async with asyncio.timeout(_BYE_S):
                     await self._lost.wait()
         self._transport.abort()
+        while not (self._frames.is_empty and self._reading.is_idle):  # noqa: ASYNC110 - takes few turns
+            await asyncio.sleep(0)  # each turn of the loop publishes a part of what has arrived
 
     # The methods of an asyncio.Protocol, which the event loop calls.
 
@@ -284,23 +293,44 @@ class Session:
 
     def data_received(self, data: bytes) -> None:
         """Process the bytes of one read. From here to the outputs there are only plain calls, no tasks."""
+        self._status.bytes_received(len(data))
+        self._reading.receive(data, *self._read_clocks())
+
+    def _process(self, data: bytes, utime: int, steady_us: int) -> bool:
+        """Process the bytes of one read for a limited time; return whether some of them remain."""
         try:
-            self._receive(data)
+            self._receive(data, utime, steady_us)
         except Exception as defect:  # noqa: BLE001 - a defect ends only this session
             self._fail_by_defect(defect)
+            return False
+        return self._protocol.has_more
 
-    def _receive(self, data: bytes) -> None:
-        utime, steady_us = self._read_clocks()
-        self._status.bytes_received(len(data))
-        state_before = self._protocol.state
-        frames, events = self._protocol.receive(data)
+    def _receive(self, data: bytes, utime: int, steady_us: int) -> None:
+        protocol = self._protocol
+        state_before = protocol.state
+        frames, events = protocol.receive(data, _MAX_PACKETS)
         for event in events:
             self._on_event(event)
+        if protocol.has_more:
+            frames += self._receive_more()
         self._report_change(state_before)
         if frames:
             self._quiet_since_s = self._running.time()
             self._status.frames_read(self._quiet_since_s)
             self._frames.receive(frames, utime, steady_us)
+
+    def _receive_more(self) -> list[Frame]:
+        """Process further packets of the read for a limited time; return the frames among them."""
+        frames = []
+        end_us = self._read_clocks()[1] + _TURN_US
+        while self._read_clocks()[1] < end_us:
+            further, events = self._protocol.receive(b"", _MAX_PACKETS)
+            frames += further
+            for event in events:
+                self._on_event(event)
+            if not self._protocol.has_more:
+                break
+        return frames
 
     def connection_lost(self, exc: Exception | None) -> None:
         """End the session, unless it has ended already: the connection is closed, by either side."""
@@ -311,14 +341,7 @@ class Session:
 
     def _set_reading(self, is_reading: bool) -> None:
         """Read from the server, or let the data wait in the kernel."""
-        transport = self._transport
-        if transport is None or transport.is_closing() or self._is_reading_paused is not is_reading:
-            return
-        self._is_reading_paused = not is_reading
-        if is_reading:
-            transport.resume_reading()
-        else:
-            transport.pause_reading()
+        self._reading.set_backlog(not is_reading)
 
     def _on_event(self, event: ProtocolEvent) -> None:
         match event:
@@ -397,9 +420,10 @@ class Session:
         self._state_changed.set()
         self._end_ask(error)
         self._files.interrupt(str(error))
-        if not isinstance(error, DefectError):  # which may be one in publishing
+        if isinstance(error, DefectError):  # which may be one in publishing
+            self._frames.drop()
+        else:
             self._frames.finish()
-        self._set_reading(True)
 
     def _flush(self) -> None:
         if self._transport is not None:

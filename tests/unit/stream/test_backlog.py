@@ -176,18 +176,34 @@ def test_without_a_clock_nothing_waits() -> None:
 def test_one_call_publishes_only_for_a_while() -> None:
     subscriber = Subscriber()
     subscriber.clock.has_clock = False
-    subscriber.costs_s = 0.1 * MS
+    subscriber.costs_s = 0.02 * MS
     subscriber.arrive(frames(1000))
     assert subscriber.backlog.publish_due() == 0.0
-    assert 50 <= len(subscriber.published) <= 50 + 16
+    assert 100 <= len(subscriber.published) <= 100 + 64
 
 
-def test_everything_can_be_published_at_once() -> None:
+def test_one_call_publishes_few_frames_of_many_components() -> None:
+    """So the time between two readings of the clock is limited, too."""
+    subscriber = Subscriber()
+    subscriber.clock.has_clock = False
+    subscriber.costs_s = 64 * 0.02 * MS
+    body = frame(0).body
+    many = split_frame((64).to_bytes(4, "big") + body[4:] * 64, "big")
+    subscriber.arrive([many] * 100)
+    assert subscriber.backlog.publish_due() == 0.0
+    assert len(subscriber.published) == 5
+
+
+def test_what_waits_can_be_hurried_and_dropped() -> None:
     subscriber = Subscriber()
     subscriber.arrive(frames(1000))
     subscriber.backlog.publish_due()
     assert 0 < len(subscriber.published) < 1000
-    subscriber.backlog.publish_all()
-    assert subscriber.numbers == list(range(1000))
-    subscriber.backlog.publish_all()
+    subscriber.backlog.hurry()
     assert subscriber.backlog.publish_due() is None
+    assert subscriber.numbers == list(range(1000))
+    subscriber.arrive(frames(1000))
+    subscriber.backlog.clear()
+    assert subscriber.backlog.is_empty
+    assert subscriber.backlog.publish_due() is None
+    assert len(subscriber.published) == 1000

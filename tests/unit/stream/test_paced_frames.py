@@ -12,10 +12,10 @@ from tests.unit.stream.virtual_time import read_clocks, until
 class Lab:
     """Paced frames, and what they call. ``numbers`` are those of the frames that were passed on."""
 
-    def __init__(self, *, has_backlog: bool = True) -> None:
+    def __init__(self, *, has_pace: bool = True) -> None:
         clock = ServerClock()
         clock.has_clock = True
-        backlog = Backlog(self._on_frames, clock, 2.0, read_clocks) if has_backlog else None
+        backlog = Backlog(self._on_frames, clock, 2.0 if has_pace else None, read_clocks)
         self.numbers: list[int] = []
         self.reading: list[bool] = []
         self.defects: list[Exception] = []
@@ -58,11 +58,12 @@ async def test_frames_that_arrive_during_a_backlog_wait_behind_it() -> None:
     assert lab.numbers == list(range(1001))
 
 
-async def test_without_a_backlog_no_frame_waits() -> None:
-    lab = Lab(has_backlog=False)
+async def test_without_a_pace_frames_wait_only_for_their_turn() -> None:
+    lab = Lab(has_pace=False)
     lab.receive(1000)
     assert lab.numbers == list(range(1000))
-    assert lab.reading == []
+    assert lab.reading == [True]
+    assert lab.paced.is_empty
 
 
 async def test_finishing_passes_on_everything_and_what_follows_at_once() -> None:
@@ -80,3 +81,5 @@ async def test_a_defect_while_a_backlog_is_passed_on_is_reported() -> None:
     lab.defect = ValueError("broken")
     await until(lambda: lab.defects)
     assert lab.defects == [lab.defect]
+    assert lab.paced.is_empty
+    assert lab.reading == [False, True]
