@@ -30,10 +30,23 @@ _DEFAULTS: Final = {
     "transport": {
         # 16 MB of /dev/shm, and files left behind after a kill, for messages of a few kB.
         "shared_memory": {"enabled": False},
-        # How long, in µs, a put waits for a slow subscriber before Zenoh drops messages for it. The
-        # scheduler alone delays a subscriber by more than Zenoh's 1 ms. Once Zenoh drops, it does not wait
-        # again until that subscriber has read something.
-        "link": {"tx": {"queue": {"congestion_control": {"drop": {"wait_before_drop": 20_000}}}}},
+        "link": {
+            "tx": {
+                "queue": {
+                    # How many batches of 48 kB wait for a subscriber; 16 is the largest number. Zenoh's
+                    # own 2 are full when the scheduler delays a subscriber by a few ms.
+                    "size": {"data": 16},
+                    # How long, in µs, a put waits for each subscriber whose queue is full, before Zenoh
+                    # drops messages for it: once, then again after each batch that it has read. A put waits
+                    # for one after the other, and nobody gets messages meanwhile. So with 20 ms, 30
+                    # subscribers that stop reading would stop the gateway for 0.6 s.
+                    # The second value is for each message that is longer than a batch.
+                    "congestion_control": {
+                        "drop": {"wait_before_drop": 200, "max_wait_before_drop_fragments": 5_000}
+                    },
+                }
+            }
+        },
     },
     # Caches for late subscribers need samples with time stamps.
     "timestamping": {"enabled": True},

@@ -1,0 +1,95 @@
+"""Subscribers, routers and LCM peers that stop, are slow or declare without end: nobody else notices."""
+
+import asyncio
+import signal
+import sys
+from asyncio.subprocess import DEVNULL, PIPE, Process
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+
+import pytest
+
+from tests.gateway_process import simulator
+from tests.hostile.gateway_under_attack import GatewayUnderAttack
+from tests.proxy import FuzzingProxy
+
+pytestmark = pytest.mark.netns
+
+NUM_STALLED = 120
+"""So many that they would be noticed if a message waited 20 ms for each of them."""
+
+
+@pytest.fixture(scope="module")
+def dense_server() -> Iterator[int]:
+    """The port of a server that fills the buffers of a subscriber that does not read within a second."""
+    with simulator("--markers", "1000", "--rate", "200", "--analog-rate", "200") as (port, _):
+        yield port
+
+
+@asynccontextmanager
+async def zenoh_peer(kind: str, endpoint: str, count: int) -> AsyncIterator[Process]:
+    """Run tests/hostile/zenoh_peer.py until the end of the block."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "tests.hostile.zenoh_peer", kind, endpoint, str(count)),
+        stdin=PIPE,
+        stdout=PIPE,
+        stderr=DEVNULL,  # Zenoh's log
+    )
+    try:
+        yield process
+    finally:
+        process.kill()
+        await process.wait()
+
+
+async def done(process: Process) -> None:
+    """Wait until the peer has done all that it does."""
+    assert process.stdout is not None
+    assert await process.stdout.readline() == b"done\n"
+
+
+async def test_subscribers_that_stop_reading(
+    dense_server: int, gateway_under_attack: GatewayUnderAttack
+) -> None:
+    async with gateway_under_attack({"dense": dense_server}) as gateway:
+        async with zenoh_peer("subscribers", gateway.zenoh_endpoint, NUM_STALLED) as stalled:
+            await done(stalled)
+            stalled.send_signal(signal.SIGSTOP)
+            await asyncio.sleep(2)
+            stalled.send_signal(signal.SIGCONT)
+            await asyncio.sleep(0.5)
+            stalled.send_signal(signal.SIGSTOP)
+        await asyncio.sleep(0.5)  # killed
+    gateway.report.check()
+
+
+async def test_subscribers_behind_a_slow_link(
+    dense_server: int, gateway_under_attack: GatewayUnderAttack
+) -> None:
+    async with gateway_under_attack({"dense": dense_server}) as gateway:
+        port = int(gateway.zenoh_endpoint.rpartition(":")[2])
+        async with (
+            FuzzingProxy(port) as slow,
+            FuzzingProxy(port) as slower,
+            zenoh_peer("subscribers", f"tcp/127.0.0.1:{slow.port}", 3) as first,
+            zenoh_peer("subscribers", f"tcp/127.0.0.1:{slower.port}", 2) as second,
+        ):
+            await asyncio.gather(done(first), done(second))
+            slow.to_client.bytes_per_s = 2_000_000
+            slower.to_client.bytes_per_s = 10_000
+            await asyncio.sleep(3)
+    gateway.report.check()
+
+
+async def test_peers_that_flood(gateway_under_attack: GatewayUnderAttack) -> None:
+    async with gateway_under_attack() as gateway:
+        endpoint = gateway.zenoh_endpoint
+        async with (
+            zenoh_peer("connections", endpoint, 300) as first,
+            zenoh_peer("keys", endpoint, 10_000) as second,
+            zenoh_peer("tokens", endpoint, 5_000) as third,
+            zenoh_peer("puts", endpoint, 100_000) as fourth,
+        ):
+            peers = [asyncio.ensure_future(done(peer)) for peer in (first, second, third, fourth)]
+            await asyncio.wait(peers, timeout=5)
+    gateway.report.check()
