@@ -17,6 +17,7 @@ from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.queries.known_parameters import ServerAnswer
 from gateway.queries.parameter_refresh import ParameterRefresh
+from gateway.queries.payloads import FilePayload
 from gateway.queries.server_requests import StreamAccess
 from gateway.queries.source_queries import SourceQueries
 from gateway.rtc3d.parameters import Parameters
@@ -232,9 +233,14 @@ class Source:
 
     async def _last_c3d(self) -> Answer:
         spool, timeout_s = self.spool, self.settings.query_timeout_s
+
+        def find() -> FilePayload | None:
+            path = spool.newest(self.name)
+            return None if path is None else FilePayload(path)
+
         try:
             async with asyncio.timeout(timeout_s):
-                newest = await spool.reader.run(lambda: spool.read_newest(self.name))
+                newest = await spool.reader.run(find)
         except TimeoutError:
             text = f"the disk of the gateway did not give the file within {timeout_s:g} s"
             raise QueryError(text, code="timeout") from None
@@ -243,8 +249,7 @@ class Source:
             raise QueryError(text, code="nothing-yet") from error
         if newest is None:
             raise QueryError(f"source {self.name!r} has sent no C3D file so far", code="nothing-yet")
-        name, content = newest
-        return Answer(content, C3D, {"name": name, "bytes": len(content)})
+        return Answer(newest, C3D, {"name": newest.name, "bytes": newest.num_bytes})
 
     def _record(self, start: bool) -> bool:
         for stream in self.streams:

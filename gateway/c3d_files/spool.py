@@ -86,7 +86,7 @@ class Spool:
         self.memory: QueueMemory = QueueMemory(max_queued_bytes)
         """The memory for the pieces of files that wait to be written."""
         self.reader: WorkerThread = WorkerThread("c3d-read")
-        """The thread that reads files for peers, one at a time."""
+        """The thread that looks for files for peers."""
 
     def begin(self) -> UnfinishedFile:
         """Create a file with a temporary name. Raises OSError."""
@@ -113,14 +113,6 @@ class Spool:
         num_bytes = unfinished.finish(path)
         deleted, not_deleted = self._delete_beyond_limits(earlier, num_bytes)
         return StoredFile(path, num_bytes, tuple(deleted), problem or not_deleted)
-
-    def read_newest(self, source: str) -> tuple[str, bytes] | None:
-        """Return the name and the content of the newest file of ``source``; None if there is none.
-
-        Raises OSError.
-        """
-        path = self.newest(source)
-        return None if path is None else (path.name, path.read_bytes())
 
     def newest(self, source: str) -> Path | None:
         """Return the newest file of ``source``, None if there is none. Raises OSError."""

@@ -82,6 +82,11 @@ Hertz = Annotated[
     Field(strict=True, gt=0, le=1_000_000, allow_inf_nan=False),
     expects("a number of frames per second above 0, up to 1000000"),
 ]
+QueryRate = Annotated[
+    float,
+    Field(strict=True, ge=1, le=1_000_000, allow_inf_nan=False),
+    expects("a number of queries per second from 1 to 1000000"),
+]
 Speed = Annotated[
     float,
     Field(strict=True, ge=1.5, le=1000, allow_inf_nan=False),

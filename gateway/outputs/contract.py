@@ -63,12 +63,37 @@ class FramePublisher(Protocol):
         """Close the publisher."""
 
 
-class Answer(NamedTuple):
-    """An answer to a peer: its bytes, their encoding as named by Zenoh, and facts such as the age in s."""
+class LazyPayload(Protocol):
+    """A payload that takes long to make, or much memory. The thread that sends the answer makes it."""
 
-    payload: bytes
+    @property
+    def num_bytes(self) -> int:
+        """How long it is, about."""
+
+    @property
+    def is_made(self) -> bool:
+        """Whether ``make`` returns at once."""
+
+    def make(self) -> bytes:
+        """Return the bytes. It may block, so call it in a thread. Raises QueryError."""
+
+
+class Answer(NamedTuple):
+    """An answer to a peer: its content, the encoding as named by Zenoh, and facts such as the age in s."""
+
+    content: bytes | LazyPayload
     encoding: str
     attachment: Mapping[str, Any] = {}
+
+    @property
+    def num_bytes(self) -> int:
+        """The size of the payload; of one that is not made yet, about."""
+        return len(self.content) if isinstance(self.content, bytes) else self.content.num_bytes
+
+    @property
+    def payload(self) -> bytes:
+        """The bytes of the content. If it is lazy, see its ``make``."""
+        return self.content if isinstance(self.content, bytes) else self.content.make()
 
 
 class ServerParameters(NamedTuple):

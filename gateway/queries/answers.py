@@ -1,18 +1,20 @@
-"""The payloads of answers: schemas, messages as bytes or JSON, parameters as JSON."""
+"""Answers that need no server: schemas, messages as they are, parameters as JSON."""
 
 from collections.abc import Mapping
+from functools import cache
 from importlib.resources import files
 from typing import Any
 
 import rtc3d
 
-from gateway.messages.decode import decode, message_type, to_json
+from gateway.messages.decode import message_type
+from gateway.messages.json_text import json_text
 from gateway.outputs.contract import Answer
-from gateway.outputs.encodings import JSON, LCM, TEXT, json_bytes
-from gateway.queries.questions import Question
+from gateway.outputs.encodings import LCM, TEXT
 from gateway.rtc3d.parameters import SECTIONS, Parameters
 
 
+@cache
 def schema_answer(name: str) -> Answer:
     """Return the ``.lcm`` text of a type for lcm-gen; the types that it contains come first."""
     texts = [
@@ -31,10 +33,8 @@ def _with_member_types(name: str) -> list[str]:
     return [*names, name]
 
 
-def message_answer(message: bytes, question: Question, attachment: Mapping[str, Any]) -> Answer:
-    """Return a message of the gateway as it is published, or as JSON with NaN as null."""
-    if question.as_json:
-        return Answer(json_bytes(to_json(decode(message))), JSON, attachment)
+def message_answer(message: bytes, attachment: Mapping[str, Any]) -> Answer:
+    """Return a message of the gateway as it is published."""
     return Answer(message, f"{LCM};rtc3d.{message_type(message).__name__}", attachment)
 
 
@@ -45,5 +45,5 @@ def parameters_json(parameters: Parameters, section: str) -> bytes | None:
     """
     values = {key: section.of(parameters) for key, section in SECTIONS.items()}
     if section:
-        return None if values[section] is None else json_bytes(to_json(values[section]))
-    return json_bytes({name: to_json(value) for name, value in values.items() if value is not None})
+        return None if values[section] is None else json_text(values[section]).encode()
+    return json_text({name: value for name, value in values.items() if value is not None}).encode()

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 from gateway.errors import ParametersError
 from gateway.queries.answers import parameters_json
-from gateway.rtc3d.parameters import Parameters, without_statistics
+from gateway.queries.payloads import JsonPayload
+from gateway.rtc3d.parameters import SECTIONS, Parameters, without_statistics
 from gateway.rtc3d.parameters_changes import (
     changed_sections,
     describe_renames,
@@ -61,10 +62,22 @@ class ServerAnswer:
 
     @cached_property
     def json(self) -> bytes | None:
-        """The parameters as JSON, built once for all queries; None if the answer has none of them."""
+        """The parameters as JSON; None if the answer has none of them. It takes long: see ``lazy_json``."""
         if not self.is_readable:
             return None
-        return parameters_json(self.parsed.parameters, self.sections[0] if len(self.sections) == 1 else "")
+        return parameters_json(self.parsed.parameters, self._section)
+
+    @cached_property
+    def lazy_json(self) -> JsonPayload | None:
+        """The parameters as JSON, made once for all queries; None if the answer has none of them."""
+        section = self._section
+        if not self.is_readable or (section and SECTIONS[section].of(self.parsed.parameters) is None):
+            return None
+        return JsonPayload(lambda: self.json or b"", len(self.xml))
+
+    @property
+    def _section(self) -> str:
+        return self.sections[0] if len(self.sections) == 1 else ""
 
     async def part(self, sections: Sections, xml_thread: XmlThread) -> "ServerAnswer | None":
         """Return the answer for some sections, taken from this one in ``xml_thread``.

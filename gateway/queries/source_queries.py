@@ -4,7 +4,7 @@ The server gets one request at a time, and equal questions at the same time shar
 """
 
 from collections.abc import Callable, Coroutine, Sequence
-from typing import Any
+from typing import Any, Final
 
 from gateway.config.settings import SourceSettings
 from gateway.errors import FrameError, QueryError
@@ -12,11 +12,13 @@ from gateway.messages.decode import prefix_of
 from gateway.messages.encode import encode_message
 from gateway.messages.host_time import now_utime
 from gateway.messages.stamp import NOT_PUBLISHED, Stamp
+from gateway.outputs.admission import TokenBucket
 from gateway.outputs.contract import Answer
 from gateway.outputs.encodings import JSON, XML, json_bytes
 from gateway.queries.answers import message_answer, schema_answer
 from gateway.queries.known_parameters import Announce
 from gateway.queries.parameter_cache import ParameterCache
+from gateway.queries.payloads import JsonPayload, NewestJson
 from gateway.queries.questions import Question
 from gateway.queries.server_requests import ServerRequests, StreamAccess
 from gateway.rtc3d.commands import SendCurrentFrame
@@ -24,6 +26,9 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY, Component, ComponentType
 from gateway.rtc3d.frames import detect_byte_order, split_frame
 from gateway.rtc3d.packets import PacketType
 from gateway.stream.state import StreamState
+
+RECORDINGS_PER_S: Final = 4.0
+"""How many commands a second to start or stop a recording reach the server."""
 
 
 class SourceQueries:
@@ -54,6 +59,8 @@ class SourceQueries:
         self._last_c3d = last_c3d
         self._record = record
         self._requests = ServerRequests(settings, streams)
+        self._newest_json = NewestJson()
+        self._recordings = TokenBucket(RECORDINGS_PER_S)
         self.parameters: ParameterCache = ParameterCache(
             settings, self._requests, announce_parameters, None if before is None else before.parameters
         )
@@ -84,7 +91,7 @@ class SourceQueries:
             case "component":
                 return await self._component(question, output)
             case "status":
-                return message_answer(self._status_message(), question, {})
+                return self._message_answer(self._status_message(), question, output)
             case "schema":
                 return schema_answer(question.name)
             case "c3d":
@@ -109,7 +116,7 @@ class SourceQueries:
                 "the server's XML cannot be read; ask without format=json to see it as received",
                 code="unreadable",
             )
-        payload = await self.parameters.xml_thread.process(cached.xml, lambda _xml: cached.json)
+        payload = cached.lazy_json
         if payload is None:
             raise QueryError(f"the server's answer has no section {question.name}", code="nothing-yet")
         return Answer(payload, JSON, attachment | {"recovered": list(cached.parsed.recovered)})
@@ -136,8 +143,18 @@ class SourceQueries:
             message = encode_message(
                 current, Stamp(utime, utime, session, self.parameters_version), NOT_PUBLISHED
             )
-        attachment = {"session": session, "parameters_version": prefix_of(message).parameters_version}
-        return message_answer(message, question, attachment)
+        return self._message_answer(message, question, output)
+
+    def _message_answer(self, message: bytes, question: Question, output: str) -> Answer:
+        payload: JsonPayload | None = None
+        if question.as_json:
+            key = question.name or question.kind
+            message, payload = self._newest_json.of(f"{key} {output}", message)
+        attachment = {}
+        if question.kind == "component":
+            prefix = prefix_of(message)
+            attachment = {"session": prefix.session, "parameters_version": prefix.parameters_version}
+        return message_answer(message, attachment) if payload is None else Answer(payload, JSON, attachment)
 
     async def _current_frame(self, component: ComponentType, stream: StreamAccess) -> Component:
         """Request a component of the current frame (§5.3.4).
@@ -167,6 +184,11 @@ class SourceQueries:
             )
         if not question.set:
             raise QueryError("recording takes one option; accepted: set=start, set=stop")
+        if not self._recordings.try_take():
+            raise QueryError(
+                f"the server gets {RECORDINGS_PER_S:g} commands a second for recordings; try again",
+                code="rate",
+            )
         if not self._record(question.set == "start"):
             raise self._requests.no_connection_error()
         return Answer(json_bytes({"source": self._settings.name, "sent": question.set}), JSON)

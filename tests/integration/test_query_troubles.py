@@ -43,7 +43,7 @@ async def test_queries_beyond_the_limit_are_refused_as_busy(monkeypatch: pytest.
         queries = output_queries(gateway)
         server.may_answer.clear()
         waiting = [asyncio.create_task(query(peer, "mocap/lab/parameters?fresh=true")) for _ in range(2)]
-        await wait_until_async(lambda: len(queries._tasks) == 2)
+        await wait_until_async(lambda: queries._admission.num_pending == 2)
         reply = await query(peer, "mocap/lab/status")
         assert (reply.code, reply.error) == ("busy", "the gateway has too many queries; try again")
         server.may_answer.set()

@@ -95,7 +95,7 @@ async def test_a_thousand_simultaneous_queries_cause_one_command() -> None:
             end = zenoh.handlers.Callback(append, drop=partial(ended.append, number))
             peer.get("mocap/lab/parameters?fresh=true", end, timeout=30)
         queries = output_queries(gateway)
-        await wait_until_async(lambda: len(queries._tasks) == 1000)
+        await wait_until_async(lambda: queries._admission.num_pending == 1000)
         server.may_answer.set()
         await wait_until_async(lambda: len(ended) == 1000, timeout_s=30)
         assert payloads == [server.xml] * 1000

@@ -1,35 +1,29 @@
-"""Queries from Zenoh and their replies, and the parameters and files that the gateway publishes.
-
-If a handler fails or does not reply, the peer cannot distinguish that from a gateway that is not running. So
-every query gets a reply, which is an error if there is no answer.
-"""
+"""What the gateway declares on Zenoh for each source besides its data: queries, parameters and files."""
 
 import asyncio
 import contextlib
 import functools
 import logging
+import math
 import threading
+import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
 
 import zenoh
 import zenoh.ext
 
-from gateway.errors import QueryError
-from gateway.log import log_fields
 from gateway.losses import Losses
 from gateway.messages.topics import zenoh_key
-from gateway.outputs.contract import Answer, KeyPath, QueryService, ServerParameters
-from gateway.outputs.encodings import JSON, TEXT, XML, json_bytes
+from gateway.outputs.admission import Admission, QueryLimits
+from gateway.outputs.contract import QueryService, ServerParameters
+from gateway.outputs.encodings import JSON, XML, json_bytes
+from gateway.outputs.send_thread import SendThread
+from gateway.outputs.zenoh.answers import MAX_PENDING, ZenohAnswers
 from gateway.outputs.zenoh.config import zenoh_reason
-from gateway.outputs.zenoh.send_thread import SendThread
-
-MAX_PENDING: Final = 4096
-"""The maximum number of queries in progress. Further ones get the error busy."""
-
-LONG_ANSWER_BYTES: Final = 1024 * 1024
-"""A second thread sends longer answers (C3D files), so that other answers need not wait."""
+from gateway.outputs.zenoh.settings import ZenohSettings
 
 # Parameters must arrive, even if that takes longer, and messages of streams have priority.
 _RELIABLE: Final = zenoh.CongestionControl.BLOCK
@@ -40,6 +34,9 @@ _OVERTAKING_S: Final = 0.05
 
 With 1000 messages per second on a busy computer, they did so for up to 7 ms after 2 of 80 publications.
 """
+
+_AGAIN_S: Final = 0.5
+"""How long to wait at least before the parameters are published for a new subscriber again."""
 
 logger = logging.getLogger(__name__)
 
@@ -55,29 +52,54 @@ class _Declared(NamedTuple):
     subscriber_watch: zenoh.Publisher
 
 
+def query_limits(settings: ZenohSettings) -> QueryLimits:
+    """Return the limits of queries in the configuration."""
+    return QueryLimits(
+        output="zenoh",
+        key_setting="max_queries_per_key_per_s",
+        per_s=settings.max_queries_per_s,
+        per_key_per_s=settings.max_queries_per_key_per_s,
+        reply_bytes_per_s=settings.max_reply_bytes_per_s,
+        pending=MAX_PENDING,
+    )
+
+
 class ZenohQueries:
-    """Answers queries below PREFIX/SOURCE/ with ``service``, through one queryable per source.
+    """Answers queries below PREFIX/SOURCE/ with ``service``, and publishes parameters and files.
+
+    There is one queryable for each source.
 
     ``open`` may be called in any thread; everything else runs in ``loop``.
     """
 
-    def __init__(self, prefix: str, service: QueryService, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(
+        self,
+        prefix: str,
+        service: QueryService,
+        loop: asyncio.AbstractEventLoop,
+        limits: QueryLimits = query_limits(ZenohSettings()),  # noqa: B008 - it is immutable
+    ) -> None:
         self._prefix = prefix
-        self._service = service
         self._loop = loop
-        self._lock = threading.Lock()  # of _session and _declared, shared with the thread that opens
+        self._lock = threading.Lock()  # of what the thread that opens and Zenoh's threads share
         self._session: zenoh.Session | None = None
         self._declared: dict[str, _Declared] = {}  # by the source's name
         self._parameters: dict[str, ServerParameters] = {}
+        self._unsent: dict[str, Future[None]] = {}  # publications of parameters that have not begun
+        self._due: set[str] = set()  # sources whose parameters will be published for a new subscriber
+        self._published_s: dict[str, float] = {}  # when that was done last
         self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "zenoh"))  # by source
-        self._tasks: set[asyncio.Task[None]] = set()
-        # Sending to a peer that has stopped reading blocks for 5 s, until Zenoh closes the link. So a thread
-        # sends. There is only one for short answers: two threads that block stop all of Zenoh meanwhile.
         self._sender = SendThread("zenoh-send")
-        self._long_sender = SendThread("zenoh-send-long")
+        self._admission = Admission(limits)
+        self._answers = ZenohAnswers(
+            *(self._prefix, service, loop, self._admission, self._sender, self._losses)
+        )
         self._is_closed = False
-        self.results: Counter[str] = Counter()
-        """Queries by result: ok, or the code of the error."""
+
+    @property
+    def results(self) -> Counter[str]:
+        """See Admission."""
+        return self._admission.results
 
     def open(self, session: zenoh.Session, sources: Sequence[str]) -> None:
         """Declare the queryables and publishers of ``sources`` on an open session."""
@@ -98,8 +120,8 @@ class ZenohQueries:
 
     def remove(self, source: str) -> None:
         """Stop answering queries about a source."""
-        self._parameters.pop(source, None)
         with self._lock:
+            self._parameters.pop(source, None)
             declared = self._declared.pop(source, None)
         if declared is not None:
             declared.queryable.undeclare()
@@ -111,11 +133,11 @@ class ZenohQueries:
         key = zenoh_key(self._prefix, source)
 
         def on_query(query: zenoh.Query) -> None:
-            self._call_in_loop(self._start_answer, source, query)
+            self._answers.receive(source, query)
 
         def on_matching(status: zenoh.MatchingStatus) -> None:
             if status.matching:
-                self._call_in_loop(self._publish_again, source)
+                self._publish_soon(source)
 
         queryable = session.declare_queryable(f"{key}/**", on_query)
         publisher = _parameters_publisher(session, f"{key}/parameters")
@@ -138,127 +160,89 @@ class ZenohQueries:
         Returns a future that is done when messages can no longer overtake them; None while the session is
         not open.
         """
-        self._parameters[source] = parameters
+        with self._lock:
+            self._parameters[source] = parameters
         sent = self._publish_again(source)
         if sent is None:
             return None
         arrived = self._loop.create_future()
-        sent.add_done_callback(lambda _: self._loop.call_later(_OVERTAKING_S, _set_done, arrived))
+        asyncio.wrap_future(sent, loop=self._loop).add_done_callback(
+            lambda _: self._loop.call_later(_OVERTAKING_S, _set_done, arrived)
+        )
         return arrived
 
     def _publish_all(self) -> None:
-        for source in self._parameters:
+        for source in list(self._parameters):
             self._publish_again(source)
 
-    def _publish_again(self, source: str) -> asyncio.Future[None] | None:
-        declared = self._declared.get(source)
-        parameters = self._parameters.get(source)
+    def _publish_soon(self, source: str) -> None:
+        """Publish the parameters again, from one of Zenoh's threads."""
+        with self._lock:
+            if source in self._due:
+                return
+            self._due.add(source)
+        self._call_in_loop(self._publish_due, source)
+
+    def _publish_due(self, source: str) -> None:
+        """Publish the parameters again, unless that has just been done: a peer can appear again and again."""
+        wait_s = self._published_s.get(source, -math.inf) + _AGAIN_S - time.monotonic()
+        if wait_s > 0:
+            self._loop.call_later(wait_s, self._publish_due, source)
+            return
+        self._published_s[source] = time.monotonic()
+        with self._lock:
+            self._due.discard(source)
+        self._publish_again(source)
+
+    def _publish_again(self, source: str) -> Future[None] | None:
+        """Publish the newest parameters; while earlier ones wait to be sent, these replace them."""
+        with self._lock:
+            if self._is_closed or source not in self._declared or source not in self._parameters:
+                return None
+            sent = self._unsent.get(source)
+            if sent is None:
+                sent = self._sender.submit(functools.partial(self._put_parameters, source))
+                self._unsent[source] = sent
+            return sent
+
+    def _put_parameters(self, source: str) -> None:
+        """Publish the newest parameters, in the sending thread."""
+        with self._lock:
+            del self._unsent[source]
+            declared, parameters = self._declared.get(source), self._parameters.get(source)
         if declared is not None and parameters is not None:
             attachment = {"session": parameters.session, "parameters_version": parameters.version}
-            put = functools.partial(declared.publisher.put, attachment=json_bytes(attachment))
-            return self._send(source, put, parameters.xml)
-        return None
+            self._put(source, declared.publisher.put, parameters.xml, attachment=json_bytes(attachment))
 
     def announce_file(self, source: str, description: Mapping[str, Any]) -> None:
         """Announce a C3D file on the key that returns it."""
         if self._session is not None:
             key = zenoh_key(self._prefix, source, "c3d")
             put = functools.partial(
-                self._session.put, encoding=JSON, congestion_control=_RELIABLE, priority=_LOW_PRIORITY
+                self._put,
+                *(source, self._session.put, key, json_bytes(description)),
+                encoding=JSON,
+                congestion_control=_RELIABLE,
+                priority=_LOW_PRIORITY,
             )
-            self._send(source, put, key, json_bytes(description))
+            if not self._sender.offer(put) and not self._is_closed:
+                text = "the announcement of a C3D file is dropped, because earlier ones wait to be sent"
+                self._losses[source].lost("put failed", text, frames=0)
 
-    def _send(self, source: str, put: Callable[..., None], *arguments: Any) -> asyncio.Future[None] | None:
-        if self._is_closed:
-            return None
-        put = functools.partial(self._put, source, put, *arguments)
-        return asyncio.wrap_future(self._sender.submit(put), loop=self._loop)
-
-    def _put(self, source: str, put: Callable[..., None], *arguments: Any) -> None:
+    def _put(self, source: str, put: Callable[..., None], *arguments: Any, **options: Any) -> None:
         """Publish, in the sending thread."""
         try:
-            put(*arguments)
+            put(*arguments, **options)
         except zenoh.ZError as error:
             if not self._is_closed:
                 text = f"Zenoh did not take parameters or an announcement: {zenoh_reason(error)}"
                 self._losses[source].lost("put failed", text, frames=0)
 
-    # Queries.
-
-    def _start_answer(self, source: str, query: zenoh.Query) -> None:
-        if self._is_closed or not self._service.serves(source):
-            query.drop()
-            return
-        if len(self._tasks) >= MAX_PENDING:
-            error = QueryError("the gateway has too many queries; try again", code="busy")
-            text = f"a query is refused as busy, because {MAX_PENDING} others are in progress; ask less often"
-            self._losses[source].lost("query beyond the queue", text, frames=0)
-            self._sender.submit(functools.partial(_reply_error, query, error))
-            self.results[error.code] += 1
-            return
-        with log_fields(source=source):
-            task = asyncio.create_task(self._answer(source, query))
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
-    async def _answer(self, source: str, query: zenoh.Query) -> None:
-        try:
-            answers = await self._answers(source, query)
-        except QueryError as error:
-            await self._refuse(query, error)
-        except Exception as error:
-            logger.exception("%s: query %s", source, query.selector)
-            await self._refuse(query, QueryError(f"a defect in the gateway: {error!r}", code="defect"))
-        else:
-            is_long = any(len(answer.payload) > LONG_ANSWER_BYTES for answer in answers.values())
-            sender = self._long_sender if is_long else self._sender
-            await asyncio.wrap_future(sender.submit(functools.partial(_reply, query, answers)))
-            self.results["ok"] += 1
-
-    async def _refuse(self, query: zenoh.Query, error: QueryError) -> None:
-        await asyncio.wrap_future(self._sender.submit(functools.partial(_reply_error, query, error)))
-        self.results[error.code] += 1
-
-    async def _answers(self, source: str, query: zenoh.Query) -> dict[str, Answer]:
-        """Return the answers by key. Raises QueryError if there is none."""
-        base = zenoh_key(self._prefix, source) + "/"
-        selected, options = str(query.key_expr), _options(query)
-        if "*" not in selected and selected.startswith(base):
-            path = tuple(selected.removeprefix(base).split("/"))
-            return {selected: await self._service.answer(source, path, options)}
-        paths = self._matching(query.key_expr, base, source)
-        if not paths:
-            raise QueryError(self._nothing_matches(selected, base, source))
-        answers = await self._service.answer_all(source, paths, options)
-        return {base + "/".join(path): answer for path, answer in answers.items()}
-
-    def _matching(self, selected: zenoh.KeyExpr, base: str, source: str) -> list[KeyPath]:
-        """Return the keys of the source that a selector with wildcards matches.
-
-        A C3D file may have hundreds of MB, so it is selected only by its name, as in mocap/*/c3d.
-        """
-        last = str(selected).rpartition("/")[2]
-        return [
-            path
-            for path in self._service.keys(source)
-            if (path != ("c3d",) or last == "c3d")
-            and selected.intersects(zenoh.KeyExpr(base + "/".join(path)))
-        ]
-
-    def _nothing_matches(self, selected: str, base: str, source: str) -> str:
-        if selected.rpartition("/")[2] == "recording":
-            return f"recording is controlled for one source at a time; accepted: {base}recording"
-        accepted = self._service.accepted_keys(source)
-        return f"nothing of source {source!r} matches {selected}; accepted below {base}: {accepted}"
-
     async def close(self) -> None:
         """Drop the pending queries. Their peers see at once that no reply follows."""
         self._is_closed = True
-        for task in self._tasks:
-            task.cancel()
-        await asyncio.gather(*self._tasks, return_exceptions=True)
-        for sender in (self._sender, self._long_sender):
-            sender.close()
+        await self._answers.close()
+        self._sender.close()
 
 
 def _parameters_publisher(session: zenoh.Session, key: str) -> _AnyPublisher:
@@ -287,35 +271,3 @@ def _parameters_publisher(session: zenoh.Session, key: str) -> _AnyPublisher:
 def _set_done(future: asyncio.Future[None]) -> None:
     if not future.done():
         future.set_result(None)
-
-
-# These functions may block, so they run in a SendThread.
-
-
-def _reply(query: zenoh.Query, answers: Mapping[str, Answer]) -> None:
-    with query:
-        try:
-            for key, answer in answers.items():
-                attachment = json_bytes(answer.attachment) if answer.attachment else None
-                query.reply(key, answer.payload, encoding=answer.encoding, attachment=attachment)
-        except zenoh.ZError as error:
-            logger.debug("zenoh: replying to %s: %s", query.selector, error)
-
-
-def _reply_error(query: zenoh.Query, error: QueryError) -> None:
-    """Reply with an error. The schema of the encoding is the error's code."""
-    with query:
-        try:
-            query.reply_err(str(error), encoding=zenoh.Encoding(TEXT).with_schema(error.code))
-        except zenoh.ZError as problem:
-            logger.debug("zenoh: replying to %s: %s", query.selector, problem)
-
-
-def _options(query: zenoh.Query) -> dict[str, str]:
-    """Return the selector's options; names that start with _ are Zenoh's own."""
-    options = {}
-    for pair in filter(None, str(query.parameters).split(";")):
-        name, _, value = pair.partition("=")
-        if not name.startswith("_"):
-            options[name] = value
-    return options

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, PlainValidator, ValidationInfo
 
 from gateway.config.section import describe, expects, validation_error
 from gateway.config.settings import OutputSettings
-from gateway.config.values import MaxRates, Switch
+from gateway.config.values import ByteLimit, MaxRates, QueryRate, Switch
 from gateway.outputs.zenoh.config import read_zenoh_config, zenoh_reason
 
 DEFAULT_ZENOH_PREFIX: Final = "mocap"
@@ -93,3 +93,12 @@ class ZenohSettings(OutputSettings):
 
     tool_poses: Switch = False
     """Whether to publish the pose of each tool on its own key, while someone subscribes to it."""
+
+    max_queries_per_s: QueryRate = 2000.0
+    """How many queries a second to answer. Further ones get the error rate; so also for the next two keys."""
+
+    max_queries_per_key_per_s: QueryRate = 1000.0
+    """How many queries a second to answer for each key, or selector with wildcards."""
+
+    max_reply_bytes_per_s: ByteLimit = 16 * 1024 * 1024
+    """How many bytes a second to send in replies. Replies of more than 1 MiB (C3D files) count apart."""

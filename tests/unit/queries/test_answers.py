@@ -6,9 +6,10 @@ import rtc3d
 
 from gateway.messages.encode import encode_message
 from gateway.messages.stamp import Stamp
-from gateway.outputs.encodings import JSON, TEXT
+from gateway.outputs.encodings import TEXT
 from gateway.queries.answers import message_answer, parameters_json, schema_answer
-from gateway.queries.questions import SCHEMA_TYPES, Question
+from gateway.queries.payloads import NewestJson
+from gateway.queries.questions import SCHEMA_TYPES
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import General, Parameters, ParametersForce, Plate, Point
@@ -42,18 +43,15 @@ def test_a_schema_contains_nested_member_types() -> None:
 
 def test_a_message_is_returned_unchanged_with_its_type_as_encoding() -> None:
     message = encoded_message(ComponentType.FORCE)
-    answer = message_answer(message, Question("component", "force"), {"session": 3})
+    answer = message_answer(message, {"session": 3})
     assert answer.payload is message
     assert answer.encoding == "application/x-lcm;rtc3d.forces_t"
     assert answer.attachment == {"session": 3}
 
 
 def test_a_message_as_json_has_null_for_missing_markers() -> None:
-    answer = message_answer(
-        encoded_message(ComponentType.MARKERS), Question("component", "3d", as_json=True), {}
-    )
-    value = json.loads(answer.payload)
-    assert answer.encoding == JSON
+    _, payload = NewestJson().of("3d", encoded_message(ComponentType.MARKERS))
+    value = json.loads(payload.make())
     assert (value["sequence"], value["session"], value["utime"]) == (4, 3, 1)
     missing = [marker for marker in value["markers"] if marker["x"] is None]
     assert missing

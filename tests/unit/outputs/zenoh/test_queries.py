@@ -13,6 +13,7 @@ from gateway.errors import QueryError
 from gateway.log import current_log_fields
 from gateway.losses import Losses
 from gateway.outputs.contract import Answer, KeyPath, ServerParameters
+from gateway.outputs.zenoh import answers as answers_module
 from gateway.outputs.zenoh import queries as queries_module
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -181,18 +182,18 @@ async def test_a_source_that_the_gateway_no_longer_has_gets_no_reply(lab: Lab) -
 async def test_long_answers_arrive_unchanged_and_are_sent_by_a_thread_of_their_own(
     lab: Lab, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(queries_module, "LONG_ANSWER_BYTES", 7)
+    monkeypatch.setattr(answers_module, "LONG_ANSWER_BYTES", 7)
     queries = lab.output._queries
     assert queries is not None
     used: list[str] = []
-    for name, sender in (("short", queries._sender), ("long", queries._long_sender)):
-        submit = sender.submit
+    for name, sender in (("short", queries._sender), ("long", queries._answers._long_sender)):
+        offer = sender.offer
 
-        def record(call: Any, name: str = name, submit: Any = submit) -> Any:
+        def record(call: Any, num_bytes: int = 0, name: str = name, offer: Any = offer) -> Any:
             used.append(name)
-            return submit(call)
+            return offer(call, num_bytes)
 
-        monkeypatch.setattr(sender, "submit", record)
+        monkeypatch.setattr(sender, "offer", record)
     assert (await lab.query("mocap/lab/status")).payload == b"payload"
     lab.service.payload = b"8 bytes."
     assert (await lab.query("mocap/lab/status")).payload == b"8 bytes."

@@ -5,7 +5,7 @@ from functools import partial
 
 import pytest
 
-from gateway.outputs.zenoh.send_thread import SendThread
+from gateway.outputs.send_thread import SendThread
 
 
 @pytest.fixture
@@ -78,7 +78,7 @@ def test_after_close_no_call_is_begun(blocked: tuple[SendThread, threading.Event
 
 def test_the_end_of_the_program_does_not_wait_for_a_call() -> None:
     code = (
-        "import threading; from gateway.outputs.zenoh.send_thread import SendThread;"
+        "import threading; from gateway.outputs.send_thread import SendThread;"
         "began = threading.Event();"
         "SendThread('s').submit(lambda: (began.set(), threading.Event().wait())); began.wait()"
     )

@@ -1,0 +1,174 @@
+"""Which questions of peers an output answers: limits of their rate, their number and their bytes.
+
+A question is admitted or refused where it arrives, in a thread of the output's library. So a flood of
+questions costs the event loop no more than the questions that are answered.
+"""
+
+import threading
+import time
+from collections import Counter, OrderedDict
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+from gateway.errors import QueryError
+
+MAX_KEYS: Final = 256
+"""Of how many keys the rate is known. The key that was asked for least recently is forgotten first."""
+
+REFUSALS_PER_S: Final = 500.0
+"""How many refusals a second are sent to peers. Further questions get no reply at all."""
+
+NO_REPLY: Final = "no-reply"
+"""The result of a question that got no reply."""
+
+
+class TokenBucket:
+    """Allows ``per_s`` a second on average, and the amount of one second at once.
+
+    An amount may be larger than what is left: then nothing more is allowed until it has been made up for,
+    which takes one second at most. Not safe for threads.
+    """
+
+    def __init__(self, per_s: float, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._per_s = per_s
+        self._capacity = max(per_s, 1.0)
+        self._monotonic = monotonic
+        self._left = self._capacity
+        self._updated_s = monotonic()
+
+    @property
+    def has_any(self) -> bool:
+        """Whether anything is allowed now."""
+        return self._now() > 0
+
+    def take(self, amount: float = 1.0) -> None:
+        """Use ``amount``."""
+        self._left = max(self._now() - amount, -self._capacity)
+        self._updated_s = self._monotonic()
+
+    def try_take(self, amount: float = 1.0) -> bool:
+        """Use ``amount`` if anything is allowed now; return whether it is."""
+        if not self.has_any:
+            return False
+        self.take(amount)
+        return True
+
+    def _now(self) -> float:
+        return min(self._left + (self._monotonic() - self._updated_s) * self._per_s, self._capacity)
+
+
+class QueryLimits(NamedTuple):
+    """The limits of one output. ``output`` and ``key_setting`` name its settings in texts for users.
+
+    ``key_setting`` limits the questions about one key, whatever that is on this output.
+    """
+
+    output: str
+    key_setting: str
+    per_s: float
+    per_key_per_s: float
+    reply_bytes_per_s: float
+    pending: int
+
+
+class Refusal(NamedTuple):
+    """Why a question is not answered. ``cause`` is rate or queue, for counters.
+
+    The peer gets ``error`` only if ``is_sent``; otherwise, it gets no reply.
+    """
+
+    error: QueryError
+    cause: str
+    is_sent: bool
+
+
+class Admission:
+    """Admits or refuses questions, and counts them by result. Any thread may call the methods."""
+
+    def __init__(self, limits: QueryLimits, monotonic: Callable[[], float] = time.monotonic) -> None:
+        self._limits = limits
+        self._monotonic = monotonic
+        self._lock = threading.Lock()
+        self._total = TokenBucket(limits.per_s, monotonic)
+        self._keys: OrderedDict[str, TokenBucket] = OrderedDict()
+        self._bytes = TokenBucket(limits.reply_bytes_per_s, monotonic)
+        self._long_bytes = TokenBucket(limits.reply_bytes_per_s, monotonic)
+        self._refusals = TokenBucket(REFUSALS_PER_S, monotonic)
+        self._num_pending = 0
+        self._results: Counter[str] = Counter()
+
+    @property
+    def results(self) -> Counter[str]:
+        """The number of questions by result: ok, the code of the error in the reply, or NO_REPLY."""
+        with self._lock:
+            return self._results.copy()
+
+    @property
+    def num_pending(self) -> int:
+        """How many questions have been admitted and are not finished."""
+        return self._num_pending
+
+    def admit(self, key: str) -> Refusal | None:
+        """Admit a question about ``key``, until ``finished`` is called for it; or return why not."""
+        with self._lock:
+            refusal = self._refusal(key)
+            if refusal is None:
+                self._total.take()
+                self._keys[key].take()
+                self._num_pending += 1
+            else:
+                self._results[refusal.error.code if refusal.is_sent else NO_REPLY] += 1
+            return refusal
+
+    def finished(self, result: str) -> None:
+        """Count the result of a question that was admitted."""
+        with self._lock:
+            self._num_pending -= 1
+            self._results[result] += 1
+
+    def count(self, num_answers: int) -> None:
+        """Count further answers to a question that has more than one."""
+        with self._lock:
+            self._total.take(num_answers)
+
+    def try_reply(self, num_bytes: int, *, is_long: bool = False) -> QueryError | None:
+        """Admit a reply of this size, or return the error to send in its place.
+
+        Long replies are counted apart, or a C3D file would keep all others waiting.
+        """
+        with self._lock:
+            if (self._long_bytes if is_long else self._bytes).try_take(num_bytes):
+                return None
+        limits = self._limits
+        return QueryError(
+            f"all replies of a second may have {limits.reply_bytes_per_s:g} bytes together; ask less often, "
+            f"or raise {limits.output}.max_reply_bytes_per_s in the gateway's configuration",
+            code="rate",
+        )
+
+    def _refusal(self, key: str) -> Refusal | None:
+        bucket = self._bucket(key)
+        if self._num_pending >= self._limits.pending:
+            error = QueryError("the gateway has too many queries; try again", code="busy")
+            return Refusal(error, "queue", self._refusals.try_take())
+        for allowed, per_s, setting, what in (
+            (self._total, self._limits.per_s, "max_queries_per_s", "in total"),
+            (bucket, self._limits.per_key_per_s, self._limits.key_setting, "like this one"),
+        ):
+            if not allowed.has_any:
+                text = (
+                    f"the gateway answers {per_s:g} queries a second {what}; ask less often, subscribe "
+                    f"instead, or raise {self._limits.output}.{setting} in the gateway's configuration"
+                )
+                return Refusal(QueryError(text, code="rate"), "rate", self._refusals.try_take())
+        return None
+
+    def _bucket(self, key: str) -> TokenBucket:
+        bucket = self._keys.get(key)
+        if bucket is None:
+            if len(self._keys) >= MAX_KEYS:
+                self._keys.popitem(last=False)
+            bucket = self._keys[key] = TokenBucket(self._limits.per_key_per_s, self._monotonic)
+        else:
+            self._keys.move_to_end(key)
+        return bucket

@@ -1,0 +1,91 @@
+"""A thread for calls that may block in an output's library. The program does not wait for it when it ends."""
+
+import contextlib
+import threading
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future
+from typing import Final
+
+MAX_CALLS: Final = 4096
+MAX_BYTES: Final = 64 * 1024 * 1024
+"""The limits of the queue of a SendThread, for calls that it may refuse."""
+
+
+class SendThread:
+    """Makes calls one after the other in its own thread.
+
+    Two queues: calls that must be made (``submit``) go first, and their callers bound them. Calls that may be
+    given up (``offer``) are refused while too many wait.
+
+    A concurrent.futures.ThreadPoolExecutor does not fit: Python waits for its threads at exit, so a peer that
+    has stopped reading would delay the end of the gateway by 5 s.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._changed = threading.Condition()
+        self._first: deque[tuple[Future[None], Callable[[], None]]] = deque()
+        self._offered: deque[tuple[int, Callable[[], None]]] = deque()
+        self._offered_bytes = 0
+        self._is_closed = False
+        threading.Thread(target=self._run, name=name, daemon=True).start()
+
+    def submit(self, call: Callable[[], None]) -> Future[None]:
+        """Queue ``call`` before those that were offered; the future has its result or exception."""
+        done: Future[None] = Future()
+        with self._changed:
+            self._first.append((done, call))
+            self._changed.notify()
+        return done
+
+    def offer(self, call: Callable[[], None], num_bytes: int = 0) -> bool:
+        """Queue ``call``, which holds ``num_bytes``; return False if the queue is full or closed.
+
+        A call of any size finds a place in an empty queue. ``call`` must not raise.
+        """
+        with self._changed:
+            is_full = len(self._offered) >= MAX_CALLS or self._offered_bytes + num_bytes > MAX_BYTES
+            if self._is_closed or (is_full and self._offered):
+                return False
+            self._offered.append((num_bytes, call))
+            self._offered_bytes += num_bytes
+            self._changed.notify()
+        return True
+
+    def close(self) -> None:
+        """Make no further calls; a call in progress continues."""
+        with self._changed:
+            self._is_closed = True
+            self._first.clear()
+            self._offered.clear()
+            self._changed.notify()
+
+    def _run(self) -> None:
+        while (call := self._next()) is not None:
+            call()
+            del call  # or it would keep its data alive until the next one
+
+    def _next(self) -> Callable[[], None] | None:
+        """Wait for the next call; None after ``close``."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._first or self._offered or self._is_closed)
+            if self._is_closed:
+                return None
+            if self._first:
+                done, call = self._first.popleft()
+                return lambda: _make(done, call)
+            num_bytes, offered = self._offered.popleft()
+            self._offered_bytes -= num_bytes
+            return offered
+
+
+def _make(done: Future[None], call: Callable[[], None]) -> None:
+    with contextlib.suppress(CancelledError):
+        if done.set_running_or_notify_cancel():
+            try:
+                call()
+            except BaseException as error:  # noqa: BLE001 - whoever waits for the future gets it
+                done.set_exception(error)
+            else:
+                done.set_result(None)

@@ -1,0 +1,361 @@
+"""From a query that Zenoh delivers to its replies.
+
+A query is admitted or refused in Zenoh's thread. The event loop takes one question in a turn, and a thread
+sends the replies: sending to a peer that has stopped reading blocks for 5 s, until Zenoh closes the link.
+Equal queries that arrive before there is an answer are one question.
+
+If a handler fails or does not reply, the peer cannot distinguish that from a gateway that is not running. So
+every query gets a reply, which is an error if there is no answer, unless there are too many of them.
+"""
+
+import asyncio
+import contextlib
+import functools
+import logging
+import threading
+import time
+from collections import defaultdict, deque
+from collections.abc import Mapping
+from typing import Final
+
+import zenoh
+
+from gateway.errors import QueryError
+from gateway.log import DefectLog, log_fields
+from gateway.losses import Losses
+from gateway.messages.topics import zenoh_key
+from gateway.outputs.admission import NO_REPLY, Admission, Refusal
+from gateway.outputs.contract import Answer, KeyPath, QueryService
+from gateway.outputs.encodings import TEXT, json_bytes
+from gateway.outputs.send_thread import SendThread
+
+MAX_PENDING: Final = 4096
+"""The maximum number of queries in progress. Further ones get the error busy."""
+
+MAX_QUESTIONS: Final = 64
+"""How many different questions are answered at a time; the others wait."""
+
+MAX_KEY_CHARS: Final = 512
+MAX_OPTIONS_CHARS: Final = 1024
+MAX_PAYLOAD_BYTES: Final = 4096
+"""The limits of a query. The payload and the attachment count together, and are ignored."""
+
+MAX_PART_WILDCARDS: Final = 2
+"""How many ``$*`` a selector may have: Zenoh's time to match grows with its power."""
+
+LONG_ANSWER_BYTES: Final = 1024 * 1024
+"""A second thread sends longer answers (C3D files), so that other answers need not wait."""
+
+_REST: Final = 3.0
+"""How long the threads rest after they have made a payload, as a multiple of the time that this took.
+
+So JSON for peers takes a quarter of a core at most.
+"""
+
+Options = tuple[tuple[str, str], ...]
+
+logger = logging.getLogger(__name__)
+
+
+class _Question:
+    """Equal queries that get the same answers. More can join while it is open, which is until the answer."""
+
+    def __init__(self, source: str, selected: str, options: Options) -> None:
+        self.source = source
+        self.selected = selected
+        self.options = options
+        self.queries: list[zenoh.Query] = []
+
+    @property
+    def selector(self) -> str:
+        """The key and the options."""
+        options = ";".join(f"{name}={value}" for name, value in self.options)
+        return f"{self.selected}?{options}" if options else self.selected
+
+    @property
+    def identity(self) -> tuple[str, str, Options]:
+        """What makes questions equal."""
+        return self.source, self.selected, self.options
+
+
+class ZenohAnswers:
+    """Answers queries below PREFIX/SOURCE/ with ``service``.
+
+    ``receive`` may be called in any thread; everything else runs in ``loop``. ``sender`` sends the replies;
+    only C3D files and other long answers have a thread of their own, because two threads that block stop all
+    of Zenoh meanwhile.
+    """
+
+    def __init__(
+        self,
+        prefix: str,
+        service: QueryService,
+        loop: asyncio.AbstractEventLoop,
+        admission: Admission,
+        sender: SendThread,
+        losses: defaultdict[str, Losses],
+    ) -> None:
+        self._prefix = prefix
+        self._service = service
+        self._loop = loop
+        self._admission = admission
+        self._sender = sender
+        self._long_sender = SendThread("zenoh-send-long")
+        self._losses = losses
+        self._lock = threading.Lock()  # of the next three, shared with Zenoh's threads
+        self._open: dict[tuple[str, str, Options], _Question] = {}
+        self._waiting: deque[_Question] = deque()
+        self._is_scheduled = False  # the call of _start_next
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._is_closed = False
+        self._rest_until_s = 0.0
+        self._defects: dict[str, DefectLog] = {}  # by source
+
+    # In Zenoh's threads.
+
+    def receive(self, source: str, query: zenoh.Query) -> None:
+        """Take a query about ``source``, or refuse it."""
+        selected = str(query.key_expr)
+        refusal = self._admission.admit(selected[:MAX_KEY_CHARS])
+        if refusal is not None:
+            self._refuse(source, query, refusal)
+            return
+        try:
+            _check(query, selected)
+            question = _Question(source, selected, tuple(sorted(_options(query).items())))
+        except QueryError as error:
+            self._send([query], source, error)
+            return
+        self._add(question, query)
+
+    def _refuse(self, source: str, query: zenoh.Query, refusal: Refusal) -> None:
+        error = refusal.error
+        if refusal.cause == "queue":
+            text = f"a query is refused as busy, because {MAX_PENDING} others are in progress; ask less often"
+            self._losses[source].lost("query beyond the queue", text, frames=0)
+        else:
+            self._losses[source].lost("query beyond the rate", f"a query is refused: {error}", frames=0)
+        reply = functools.partial(_reply_error, query, error)
+        if not refusal.is_sent or not self._sender.offer(reply):
+            query.drop()
+
+    def _add(self, question: _Question, query: zenoh.Query) -> None:
+        with self._lock:
+            joined = self._open.setdefault(question.identity, question)
+            joined.queries.append(query)
+            if joined is not question:
+                return
+            self._waiting.append(question)
+            if self._is_scheduled:
+                return
+            self._is_scheduled = True
+        with contextlib.suppress(RuntimeError):  # the loop has just ended
+            self._loop.call_soon_threadsafe(self._start_next)
+
+    # In the event loop.
+
+    def _start_next(self) -> None:
+        """Start to answer one question. Frames that have arrived come before the next one."""
+        with self._lock:
+            if not self._waiting or len(self._tasks) >= MAX_QUESTIONS:
+                self._is_scheduled = False
+                return
+            question = self._waiting.popleft()
+        with log_fields(source=question.source):
+            task = asyncio.create_task(self._answer(question))
+        self._tasks.add(task)
+        task.add_done_callback(self._finish)
+        self._loop.call_soon(self._start_next)
+
+    def _finish(self, task: asyncio.Task[None]) -> None:
+        self._tasks.discard(task)
+        with self._lock:
+            if self._is_scheduled or not self._waiting:
+                return
+            self._is_scheduled = True
+        self._loop.call_soon(self._start_next)
+
+    async def _answer(self, question: _Question) -> None:
+        outcome: dict[str, Answer] | QueryError | None = None
+        try:
+            if self._service.serves(question.source):
+                outcome = await self._answers(question)
+        except QueryError as error:
+            outcome = error
+        except Exception as defect:  # noqa: BLE001 - every query gets a reply
+            self._log_defect(question.source, question.selector, defect)
+            outcome = _defect_error(defect)
+        finally:
+            with self._lock:
+                del self._open[question.identity]
+        if outcome is None:  # the source has been removed
+            self._drop(question.queries)
+        else:
+            self._send(question.queries, question.source, outcome)
+
+    async def _answers(self, question: _Question) -> dict[str, Answer]:
+        """Return the answers by key. Raises QueryError if there is none."""
+        source, selected, options = question.source, question.selected, dict(question.options)
+        base = zenoh_key(self._prefix, source) + "/"
+        if "*" not in selected and selected.startswith(base):
+            path = tuple(selected.removeprefix(base).split("/"))
+            return {selected: await self._service.answer(source, path, options)}
+        paths = _matching(selected, base, tuple(self._service.keys(source)))
+        if not paths:
+            raise QueryError(self._nothing_matches(selected, base, source))
+        self._admission.count(len(paths) - 1)
+        answers = await self._service.answer_all(source, paths, options)
+        return {base + "/".join(path): answer for path, answer in answers.items()}
+
+    def _nothing_matches(self, selected: str, base: str, source: str) -> str:
+        if selected.rpartition("/")[2] == "recording":
+            return f"recording is controlled for one source at a time; accepted: {base}recording"
+        accepted = self._service.accepted_keys(source)
+        return f"nothing of source {source!r} matches {selected}; accepted below {base}: {accepted}"
+
+    async def close(self) -> None:
+        """Drop the pending queries. Their peers see at once that no reply follows."""
+        self._is_closed = True
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        with self._lock:
+            questions = list(self._waiting)
+            self._waiting.clear()
+            self._open.clear()
+        for question in questions:
+            self._drop(question.queries)
+        self._long_sender.close()
+
+    # In any thread.
+
+    def _send(
+        self, queries: list[zenoh.Query], source: str, outcome: Mapping[str, Answer] | QueryError
+    ) -> None:
+        num_bytes = 0 if isinstance(outcome, QueryError) else _num_bytes(outcome)
+        sender = self._long_sender if num_bytes > LONG_ANSWER_BYTES else self._sender
+        for query in queries:
+            reply = functools.partial(self._reply, query, source, outcome)
+            if not sender.offer(reply, num_bytes // len(queries)):
+                self._drop([query])
+                if not self._is_closed:
+                    self._losses[source].lost(
+                        "answer beyond the queue",
+                        "answers to queries are dropped, because earlier ones wait to be sent; ask less "
+                        "often, and check for peers that ask and do not read the answers",
+                        frames=0,
+                    )
+
+    def _drop(self, queries: list[zenoh.Query]) -> None:
+        """Let the peers see that no reply follows."""
+        for query in queries:
+            query.drop()
+            self._admission.finished(NO_REPLY)
+
+    def _log_defect(self, source: str, selector: str, defect: Exception) -> None:
+        log = self._defects.setdefault(source, DefectLog(logger, source))
+        log.log(defect, f"query {ascii(selector)[1:-1]}")
+
+    # In a thread that sends. Zenoh's calls may block.
+
+    def _reply(self, query: zenoh.Query, source: str, outcome: Mapping[str, Answer] | QueryError) -> None:
+        result = "ok"
+        try:
+            with query:
+                error = outcome if isinstance(outcome, QueryError) else self._reply_all(query, outcome)
+                if error is not None:
+                    result = error.code
+                    _reply_error(query, error)
+        except Exception as problem:  # noqa: BLE001 - the thread continues
+            result = "defect"
+            self._log_defect(source, str(query.key_expr), problem)
+        finally:
+            self._admission.finished(result)
+
+    def _reply_all(self, query: zenoh.Query, answers: Mapping[str, Answer]) -> QueryError | None:
+        """Reply with each of the answers; return an error if there is none."""
+        num_bytes = _num_bytes(answers)
+        error = self._admission.try_reply(num_bytes, is_long=num_bytes > LONG_ANSWER_BYTES)
+        if error is not None:
+            return error
+        num_replies = 0
+        for key, answer in answers.items():
+            try:
+                payload = self._payload(answer)
+            except QueryError as problem:
+                error = problem
+                continue
+            num_replies += 1
+            attachment = json_bytes(answer.attachment) if answer.attachment else None
+            try:
+                query.reply(key, payload, encoding=answer.encoding, attachment=attachment)
+            except zenoh.ZError as problem:
+                logger.debug("zenoh: replying to %s: %s", query.selector, problem)
+        return None if num_replies else error
+
+    def _payload(self, answer: Answer) -> bytes:
+        """Return the payload of an answer, and make it if necessary, with rests in between."""
+        if isinstance(answer.content, bytes) or answer.content.is_made:
+            return answer.payload
+        time.sleep(max(0.0, self._rest_until_s - time.monotonic()))
+        begun_s = time.thread_time()
+        try:
+            return answer.payload
+        finally:
+            self._rest_until_s = time.monotonic() + _REST * (time.thread_time() - begun_s)
+
+
+def _num_bytes(answers: Mapping[str, Answer]) -> int:
+    return sum(answer.num_bytes for answer in answers.values())
+
+
+def _reply_error(query: zenoh.Query, error: QueryError) -> None:
+    """Reply with an error. The schema of the encoding is the error's code."""
+    with query:
+        try:
+            query.reply_err(str(error), encoding=zenoh.Encoding(TEXT).with_schema(error.code))
+        except zenoh.ZError as problem:
+            logger.debug("zenoh: replying to %s: %s", query.selector, problem)
+
+
+def _defect_error(defect: Exception) -> QueryError:
+    return QueryError(f"a defect in the gateway: {defect!r}", code="defect")
+
+
+def _check(query: zenoh.Query, selected: str) -> None:
+    """Raise QueryError if a query is too long, or its selector takes too long to match."""
+    num_bytes = sum(len(each) for each in (query.payload, query.attachment) if each is not None)
+    if num_bytes > MAX_PAYLOAD_BYTES:
+        raise QueryError(
+            f"a query has {num_bytes} bytes of payload and attachment; accepted: {MAX_PAYLOAD_BYTES}"
+        )
+    if len(selected) > MAX_KEY_CHARS:
+        raise QueryError(f"a key has {len(selected)} characters; accepted: {MAX_KEY_CHARS}")
+    if len(str(query.parameters)) > MAX_OPTIONS_CHARS:
+        raise QueryError(f"the options have more than {MAX_OPTIONS_CHARS} characters")
+    if selected.count("$*") > MAX_PART_WILDCARDS:
+        raise QueryError(f"a selector has more than {MAX_PART_WILDCARDS} times $*; use * or **")
+
+
+@functools.lru_cache(maxsize=256)
+def _matching(selected: str, base: str, paths: tuple[KeyPath, ...]) -> list[KeyPath]:
+    """Return the keys of a source that a selector with wildcards matches.
+
+    A C3D file may have hundreds of MB, so it is selected only by its name, as in mocap/*/c3d.
+    """
+    expression, last = zenoh.KeyExpr(selected), selected.rpartition("/")[2]
+    return [
+        path
+        for path in paths
+        if (path != ("c3d",) or last == "c3d") and expression.intersects(zenoh.KeyExpr(base + "/".join(path)))
+    ]
+
+
+def _options(query: zenoh.Query) -> dict[str, str]:
+    """Return the selector's options; names that start with _ are Zenoh's own."""
+    options = {}
+    for pair in filter(None, str(query.parameters).split(";")):
+        name, _, value = pair.partition("=")
+        if not name.startswith("_"):
+            options[name] = value
+    return options
