@@ -121,26 +121,27 @@ class Admission:
             return refusal
 
     def finished(self, result: str) -> None:
-        """Count the result of a question that was admitted."""
+        """Count the result of a question that was admitted; "" if it has none."""
         with self._lock:
             self._num_pending -= 1
-            self._results[result] += 1
+            if result:
+                self._results[result] += 1
 
     def count(self, num_answers: int) -> None:
         """Count further answers to a question that has more than one."""
         with self._lock:
             self._total.take(num_answers)
 
-    def try_reply(self, num_bytes: int, *, is_long: bool = False) -> QueryError | None:
-        """Admit a reply of this size, or return the error to send in its place.
+    def check_reply(self, num_bytes: int, *, is_long: bool = False) -> None:
+        """Count a reply of this size. Raise QueryError if it must not be sent now.
 
         Long replies are counted apart, or a C3D file would keep all others waiting.
         """
         with self._lock:
             if (self._long_bytes if is_long else self._bytes).try_take(num_bytes):
-                return None
+                return
         limits = self._limits
-        return QueryError(
+        raise QueryError(
             f"all replies of a second may have {limits.reply_bytes_per_s:g} bytes together; ask less often, "
             f"or raise {limits.output}.max_reply_bytes_per_s in the gateway's configuration",
             code="rate",

@@ -298,13 +298,12 @@ async def test_a_requester_can_send_the_next_request_as_soon_as_it_has_a_reply(
     async with gateway_with_lcm_peer() as (_, gateway, peer):
         queries = output_queries(gateway)
         assert isinstance(queries, LcmQueries)
-        publish, free, is_slot_free = queries._publish, queries._free_slots, []
+        publish, is_slot_free = queries._publish, []
 
         def publish_and_check(connection: Any, source: str, name: str, message: Any) -> None:
             publish(connection, source, name, message)
             if name == "PARAMETERS_REPLY":
-                is_slot_free.append(free.acquire(blocking=False))
-                free.release()
+                is_slot_free.append(queries._admission.num_pending == 0)
 
         monkeypatch.setattr(queries, "_publish", publish_and_check)
         assert (await peer.request(1)).error == ""

@@ -82,10 +82,9 @@ class LcmOutput(Output):
         if self._queries is not None:
             self._queries.remove(source)
 
-    def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
+    def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
         """Publish the XML as ``parameters_t``, now and every few seconds. LCM keeps the order of messages."""
-        if self._queries is not None:
-            self._queries.publish_parameters(source, parameters)
+        return None if self._queries is None else self._queries.publish_parameters(source, parameters)
 
     def serve_queries(self, service: QueryService) -> None:
         """Publish parameters and, with ``lcm.queries``, answer ``parameters_request_t`` for each source."""

@@ -1,34 +1,44 @@
-"""Requests from LCM (parameters_request_t) and their replies, and the parameters that the gateway publishes.
+"""Requests from LCM (parameters_request_t), their replies, and parameters that the gateway publishes.
 
-Anybody on the network can send on LCM, and LCM has no flow control. So requests wait in a bounded queue, and
-malformed ones are counted and ignored.
+Anybody on the network can send on LCM, and LCM has no flow control. So the thread that receives requests
+admits or refuses them. Malformed ones are counted and ignored.
 """
 
 import asyncio
 import contextlib
+import functools
 import logging
 import threading
 import time
 from collections import Counter, defaultdict
+from concurrent.futures import Future
 from typing import Any, Final
 
 import lcm
 import rtc3d
 
 from gateway.errors import OutputError, QueryError
-from gateway.log import FailureLog, log_fields
+from gateway.log import DefectLog, FailureLog, log_fields
 from gateway.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import lcm_channel
+from gateway.outputs.admission import Admission, QueryLimits, Refusal, TokenBucket
 from gateway.outputs.contract import QueryService, ServerParameters
 from gateway.outputs.lcm.connection import open_lcm, scheme_of, send_problem
 from gateway.outputs.lcm.sender import RETRY_S, LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.thread_sender import LcmThreadSender, new_sender
+from gateway.outputs.send_thread import SendThread
 from gateway.worker_thread import WorkerThread
 
 MAX_PENDING: Final = 64
 """The maximum number of requests in progress. Further ones are dropped and counted."""
+
+RECEIVED_PER_S: Final = 2000.0
+"""How many messages a second are received. LCM itself discards further ones, which cannot be counted."""
+
+LONG_XML_BYTES: Final = 32 * 1024
+"""Longer parameters are encoded and sent by a thread: 16 MB take 30 ms."""
 
 MAX_REQUEST_BYTES: Final = 4096
 MAX_REQUESTER_BYTES: Final = 128
@@ -36,17 +46,25 @@ REPEAT_S: Final = 5.0
 """How often the parameters are published again, for late subscribers."""
 
 _POLL_MS: Final = 100
+_PAUSE_S: Final = 0.02
 _JOIN_S: Final = 1.0
+
+_FINGERPRINT: Final[bytes] = rtc3d.parameters_request_t._get_packed_fingerprint()  # noqa: SLF001 - see decode.py
 
 logger = logging.getLogger(__name__)
 
 
 class _Publication:
-    """A source's newest parameters, and when they are due to be published again."""
+    """A source's newest parameters, and when they are due to be published again.
+
+    ``sent`` is the latest publication by the thread.
+    """
 
     def __init__(self) -> None:
-        self.message = rtc3d.parameters_t()
+        self.newest: tuple[ServerParameters, int] | None = None  # with the time when they arrived, in µs
+        self.sequence = 0
         self.due_s = 0.0
+        self.sent: Future[None] | None = None
 
 
 class LcmQueries:
@@ -78,12 +96,27 @@ class LcmQueries:
         self._thread = threading.Thread(target=self._receive, name="lcm-requests", daemon=True)
         self._closing = threading.Event()
         self._opening = FailureLog(logger, "lcm")
-        self._free_slots = threading.BoundedSemaphore(MAX_PENDING)  # acquired in the receiving thread
+        self._received = TokenBucket(RECEIVED_PER_S)  # used in the receiving thread
+        self._admission = Admission(
+            QueryLimits(
+                output="lcm",
+                key_setting="max_queries_per_source_per_s",
+                per_s=settings.max_queries_per_s,
+                per_key_per_s=settings.max_queries_per_source_per_s,
+                reply_bytes_per_s=settings.max_reply_bytes_per_s,
+                pending=MAX_PENDING,
+            )
+        )
+        self._long_sender = SendThread("lcm-send-long")
         self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "lcm"))  # by source
         self._tasks: set[asyncio.Task[None]] = set()
         self._publications: dict[str, _Publication] = {}
-        self.results: Counter[str] = Counter()
-        """Requests by result: ok, or the code of the error."""
+        self._defects: dict[str, DefectLog] = {}  # by source
+
+    @property
+    def results(self) -> Counter[str]:
+        """See Admission."""
+        return self._admission.results
 
     def start(self) -> None:
         """Receive requests. Called in any thread, after the output has opened."""
@@ -117,6 +150,8 @@ class LcmQueries:
             self._reply_sender.open()
         while connection is not None and not self._closing.is_set():
             self._subscribe(connection)
+            if not self._received.has_any:
+                self._closing.wait(_PAUSE_S)  # or a flood would keep other threads from running
             try:
                 connection.handle_timeout(_POLL_MS)
             except OSError as error:
@@ -169,30 +204,52 @@ class LcmQueries:
 
     def _take(self, source: str, data: bytes) -> None:
         """Check a request and pass it to the event loop."""
+        self._received.take()
+        if len(data) > MAX_REQUEST_BYTES or data[: len(_FINGERPRINT)] != _FINGERPRINT:
+            self._count_malformed(source, data)
+            return
+        refusal = self._admission.admit(source)
+        if refusal is not None:
+            self._refuse(source, data, refusal)
+            return
         request = _decoded(data)
         if request is None:
-            self._losses[source].lost(
-                "malformed request",
-                f"a message on the channel of requests is ignored: {len(data)} bytes that are no "
-                "parameters_request_t; correct the program that sends it",
-                frames=0,
-            )
-        elif not self._free_slots.acquire(blocking=False):
+            self._admission.finished("")
+            self._count_malformed(source, data)
+            return
+        with contextlib.suppress(RuntimeError):  # the loop has just ended
+            self._loop.call_soon_threadsafe(self._start_answer, source, request)
+
+    def _count_malformed(self, source: str, data: bytes) -> None:
+        self._losses[source].lost(
+            "malformed request",
+            f"a message on the channel of requests is ignored: {len(data)} bytes that are no "
+            "parameters_request_t; correct the program that sends it",
+            frames=0,
+        )
+
+    def _refuse(self, source: str, data: bytes, refusal: Refusal) -> None:
+        if refusal.cause == "queue":
             self._losses[source].lost(
                 "request beyond the queue",
                 f"a request on LCM is ignored, because {MAX_PENDING} others are in progress; "
                 "ask less often, or subscribe to the parameters",
                 frames=0,
             )
-        else:
-            with contextlib.suppress(RuntimeError):  # the loop has just ended
-                self._loop.call_soon_threadsafe(self._start_answer, source, request)
+            return
+        error = refusal.error
+        self._losses[source].lost("request beyond the rate", f"a request is refused: {error}", frames=0)
+        request = _decoded(data) if refusal.is_sent else None
+        if request is not None:
+            reply = _reply_to(request)
+            reply.error, reply.error_code = str(error), error.code
+            self._long_sender.offer(functools.partial(self._send_reply, source, reply))
 
     # In the event loop.
 
     def _start_answer(self, source: str, request: Any) -> None:
         if not self._service.serves(source):
-            self._free_slots.release()
+            self._admission.finished("")
             return
         with log_fields(source=source):
             task = asyncio.create_task(self._answer(source, request))
@@ -200,31 +257,44 @@ class LcmQueries:
         task.add_done_callback(self._tasks.discard)
 
     async def _answer(self, source: str, request: Any) -> None:
-        reply = rtc3d.parameters_reply_t()
-        reply.request_id, reply.requester = request.request_id, request.requester
+        reply = _reply_to(request)
+        parameters: ServerParameters | None = None
         try:
             parameters = await self._service.parameters(source, request.sections, fresh=request.fresh)
+            self._admission.check_reply(len(parameters.xml))
         except QueryError as error:
-            reply.error, reply.error_code = str(error), error.code
-        except Exception as error:
-            logger.exception("%s: LCM request %d of %r", source, reply.request_id, reply.requester)
+            parameters, reply.error, reply.error_code = None, str(error), error.code
+        except Exception as error:  # noqa: BLE001 - every request gets a reply
+            log = self._defects.setdefault(source, DefectLog(logger, source))
+            log.log(error, text=f"LCM request {reply.request_id} of {reply.requester!r}")
             reply.error, reply.error_code = f"a defect in the gateway: {error!r}", "defect"
-        else:
-            reply.xml, reply.age_s = _text(parameters.xml), parameters.age_s
-            reply.parameters_version = parameters.version
         finally:
-            self._free_slots.release()  # before the reply is sent: its receiver may ask again at once
-        self.results[reply.error_code or "ok"] += 1
-        self._publish(self._reply_sender, source, "PARAMETERS_REPLY", reply)
+            # Before the reply is sent: its receiver may ask again at once. Cancelled, it has no result.
+            has_result = parameters is not None or reply.error_code
+            self._admission.finished((reply.error_code or "ok") if has_result else "")
+        self._send_answer(source, reply, parameters)
 
-    def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
-        """Publish a source's parameters, now and every REPEAT_S seconds."""
+    def _send_answer(self, source: str, reply: Any, parameters: ServerParameters | None) -> None:
+        if parameters is None or len(parameters.xml) <= LONG_XML_BYTES:
+            self._send_reply(source, reply, parameters)
+            return
+        send = functools.partial(self._send_reply, source, reply, parameters)
+        if not self._long_sender.offer(send, len(parameters.xml)):
+            self._losses[source].lost(
+                "reply beyond the queue",
+                "a reply on LCM is dropped, because earlier ones wait to be sent; ask less often",
+                frames=0,
+            )
+
+    def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
+        """Publish a source's parameters, now and every REPEAT_S seconds.
+
+        Returns a future that is done when long parameters have been sent; None if these have been.
+        """
         publication = self._publications.setdefault(source, _Publication())
-        publication.message.xml = _text(parameters.xml)
-        publication.message.capture_utime = now_utime()
-        publication.message.session = parameters.session
-        publication.message.parameters_version = parameters.version
-        self._publish_again(source, publication)
+        publication.newest = parameters, now_utime()
+        sent = self._publish_again(source, publication)
+        return None if sent is None else asyncio.wrap_future(sent, loop=self._loop)
 
     def maintain(self) -> None:
         """Publish the parameters again that are due. Called once a second."""
@@ -234,11 +304,36 @@ class LcmQueries:
             if time.monotonic() >= publication.due_s:
                 self._publish_again(source, publication)
 
-    def _publish_again(self, source: str, publication: _Publication) -> None:
-        publication.message.utime = now_utime()
-        self._publish(self._sender, source, "PARAMETERS", publication.message)
-        publication.message.sequence += 1
+    def _publish_again(self, source: str, publication: _Publication) -> Future[None] | None:
         publication.due_s = time.monotonic() + REPEAT_S
+        waits = publication.sent is not None and not publication.sent.done()
+        is_long = publication.newest is not None and len(publication.newest[0].xml) > LONG_XML_BYTES
+        if not (waits or is_long):
+            self._publish_newest(source, publication)
+            return None
+        # If one waits to be sent, it may have begun with the former parameters.
+        publication.sent = self._long_sender.submit(
+            functools.partial(self._publish_newest, source, publication)
+        )
+        return publication.sent
+
+    # In the event loop, or in the thread that sends what is long.
+
+    def _publish_newest(self, source: str, publication: _Publication) -> None:
+        if publication.newest is None:
+            return
+        parameters, message = publication.newest[0], rtc3d.parameters_t()
+        message.utime, message.capture_utime = now_utime(), publication.newest[1]
+        message.sequence, publication.sequence = publication.sequence, publication.sequence + 1
+        message.session, message.parameters_version = parameters.session, parameters.version
+        message.xml = _text(parameters.xml)
+        self._publish(self._sender, source, "PARAMETERS", message)
+
+    def _send_reply(self, source: str, reply: Any, parameters: ServerParameters | None = None) -> None:
+        if parameters is not None:
+            reply.xml, reply.age_s = _text(parameters.xml), parameters.age_s
+            reply.parameters_version = parameters.version
+        self._publish(self._reply_sender, source, "PARAMETERS_REPLY", reply)
 
     def _publish(self, sender: LcmSender | LcmThreadSender, source: str, name: str, message: Any) -> None:
         try:
@@ -252,6 +347,7 @@ class LcmQueries:
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        self._long_sender.close()
         if self._thread.is_alive():
             await WorkerThread("join lcm-requests").run(lambda: self._thread.join(_JOIN_S))
         if self._shared is not None:
@@ -261,10 +357,14 @@ class LcmQueries:
             self._reply_sender.close()
 
 
+def _reply_to(request: Any) -> Any:
+    reply = rtc3d.parameters_reply_t()
+    reply.request_id, reply.requester = request.request_id, request.requester
+    return reply
+
+
 def _decoded(data: bytes) -> Any | None:
-    """Return ``data`` as a ``parameters_request_t``; None if it is malformed or too long."""
-    if len(data) > MAX_REQUEST_BYTES:
-        return None
+    """Return ``data`` as a ``parameters_request_t``; None if it is malformed."""
     try:
         request = rtc3d.parameters_request_t.decode(data)
     except Exception:  # noqa: BLE001 - lcm-gen's decoders raise anything

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, Field
 
 from gateway.config.section import Effective, expects, join_or
 from gateway.config.settings import OutputSettings
-from gateway.config.values import MaxRates, Switch
+from gateway.config.values import ByteLimit, MaxRates, QueryRate, Switch
 from gateway.outputs.lcm.connection import DEFAULT_GROUP, DEFAULT_PORT
 
 DEFAULT_LCM_PREFIX: Final = "MOCAP"
@@ -96,6 +96,15 @@ class LcmSettings(OutputSettings):
 
     tool_poses: Switch = False
     """Whether to publish the pose of each tool on its own channel."""
+
+    max_queries_per_s: QueryRate = 200.0
+    """How many requests a second to answer. Beyond this limit or the next two, they get the error rate."""
+
+    max_queries_per_source_per_s: QueryRate = 100.0
+    """How many requests a second to answer about each source."""
+
+    max_reply_bytes_per_s: ByteLimit = 4 * 1024 * 1024
+    """How many bytes a second to send in replies, which every program on the network receives."""
 
     @property
     def effective(self) -> dict[str, Effective]:

@@ -28,6 +28,7 @@ from gateway.outputs.admission import NO_REPLY, Admission, Refusal
 from gateway.outputs.contract import Answer, KeyPath, QueryService
 from gateway.outputs.encodings import TEXT, json_bytes
 from gateway.outputs.send_thread import SendThread
+from gateway.safe_text import safe_text
 
 MAX_PENDING: Final = 4096
 """The maximum number of queries in progress. Further ones get the error busy."""
@@ -135,7 +136,7 @@ class ZenohAnswers:
             self._losses[source].lost("query beyond the queue", text, frames=0)
         else:
             self._losses[source].lost("query beyond the rate", f"a query is refused: {error}", frames=0)
-        reply = functools.partial(_reply_error, query, error)
+        reply = functools.partial(_reply_refusal, query, error)
         if not refusal.is_sent or not self._sender.offer(reply):
             query.drop()
 
@@ -254,7 +255,7 @@ class ZenohAnswers:
 
     def _log_defect(self, source: str, selector: str, defect: Exception) -> None:
         log = self._defects.setdefault(source, DefectLog(logger, source))
-        log.log(defect, f"query {ascii(selector)[1:-1]}")
+        log.log(defect, text=f"query {safe_text(selector)}")
 
     # In a thread that sends. Zenoh's calls may block.
 
@@ -262,8 +263,11 @@ class ZenohAnswers:
         result = "ok"
         try:
             with query:
-                error = outcome if isinstance(outcome, QueryError) else self._reply_all(query, outcome)
-                if error is not None:
+                try:
+                    if isinstance(outcome, QueryError):
+                        raise outcome
+                    self._reply_all(query, outcome)
+                except QueryError as error:
                     result = error.code
                     _reply_error(query, error)
         except Exception as problem:  # noqa: BLE001 - the thread continues
@@ -272,13 +276,11 @@ class ZenohAnswers:
         finally:
             self._admission.finished(result)
 
-    def _reply_all(self, query: zenoh.Query, answers: Mapping[str, Answer]) -> QueryError | None:
-        """Reply with each of the answers; return an error if there is none."""
+    def _reply_all(self, query: zenoh.Query, answers: Mapping[str, Answer]) -> None:
+        """Reply with each of the answers. Raises QueryError if there is none, or too many bytes."""
         num_bytes = _num_bytes(answers)
-        error = self._admission.try_reply(num_bytes, is_long=num_bytes > LONG_ANSWER_BYTES)
-        if error is not None:
-            return error
-        num_replies = 0
+        self._admission.check_reply(num_bytes, is_long=num_bytes > LONG_ANSWER_BYTES)
+        num_replies, error = 0, None
         for key, answer in answers.items():
             try:
                 payload = self._payload(answer)
@@ -291,7 +293,8 @@ class ZenohAnswers:
                 query.reply(key, payload, encoding=answer.encoding, attachment=attachment)
             except zenoh.ZError as problem:
                 logger.debug("zenoh: replying to %s: %s", query.selector, problem)
-        return None if num_replies else error
+        if error is not None and num_replies == 0:
+            raise error
 
     def _payload(self, answer: Answer) -> bytes:
         """Return the payload of an answer, and make it if necessary, with rests in between."""
@@ -309,13 +312,17 @@ def _num_bytes(answers: Mapping[str, Answer]) -> int:
     return sum(answer.num_bytes for answer in answers.values())
 
 
+def _reply_refusal(query: zenoh.Query, error: QueryError) -> None:
+    with query:
+        _reply_error(query, error)
+
+
 def _reply_error(query: zenoh.Query, error: QueryError) -> None:
     """Reply with an error. The schema of the encoding is the error's code."""
-    with query:
-        try:
-            query.reply_err(str(error), encoding=zenoh.Encoding(TEXT).with_schema(error.code))
-        except zenoh.ZError as problem:
-            logger.debug("zenoh: replying to %s: %s", query.selector, problem)
+    try:
+        query.reply_err(str(error), encoding=zenoh.Encoding(TEXT).with_schema(error.code))
+    except zenoh.ZError as problem:
+        logger.debug("zenoh: replying to %s: %s", query.selector, problem)
 
 
 def _defect_error(defect: Exception) -> QueryError:

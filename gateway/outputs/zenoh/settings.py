@@ -95,10 +95,10 @@ class ZenohSettings(OutputSettings):
     """Whether to publish the pose of each tool on its own key, while someone subscribes to it."""
 
     max_queries_per_s: QueryRate = 2000.0
-    """How many queries a second to answer. Further ones get the error rate; so also for the next two keys."""
+    """How many queries a second to answer. Beyond this limit or the next two, they get the error rate."""
 
     max_queries_per_key_per_s: QueryRate = 1000.0
     """How many queries a second to answer for each key, or selector with wildcards."""
 
     max_reply_bytes_per_s: ByteLimit = 16 * 1024 * 1024
-    """How many bytes a second to send in replies. Replies of more than 1 MiB (C3D files) count apart."""
+    """How many bytes a second to send in replies. Those of more than 1 MiB (C3D files) count apart."""

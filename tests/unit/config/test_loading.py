@@ -161,7 +161,8 @@ MISTAKES: list[tuple[str, str]] = [
     (
         "zenoh:",
         "lab.yaml:4:7: zenoh: found nothing; expected a mapping with any of the keys enabled, prefix, "
-        "config, express, max_rate_hz, tool_poses",
+        "config, express, max_rate_hz, tool_poses, "
+        "max_queries_per_s, max_queries_per_key_per_s, max_reply_bytes_per_s",
     ),
     ("lcm: {enabled: 1}", "lab.yaml:4:16: lcm.enabled: found 1; expected true or false"),
     ("  - host: lab-2", "lab.yaml:4:5: sources[1].name: missing; this key is required"),
@@ -231,7 +232,8 @@ sources:
 """
     assert refused(file, text) == [
         "lab.yaml:1:7: lcm.enable: unknown key (did you mean 'enabled'?); "
-        "known keys: enabled, prefix, url, queries, queries_url, max_rate_hz, tool_poses",
+        "known keys: enabled, prefix, url, queries, queries_url, max_rate_hz, tool_poses, "
+        "max_queries_per_s, max_queries_per_source_per_s, max_reply_bytes_per_s",
         "lab.yaml:2:17: zenoh.prefix: found '/mocap'; expected a Zenoh key of at most 128 characters, "
         "such as mocap or site/mocap, without spaces, * $ # ?, and without a leading, trailing or double /",
         "lab.yaml:4:5: sources[0].name: missing; this key is required",

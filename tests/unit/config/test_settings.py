@@ -148,7 +148,8 @@ def test_all_mistakes_are_reported_together() -> None:
         "query_timeout_s, fresh_interval_s, parameters_interval_s, remote_control",
         "sources.1.host": "missing; this key is required",
         "lcm": "found nothing; expected a mapping with any of the keys enabled, prefix, url, queries, "
-        "queries_url, max_rate_hz, tool_poses",
+        "queries_url, max_rate_hz, tool_poses, max_queries_per_s, max_queries_per_source_per_s, "
+        "max_reply_bytes_per_s",
         "zenho": "unknown key (did you mean 'zenoh'?); known keys: sources, spool, metrics, zenoh, lcm",
     }
 

@@ -5,7 +5,9 @@ from functools import partial
 
 import pytest
 
+from gateway.outputs import send_thread
 from gateway.outputs.send_thread import SendThread
+from tests.waiting import wait_until
 
 
 @pytest.fixture
@@ -83,3 +85,48 @@ def test_the_end_of_the_program_does_not_wait_for_a_call() -> None:
         "SendThread('s').submit(lambda: (began.set(), threading.Event().wait())); began.wait()"
     )
     assert subprocess.run([sys.executable, "-c", code], timeout=30, check=False).returncode == 0
+
+
+def test_offered_calls_are_made_after_those_that_must_be_made(
+    blocked: tuple[SendThread, threading.Event],
+) -> None:
+    sender, go = blocked
+    made: list[str] = []
+    last = threading.Event()
+    assert sender.offer(lambda: made.append("offered"))
+    assert sender.offer(last.set)
+    sender.submit(lambda: made.append("submitted"))
+    go.set()
+    assert last.wait(10)
+    assert made == ["submitted", "offered"]
+    sender.close()
+
+
+def test_offered_calls_beyond_the_number_or_the_bytes_are_refused(
+    blocked: tuple[SendThread, threading.Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(send_thread, "MAX_CALLS", 3)
+    monkeypatch.setattr(send_thread, "MAX_BYTES", 100)
+    sender, go = blocked
+    made: list[int] = []
+    last = threading.Event()
+    assert sender.offer(lambda: made.append(1000), 1000)  # a call of any size, alone
+    assert not sender.offer(lambda: made.append(1), 1)
+    sender.submit(lambda: made.append(0))  # never refused
+    go.set()
+    sender.submit(lambda: None).result(10)
+    wait_until(lambda: made == [0, 1000])
+    assert sender.offer(last.set, 1)
+    assert last.wait(10)
+    sender.close()
+    assert not sender.offer(lambda: None)
+
+
+def test_the_number_of_offered_calls_is_limited(
+    blocked: tuple[SendThread, threading.Event], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(send_thread, "MAX_CALLS", 3)
+    sender, go = blocked
+    assert [sender.offer(lambda: None) for _ in range(5)] == [True] * 3 + [False] * 2
+    go.set()
+    sender.close()

@@ -1,0 +1,148 @@
+"""Rates, numbers and bytes of questions, on a clock that the test sets."""
+
+from collections import Counter
+
+import pytest
+
+from gateway.errors import QueryError
+from gateway.outputs import admission as admission_module
+from gateway.outputs.admission import MAX_KEYS, NO_REPLY, Admission, QueryLimits, TokenBucket
+
+LIMITS = QueryLimits("zenoh", "max_queries_per_key_per_s", 100.0, 10.0, 1000.0, 40)
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.now_s = 1000.0
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+def asked(admission: Admission, key: str, times: int) -> Counter[str]:
+    """Ask ``times`` times; return the codes of the refusals; ok is for what was admitted."""
+    results: Counter[str] = Counter()
+    for _ in range(times):
+        refusal = admission.admit(key)
+        results["ok" if refusal is None else refusal.error.code] += 1
+        if refusal is None:
+            admission.finished("ok")
+    return results
+
+
+def test_a_bucket_allows_the_amount_of_a_second_at_once_and_then_its_rate(clock: Clock) -> None:
+    bucket = TokenBucket(10.0, clock)
+    assert [bucket.try_take() for _ in range(12)] == [True] * 10 + [False] * 2
+    clock.now_s += 0.55
+    assert [bucket.try_take() for _ in range(7)] == [True] * 6 + [False]
+    clock.now_s += 3600
+    assert sum(bucket.try_take() for _ in range(100)) == 10
+
+
+def test_a_large_amount_is_made_up_for_within_a_second(clock: Clock) -> None:
+    bucket = TokenBucket(10.0, clock)
+    assert bucket.try_take(1_000_000)
+    clock.now_s += 0.99
+    assert not bucket.has_any
+    clock.now_s += 0.02
+    assert bucket.has_any
+
+
+def test_a_rate_below_one_allows_one_at_once(clock: Clock) -> None:
+    bucket = TokenBucket(0.5, clock)
+    assert [bucket.try_take(), bucket.try_take()] == [True, False]
+    clock.now_s += 2.1
+    assert bucket.try_take()
+
+
+def test_each_key_has_its_rate(clock: Clock) -> None:
+    admission = Admission(LIMITS, clock)
+    assert asked(admission, "lab/3d", 30) == {"ok": 10, "rate": 20}
+    assert asked(admission, "lab/6d", 10) == {"ok": 10}
+    clock.now_s += 0.5
+    assert asked(admission, "lab/3d", 30) == {"ok": 5, "rate": 25}
+
+
+def test_all_keys_together_have_a_rate(clock: Clock) -> None:
+    admission = Admission(LIMITS, clock)
+    results = sum((asked(admission, f"lab/{number}", 2) for number in range(200)), Counter())
+    assert results == {"ok": 100, "rate": 300}
+
+
+def test_an_admitted_question_with_many_answers_counts_as_many(clock: Clock) -> None:
+    admission = Admission(LIMITS, clock)
+    assert asked(admission, "lab/**", 1) == {"ok": 1}
+    admission.count(99)
+    assert asked(admission, "lab/3d", 1) == {"rate": 1}
+
+
+def test_a_refusal_says_which_limit_and_its_setting(clock: Clock) -> None:
+    admission = Admission(LIMITS, clock)
+    asked(admission, "lab/3d", 10)
+    refusal = admission.admit("lab/3d")
+    assert refusal is not None
+    assert str(refusal.error) == (
+        "the gateway answers 10 queries a second like this one; ask less often, subscribe instead, or raise "
+        "zenoh.max_queries_per_key_per_s in the gateway's configuration"
+    )
+    for number in range(9):
+        asked(admission, f"lab/{number}", 10)
+    refusal = admission.admit("lab/6d")
+    assert refusal is not None
+    assert "100 queries a second in total" in str(refusal.error)
+    assert "zenoh.max_queries_per_s" in str(refusal.error)
+
+
+def test_questions_in_progress_are_limited(clock: Clock) -> None:
+    admission = Admission(LIMITS._replace(pending=3), clock)
+    assert [admission.admit("a") for _ in range(3)] == [None] * 3
+    refusal = admission.admit("b")
+    assert refusal is not None
+    assert (refusal.error.code, refusal.cause) == ("busy", "queue")
+    admission.finished("ok")
+    assert admission.admit("b") is None
+    assert admission.num_pending == 3
+
+
+def test_refusals_are_limited_and_everything_is_counted(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(admission_module, "REFUSALS_PER_S", 5.0)
+    admission = Admission(LIMITS, clock)
+    assert asked(admission, "lab/3d", 30) == {"ok": 10, "rate": 20}
+    assert admission.results == {"ok": 10, "rate": 5, NO_REPLY: 15}
+
+
+def test_the_number_of_known_keys_is_limited(clock: Clock) -> None:
+    admission = Admission(LIMITS._replace(per_s=1e6), clock)
+    asked(admission, "lab/3d", 10)
+    for number in range(MAX_KEYS - 1):
+        asked(admission, f"hostile/{number}", 1)
+    assert asked(admission, "lab/3d", 1) == {"rate": 1}
+    for number in range(10 * MAX_KEYS):
+        asked(admission, f"hostile/{number}", 1)
+    assert len(admission._keys) == MAX_KEYS
+
+
+def test_the_bytes_of_replies_have_a_rate_and_long_replies_their_own(clock: Clock) -> None:
+    admission = Admission(LIMITS, clock)
+    admission.check_reply(999)
+    admission.check_reply(999)
+    with pytest.raises(QueryError, match=r"zenoh\.max_reply_bytes_per_s") as caught:
+        admission.check_reply(1)
+    assert caught.value.code == "rate"
+    admission.check_reply(10**9, is_long=True)
+    clock.now_s += 1.1
+    admission.check_reply(1)
+
+
+def test_an_admitted_question_without_result_only_frees_its_place(clock: Clock) -> None:
+    admission = Admission(LIMITS, clock)
+    admission.admit("a")
+    admission.finished("")
+    assert (admission.num_pending, admission.results) == (0, {})
