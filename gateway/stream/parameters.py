@@ -1,6 +1,5 @@
 """Reading the server's parameters (§6) over a connection."""
 
-import threading
 from collections.abc import Awaitable, Callable
 from typing import Final, Protocol, TypeVar
 
@@ -10,9 +9,9 @@ from gateway.rtc3d.parameters_xml import ParsedParameters
 from gateway.worker_thread import WorkerThread
 
 LONG_XML_BYTES: Final = 64 * 1024
-"""Only one source at a time processes longer XML. To parse 1 MiB of it, made to be slow, takes 1.4 s."""
+"""All sources share a thread for longer XML. To parse 1 MiB of it, made to be slow, takes 1.4 s."""
 
-_processing_long_xml: Final = threading.Lock()
+_long_xml_thread: Final = WorkerThread("xml-long")
 
 UNANSWERED: Final = f"the server did not answer {SendParameters()}"
 """The limitation of a stream whose server was silent in the handshake, until it gives its parameters."""
@@ -36,10 +35,11 @@ ReadParameters = Callable[[Connection], Awaitable[ParsedParameters]]
 
 
 class XmlThread:
-    """Processes the XML of one source in a thread of its own, so that no frame waits for it.
+    """Processes the XML of one source in a thread, so that no frame waits for it.
 
-    The threads of several sources would take turns with the event loop, which would then wait for each of
-    them. So they process long XML one at a time. Short XML, that of almost any server, does not wait.
+    Threads that run Python take turns with the event loop, which has to wait for each of them, and each keeps
+    the memory that it needed once. So all sources share one thread for long XML. Short XML, that of almost
+    any server, does not wait for it.
     """
 
     def __init__(self, source: str) -> None:
@@ -47,11 +47,5 @@ class XmlThread:
 
     async def process(self, xml: bytes, function: Callable[[bytes], _Result]) -> _Result:
         """Return ``function(xml)``."""
-        if len(xml) <= LONG_XML_BYTES:
-            return await self._thread.run(lambda: function(xml))
-        return await self._thread.run(lambda: _process_alone(xml, function))
-
-
-def _process_alone(xml: bytes, function: Callable[[bytes], _Result]) -> _Result:
-    with _processing_long_xml:
-        return function(xml)
+        thread = self._thread if len(xml) <= LONG_XML_BYTES else _long_xml_thread
+        return await thread.run(lambda: function(xml))

@@ -1,4 +1,4 @@
-"""XmlThread: XML is processed in a thread for each source, and long XML by one source at a time."""
+"""XmlThread: XML is processed in a thread for each source, and long XML in one thread for all."""
 
 import asyncio
 import threading
