@@ -22,6 +22,8 @@ import zenoh
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm
 from tests.hostile.servers import SERVERS
+from tests.hostile.test_parameters import ATTACKS as PARAMETERS
+from tests.hostile.test_parameters import giving
 from tests.networks import open_zenoh
 from tests.servers import Script, ScriptedServer
 
@@ -128,6 +130,7 @@ async def _reloads(target: Target) -> None:
 
 ATTACKS: Final[dict[str, Attack]] = {
     **{f"server: {name}": _server(script) for group in SERVERS.values() for name, script in group.items()},
+    **{f"parameters: {name}": _server(giving(xml)) for name, xml in PARAMETERS.items()},
     "asker: all frames as JSON": _questions("mocap/healthy/3d?format=json"),
     "asker: everything": _questions("mocap/healthy/**"),
     "asker: unknown keys": _questions("mocap/healthy/none/of/these?format=none"),

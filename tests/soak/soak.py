@@ -40,6 +40,7 @@ from tests.hostile.gateway_under_attack import (
     num_missing,
     run_gateway,
 )
+from tests.name_server import dead_name_server
 from tests.networks import free_port
 from tests.soak.attacks import ATTACKS, Target
 from tests.waiting import wait_until_async
@@ -137,11 +138,14 @@ class Soak:
                         "stall_timeout_s": STALL_S,
                     },
                     **ports,
-                    "dead-name": {"host": "nowhere.invalid"},
+                    "dead-name": {"host": "dead.example.org"},
                     "nobody": free_port(),
                 }
-                async with run_gateway(Path(folder), healthy_port, sources) as gateway:
-                    await self._run(simulator, gateway, tuple(ports.values()), console)
+                with dead_name_server(Path(folder)) as before_command:
+                    async with run_gateway(
+                        Path(folder), healthy_port, sources, before_command=before_command
+                    ) as gateway:
+                        await self._run(simulator, gateway, tuple(ports.values()), console)
                 self.gateway_report = gateway.report
 
     async def _run(
