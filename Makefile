@@ -15,7 +15,7 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 # What a wheel is built from.
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
-.PHONY: demo test test-compiled check lint types contracts generated docs lcm-types fuzz soak mutants bench bench-quick zenohd \
+.PHONY: demo test test-compiled check lint types contracts generated docs lcm-types fuzz soak stops mutants bench bench-quick zenohd \
     wheel compiled wheelhouse install uninstall clean
 
 demo: .venv/installed
@@ -164,6 +164,12 @@ SOAK_MINUTES ?= 30
 
 soak: build/compiled/complete
 	$(COMPILED) tests/with-netns $(BIN)/python -m tests.soak --minutes $(SOAK_MINUTES) --report docs/reliability.md
+
+# Stop a gateway under load STOPS times; every stop must end with status 0 within 2 s. Not part of the check.
+STOPS ?= 500
+
+stops: .venv/installed
+	tests/with-netns $(BIN)/python -m tests.stops --count $(STOPS)
 
 # Mutation tests: thousands of small changes to the code, each of which some test should notice; hours for all
 # packages. PACKAGES="rtc3d stream publish outputs" are all there are. SAMPLE=300 runs 300 random mutants of each, and

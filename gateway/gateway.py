@@ -86,7 +86,7 @@ class Gateway:
                 for task in (periodic, *self._source_tasks.values()):
                     task.cancel()
         finally:
-            await asyncio.gather(*map(_close, self._outputs))
+            await _close_all(self._outputs)
             for source in self._sources.values():
                 source.fan_out.end_losses()
 
@@ -98,7 +98,7 @@ class Gateway:
             await asyncio.sleep(_OPENING_POLL_S)
 
     def _start_source(self, name: str) -> None:
-        self._source_tasks[name] = self._tasks.create_task(self._sources[name].run())
+        self._source_tasks[name] = self._tasks.create_task(self._sources[name].run(), name=f"source {name}")
 
     async def _run_every_second(self) -> None:
         """Maintain the outputs and publish the status of each source."""
@@ -152,7 +152,7 @@ class Gateway:
             self._serve_queries(output)
         for source in self._sources.values():
             source.fan_out.set_outputs(outputs)
-        await asyncio.gather(*map(_close, removed))  # first, because a new output may use the same address
+        await _close_all(removed)  # first, because a new output may use the same address
         for output in new:
             output.start()
             self._publish_known_parameters(output)
@@ -209,6 +209,11 @@ class Gateway:
     def _announce_file(self, source: str, description: Mapping[str, Any]) -> None:
         for output in self._outputs:
             output.announce_file(source, description)
+
+
+async def _close_all(outputs: Sequence[Output]) -> None:
+    closing = (asyncio.create_task(_close(output), name=f"output {output.name}") for output in outputs)
+    await asyncio.gather(*closing)
 
 
 async def _close(output: Output) -> None:

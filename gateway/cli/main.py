@@ -5,6 +5,7 @@ Exit status: 0 success, 1 failure, 2 wrong command line or configuration; ``para
 
 import os
 import sys
+import traceback
 from typing import Annotated, NoReturn
 
 import typer
@@ -20,6 +21,7 @@ from gateway.cli.run import run
 from gateway.cli.simulate import simulate
 from gateway.errors import ConfigError, GatewayError
 from gateway.safe_text import safe_lines
+from gateway.service.process_end import end_process
 
 app = typer.Typer(
     name="rtc3d-gateway",
@@ -34,22 +36,32 @@ app.add_typer(config.app, name="config")
 
 
 def main() -> NoReturn:
-    """Run the command line. Errors of the gateway are printed to stderr without a traceback."""
+    """Run the command line and end the process."""
+    end_process(_run_command())
+
+
+def _run_command() -> int:
+    """Return the exit status. Errors of the gateway are printed to stderr without a traceback."""
     try:
         app()
+    except SystemExit as end:
+        return end.code if isinstance(end.code, int) else int(end.code is not None)
     except ConfigError as error:
-        _exit(str(error), 2)
+        return _print_error(error, 2)
     except GatewayError as error:
-        _exit(str(error), 1)
+        return _print_error(error, 1)
     except BrokenPipeError:
-        # The reader of stdout is gone (… | head). Without this, Python reports another error at exit.
+        # The reader of stdout is gone (… | head). Without this, flushing it fails again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    sys.exit(0)
+    except BaseException:  # noqa: BLE001 - a defect
+        traceback.print_exc()
+        return 1
+    return 0
 
 
-def _exit(text: str, status: int) -> NoReturn:
-    print(safe_lines(text), file=sys.stderr)
-    sys.exit(status)
+def _print_error(error: GatewayError, status: int) -> int:
+    print(safe_lines(str(error)), file=sys.stderr)
+    return status
 
 
 def _print_version(wanted: bool) -> None:

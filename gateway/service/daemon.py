@@ -5,12 +5,14 @@ import logging
 import os
 import signal
 from collections.abc import Callable
+from types import FrameType
 
 from gateway.config.settings import Settings
 from gateway.errors import ConfigError
 from gateway.gateway import Gateway
 from gateway.monitoring.server import MonitoringServer
 from gateway.monitoring.status_line import status_lines
+from gateway.service.process_end import StopDeadline, named_tasks
 from gateway.service.systemd import SystemdNotifier
 from gateway.worker_thread import WorkerThread
 
@@ -23,7 +25,9 @@ async def serve(load: Callable[[], Settings]) -> None:
     SIGHUP calls ``load`` again and applies the changes; a configuration with an error is refused as a
     whole. Raises ConfigError if the settings cannot be used at the start.
     """
-    await Daemon(load, Gateway(load())).run()
+    daemon = Daemon(load, Gateway(load()))
+    daemon.on_stop_request = StopDeadline(daemon.unfinished).begin
+    await daemon.run()
 
 
 class Daemon:
@@ -34,17 +38,21 @@ class Daemon:
         self._gateway = gateway
         self._monitoring = MonitoringServer(gateway.settings.metrics, gateway)
         self._systemd = SystemdNotifier()
+        self._loop = asyncio.get_running_loop()
         self._stop = asyncio.Event()
         self._reload_requested = asyncio.Event()
         self._started_on_terminal = os.isatty(0)
         self._reload_problem = ""
         """Why the last reload was refused; "" if it succeeded."""
+        self.on_stop_request: Callable[[], None] = lambda: None
+        """Called for each request to stop, perhaps in a signal handler."""
 
     async def run(self) -> None:
         """Run until SIGTERM, SIGINT or the end of the controlling terminal."""
-        loop = asyncio.get_running_loop()
+        loop = self._loop
         for number in (signal.SIGINT, signal.SIGTERM):
-            loop.add_signal_handler(number, self._request_stop)
+            # Unlike a handler of the event loop, this one is called while the event loop is busy or blocked.
+            signal.signal(number, self._on_stop_signal)
         loop.add_signal_handler(signal.SIGHUP, self._on_hangup)
         async with asyncio.TaskGroup() as tasks:
             background = [
@@ -59,6 +67,10 @@ class Daemon:
                 for task in background:
                     task.cancel()
 
+    def _on_stop_signal(self, _number: int, _frame: FrameType | None) -> None:
+        self.on_stop_request()
+        self._loop.call_soon_threadsafe(self._request_stop)
+
     def _request_stop(self) -> None:
         self._systemd.notify_stopping()
         self._stop.set()
@@ -66,9 +78,15 @@ class Daemon:
     def _on_hangup(self) -> None:
         """Stop if SIGHUP means that the terminal is gone; otherwise reload the configuration."""
         if self._started_on_terminal and not os.isatty(0):
-            self._request_stop()
+            if not self._stop.is_set():
+                self.on_stop_request()
+                self._request_stop()
         else:
             self._reload_requested.set()
+
+    def unfinished(self) -> list[str]:
+        """Return what a stop still waits for. This may be called in any thread."""
+        return named_tasks(self._loop) if self._stop.is_set() else ["the event loop, which is busy"]
 
     async def _notify_systemd(self) -> None:
         """Notify systemd of the start, then periodically of the status.

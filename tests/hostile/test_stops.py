@@ -1,0 +1,368 @@
+"""SIGTERM ends the gateway within 2 s with status 0, whatever its servers, peers and disks do."""
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import socket
+import sys
+import time
+from asyncio.subprocess import DEVNULL, PIPE, Process
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+import yaml
+
+from tests.gateway_process import PROGRAM
+from tests.hostile.gateway_under_attack import MAX_STOP_S
+from tests.lcm_relay import LcmRelay
+from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
+from tests.servers import Client, ScriptedServer, markers_frame, ok, packet
+from tests.stops import report, run_stops
+from tests.waiting import wait_until_async
+
+pytestmark = pytest.mark.netns
+
+NUM_STOPS: Final = 10
+"""How many stops under load are tried; `make stops` tries 500."""
+
+NEVER_ENDS: Final = "import {0}, time; {0}.{1} = lambda *arguments: time.sleep(60)"
+"""A module that Python imports at its start, which replaces a function by one that never returns."""
+
+
+class Site:
+    """A gateway process with a configuration of the test."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self.config = folder / "gateway.yaml"
+        self.endpoint = free_endpoint()
+        self.process: Process
+
+    @property
+    def log(self) -> str:
+        return (self._folder / "gateway.log").read_text()
+
+    def configure(self, ports: Sequence[int], **sections: Any) -> None:
+        sources = [
+            {"name": f"lab-{number}", "host": "127.0.0.1", "port": port} for number, port in enumerate(ports)
+        ]
+        configuration = {
+            "sources": sources,
+            "spool": {"directory": str(self._folder / "spool")},
+            "zenoh": {"config": zenoh_keys("peer", listen=self.endpoint)},
+            "lcm": {"enabled": False},
+            "metrics": {"enabled": False},
+        }
+        self.config.write_text(yaml.safe_dump(configuration | sections))
+
+    @contextlib.asynccontextmanager
+    async def running(self, *, sabotage: str = "", stderr: int | None = None) -> AsyncIterator[None]:
+        """Run the gateway; kill it at the end of the block."""
+        (self._folder / "sitecustomize.py").write_text(sabotage)
+        path = os.pathsep.join(filter(None, (str(self._folder), os.environ.get("PYTHONPATH"))))
+        with (self._folder / "gateway.log").open("wb") as log:
+            self.process = await asyncio.create_subprocess_exec(
+                *(*PROGRAM, "run", "--config", str(self.config)),
+                env=os.environ | {"PYTHONPATH": path},
+                stdin=DEVNULL,
+                stderr=log if stderr is None else stderr,
+            )
+        try:
+            yield
+        finally:
+            if self.process.returncode is None:
+                self.process.kill()
+                await self.process.wait()
+
+    async def until_logged(self, text: str, count: int = 1) -> None:
+        await wait_until_async(lambda: self.log.count(text) >= count, 30)
+
+    async def stop(self, number: signal.Signals = signal.SIGTERM) -> float:
+        """Send a signal; return how long the gateway took to end in s. Its status must be 0."""
+        began_s = time.monotonic()
+        self.process.send_signal(number)
+        status = await asyncio.wait_for(self.process.wait(), 20)
+        seconds = time.monotonic() - began_s
+        assert status == 0, self.log
+        assert seconds < MAX_STOP_S, self.log
+        return seconds
+
+
+@pytest.fixture
+def site(tmp_path: Path) -> Site:
+    return Site(tmp_path)
+
+
+def stream(client: Client, *, answers_bye: bool) -> Callable[[str], bytes | None]:
+    """Return what a server answers, which sends a frame for StreamFrames and nothing after it."""
+
+    def answer(command: str) -> bytes | None:
+        if command.startswith("StreamFrames"):
+            client.send(ok("OK-StreamFrames") + markers_frame(1, (1.0, 2.0, 3.0)))
+            return None
+        return None if command == "Bye" and not answers_bye else ok(f"OK-{command}")
+
+    return answer
+
+
+async def ignore_bye(client: Client) -> None:
+    with contextlib.suppress(asyncio.IncompleteReadError):
+        await client.commands(stream(client, answers_bye=False))
+    await asyncio.Event().wait()
+
+
+async def send_a_file(client: Client) -> None:
+    def answer(command: str) -> bytes | None:
+        reply = stream(client, answers_bye=True)(command)
+        if command.startswith("StreamFrames"):
+            client.send(packet(5, b"\x02\x50" + bytes(2_000_000)))
+        return reply
+
+    await client.commands(answer)
+
+
+async def never_read(_client: Client) -> None:
+    await asyncio.Event().wait()
+
+
+async def flood(client: Client) -> None:
+    """Send frames as fast as the gateway reads them."""
+    frames = b"".join(markers_frame(number, (1.0, 2.0, 3.0)) for number in range(1000))
+
+    async def send() -> None:
+        with contextlib.suppress(ConnectionError):
+            while True:
+                client.send(frames)
+                await client.drain()
+
+    sending: list[asyncio.Task[None]] = []
+
+    def answer(command: str) -> bytes | None:
+        if command.startswith("StreamFrames"):
+            sending.append(asyncio.create_task(send()))
+        return ok(f"OK-{command}")
+
+    await client.commands(answer)
+
+
+@contextlib.contextmanager
+def full_server() -> Iterator[int]:
+    """Listen on a port that answers no connection; yield it."""
+    with socket.create_server(("127.0.0.1", 0), backlog=0) as server, contextlib.ExitStack() as clients:
+        for _ in range(3):
+            client = clients.enter_context(socket.socket())
+            client.setblocking(False)
+            client.connect_ex(server.getsockname())
+        yield server.getsockname()[1]
+
+
+@contextlib.asynccontextmanager
+async def peer(code: str, *arguments: str) -> AsyncIterator[Process]:
+    """Run a program that opens a Zenoh session and prints a line when it is ready."""
+    program = "import json, sys, zenoh\nsession = zenoh.open(zenoh.Config.from_json5(sys.argv[1]))\n" + code
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-c", program, *arguments), stdin=PIPE, stdout=PIPE
+    )
+    try:
+        assert process.stdout is not None
+        assert await process.stdout.readline()
+        yield process
+    finally:
+        process.kill()
+        await process.wait()
+
+
+@pytest.mark.parametrize("delay_s", [0.1, 0.4, 0.8])
+async def test_while_it_starts(site: Site, delay_s: float) -> None:
+    site.configure([free_port()])
+    async with site.running():
+        await asyncio.sleep(delay_s)
+        began_s = time.monotonic()
+        site.process.terminate()
+        status = await site.process.wait()
+        assert status in {0, -signal.SIGTERM}  # the latter before Python runs the first line of the gateway
+        assert time.monotonic() - began_s < MAX_STOP_S
+        assert "Traceback" not in site.log
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+async def test_with_servers_that_do_not_answer(site: Site, number: signal.Signals) -> None:
+    """Eight of each: they do not answer the connection, never read, or ignore Bye."""
+    with full_server() as full:
+        async with ScriptedServer(never_read) as silent, ScriptedServer(ignore_bye) as rude:
+            site.configure([*[full] * 8, *[silent.port] * 8, *[rude.port] * 8])
+            async with site.running():
+                await site.until_logged("→ streaming", 8)
+                await wait_until_async(lambda: silent.connections >= 8)
+                await site.stop(number)
+
+
+async def test_during_a_reload_of_servers_that_ignore_bye(site: Site) -> None:
+    async with ScriptedServer(ignore_bye) as server:
+        site.configure([server.port] * 8)
+        async with site.running():
+            await site.until_logged("→ streaming", 8)
+            site.configure([free_port()] * 8, lcm={"url": lcm_url()})
+            site.process.send_signal(signal.SIGHUP)
+            await asyncio.sleep(0.1)
+            await site.stop()
+
+
+async def test_during_a_reload_that_does_not_end(site: Site) -> None:
+    site.configure([free_port()])
+    async with site.running():
+        await site.until_logged("zenoh: the session is open")
+        site.config.unlink()
+        os.mkfifo(site.config)
+        site.process.send_signal(signal.SIGHUP)
+        await asyncio.sleep(0.2)
+        await site.stop()
+
+
+async def test_while_frames_come_as_fast_as_possible(site: Site) -> None:
+    async with ScriptedServer(flood) as server:
+        site.configure([server.port] * 2)
+        async with site.running():
+            await site.until_logged("→ streaming", 2)
+            await asyncio.sleep(1)
+            await site.stop()
+
+
+async def test_with_a_disk_that_does_not_respond(site: Site) -> None:
+    async with ScriptedServer(send_a_file) as server:
+        site.configure([server.port] * 8)
+        async with site.running(sabotage=NEVER_ENDS.format("os", "fsync")):
+            await site.until_logged("→ streaming", 8)
+            await wait_until_async(lambda: any(site.config.parent.glob("spool/*")))
+            await site.stop()
+
+
+async def test_with_an_lcm_peer_that_does_not_answer(site: Site) -> None:
+    with full_server() as port, full_server() as other:
+        urls = {"url": f"tcpq://127.0.0.1:{port}", "queries_url": f"tcpq://127.0.0.1:{other}"}
+        site.configure([free_port()], lcm=urls)
+        async with site.running():
+            await site.until_logged("zenoh: the session is open")
+            await site.stop()
+
+
+async def test_with_an_lcm_peer_that_does_not_read(site: Site) -> None:
+    relay = LcmRelay()
+    async with ScriptedServer(flood) as server:
+        site.configure([server.port], lcm={"url": relay.url})
+        async with site.running():
+            await site.until_logged("lcm: sending messages")
+            relay.stop_reading()
+            await site.until_logged("does not take messages fast enough")
+            await site.stop()
+    relay.close()
+
+
+async def test_without_a_zenoh_router(site: Site) -> None:
+    site.configure([free_port()], zenoh={"config": zenoh_keys("client", connect=site.endpoint)})
+    async with site.running():
+        await site.until_logged("zenoh: the Zenoh session does not open")
+        await site.stop()
+
+
+async def test_with_a_zenoh_router_that_has_stopped(site: Site) -> None:
+    router = zenoh_keys("router", listen=site.endpoint)
+    code = "print('ready', flush=True)\nsys.stdin.read()"
+    async with ScriptedServer(flood) as server, peer(code, json.dumps(router)) as process:
+        site.configure([server.port], zenoh={"config": zenoh_keys("client", connect=site.endpoint)})
+        async with site.running():
+            await site.until_logged("→ streaming")
+            process.send_signal(signal.SIGSTOP)
+            await asyncio.sleep(1)
+            await site.stop()
+
+
+PEERS: Final[Mapping[str, str]] = {
+    "subscriber": (
+        "session.declare_subscriber('mocap/**', lambda sample: print(flush=True))\nsys.stdin.read()"
+    ),
+    "asker": (
+        "import time, threading\n"
+        "def ask():\n    while True: list(session.get('mocap/**', timeout=1))\n"
+        "for _ in range(8): threading.Thread(target=ask, daemon=True).start()\n"
+        "time.sleep(0.5)\nprint(flush=True)\nsys.stdin.read()"
+    ),
+}
+
+
+@pytest.mark.parametrize("code", PEERS.values(), ids=PEERS.keys())
+async def test_with_a_zenoh_peer_that_has_stopped(site: Site, code: str) -> None:
+    async with ScriptedServer(flood) as server:
+        site.configure([server.port])
+        async with site.running():
+            await site.until_logged("→ streaming")
+            async with peer(code, json.dumps(zenoh_keys("client", connect=site.endpoint))) as process:
+                process.send_signal(signal.SIGSTOP)
+                await asyncio.sleep(1)
+                await site.stop()
+
+
+async def test_with_connections_to_the_monitoring_that_are_held(site: Site) -> None:
+    port = free_port()
+    site.configure([free_port()], metrics={"port": port})
+    async with site.running():
+        await site.until_logged("metrics: /metrics and /healthz are served")
+        with contextlib.ExitStack() as stack:
+            for _ in range(24):
+                stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+            await asyncio.sleep(0.1)
+            await site.stop()
+
+
+async def test_with_a_log_that_nobody_reads(site: Site) -> None:
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    with contextlib.suppress(BlockingIOError):
+        while True:
+            os.write(writing, bytes(4096))
+    os.set_blocking(writing, True)
+    site.configure([free_port()])
+    async with site.running(stderr=writing):
+        await asyncio.sleep(2)
+        seconds = await site.stop()
+        assert seconds > 1  # the end of the time limit, because the event loop waits for the log
+    os.close(reading)
+    os.close(writing)
+
+
+HANGING_CLOSE: Final = """
+import time
+import gateway.gateway
+async def never(output):
+    time.sleep(60)
+gateway.gateway._close = never
+"""
+
+
+async def test_what_does_not_finish_is_logged(site: Site) -> None:
+    site.configure([free_port()])
+    async with site.running(sabotage=HANGING_CLOSE):
+        await site.until_logged("zenoh: the session is open")
+        await site.stop()
+        assert (
+            "the gateway ends at once, because it did not stop within 1.5 s; not finished: output zenoh"
+        ) in site.log
+
+
+async def test_a_second_signal_ends_it_at_once(site: Site) -> None:
+    site.configure([free_port()])
+    async with site.running(sabotage=HANGING_CLOSE):
+        await site.until_logged("zenoh: the session is open")
+        site.process.terminate()
+        await site.until_logged("stopping")
+        assert await site.stop(signal.SIGINT) < 1
+        assert "because of a second signal" in site.log
+
+
+async def test_stops_under_load(tmp_path: Path) -> None:
+    stops = await asyncio.to_thread(lambda: list(run_stops(NUM_STOPS, tmp_path)))
+    assert all(stop.status == 0 and stop.seconds < MAX_STOP_S for stop in stops), report(stops)
