@@ -11,6 +11,7 @@ from gateway.c3d_files.spool import Spool, StoredFile
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import LinkError, QueryError
 from gateway.log import DefectLog, FailureLog, log_fields
+from gateway.messages.limits import encode_within_limits
 from gateway.outputs.contract import Answer, ServerParameters
 from gateway.outputs.encodings import C3D
 from gateway.publish.fan_out import FanOut
@@ -147,7 +148,7 @@ class Source:
                 stream.status.losses.check()
             self.fan_out.check_losses()
             self.fan_out.publish_status(self._newest_status)
-            self.fan_out.publish_clock(clock.encode())
+            self.fan_out.publish_clock(encode_within_limits(clock))
 
     def _encoded_status(self) -> bytes:
         message = status_message(
@@ -157,8 +158,7 @@ class Source:
             streams=self.rated_statuses,
             outputs=[(status, output.health()) for output, status in self.fan_out.outputs],
         )
-        encoded: bytes = message.encode()
-        return encoded
+        return encode_within_limits(message)
 
     def _new_stream(self, stream: StreamSettings, listener: Listener) -> Supervisor:
         status = StreamStatus(

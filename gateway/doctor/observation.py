@@ -76,7 +76,7 @@ class ObservedComponent:
         steps_us = np.diff(np.array(self._timestamps_us, np.int64))
         if intervals < 1 or bool(np.any(steps_us <= 0)):
             return arrival_hz
-        timestamp_hz = intervals * 1e6 / float(steps_us.sum())
+        timestamp_hz = intervals * 1e6 / (self._timestamps_us[-1] - self._timestamps_us[0])
         is_plausible = not arrival_hz or 0.5 < timestamp_hz / arrival_hz < 2
         return timestamp_hz if is_plausible else arrival_hz
 

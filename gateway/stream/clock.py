@@ -306,8 +306,9 @@ def envelope_slope(samples: Sequence[Sample]) -> float:
         while len(hull) > 1 and not _turns_up(hull[-2], hull[-1], sample):
             hull.pop()
         hull.append(sample)
-    mean_us = sum(sample.timestamp_us for sample in samples) / len(samples)
-    left, right = next(edge for edge in pairwise(hull) if edge[1].timestamp_us >= mean_us)
+    # Without a division, because a float may be larger than all time stamps that it is the mean of.
+    total_us = sum(sample.timestamp_us for sample in samples)
+    left, right = next(edge for edge in pairwise(hull) if edge[1].timestamp_us * len(samples) >= total_us)
     return (right.offset_us - left.offset_us) / (right.timestamp_us - left.timestamp_us)
 
 
