@@ -21,14 +21,17 @@ import zenoh
 
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm
-from tests.hostile.servers import SERVERS
+from tests.hostile.servers import SERVERS, streaming
 from tests.hostile.test_parameters import ATTACKS as PARAMETERS
 from tests.hostile.test_parameters import giving
+from tests.hostile.zenoh_peer import KINDS
 from tests.networks import open_zenoh
-from tests.servers import Script, ScriptedServer
+from tests.servers import Client, Script, ScriptedServer, c3d_file, packet
 
-ASKS_AT_ONCE: Final = 500
-NUM_STALLED: Final = 5
+ASKS_AT_ONCE: Final = 2000
+NUM_STALLED: Final = 20
+NUM_DECLARATIONS: Final = 2000
+LARGE_BYTES: Final = 100 * 1024 * 1024
 NUM_HTTP_CONNECTIONS: Final = 100
 _AGAIN_S: Final = 0.1
 
@@ -67,7 +70,7 @@ def _questions(selector: str) -> Attack:
         while True:
             for _ in range(ASKS_AT_ONCE):
                 session.get(selector, lambda _reply: None)
-            await asyncio.sleep(0.2)
+            await asyncio.sleep(0.5)
 
     return attack
 
@@ -95,19 +98,31 @@ async def _lcm_garbage(target: Target) -> None:
 
 async def _stalled_subscribers(target: Target) -> None:
     """Subscribe to everything, and never read it: this process stops."""
-    sessions = [open_zenoh("client", connect=target.zenoh_endpoint) for _ in range(NUM_STALLED)]
-    for session in sessions:
-        session.declare_subscriber("mocap/**", lambda _sample: None)
+    _kept = list(KINDS["subscribers"](target.zenoh_endpoint, NUM_STALLED))
     await asyncio.sleep(0.5)
     os.kill(os.getpid(), signal.SIGSTOP)
 
 
-async def _short_lived_subscribers(target: Target) -> None:
+def _zenoh_peer(kind: str) -> Attack:
+    async def attack(target: Target) -> None:
+        _kept = list(KINDS[kind](target.zenoh_endpoint, NUM_DECLARATIONS))
+        await asyncio.Event().wait()
+
+    return attack
+
+
+async def _many_files(client: Client) -> None:
     while True:
-        session = await asyncio.to_thread(open_zenoh, "client", connect=target.zenoh_endpoint)
-        session.declare_subscriber("mocap/**", lambda _sample: None)
-        await asyncio.sleep(0.05)
-        await asyncio.to_thread(session.close)
+        client.send(packet(5, c3d_file()) * 20)
+        await client.drain()
+        await asyncio.sleep(0.01)
+
+
+async def _large_files(client: Client) -> None:
+    file = packet(5, c3d_file(b"", LARGE_BYTES))
+    while True:
+        client.send(file)
+        await client.drain()
 
 
 async def _held_http_connections(target: Target) -> None:
@@ -130,6 +145,8 @@ async def _reloads(target: Target) -> None:
 
 ATTACKS: Final[dict[str, Attack]] = {
     **{f"server: {name}": _server(script) for group in SERVERS.values() for name, script in group.items()},
+    "server: many-files": _server(streaming(_many_files)),
+    "server: large-files": _server(streaming(_large_files)),
     **{f"parameters: {name}": _server(giving(xml)) for name, xml in PARAMETERS.items()},
     "asker: all frames as JSON": _questions("mocap/healthy/3d?format=json"),
     "asker: everything": _questions("mocap/healthy/**"),
@@ -137,8 +154,8 @@ ATTACKS: Final[dict[str, Attack]] = {
     "asker: fresh parameters": _questions("mocap/*/parameters?fresh=true"),
     "asker: LCM": _lcm_requests,
     "sender: LCM": _lcm_garbage,
-    "subscribers: stalled": _stalled_subscribers,
-    "subscribers: short-lived": _short_lived_subscribers,
+    "Zenoh peer: stalled subscribers": _stalled_subscribers,
+    **{f"Zenoh peer: {kind}": _zenoh_peer(kind) for kind in KINDS},
     "host: HTTP connections": _held_http_connections,
     "host: reloads": _reloads,
 }
