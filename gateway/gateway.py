@@ -73,6 +73,7 @@ class Gateway:
         """Run until ``stop`` is set; then send Bye to every server and close the outputs."""
         for output in self._outputs:
             output.start()
+        self._spool.reader.submit(self._spool.delete_abandoned)
         try:
             await self._wait_for_outputs(stop)
             async with self._tasks:

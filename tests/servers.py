@@ -58,7 +58,7 @@ class Client:
         return packet_type, await self._reader.readexactly(size - 8)
 
     def send(self, data: bytes) -> None:
-        """Send bytes; raises ConnectionError if the connection is closed, where uvloop raises RuntimeError."""
+        """Send bytes; raises ConnectionError after the end of the connection (uvloop: RuntimeError)."""
         if self._writer.is_closing():
             raise ConnectionResetError("the connection is closed")
         self._writer.write(data)

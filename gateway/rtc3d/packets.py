@@ -175,9 +175,9 @@ class PacketReader:
 
     def _take_file_piece(self, data: bytes, start: int, packets: list[Packet]) -> int:
         """Append a piece of a C3D file that is in ``data`` from ``start`` on; return where it ends."""
-        piece = data[start : start + self._missing_file_bytes]
-        # A whole read is not copied, because it is its own slice. A piece without content says nothing,
-        # unless the file is empty.
+        is_whole_read = start == 0 and len(data) <= self._missing_file_bytes  # which is not copied then
+        piece = data if is_whole_read else data[start : start + self._missing_file_bytes]
+        # A piece without content says nothing, unless the file is empty.
         if piece or not self._file_bytes:
             packets.append(FilePiece(piece, self._file_bytes - self._missing_file_bytes, self._file_bytes))
         self._missing_file_bytes -= len(piece)

@@ -112,7 +112,7 @@ class StreamStatus:
     _failures: FailureLog = field(init=False)
     _defects: DefectLog = field(init=False)
     _unknown_types: set[int] = field(default_factory=set, init=False)  # of this connection, those listed
-    _unknown_text: str = field(default="", init=False)
+    _unknown_text: str = field(default_factory=str, init=False)  # compiled, a default would not be assigned
     _logged_limitations: deque[str] = field(default_factory=lambda: deque(maxlen=MAX_LIMITATIONS), init=False)
 
     def __post_init__(self) -> None:

@@ -16,7 +16,7 @@ from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 
-ATTACK_S: Final = 3.0
+ATTACK_S: Final = 2.0
 MIB: Final = 1024 * 1024
 LARGE_BYTES: Final = 200 * MIB
 MAX_GROWTH_KIB: Final = 400 * 1024

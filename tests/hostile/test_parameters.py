@@ -13,7 +13,7 @@ from tests.servers import Client, Script, ScriptedServer, ok, packet
 
 pytestmark = pytest.mark.netns
 
-ATTACK_S: Final = 4.0
+ATTACK_S: Final = 3.0
 FRESH: Final = {"parameters_interval_s": 0.5, "fresh_interval_s": 0.1}
 
 

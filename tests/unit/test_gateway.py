@@ -392,6 +392,15 @@ async def test_sessions_never_go_back_when_a_reload_changes_the_number_of_stream
     assert sessions == sorted(sessions)
 
 
+async def test_the_start_deletes_what_a_killed_gateway_left(servers: Servers, tmp_path: Path) -> None:
+    left = tmp_path / "tmpkilled.c3d.part"
+    left.touch()
+    async with running(settings(spool=SpoolSettings(directory=str(tmp_path)))) as (gateway, _):
+        await connected(gateway)
+        assert servers
+    assert not left.exists()
+
+
 async def test_a_changed_spool_is_used_by_running_sources(servers: Servers, tmp_path: Path) -> None:
     before, after = (SpoolSettings(directory=str(tmp_path / name)) for name in ("before", "after"))
     async with running(settings(spool=before)) as (gateway, _):
