@@ -8,7 +8,7 @@ import struct
 import sys
 from pathlib import Path
 from typing import Final
-from urllib.parse import urlsplit
+from urllib.parse import urlsplit, urlunsplit
 
 import lcm
 
@@ -115,6 +115,30 @@ def receiving_url(url: str) -> str:
     return f"{url}{'&' if '?' in url else '?'}recv_buf_size={min(_RECEIVE_BUFFER_BYTES, largest)}"
 
 
+def _with_address(url: str) -> str:
+    """Return a tcpq URL with the IPv4 address of its host; other URLs have no host names.
+
+    LCM itself takes addresses only. With a name, it connects to this computer and reports no error.
+    Raises OutputError if the name is not known.
+    """
+    if scheme_of(url) != "tcpq":
+        return url
+    parts = urlsplit(url)
+    name = parts.netloc.rpartition(":")[0] if ":" in parts.netloc else parts.netloc
+    if not name:
+        return url
+    try:
+        address = socket.gethostbyname(name)
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise OutputError(
+            f"the host name {name!r} of {url} cannot be resolved: {reason}; "
+            "check lcm.url and the name server (DNS), or use an IP address",
+            cause="not open",
+        ) from error
+    return urlunsplit(parts._replace(netloc=address + parts.netloc.removeprefix(name)))
+
+
 def open_lcm(url: str) -> lcm.LCM:
     """Return an LCM object on ``url``. Raises OutputError with the reason and the remedy.
 
@@ -124,7 +148,7 @@ def open_lcm(url: str) -> lcm.LCM:
     if problem:
         raise OutputError(problem, cause="not open")
     try:
-        return lcm.LCM(url)
+        return lcm.LCM(_with_address(url))
     except RuntimeError as error:
         raise OutputError(f"LCM does not open {url}: {error}; check lcm.url", cause="not open") from error
 

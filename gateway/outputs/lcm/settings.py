@@ -4,11 +4,11 @@ import os
 from typing import Annotated, Final
 from urllib.parse import urlsplit, urlunsplit
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, TypeAdapter
 
 from gateway.config.section import Effective, expects, join_or
 from gateway.config.settings import OutputSettings
-from gateway.config.values import ByteLimit, MaxRates, QueryRate, Switch
+from gateway.config.values import ByteLimit, Host, MaxRates, QueryRate, Switch
 from gateway.outputs.lcm.connection import DEFAULT_GROUP, DEFAULT_PORT
 
 DEFAULT_LCM_PREFIX: Final = "MOCAP"
@@ -20,13 +20,18 @@ LCM_SCHEMES: Final = ("udpm", "mpudpm", "memq", "tcpq", "file")
 """The URL schemes that the lcm package supports."""
 
 
+_HOST: Final[TypeAdapter[str]] = TypeAdapter(Host)
+
+
 def _lcm_url(text: str) -> str:
     scheme, separator, rest = text.partition("://")
     if scheme not in LCM_SCHEMES or not separator or not text.isprintable() or " " in text:
         raise ValueError
     if len(text) > 1000:
         raise ValueError
-    urlsplit(text)  # raises ValueError
+    parts = urlsplit(text)  # raises ValueError
+    if scheme == "tcpq" and parts.hostname:
+        _HOST.validate_python(parts.hostname)  # raises ValidationError, a ValueError
     if "@" in rest.partition("/")[0]:  # LCM has no passwords, and logs the whole URL
         raise ValueError
     return text

@@ -295,6 +295,8 @@ def test_urls_of_all_lcm_providers_are_accepted(url: str) -> None:
         "udpm://a b",
         "udpm://\n",
         "tcpq://me@lab",
+        "tcpq://a..b:7700",
+        "tcpq://127.1:7700",
     ],
 )
 def test_other_lcm_urls_are_refused(url: str) -> None:

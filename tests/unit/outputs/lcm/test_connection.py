@@ -1,11 +1,14 @@
-"""The receive buffer of subscribers on LCM."""
+"""URLs of LCM: the receive buffer of subscribers, and host names."""
 
 from pathlib import Path
 
 import pytest
 
+from gateway.errors import OutputError
 from gateway.outputs.lcm import connection
-from gateway.outputs.lcm.connection import receiving_url
+from gateway.outputs.lcm.connection import open_lcm, receiving_url
+from tests.lcm_relay import LcmRelay
+from tests.waiting import wait_until
 
 
 @pytest.fixture
@@ -32,6 +35,24 @@ def test_a_multicast_subscriber_gets_as_large_a_buffer_as_the_kernel_allows(
 def test_other_urls_stay_as_they_are(rmem_max: Path, url: str) -> None:
     rmem_max.write_text("212992\n")
     assert receiving_url(url) == url
+
+
+@pytest.mark.parametrize("host", ["localhost", "127.0.0.1"])
+def test_a_relay_is_found_by_its_name(host: str) -> None:
+    relay = LcmRelay()
+    connection = open_lcm(relay.url.replace("127.0.0.1", host))
+    connection.subscribe("NAME", lambda *_: None)
+    wait_until(lambda: "NAME" in relay.subscribed)
+    relay.close()
+
+
+@pytest.mark.netns
+def test_a_name_that_is_not_known_does_not_mean_this_computer() -> None:
+    relay = LcmRelay()
+    url = relay.url.replace("127.0.0.1", "nowhere.invalid")
+    with pytest.raises(OutputError, match=f"the host name 'nowhere.invalid' of {url} cannot be resolved: "):
+        open_lcm(url)
+    relay.close()
 
 
 def test_without_a_known_limit_the_kernel_decides(rmem_max: Path) -> None:
