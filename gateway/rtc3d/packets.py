@@ -154,7 +154,8 @@ class PacketReader:
         packets: list[Packet] = []
         used = 0
         if self._rest:
-            data, used, self._rest = self._rest + data, self._rest_start, b""
+            # Compiled code would copy the read to add b"".
+            data, used, self._rest = self._rest + data if data else self._rest, self._rest_start, b""
         elif self._missing_file_bytes:
             used = self._take_file_piece(data, 0, packets)
             self._offset += used
