@@ -29,6 +29,7 @@ class SendThread:
         self._offered: deque[tuple[int, Callable[[], None]]] = deque()
         self._offered_bytes = 0
         self._is_closed = False
+        self._last: Callable[[], None]
         threading.Thread(target=self._run, name=name, daemon=True).start()
 
     def submit(self, call: Callable[[], None]) -> Future[None]:
@@ -53,18 +54,21 @@ class SendThread:
             self._changed.notify()
         return True
 
-    def close(self) -> None:
-        """Make no further calls; a call in progress continues."""
+    def close(self, last: Callable[[], None] = lambda: None) -> None:
+        """Make no further calls but ``last``; a call in progress continues."""
         with self._changed:
             self._is_closed = True
-            self._first.clear()
-            self._offered.clear()
+            self._last = last
             self._changed.notify()
 
     def _run(self) -> None:
         while (call := self._next()) is not None:
             call()
             del call  # or it would keep its data alive until the next one
+        self._last()
+        # What the other calls hold is freed here, because to free a query of Zenoh can block.
+        self._first.clear()
+        self._offered.clear()
 
     def _next(self) -> Callable[[], None] | None:
         """Wait for the next call; None after ``close``."""

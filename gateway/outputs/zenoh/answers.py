@@ -1,7 +1,10 @@
 """From a query that Zenoh delivers to its replies.
 
 A query is admitted or refused in Zenoh's thread. The event loop takes one question in a turn, and a thread
-sends the replies: sending to a peer that has stopped reading blocks for 5 s, until Zenoh closes the link.
+sends the replies: to reply to a peer that has stopped reading blocks for 5 s, until Zenoh closes the link.
+To drop a query blocks, too, and to free one that has not been dropped, because both tell the peer that no
+further reply follows. So queries end in that thread only.
+
 Equal queries that arrive before there is an answer are one question.
 
 If a handler fails or does not reply, the peer cannot distinguish that from a gateway that is not running. So
@@ -136,9 +139,9 @@ class ZenohAnswers:
             self._losses[source].lost("query beyond the queue", text, frames=0)
         else:
             self._losses[source].lost("query beyond the rate", f"a query is refused: {error}", frames=0)
-        reply = functools.partial(_reply_refusal, query, error)
-        if not refusal.is_sent or not self._sender.offer(reply):
-            query.drop()
+        end = functools.partial(_reply_refusal, query, error) if refusal.is_sent else query.drop
+        if not self._sender.offer(end):
+            query.drop()  # this holds up the peers that ask, which is better than to store their queries
 
     def _add(self, question: _Question, query: zenoh.Query) -> None:
         with self._lock:
@@ -188,7 +191,7 @@ class ZenohAnswers:
             outcome = _defect_error(defect)
         finally:
             with self._lock:
-                del self._open[question.identity]
+                self._open.pop(question.identity, None)
         if outcome is None:  # the source has been removed
             self._drop(question.queries)
         else:
@@ -215,17 +218,15 @@ class ZenohAnswers:
         return f"nothing of source {source!r} matches {selected}; accepted below {base}: {accepted}"
 
     async def close(self) -> None:
-        """Drop the pending queries. Their peers see at once that no reply follows."""
+        """Drop the pending queries, and close the sender. Peers see at once that no reply follows."""
         self._is_closed = True
+        with self._lock:
+            queries = [query for question in self._open.values() for query in question.queries]
+            self._waiting.clear()
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        with self._lock:
-            questions = list(self._waiting)
-            self._waiting.clear()
-            self._open.clear()
-        for question in questions:
-            self._drop(question.queries)
+        self._sender.close(functools.partial(self._drop_now, queries))
         self._long_sender.close()
 
     # In any thread.
@@ -249,15 +250,18 @@ class ZenohAnswers:
 
     def _drop(self, queries: list[zenoh.Query]) -> None:
         """Let the peers see that no reply follows."""
-        for query in queries:
-            query.drop()
-            self._admission.finished(NO_REPLY)
+        self._sender.submit(functools.partial(self._drop_now, queries))
 
     def _log_defect(self, source: str, selector: str, defect: Exception) -> None:
         log = self._defects.setdefault(source, DefectLog(logger, source))
         log.log(defect, text=f"query {safe_text(selector)}")
 
     # In a thread that sends. Zenoh's calls may block.
+
+    def _drop_now(self, queries: list[zenoh.Query]) -> None:
+        for query in queries:
+            query.drop()
+            self._admission.finished(NO_REPLY)
 
     def _reply(self, query: zenoh.Query, source: str, outcome: Mapping[str, Answer] | QueryError) -> None:
         result = "ok"

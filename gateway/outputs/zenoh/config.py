@@ -1,6 +1,7 @@
 """Zenoh's own configuration, and readable texts of Zenoh's errors."""
 
 import json
+import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -54,6 +55,19 @@ _DEFAULTS: Final = {
     "connect": {"retry": {"period_init_ms": 200, "period_max_ms": 500, "period_increase_factor": 1.5}},
 }
 """The gateway's defaults where they differ from Zenoh's; an inline configuration overrides them."""
+
+_THREADS: Final = "(tx: (worker_threads: 4), net: (worker_threads: 4))"
+"""The threads of Zenoh that send, in the form of its environment variable ZENOH_RUNTIME.
+
+With its default of one each, Zenoh sent nothing to anybody for 5 s while it closed the link of a peer that
+had asked and did not read the answers. Each thread of the gateway that sends answers can wait for one such
+link at a time.
+"""
+
+
+def prepare_threads() -> None:
+    """Let Zenoh have _THREADS, unless the environment says otherwise. Call it before the first session."""
+    os.environ.setdefault("ZENOH_RUNTIME", _THREADS)
 
 
 def zenoh_config(config: Path | Mapping[str, Any]) -> zenoh.Config:

@@ -18,7 +18,7 @@ from gateway.losses import Losses
 from gateway.messages.topics import Topic, zenoh_key
 from gateway.outputs.contract import Output, QueryService, ServerParameters
 from gateway.outputs.status import OutputHealth
-from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason
+from gateway.outputs.zenoh.config import prepare_threads, zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.publisher import ZenohLink, ZenohPublisher
 from gateway.outputs.zenoh.queries import ZenohQueries, query_limits
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -85,6 +85,7 @@ class ZenohOutput(Output):
         self._opener.start()
 
     def _open(self) -> None:
+        prepare_threads()
         while not self._closing.is_set():
             try:
                 session = zenoh.open(self.config)

@@ -242,7 +242,6 @@ class ZenohQueries:
         """Drop the pending queries. Their peers see at once that no reply follows."""
         self._is_closed = True
         await self._answers.close()
-        self._sender.close()
 
 
 def _parameters_publisher(session: zenoh.Session, key: str) -> _AnyPublisher:

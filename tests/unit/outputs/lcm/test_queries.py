@@ -52,10 +52,10 @@ class Service:
 class Lab:
     """An output on LCM in memory, and a peer on the same LCM object."""
 
-    def __init__(self) -> None:
+    def __init__(self, **settings: Any) -> None:
         self.service = Service()
         self.lcm = lcm.LCM("memq://")
-        self.output = LcmOutput(LcmSettings(url="memq://"), self.lcm)
+        self.output = LcmOutput(LcmSettings(url="memq://", **settings), self.lcm)
         self.output.serve_queries(self.service)  # type: ignore[arg-type]  # it has the methods that LCM calls
         self._losses = {name: Losses(logging.getLogger("tests"), name) for name in ("lab", "hall")}
         for name, losses in self._losses.items():
@@ -197,6 +197,51 @@ async def test_requests_beyond_the_limit_are_dropped_and_counted_by_source(
     lab.send(request(5))
     await lab.receive(3)
     assert lab.lost("lab") == {"request beyond the queue": (2, 0)}
+    await lab.output.stop_queries()
+
+
+async def test_requests_beyond_the_rate_get_an_error_and_are_counted() -> None:
+    lab = Lab(max_queries_per_source_per_s=1.0)
+    lab.open()
+    for number in range(8):
+        lab.send(request(number))
+    replies = await lab.receive(8)
+    refused = [reply for reply in replies if reply.error_code == "rate"]
+    assert refused
+    assert len(refused) < 8
+    assert {reply.requester for reply in refused} == {"test"}
+    assert "raise lcm.max_queries_per_source_per_s" in refused[0].error
+    assert lab.lost("lab") == {"request beyond the rate": (len(refused), 0)}
+    assert lab.output.query_results == {"ok": 8 - len(refused), "rate": len(refused)}
+    await lab.output.stop_queries()
+
+
+async def test_replies_beyond_the_bytes_of_a_second_are_errors() -> None:
+    lab = Lab(max_reply_bytes_per_s=1024)
+    lab.service.reply = ServerParameters(b"x" * 4000, 3, 4)
+    lab.open()
+    lab.send(request(1))
+    lab.send(request(2))
+    assert [reply.error_code for reply in await lab.receive(2)] == ["", "rate"]
+    await lab.output.stop_queries()
+
+
+async def test_long_parameters_are_sent_by_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(queries_module, "LONG_XML_BYTES", 10)
+    lab = Lab()
+    lab.open()
+    sent = lab.output.publish_parameters("lab", ServerParameters(b"<long enough/>", 3, 4))
+    assert sent is not None
+    await sent
+    again = lab.output.publish_parameters("lab", ServerParameters(b"<longer than that/>", 3, 5))
+    assert again is not None
+    await again
+    lab.deliver()
+    assert [message.xml for message in lab.parameters] == ["<long enough/>", "<longer than that/>"]
+    assert [message.sequence for message in lab.parameters] == [0, 1]
+    lab.send(request(1))
+    [reply] = await lab.receive()
+    assert reply.xml == XML.decode()
     await lab.output.stop_queries()
 
 

@@ -1,0 +1,149 @@
+"""Peers that ask without end, on Zenoh and on LCM: the frames of the healthy source do not wait for them."""
+
+import asyncio
+import json
+import signal
+import sys
+from asyncio.subprocess import DEVNULL, PIPE, Process
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+
+import pytest
+import rtc3d
+
+from gateway.outputs.lcm.connection import open_lcm
+from gateway.outputs.lcm.settings import lcm_queries_url
+from tests.gateway_process import simulator
+from tests.hostile.gateway_under_attack import GatewayUnderAttack, RunningGateway
+from tests.waiting import wait_until_async
+
+pytestmark = pytest.mark.netns
+
+MAX_GROWTH_KIB = 30 * 1024
+"""How much memory an attack may leave behind; without limits, it was 160 to 300 MB."""
+
+
+@pytest.fixture(scope="module")
+def dense_server() -> Iterator[int]:
+    """The port of a server with 1000 markers at 200 Hz."""
+    with simulator("--markers", "1000", "--rate", "200", "--analog-rate", "200") as (port, _):
+        yield port
+
+
+@asynccontextmanager
+async def asker(
+    gateway: RunningGateway, count: int, *selectors: str, num_bytes: int = 0
+) -> AsyncIterator[Process]:
+    """Run tests/hostile/asker.py until the end of the block."""
+    process = await asyncio.create_subprocess_exec(
+        *(sys.executable, "-m", "tests.hostile.asker", gateway.zenoh_endpoint, str(count), str(num_bytes)),
+        *selectors,
+        stdout=PIPE,
+        stderr=DEVNULL,  # Zenoh's log
+    )
+    try:
+        yield process
+    finally:
+        if process.returncode is None:
+            process.kill()
+        await process.wait()
+
+
+async def ask(gateway: RunningGateway, count: int, *selectors: str, num_bytes: int = 0) -> dict[str, int]:
+    """Ask ``count`` times at once; return the number of replies by code."""
+    async with asker(gateway, count, *selectors, num_bytes=num_bytes) as process:
+        output, _ = await process.communicate()
+    return dict(json.loads(output.splitlines()[-1]))
+
+
+async def wait_for_frames(gateway: RunningGateway) -> None:
+    """Wait until the attacked source has frames."""
+    await wait_until_async(lambda: "lab" in gateway.log and "streaming" in gateway.log.partition(" lab ")[2])
+
+
+def check(gateway: RunningGateway) -> None:
+    report = gateway.report
+    report.check()
+    assert report.rss_after_kib - report.rss_before_kib < MAX_GROWTH_KIB, report
+
+
+async def test_many_questions_for_json_of_large_frames(
+    dense_server: int, gateway_under_attack: GatewayUnderAttack
+) -> None:
+    async with gateway_under_attack({"lab": dense_server}) as gateway:
+        await wait_for_frames(gateway)
+        replies = await ask(gateway, 2000, "mocap/lab/3d?format=json")
+        assert replies["ok"] > 50
+        assert replies["rate"] > 500
+        assert set(replies) == {"ok", "rate", "unanswered"}
+        assert (await ask(gateway, 1, "mocap/lab/status"))["ok"] == 1
+    check(gateway)
+
+
+async def test_many_questions_for_everything(
+    dense_server: int, gateway_under_attack: GatewayUnderAttack
+) -> None:
+    async with gateway_under_attack({"lab": dense_server}) as gateway:
+        await wait_for_frames(gateway)
+        replies = await ask(gateway, 8000, "mocap/lab/**")
+        assert replies["ok"] > 1000
+        assert replies["rate"] > 100
+    check(gateway)
+
+
+async def test_many_different_questions(dense_server: int, gateway_under_attack: GatewayUnderAttack) -> None:
+    selectors = (
+        *("mocap/lab/**?format=json;x{}=1", "mocap/**?fresh=true", "mocap/lab/{}", "mocap/*/3d?format=json"),
+        *("mocap/lab/parameters/*?format=json;fresh=true", "mocap/l$*b/s$*/**", "**?_a={}", "mocap/lab/*?{}"),
+        *("mocap/**" + "/lab/**" * 40, "mocap/lab/schema/" + "$*a" * 20 + "$*b", "mocap/lab/x{}/**"),
+        *("mocap/lab/recording?set=start", "mocap/lab/" + 9999 * "x", "mocap/lab/3d?" + 9999 * "y"),
+    )
+    async with gateway_under_attack({"lab": dense_server}) as gateway:
+        await wait_for_frames(gateway)
+        await asyncio.gather(*(ask(gateway, 3000, *selectors) for _ in range(2)))
+    check(gateway)
+
+
+async def test_questions_with_large_payloads(gateway_under_attack: GatewayUnderAttack) -> None:
+    async with gateway_under_attack() as gateway:
+        replies = await ask(gateway, 200, "mocap/healthy/status", num_bytes=1_000_000)
+        assert replies["bad-request"] == 200
+    check(gateway)
+
+
+async def test_askers_that_do_not_read_the_answers(
+    dense_server: int, gateway_under_attack: GatewayUnderAttack
+) -> None:
+    async with gateway_under_attack({"lab": dense_server}) as gateway:
+        await wait_for_frames(gateway)
+        spool = Path(gateway.folder) / "spool"
+        spool.mkdir(exist_ok=True)
+        (spool / "lab-20260102T030405.678901Z.c3d").write_bytes(bytes(50_000_000))
+        async with asker(
+            gateway, 1000, "mocap/lab/3d?format=json", "mocap/lab/c3d", "mocap/lab/**"
+        ) as stalled:
+            assert stalled.stdout is not None
+            await stalled.stdout.readline()
+            stalled.send_signal(signal.SIGSTOP)
+            await asyncio.sleep(6)
+            # Answers to others wait for the stalled one, frames do not.
+    check(gateway)
+
+
+@pytest.mark.parametrize("attack", ["requests", "fresh requests", "malformed", "long", "fragments"])
+async def test_floods_on_lcm(
+    attack: str, dense_server: int, gateway_under_attack: GatewayUnderAttack
+) -> None:
+    request = rtc3d.parameters_request_t()
+    request.requester, request.fresh = "flood", attack == "fresh requests"
+    messages = {"malformed": bytes(40), "long": bytes(60_000), "fragments": bytes(200_000)}
+    async with gateway_under_attack({"lab": dense_server}) as gateway:
+        await wait_for_frames(gateway)
+        connection = open_lcm(lcm_queries_url(gateway.lcm_url))
+        message = messages.get(attack) or request.encode()
+        for _ in range(200):  # 2 s
+            for _ in range(100 if len(message) < 1000 else 5):
+                connection.publish("MOCAP_LAB_PARAMETERS_REQUEST", message)
+            await asyncio.sleep(0.01)
+    check(gateway)
