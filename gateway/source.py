@@ -10,7 +10,7 @@ from gateway.c3d_files.receiving import SourceFiles
 from gateway.c3d_files.spool import Spool, StoredFile
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import LinkError, QueryError
-from gateway.log import DefectLog, FailureLog, log_fields
+from gateway.log import HOLD_S, DefectLog, FailureLog, log_fields
 from gateway.messages.limits import encode_within_limits
 from gateway.outputs.contract import Answer, ServerParameters
 from gateway.outputs.encodings import C3D
@@ -64,7 +64,7 @@ class Source:
         self.parameters_version: int = 0 if before is None else before.parameters_version
         """The version of the server's parameters; 0 before the first."""
         self._files = SourceFiles(settings.name, lambda: self.spool, self._on_stored)
-        self._spool_problems = FailureLog(logger, settings.name)
+        self._spool_problems = FailureLog(logger, settings.name, HOLD_S)
         self._streams: ConfiguredStreams | AutomaticStreams = (
             AutomaticStreams(settings.stall_timeout_s, self._new_stream)
             if settings.streams == "auto"
@@ -242,7 +242,7 @@ class Source:
             async with asyncio.timeout(timeout_s):
                 newest = await spool.reader.run(find)
         except TimeoutError:
-            text = f"the disk of the gateway did not give the file within {timeout_s:g} s"
+            text = f"the disk of the gateway did not find the file within {timeout_s:g} s"
             raise QueryError(text, code="timeout") from None
         except OSError as error:
             text = f"the newest C3D file of source {self.name!r} cannot be read: {error.strerror}"

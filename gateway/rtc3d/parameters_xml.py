@@ -16,7 +16,7 @@ from gateway.safe_text import quoted, safe_text
 
 MAX_XML_BYTES: Final = 1024 * 1024
 """Larger documents are not parsed. This is enough for about 8000 markers; parsing takes 1.4 s at worst."""
-MAX_ITEMS: Final = 20_000
+MAX_ITEMS: Final = 10_000
 """The highest number of markers, tools, channels, plates and the like in one list."""
 MAX_TEXT_CHARACTERS: Final = 1000
 """Longer texts are cut: labels go into log messages and into the names of topics."""

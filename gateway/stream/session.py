@@ -111,6 +111,7 @@ class Session:
         self._answered: dict[type[Command], Command] = {}  # the newest that was answered, by type
         self._state_changed = asyncio.Event()  # set when the protocol's state changes
         self._quiet_since_s = 0.0  # when the stall time-out last started, on the running clock
+        self._last_piece_s = 0.0  # when the newest piece of a file arrived: nothing can arrive before its end
 
     @property
     def is_open(self) -> bool:
@@ -192,11 +193,11 @@ class Session:
     async def _wait_for_reply(self, reply: "asyncio.Future[Packet]") -> Packet:
         """Wait for ``reply``; raise TimeoutError if the server does not answer within reply_timeout_s.
 
-        The time-out starts again when a backlog ends, because the reply may be behind it.
+        The time-out starts again when a backlog or a piece of a file ends: the reply may be behind it.
         """
         since_s = self._running.time()
         while not reply.done():
-            since_s = max(since_s, self._frames.caught_up_s)
+            since_s = max(since_s, self._frames.caught_up_s, self._last_piece_s)
             wait_s = self._source.reply_timeout_s - (self._running.time() - since_s)
             if wait_s <= 0:
                 raise TimeoutError
@@ -219,7 +220,7 @@ class Session:
         """
         while True:
             self._check_open()
-            quiet_since_s = max(self._quiet_since_s, self._frames.caught_up_s)
+            quiet_since_s = max(self._quiet_since_s, self._frames.caught_up_s, self._last_piece_s)
             wait_s = self._source.stall_timeout_s - (self._running.time() - quiet_since_s)
             if wait_s <= 0:
                 self._check_stall()
@@ -356,6 +357,7 @@ class Session:
                 self._status.frame_rejected(self._rejection, self._num_lost(num_components))
             case FilePiece():
                 if self._error is None:
+                    self._last_piece_s = self._running.time()
                     self._files.receive(event)
             case ByteOrderMismatch(byte_order):
                 self._status.add_limitation(

@@ -249,13 +249,10 @@ async def test_a_file_is_announced_although_an_old_one_cannot_be_deleted(
                 lab.server.connection.send(packet(5, c3d_file(b"", 600)))
                 await settle()
         assert len(lab.files) == 3
-        lab.server.connection.send(packet(5, c3d_file(b"", 600)))
-        await settle()
     warnings = [record.message for record in caplog.records if record.levelno == logging.WARNING]
     [warning] = [text for text in warnings if "C3D" in text]
     assert warning.startswith(f"lab: old C3D files are not deleted: {tmp_path}/lab-")
     assert warning.endswith(" cannot be deleted: Operation not permitted")
-    assert any("old C3D files can be deleted again" in message for message in caplog.messages)
 
 
 async def test_files_that_cannot_be_stored_are_logged_once(
@@ -311,7 +308,7 @@ async def test_a_disk_that_does_not_give_the_file_is_an_error_for_the_peer(
 ) -> None:
     lab = Lab(servers, spool)
     monkeypatch.setattr(WorkerThread, "submit", lambda _thread, _call: Future())
-    with pytest.raises(QueryError, match="did not give the file within 4 s") as caught:
+    with pytest.raises(QueryError, match="did not find the file within 4 s") as caught:
         await lab.source.queries.answer(Question("c3d"))
     assert caught.value.code == "timeout"
 

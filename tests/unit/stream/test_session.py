@@ -231,6 +231,34 @@ async def test_the_end_of_the_session_interrupts_a_file_and_later_pieces_are_ign
     await closing
 
 
+async def test_a_file_that_takes_long_is_no_silence(lab: Lab) -> None:
+    await lab.streaming()
+    lab.connection.send_frames(1)
+    file = packet(5, bytes(20))
+    monitoring = asyncio.create_task(lab.session.monitor(lab.check_silence))
+    lab.connection.send(file[:9])
+    for byte in file[9:]:
+        await asyncio.sleep(2.9)  # the server is silent after 3 s
+        lab.connection.send(bytes([byte]))
+    assert not monitoring.done()
+    with pytest.raises(SilenceError, match="no frame from"):
+        await monitoring
+
+
+async def test_the_reply_to_a_command_may_be_behind_a_file(lab: Lab) -> None:
+    lab.server.answer = silent_to("Version")
+    await lab.session.connect()
+    asking = asyncio.create_task(lab.session.ask(Version()))
+    await settle()
+    file = packet(5, bytes(20))
+    lab.connection.send(file[:9])
+    for byte in file[9:]:
+        await asyncio.sleep(1.9)  # the server does not answer after 2 s
+        lab.connection.send(bytes([byte]))
+    lab.connection.send(ok("OK-Version"))
+    assert (await asking).body == b"OK-Version"
+
+
 # --- the connection
 
 
