@@ -1,5 +1,6 @@
 """Ports, Zenoh sessions, LCM URLs and routes for tests, all on the loopback interface."""
 
+import contextlib
 import itertools
 import json
 import socket
@@ -94,3 +95,23 @@ def lan_interface(address: str) -> Iterator[int]:
             subprocess.run(["ip", "link", "del", "lan"], check=False)
             add_multicast_route()
             process.kill()
+
+
+@contextlib.contextmanager
+def slow_interface(kbit_per_s: int) -> Iterator[str]:
+    """Add a network interface that sends slowly (marker netns); yield a multicast URL that uses it."""
+    group = "239.255.77.1"
+    commands = (
+        "ip link add slow type veth peer name slow-end",
+        "ip address add 10.77.0.1/24 dev slow",
+        "ip link set slow up",
+        "ip link set slow-end up",
+        f"ip route add {group} dev slow",
+        f"tc qdisc add dev slow root tbf rate {kbit_per_s}kbit burst 10k limit 10mb",
+    )
+    try:
+        for command in commands:
+            subprocess.run(command.split(), check=True)
+        yield f"udpm://{group}:7667?ttl=1"
+    finally:
+        subprocess.run(["ip", "link", "del", "slow"], check=True)

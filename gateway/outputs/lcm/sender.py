@@ -9,7 +9,7 @@ import lcm
 
 from gateway.errors import OutputError
 from gateway.log import HOLD_S, FailureLog
-from gateway.outputs.lcm.connection import open_lcm, send_problem
+from gateway.outputs.lcm.connection import open_lcm_to_send, send_problem
 
 _NEVER: Final = float("inf")
 RETRY_S: Final = 1.0
@@ -45,7 +45,7 @@ class LcmSender:
     def open(self) -> None:
         """Open LCM. If this fails, ``maintain`` tries again."""
         try:
-            self._lcm = self._shared or open_lcm(self._url)
+            self._lcm = self._shared or open_lcm_to_send(self._url)
         except OutputError as error:
             self.problem = str(error)
             self._opening.failed(self.problem)

@@ -8,11 +8,12 @@ import lcm
 import pytest
 
 from gateway.errors import OutputError
+from gateway.outputs.lcm import connection as connection_module
 from gateway.outputs.lcm import sender as sender_module
 from gateway.outputs.lcm.connection import DEFAULT_GROUP, multicast_problem, open_lcm, send_problem
 from gateway.outputs.lcm.sender import CLOSED, NOT_OPEN, RETRY_S, LcmPublisher, LcmSender
 from gateway.outputs.lcm.thread_sender import LcmThreadSender, new_sender
-from tests.networks import add_multicast_route, lcm_url, remove_multicast_route
+from tests.networks import add_multicast_route, lcm_url, remove_multicast_route, slow_interface
 
 BAD_URL = "udpm://not-an-address:7667"
 
@@ -219,3 +220,27 @@ def test_a_closed_publisher_says_so_and_frees_its_channel_once() -> None:
     )
     assert sent == [("MOCAP_LAB_3D", b"message")]
     assert forgotten == [publisher]
+
+
+# An interface that is too slow ---------------------------------------------------------------
+
+
+@pytest.mark.netns
+def test_a_slow_interface_loses_messages_and_delays_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connection_module, "_SEND_BUFFER_BYTES", 4096)
+    with slow_interface(100) as url:
+        sender = LcmSender(url, None, lambda: None)
+        sender.open()
+        results = [refused_or_sent(sender) for _ in range(30)]
+        text = f"the network interface does not take messages to {url} fast enough; use a faster one, "
+        assert results[0] is None
+        assert results[-1] == (text + "or set lcm.max_rate_hz", "send failed")
+        sender.close()
+
+
+def refused_or_sent(sender: LcmSender) -> tuple[str, str] | None:
+    try:
+        sender.send("CHANNEL", bytes(1400))
+    except OutputError as error:
+        return str(error), error.cause
+    return None
