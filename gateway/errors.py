@@ -101,7 +101,7 @@ class DefectError(LinkError):
     """A defect in this program ended the connection; ``__cause__`` is the exception."""
 
     @staticmethod
-    def of(defect: Exception) -> "DefectError":
+    def of(defect: BaseException) -> "DefectError":
         """Return the error for an exception that nobody expected."""
         error = DefectError(
             f"defect in the gateway: {type(defect).__name__}: {safe_text(str(defect))}; connecting again; "

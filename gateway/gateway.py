@@ -3,18 +3,22 @@
 import asyncio
 import logging
 from collections.abc import Collection, Mapping, Sequence
+from functools import partial
 from typing import Any, Final
 
 from gateway.c3d_files.spool import Spool
 from gateway.config.settings import Settings, SourceSettings, SpoolSettings
+from gateway.log import defect_text, log_fields
 from gateway.messages.host_time import host_clock
 from gateway.outputs.contract import Command, Output, ServerParameters
+from gateway.outputs.guard import guarded, health, log_defect
 from gateway.outputs.registry import build_outputs
 from gateway.publish.fan_out import FanOut
 from gateway.publish.routes import OPENING_S
 from gateway.queries.service import SourceQueryService
 from gateway.queries.source_queries import SourceQueries
 from gateway.source import Source
+from gateway.stream.backoff import Backoff
 from gateway.worker_thread import WorkerThread
 
 _STATUS_PERIOD_S: Final = 1.0
@@ -72,7 +76,7 @@ class Gateway:
     async def run(self, stop: asyncio.Event) -> None:
         """Run until ``stop`` is set; then send Bye to every server and close the outputs."""
         for output in self._outputs:
-            output.start()
+            guarded(output, output.start, None)
         self._spool.reader.submit(self._spool.delete_abandoned)
         try:
             await self._wait_for_outputs(stop)
@@ -94,22 +98,50 @@ class Gateway:
     async def _wait_for_outputs(self, stop: asyncio.Event) -> None:
         deadline_s = asyncio.get_running_loop().time() + OPENING_S
         while asyncio.get_running_loop().time() < deadline_s and not stop.is_set():
-            if all(output.health().connected for output in self._outputs):
+            if all(health(output).connected for output in self._outputs):
                 return
             await asyncio.sleep(_OPENING_POLL_S)
 
     def _start_source(self, name: str) -> None:
-        self._source_tasks[name] = self._tasks.create_task(self._sources[name].run(), name=f"source {name}")
+        self._source_tasks[name] = self._tasks.create_task(self._run_source(name), name=f"source {name}")
+
+    async def _run_source(self, name: str) -> None:
+        """Run a source until cancelled.
+
+        The rule for defects: what goes wrong in one connection ends that connection (see Supervisor.run).
+        Whatever else goes wrong in handling a source arrives here. It is logged as an error, and the source
+        is built again and run after a pause, which grows as long as the defect returns soon. Nobody else
+        notices.
+        """
+        loop = asyncio.get_running_loop()
+        with log_fields(source=name):
+            backoff = Backoff(self._sources[name].settings.reconnect)
+            while True:
+                source = self._sources[name]
+                began_s = loop.time()
+                defect = await _run_to_defect(source)
+                text = f"{defect_text(defect)}; the source is started again; report this with the log"
+                source.defects.log(defect, text)
+                pause_s = backoff.delay_after(loop.time() - began_s, had_data=True)
+                try:
+                    self._add_source(source.settings, source)
+                    self._sources[name].show_restart(text)
+                except Exception as defect:  # noqa: BLE001 - the former one fails at once, and this is repeated
+                    source.defects.log(defect)
+                await asyncio.sleep(pause_s)
 
     async def _run_every_second(self) -> None:
-        """Maintain the outputs and publish the status of each source."""
+        """Maintain the outputs, and check each source and publish its status."""
         while True:
             await asyncio.sleep(_STATUS_PERIOD_S)
             host_clock.read()  # detects a step of the wall clock even if no frame arrives
             for output in self._outputs:
-                output.maintain()
+                guarded(output, output.maintain, None)
             for source in self._sources.values():
-                source.publish_status()
+                try:
+                    source.publish_status()
+                except Exception as defect:  # noqa: BLE001 - the others continue
+                    source.fail(defect)
 
     # Reloading.
 
@@ -155,7 +187,7 @@ class Gateway:
             source.fan_out.set_outputs(outputs)
         await _close_all(removed)  # first, because a new output may use the same address
         for output in new:
-            output.start()
+            guarded(output, output.start, None)
             self._publish_known_parameters(output)
         return _changes("output", [output.name for output in removed], [output.name for output in new])
 
@@ -173,6 +205,7 @@ class Gateway:
         }
         new = [settings for name, settings in wanted.items() if name in stopped or name not in self._sources]
         await asyncio.gather(*map(self._stop_source, stopped))
+        stopped = {name: self._sources[name] for name in stopped}  # a defect may have replaced one
         for name in stopped.keys() - wanted.keys():
             self._removed_sources[name] = source = self._sources.pop(name)
             source.fan_out.close()
@@ -202,14 +235,33 @@ class Gateway:
 
     async def _publish_parameters(self, source: str, parameters: ServerParameters) -> None:
         """Publish on every output; wait until they have sent it, but at most _SENDING_TIMEOUT_S."""
-        sent = [output.publish_parameters(source, parameters) for output in self._outputs]
+        sent = [
+            guarded(output, partial(output.publish_parameters, source, parameters), None)
+            for output in self._outputs
+        ]
         pending = [future for future in sent if future is not None]
         if pending:
             await asyncio.wait(pending, timeout=_SENDING_TIMEOUT_S)
 
     def _announce_file(self, source: str, description: Mapping[str, Any]) -> None:
         for output in self._outputs:
-            output.announce_file(source, description)
+            guarded(output, partial(output.announce_file, source, description), None)
+
+
+async def _run_to_defect(source: Source) -> BaseException:
+    """Run a source until a defect ends it, and return that; raises CancelledError if cancelled."""
+    # In a task of its own: in Python 3.11, the one that leaves a TaskGroup does not know who cancelled it.
+    task = asyncio.create_task(source.run())
+    try:
+        await asyncio.wait([task])
+    except asyncio.CancelledError:
+        task.cancel()
+        await asyncio.wait([task])
+        if not task.cancelled() and (defect := task.exception()) is not None:
+            source.defects.log(defect)
+        raise
+    end = None if task.cancelled() else task.exception()
+    return end or RuntimeError("the source has ended, and nobody stopped it")
 
 
 async def _close_all(outputs: Sequence[Output]) -> None:
@@ -218,8 +270,11 @@ async def _close_all(outputs: Sequence[Output]) -> None:
 
 
 async def _close(output: Output) -> None:
-    await output.stop_queries()
-    await WorkerThread(f"close {output.name}").run(output.close)
+    for close in (output.stop_queries, partial(WorkerThread(f"close {output.name}").run, output.close)):
+        try:
+            await close()
+        except Exception as defect:  # noqa: BLE001 - the others are closed nevertheless
+            log_defect(output, defect)
 
 
 def _switch_tool_poses(outputs: Sequence[Output], wanted: Sequence[Output]) -> list[str]:

@@ -14,6 +14,7 @@ from gateway.log import HOLD_S, DefectLog, FailureLog, log_fields
 from gateway.messages.limits import encode_within_limits
 from gateway.outputs.contract import Answer, ServerParameters
 from gateway.outputs.encodings import C3D
+from gateway.outputs.guard import health
 from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.queries.known_parameters import ServerAnswer
@@ -51,6 +52,8 @@ class Source:
         before: "Source | None" = None,
     ) -> None:
         self.settings = settings
+        self.defects: DefectLog = DefectLog(logger, settings.name, None if before is None else before.defects)
+        """The log of defects in handling this source."""
         self.spool = spool
         self.fan_out = fan_out
         self._refresh = ParameterRefresh(
@@ -73,7 +76,7 @@ class Source:
         self.queries = self._new_queries(before)
         self._publish_parameters = publish_parameters
         self._announce_file = announce_file
-        self._defects = DefectLog(logger, self.name)
+        self._failure: asyncio.Future[None] | None = None  # ends ``run``
         # The names and units of the former server do not apply to another one, not even until its handshake.
         self._has_new_server = before is not None and (before.settings.host, before.settings.port) != (
             *(settings.host, settings.port),
@@ -118,13 +121,20 @@ class Source:
         return [(stream.status, stream.frame_rate.rate_hz) for stream in self.streams]
 
     async def run(self) -> None:
-        """Run every stream until cancelled; then send Bye to the server."""
+        """Run every stream until cancelled; then send Bye to the server.
+
+        Raises any exception that is a defect, of the source or of a stream. The caller builds the source
+        again, because the state of this one can no longer be trusted.
+        """
+        self._failure = asyncio.get_running_loop().create_future()
         if self._has_new_server:
             await self.queries.parameters.known.make_void("the configuration names another server")
         try:
             async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(_wait_for(self._failure))
                 tasks.create_task(self._refresh.run())
                 await self._streams.run()
+                raise RuntimeError("the streams have ended, and nobody stopped them")
         finally:
             await self._files.finish()
             for stream in self._streams.known:
@@ -132,23 +142,55 @@ class Source:
 
     # Status.
 
+    def fail(self, defect: Exception) -> None:
+        """End ``run`` with this defect."""
+        if self._failure is not None and not self._failure.done():
+            self._failure.set_exception(defect)
+
+    def show_restart(self, defect: str) -> None:
+        """Show why this source was built again, until its streams are connected."""
+        self.fan_out.show_streaming(False)
+        for status in self.statuses:
+            status.record_error(defect)
+
     def publish_status(self) -> None:
-        """Check the streams, and publish the status and the clock of this source. Called once a second."""
-        self.sequence += 1
-        self._streams.check()
-        self._files.check()
+        """Check the streams, and publish the status and the clock of this source. Called once a second.
+
+        A defect in checking the streams ends ``run``. One in publishing does not: the data is what matters.
+        """
+        with log_fields(source=self.name):
+            self.sequence += 1
+            try:
+                self._streams.check()
+            except Exception as defect:  # noqa: BLE001 - ``run`` raises it
+                self.fail(defect)
+            for work in (
+                self._files.check,
+                self._check_logs,
+                self._publish_newest_status,
+                self._publish_clock,
+            ):
+                try:
+                    work()
+                except Exception as defect:  # noqa: BLE001 - the next status may succeed
+                    self.defects.log(defect)
+
+    def _check_logs(self) -> None:
+        for stream in self._streams.known:
+            stream.status.check()
+        self.fan_out.check_losses()
+
+    def _publish_newest_status(self) -> None:
         for stream in self.streams:
             stream.frame_rate.update(stream.status.frames_in)
         self._newest_status = self._encoded_status()
+        self.fan_out.publish_status(self._newest_status)
+
+    def _publish_clock(self) -> None:
         # One server has one clock: publish the best estimate of all streams.
         best = min(self.statuses, key=_uncertainty_us)
         clock = clock_message(self.queries.session, self.sequence, best)
-        with log_fields(source=self.name):
-            for stream in self._streams.known:
-                stream.status.losses.check()
-            self.fan_out.check_losses()
-            self.fan_out.publish_status(self._newest_status)
-            self.fan_out.publish_clock(encode_within_limits(clock))
+        self.fan_out.publish_clock(encode_within_limits(clock))
 
     def _encoded_status(self) -> bytes:
         message = status_message(
@@ -156,7 +198,7 @@ class Source:
             server=f"{self.settings.host}:{self.settings.port}",
             sequence=self.sequence,
             streams=self.rated_statuses,
-            outputs=[(status, output.health()) for output, status in self.fan_out.outputs],
+            outputs=[(status, health(output)) for output, status in self.fan_out.outputs],
         )
         return encode_within_limits(message)
 
@@ -168,6 +210,7 @@ class Source:
             session=self.sessions.newest,
             sessions=self.sessions,
             parameters_version=self.parameters_version,
+            known_defects=self.defects,
         )
         return Supervisor(self.settings, stream, status, self._callbacks(status), listener)
 
@@ -216,7 +259,7 @@ class Source:
         try:
             self._report_stored(stored)
         except Exception as defect:  # noqa: BLE001 - a defect in an output must not stop the streams
-            self._defects.log(defect)
+            self.defects.log(defect)
 
     def _report_stored(self, stored: StoredFile) -> None:
         """Log and announce a file. It is there, even if old ones could not be deleted."""
@@ -260,6 +303,10 @@ class Source:
                     continue
                 return True
         return False
+
+
+async def _wait_for(failure: "asyncio.Future[None]") -> None:
+    await failure
 
 
 def _uncertainty_us(status: StreamStatus) -> float:

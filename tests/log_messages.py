@@ -7,7 +7,10 @@ from itertools import chain
 from pathlib import Path
 from typing import Final
 
-_LOGGERS: Final = {"logger", "_log", "_logger"}
+_EVENT_LOGS: Final = {"events", "_events"}
+"""Their second argument is the text."""
+
+_LOGGERS: Final = {"logger", "_log", "_logger", *_EVENT_LOGS}
 _LOUD_METHODS: Final = {"warning", "error", "exception", "critical"}
 """Methods of loggers that log at WARNING and above; ``log`` can do so, too."""
 
@@ -42,9 +45,8 @@ def message_patterns(package: Path) -> dict[str, str]:
             continue
         for scope in _scopes(module):
             for call in _logging_calls(scope):
-                is_loss = isinstance(call.func, ast.Attribute) and call.func.attr in _LOSS_METHODS
                 arguments = [
-                    *(call.args[1:] if is_loss else call.args),
+                    *_arguments(call),
                     *(keyword.value for keyword in call.keywords if keyword.arg == "limitation"),
                 ]
                 texts = chain.from_iterable(
@@ -53,6 +55,16 @@ def message_patterns(package: Path) -> dict[str, str]:
                 for text in filter(re.compile("[a-z]{3}").search, texts):
                     found.setdefault(text, f"{path.relative_to(package)}:{call.lineno}")
     return found
+
+
+def _arguments(call: ast.Call) -> Sequence[ast.expr]:
+    """Return the arguments that may be texts."""
+    match call.func:
+        case ast.Attribute(attr=name) if name in _LOSS_METHODS:
+            return call.args[1:]
+        case ast.Attribute(value=ast.Attribute(attr=owner)) if owner in _EVENT_LOGS:
+            return call.args[1:2]
+    return call.args
 
 
 def _scopes(module: ast.Module) -> Iterator[ast.AST]:

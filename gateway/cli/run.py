@@ -16,6 +16,7 @@ from gateway.cli.options import (
 )
 from gateway.service.daemon import serve
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
+from gateway.service.log_limit import LogLimit
 from gateway.service.process_end import end_at_once
 
 _SWITCH_INTERVAL_S: Final = 0.0005
@@ -32,9 +33,11 @@ def run(
     """Run the gateway until Ctrl-C or SIGTERM. SIGHUP reloads the configuration."""
     for number in (signal.SIGINT, signal.SIGTERM):  # until the daemon handles them
         signal.signal(number, end_at_once)
-    set_up_log(log_level, log_format)
+    limit = LogLimit()
+    set_up_log(log_level, log_format, limit)
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     # The objects of all modules stay until the end. Without this, each full garbage collection looks through
     # them and stops the event loop for some 20 ms; many tiny packets cause one every second.
     gc.freeze()
-    uvloop.run(serve(lambda: configuration_from_options(config, server).settings))
+    uvloop.run(serve(lambda: configuration_from_options(config, server).settings, limit.report))
+    limit.report(at_once=True)

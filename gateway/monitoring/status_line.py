@@ -6,6 +6,7 @@ from gateway.config.settings import SourceSettings
 from gateway.gateway import Gateway
 from gateway.losses import Loss, last_minute_text
 from gateway.monitoring.health import unusable_frames
+from gateway.outputs.guard import health as output_health
 from gateway.outputs.status import OutputHealth
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
@@ -13,7 +14,7 @@ from gateway.stream.status import StreamStatus
 
 def status_lines(gateway: Gateway) -> list[str]:
     """Return a text for each source, for each output that cannot send, and for what an output loses."""
-    outputs = ((output.name, output.health()) for output in gateway.outputs)
+    outputs = ((output.name, output_health(output)) for output in gateway.outputs)
     losses = (
         (f"{source.name} to {output.name}", status.losses)
         for source in gateway.sources

@@ -1,12 +1,13 @@
 """Publishing one source's frames on every output."""
 
 from collections.abc import Callable, Collection, Sequence
-from functools import lru_cache
+from functools import lru_cache, partial
 from typing import Final
 
 from gateway.messages.encode import MESSAGE_TYPES, encode_content, has_lcm_form, lcm_content
 from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import Output
+from gateway.outputs.guard import guarded
 from gateway.outputs.status import OutputStatus
 from gateway.publish.item_counts import ItemCounts
 from gateway.publish.routes import ComponentRoute, FrameRoute, OutputRoute
@@ -231,7 +232,7 @@ class FanOut:
         """Show on every output whether frames of the source arrive."""
         self._is_streaming = is_streaming
         for route in self._routes:
-            route.output.show_streaming(self._source, is_streaming)
+            guarded(route.output, partial(route.output.show_streaming, self._source, is_streaming), None)
 
     def check_losses(self) -> None:
         """Log the end of each period in which messages were lost. Called once a second."""

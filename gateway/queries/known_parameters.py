@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 from gateway.errors import ParametersError
+from gateway.log import EventLog
 from gateway.queries.answers import parameters_json
 from gateway.queries.payloads import JsonPayload
 from gateway.rtc3d.parameters import SECTIONS, Parameters, without_statistics
@@ -127,7 +128,9 @@ class KnownParameters:
         announce: Announce,
         former: "KnownParameters | None" = None,
     ) -> None:
-        self._source = source
+        self._events: EventLog = EventLog(logger, source)
+        if former is not None:
+            self._events = former._events  # noqa: SLF001 - of the same class
         self._xml_thread = xml_thread
         self._announce = announce
         self._lock = asyncio.Lock()  # for one change at a time
@@ -171,31 +174,33 @@ class KnownParameters:
                 return
             self.newest = None
             self.version += 1
-            logger.warning(
-                "%s: the server gives no parameters any more: %s; the former names and units are void "
-                "(parameters_version %d)",
-                *(self._source, reason, self.version),
+            self._events.log(
+                logging.WARNING,
+                f"the server gives no parameters any more: {reason}; the former names and units are void "
+                f"(parameters_version {self.version})",
+                "void",
             )
             await self._announce(None, self.version)
 
     def _log_change(self, reading: "_Reading", *, is_first: bool) -> None:
         if is_first:
             if self.version > 1:
-                logger.info(
-                    "%s: the server gives parameters again (parameters_version %d)",
-                    *(self._source, self.version),
-                )
+                text = f"the server gives parameters again (parameters_version {self.version})"
+                self._events.log(logging.INFO, text, "given again")
             return
         if reading.renamed:
-            logger.warning(
-                "%s: markers or tools were renamed on the server: %s; programs that use the names need "
-                "the new ones (parameters_version %d)",
-                *(self._source, reading.renamed, self.version),
+            self._events.log(
+                logging.WARNING,
+                f"markers or tools were renamed on the server: {reading.renamed}; programs that use the "
+                f"names need the new ones (parameters_version {self.version})",
+                "renamed",
             )
         if reading.changed_sections:
-            logger.info(
-                "%s: the server's parameters changed: %s (parameters_version %d)",
-                *(self._source, ", ".join(reading.changed_sections), self.version),
+            sections = ", ".join(reading.changed_sections)
+            self._events.log(
+                logging.INFO,
+                f"the server's parameters changed: {sections} (parameters_version {self.version})",
+                "changed",
             )
 
 

@@ -6,10 +6,12 @@ import os
 import signal
 from collections.abc import Callable
 from types import FrameType
+from typing import Any
 
 from gateway.config.settings import Settings
 from gateway.errors import ConfigError
 from gateway.gateway import Gateway
+from gateway.log import DefectLog, defect_text
 from gateway.monitoring.server import MonitoringServer
 from gateway.monitoring.status_line import status_lines
 from gateway.service.process_end import StopDeadline, named_tasks
@@ -19,23 +21,31 @@ from gateway.worker_thread import WorkerThread
 logger = logging.getLogger(__name__)
 
 
-async def serve(load: Callable[[], Settings]) -> None:
+async def serve(load: Callable[[], Settings], every_second: Callable[[], None] = lambda: None) -> None:
     """Run a gateway with the settings that ``load`` returns, until SIGTERM or SIGINT.
 
-    SIGHUP calls ``load`` again and applies the changes; a configuration with an error is refused as a
-    whole. Raises ConfigError if the settings cannot be used at the start.
+    SIGHUP calls ``load`` again and applies the changes; a configuration with an error is refused as a whole.
+    ``every_second`` is called about once a second.
+    Raises ConfigError if the settings cannot be used at the start.
     """
-    daemon = Daemon(load, Gateway(load()))
+    daemon = Daemon(load, Gateway(load()), every_second)
     daemon.on_stop_request = StopDeadline(daemon.unfinished).begin
     await daemon.run()
 
 
 class Daemon:
-    """Runs one gateway for the lifetime of the process; ``load`` returns its current settings."""
+    """Runs one gateway for the lifetime of the process; ``load`` returns its current settings.
 
-    def __init__(self, load: Callable[[], Settings], gateway: Gateway) -> None:
+    ``every_second`` is called about once a second.
+    """
+
+    def __init__(
+        self, load: Callable[[], Settings], gateway: Gateway, every_second: Callable[[], None] = lambda: None
+    ) -> None:
         self._load = load
         self._gateway = gateway
+        self._every_second = every_second
+        self._defects = DefectLog(logger, "gateway")
         self._monitoring = MonitoringServer(gateway.settings.metrics, gateway)
         self._systemd = SystemdNotifier()
         self._loop = asyncio.get_running_loop()
@@ -54,6 +64,7 @@ class Daemon:
             # Unlike a handler of the event loop, this one is called while the event loop is busy or blocked.
             signal.signal(number, self._on_stop_signal)
         loop.add_signal_handler(signal.SIGHUP, self._on_hangup)
+        loop.set_exception_handler(self._on_loop_error)
         async with asyncio.TaskGroup() as tasks:
             background = [
                 tasks.create_task(self._notify_systemd()),
@@ -88,6 +99,14 @@ class Daemon:
         """Return what a stop still waits for. This may be called in any thread."""
         return named_tasks(self._loop) if self._stop.is_set() else ["the event loop, which is busy"]
 
+    def _on_loop_error(self, loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
+        """Log what a callback or a forgotten task has raised, each defect once (see DefectLog)."""
+        defect = context.get("exception")
+        if isinstance(defect, Exception):
+            self._defects.log(defect)
+        else:
+            loop.default_exception_handler(context)
+
     async def _notify_systemd(self) -> None:
         """Notify systemd of the start, then periodically of the status.
 
@@ -99,9 +118,15 @@ class Daemon:
         while True:
             await asyncio.sleep(self._systemd.period_s)
             self._systemd.notify_alive(self._status_line())
+            self._every_second()
 
     def _status_line(self) -> str:
-        return "; ".join(filter(None, (self._reload_problem, *status_lines(self._gateway))))
+        try:
+            lines = status_lines(self._gateway)
+        except Exception as defect:  # noqa: BLE001 - what shows the status must not stop the gateway
+            self._defects.log(defect)
+            lines = [defect_text(defect)]
+        return "; ".join(filter(None, (self._reload_problem, *lines)))
 
     async def _handle_reloads(self) -> None:
         await self._gateway.opened.wait()
@@ -134,6 +159,9 @@ class Daemon:
             self._reload_problem = f"new configuration refused, the old one stays in use: {problems[0]}"
             if len(problems) > 1:
                 self._reload_problem += f" (and {len(problems) - 1} more in the log)"
+        except Exception as defect:  # noqa: BLE001 - what runs continues to run
+            self._defects.log(defect)
+            self._reload_problem = f"the configuration was not reloaded completely: {defect_text(defect)}"
         else:
             self._reload_problem = ""
             logger.info("configuration reloaded: %s", ", ".join(changes) or "nothing changed")

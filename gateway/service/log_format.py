@@ -56,13 +56,17 @@ class ContextFilter(logging.Filter):
         return True
 
 
-def set_up_log(level: LogLevel, log_format: LogFormat = LogFormat.AUTO) -> None:
-    """Send all log records to stderr or to the journal.
+def set_up_log(
+    level: LogLevel, log_format: LogFormat = LogFormat.AUTO, limit: logging.Filter | None = None
+) -> None:
+    """Send all log records that pass ``limit`` to stderr or to the journal.
 
     Raises ConfigError if ``log_format`` is JOURNAL and cysystemd is not installed.
     """
     handler = _handler_for(log_format)
     handler.addFilter(ContextFilter())
+    if limit is not None:
+        handler.addFilter(limit)
     logging.basicConfig(level=level.upper(), handlers=[handler])
 
 
@@ -127,7 +131,7 @@ class JsonFormatter(logging.Formatter):
             **_fields(record),
         }
         if record.exc_info:
-            fields["exception"] = safe_lines(self.formatException(record.exc_info))
+            fields["exception"] = safe_lines(record.exc_text or self.formatException(record.exc_info))
         return json.dumps(fields, ensure_ascii=False)
 
 

@@ -7,7 +7,6 @@ from typing import Any, Final
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import DefectError, LinkError, RequestError
-from gateway.log import FailureLog
 from gateway.rtc3d.components import ComponentType
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
@@ -50,7 +49,6 @@ class ChangeTasks:
         self._session = session
         self._control = control
         self._has_subscribers = has_subscribers
-        self._lateness = FailureLog(logger, status)
         self._is_wanted = True
         self._halvings = 0  # as wanted
         self._requested_halvings = 0  # in the newest request for another rate
@@ -73,9 +71,9 @@ class ChangeTasks:
             self._halvings = halvings
             self._changed.set()
         elif halvings:
-            self._lateness.failed(f"frames arrive {1000 * self._status.lag_s:.0f} ms late")
+            self._status.lateness.failed(f"frames arrive {1000 * self._status.lag_s:.0f} ms late")
         else:
-            self._lateness.recovered("frames arrive in time")
+            self._status.lateness.recovered("frames arrive in time")
 
     def request_components(self, components: Sequence[ComponentType]) -> None:
         """Start to request these components instead of the former ones; return at once."""
@@ -131,7 +129,9 @@ class ChangeTasks:
         if not self._is_wanted:
             return control.is_stopped or await self._stop()
         if control.is_stopped:
-            logger.info("%s: a subscriber appeared; frames are requested again", self._status.name)
+            self._status.events.log(
+                logging.INFO, "a subscriber appeared; frames are requested again", "demand"
+            )
             return await self._request_rate()
         if self._components is not None:
             components, self._components = self._components, None
@@ -144,7 +144,7 @@ class ChangeTasks:
     async def _stop(self) -> bool:
         is_stopped = await self._control.stop()
         if is_stopped:
-            logger.info("%s: no subscribers; the stream is stopped", self._status.name)
+            self._status.events.log(logging.INFO, "no subscribers; the stream is stopped", "demand")
         return is_stopped
 
     async def _request_rate(self) -> bool:
@@ -157,11 +157,11 @@ class ChangeTasks:
         await self._request_rate()
         request = f"asked the server for {self._status.rate or 'its default rate'}"
         if lag_ms > self._source.max_lag_ms:
-            self._lateness.failed(f"frames arrive {lag_ms:.0f} ms late; {request}")
+            self._status.lateness.failed(f"frames arrive {lag_ms:.0f} ms late; {request}")
         elif self._halvings:
             logger.debug("%s: frames arrive in time; %s", self._status.name, request)
         else:
-            self._lateness.recovered(f"frames arrive in time; {request}")
+            self._status.lateness.recovered(f"frames arrive in time; {request}")
 
     async def _follow_demand(self) -> None:
         """Want no frames while there are no subscribers, and frames within DEMAND_POLL_S of the first one."""

@@ -72,12 +72,12 @@ class PacedFrames:
         self._timer = None
         try:
             wait_s = self._backlog.publish_due()
+            # What follows has not been read yet, so silence and unanswered commands mean nothing.
+            self.caught_up_s = self._running.time()
+            self._set_reading(wait_s is None)
         except Exception as defect:  # noqa: BLE001 - the session reports it
-            self.drop()
             self._on_defect(defect)
+            self.drop()
             return
-        # What follows has not been read yet, so silence and unanswered commands mean nothing.
-        self.caught_up_s = self._running.time()
-        self._set_reading(wait_s is None)
         if wait_s is not None:
             self._timer = self._running.loop.call_later(wait_s, self._pass_on)

@@ -27,8 +27,6 @@ the server, frames that are read together after a stop of this process look like
 AnnouncedRates = Mapping[ComponentType, float]
 """The rates that the server announces, in Hz."""
 
-logger = logging.getLogger(__name__)
-
 
 class Arrivals(NamedTuple):
     """What has arrived in a session so far.
@@ -157,7 +155,8 @@ class RateWatch:
             return
         self._status.replace_limitation(self._reported.text, difference.text)
         if difference.kind is _Kind.NONE:
-            logger.info("%s: frames arrive at the right rate again", self._status.name)
+            text = "frames arrive at the right rate again"
+            self._status.events.log(logging.INFO, text, text)
         self._reported = difference
 
 

@@ -259,7 +259,10 @@ class Session:
                 self._transport.abort()
 
     def _fail_by_defect(self, defect: Exception) -> None:
-        self.fail(DefectError.of(defect))  # the supervisor logs it and connects again
+        if self._error is None:
+            self.fail(DefectError.of(defect))  # the supervisor logs it and connects again
+        else:
+            self._status.defect(defect)
 
     async def close(self) -> None:
         """Send Bye, and close the connection when the server does, or after 0.5 s.
@@ -333,11 +336,24 @@ class Session:
                 break
         return frames
 
+    def eof_received(self) -> None:
+        """Let the event loop close the connection: a server that sends no more is of no use."""
+
+    def pause_writing(self) -> None:
+        """End the session: commands are few and short, so the server has not read for long."""
+        self.fail(ClosedError(f"{self.server} does not read the gateway's commands; restart its application"))
+
+    def resume_writing(self) -> None:
+        """Do nothing; ``pause_writing`` has ended the session."""
+
     def connection_lost(self, exc: Exception | None) -> None:
         """End the session, unless it has ended already: the connection is closed, by either side."""
-        self._protocol.end()
-        reason = f"broke: {exc}" if exc else "was closed by the server"
-        self.fail(ClosedError(f"the connection to {self.server} {reason}"))
+        try:
+            self._protocol.end()
+            reason = f"broke: {exc}" if exc else "was closed by the server"
+            self.fail(ClosedError(f"the connection to {self.server} {reason}"))
+        except Exception as defect:  # noqa: BLE001 - a defect ends only this session
+            self._fail_by_defect(defect)
         self._lost.set()
 
     def _set_reading(self, is_reading: bool) -> None:
@@ -394,11 +410,15 @@ class Session:
 
     def _assume_reply(self) -> None:
         """No further reply has followed: the newest one answers the pending command."""
-        if self._error is None:
+        if self._error is not None:
+            return
+        try:
             state_before = self._protocol.state
             for event in self._protocol.assume_reply():
                 self._on_event(event)
             self._report_change(state_before)
+        except Exception as defect:  # noqa: BLE001 - a defect ends only this session
+            self._fail_by_defect(defect)
 
     def _report_change(self, state_before: ProtocolState) -> None:
         """Report the protocol's state if it has changed, and restart the stall time-out."""
@@ -421,11 +441,14 @@ class Session:
         self._ended.set()
         self._state_changed.set()
         self._end_ask(error)
-        self._files.interrupt(str(error))
-        if isinstance(error, DefectError):  # which may be one in publishing
-            self._frames.drop()
-        else:
-            self._frames.finish()
+        try:
+            self._files.interrupt(str(error))
+            if isinstance(error, DefectError):  # which may be one in publishing
+                self._frames.drop()
+            else:
+                self._frames.finish()
+        except Exception as defect:  # noqa: BLE001 - whoever waits for the end must not wait for ever
+            self._error = DefectError.of(defect)
 
     def _flush(self) -> None:
         if self._transport is not None:

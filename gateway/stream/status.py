@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from gateway.errors import DefectError, LinkError
-from gateway.log import DefectLog, FailureLog
+from gateway.log import HOLD_S, DefectLog, EventLog, FailureLog, defect_text
 from gateway.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.protocol_state import ProtocolState
@@ -79,6 +79,8 @@ class StreamStatus:
     output. ``limitations`` lists what the current connection lacks. ``unwanted_components`` are the
     components of the newest frame if it had none of this stream's; ``unwanted_since_s`` is when the first
     of these frames arrived, on the running clock. ``num_state_changes`` grows with every change of ``state``.
+    ``known_defects`` has the defects that are logged already. ``events`` logs what the server can cause again
+    and again, ``lateness`` late frames.
     """
 
     components: str
@@ -108,17 +110,23 @@ class StreamStatus:
     last_error: str = ""
     last_error_utime: int = 0
     last_error_s: float = -math.inf
+    known_defects: DefectLog | None = None
     _phase: Phase = field(default=Phase.WAITING, init=False)
+    events: EventLog = field(init=False)
+    lateness: FailureLog = field(init=False)
     _failures: FailureLog = field(init=False)
     _defects: DefectLog = field(init=False)
     _unknown_types: set[int] = field(default_factory=set, init=False)  # of this connection, those listed
     _unknown_text: str = field(default_factory=str, init=False)  # compiled, a default would not be assigned
     _logged_limitations: deque[str] = field(default_factory=lambda: deque(maxlen=MAX_LIMITATIONS), init=False)
+    _logged_request: str = field(default="", init=False)
 
     def __post_init__(self) -> None:
-        """Create the logs of losses, lost connections and defects."""
-        self._failures = FailureLog(logger, self)
-        self._defects = DefectLog(logger, self)
+        """Create the logs of losses, lost connections, defects and other events."""
+        self.events = EventLog(logger, self)
+        self.lateness = FailureLog(logger, self)
+        self._failures = FailureLog(logger, self, HOLD_S)
+        self._defects = DefectLog(logger, self, self.known_defects)
         self.losses = Losses(logger, self)
 
     def __str__(self) -> str:
@@ -153,7 +161,12 @@ class StreamStatus:
     def handshake_done(self, protocol_state: ProtocolState, server: str, request: str) -> None:
         """Note that the server accepted ``request``, a StreamFrames; frames may have arrived already."""
         self.tries = 0
-        logger.info("%s: connected to %s, which accepted %s", self.name, server, request)
+        text = f"connected to {server}, which accepted {request}"
+        if self._failures.failing and text == self._logged_request:
+            logger.debug("%s: %s", self.name, text)
+        else:
+            self._logged_request = text
+            self.events.log(logging.INFO, text, "connected")
         self._phase = Phase.READY
         self._update_state(protocol_state, "handshake done", server)
 
@@ -174,6 +187,17 @@ class StreamStatus:
         else:
             self._failures.failed(str(error))
         self._enter(Phase.WAITING, "the connection ended", str(error))
+
+    def defect(self, defect: Exception) -> None:
+        """Log a defect that ends no connection."""
+        self.record_error(defect_text(defect))
+        self._defects.log(defect)
+
+    def check(self) -> None:
+        """Log recoveries that have held for long enough. Call it once a second."""
+        if self.state in _RECEIVING:
+            self._failures.recovered(f"{self.state.value} again")
+        self.losses.check()
 
     def stopped(self, reason: str) -> None:
         """Note that the gateway closed the connection itself."""
@@ -268,12 +292,12 @@ class StreamStatus:
         self.parameters_version = version
 
     def parameters_repaired(self, repairs: Sequence[str]) -> None:
-        """Log what was repaired in the server's parameters, once for each text."""
+        """Log what was repaired in the server's parameters, once for each text unless there are many."""
         rest = f"; and {len(repairs) - _MAX_REPAIRS} more" if len(repairs) > _MAX_REPAIRS else ""
         text = f"parameters repaired: {'; '.join(repairs[:_MAX_REPAIRS])}{rest}"
         if text not in self._logged_limitations:
             self._logged_limitations.append(text)
-            logger.info("%s: %s", self.name, text)
+            self.events.log(logging.INFO, text, "parameters repaired")
 
     def rate_agreed(self, rate: str) -> None:
         """Note the rate at which the server streams; empty for its default, or while it does not stream."""
@@ -291,7 +315,7 @@ class StreamStatus:
             logger.debug("%s: %s", self.name, text)
             return
         self._logged_limitations.append(text)
-        logger.warning("%s: %s", self.name, text)
+        self.events.log(logging.WARNING, text, "limitation", MAX_LIMITATIONS)
 
     def _list_limitation(self, text: str) -> bool:
         """Add ``text`` to the limitations and return True, unless it is there or there are too many."""
@@ -324,16 +348,18 @@ class StreamStatus:
         if self.state is before:
             return
         self.num_state_changes += 1
-        # Up to the end of the handshake, these states alternate while a server is away.
+        # Up to the end of the handshake, these states alternate while a server is away. After a failure, all
+        # of them may alternate; ``check`` logs when this is over.
         is_attempt = self.state in _CONNECTING or (before in _CONNECTING and self.state not in _RECEIVING)
-        level = logging.DEBUG if is_attempt else logging.INFO
-        logger.log(level, "%s: %s → %s: %s (%s)", self.name, before.value, self.state.value, event, cause)
-        if self.state in _RECEIVING:
-            self._failures.recovered(f"{self.state.value} again")
+        text = f"{before.value} → {self.state.value}: {event} ({cause})"
+        if is_attempt or self._failures.failing:
+            logger.debug("%s: %s", self.name, text)
+        else:
+            self.events.log(logging.INFO, text, f"{before.value} → {self.state.value}")
         try:
             self.on_state(before)
         except Exception as defect:  # noqa: BLE001 - what shows the state must not stop the stream
-            self._defects.log(defect)
+            self.defect(defect)
 
 
 class FrameRate:

@@ -24,8 +24,6 @@ from gateway.stream.rate_control import halved, stream_requests
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 
-logger = logging.getLogger(__name__)
-
 
 class _Outcome(Enum):
     """How the server reacts to a request for frames."""
@@ -139,7 +137,7 @@ class StreamControl:
             text = f"all frames from {server} are rejected: {rejection}"
         if self._asked_again:
             raise SilenceError(f"{text}, although the gateway asked again; connecting again")
-        logger.info("%s: %s; asking again", self._status.name, text)
+        self._status.events.log(logging.INFO, f"{text}; asking again", "asking again")
         if await self._request(requested) is not _Outcome.ACCEPTED:
             raise RequestError(f"{server} no longer accepts {requested}; connecting again")
         self._asked_again = True

@@ -2,17 +2,17 @@
 
 import asyncio
 import logging
-import random
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple, NoReturn
 
-from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
+from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import DefectError, LinkError
 from gateway.log import log_fields
 from gateway.messages.host_time import host_clock
 from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
+from gateway.stream.backoff import Backoff
 from gateway.stream.change_tasks import ChangeTasks
 from gateway.stream.files import FileReceiver
 from gateway.stream.ingest import Ingest, Publish, Skip
@@ -55,17 +55,6 @@ class Listener:
 
     def ended(self, stream: "Supervisor", error: LinkError) -> None:
         """Called when a connection ended, or could not be made."""
-
-
-def backoff_delays_s(reconnect: ReconnectSettings) -> Iterator[float]:
-    """Yield the delays between attempts: doubling up to a maximum, each shortened at random by up to half.
-
-    The randomness prevents many gateways from reconnecting to a restarted server at the same moment.
-    """
-    delay_s = reconnect.first_delay_s
-    while True:
-        yield delay_s * random.uniform(0.5, 1.0)  # noqa: S311 - spreads load, hides nothing
-        delay_s = min(2 * delay_s, reconnect.max_delay_s)
 
 
 class Supervisor:
@@ -147,8 +136,7 @@ class Supervisor:
 
     async def _run_sessions(self) -> None:
         loop = asyncio.get_running_loop()
-        reconnect = self._source.reconnect
-        delays_s = backoff_delays_s(reconnect)
+        backoff = Backoff(self._source.reconnect)
         while True:
             frames_before = self.status.frames_in
             began_s = loop.time()
@@ -156,14 +144,14 @@ class Supervisor:
             had_data = self.status.frames_in > frames_before or (
                 self.status.state is StreamState.NO_MEASUREMENT
             )
-            if had_data and not isinstance(error, DefectError):
-                delays_s = backoff_delays_s(reconnect)
             self.status.disconnected(error)
             self._listener.ended(self, error)
             # The time that the attempt took counts as waiting. Otherwise a server that hung for long and has
             # recovered would wait for its client even longer.
             lasted_s = loop.time() - began_s
-            await asyncio.sleep(max(next(delays_s) - lasted_s, next(backoff_delays_s(reconnect))))
+            is_defect = isinstance(error, DefectError)
+            delay_s = backoff.delay_after(lasted_s, had_data=had_data and not is_defect)
+            await asyncio.sleep(max(delay_s - lasted_s, backoff.shortest_s))
             self.status.reconnecting()
 
     async def _run_session_to_its_end(self) -> LinkError:
@@ -173,7 +161,23 @@ class Supervisor:
         except LinkError as error:
             return error
         except Exception as defect:  # noqa: BLE001 - a defect in one stream must not stop the others
+            self._check_cancelled(defect)
             return DefectError.of(defect)
+        except asyncio.CancelledError as defect:
+            self._check_cancelled(defect)
+            return DefectError.of(defect)
+
+    def _check_cancelled(self, defect: BaseException) -> None:
+        """Raise CancelledError if somebody has cancelled the stream.
+
+        A defect while the session is closed must not replace it, or the stream would never end. A
+        CancelledError that nobody asked for, of something that the session waited for, is a defect.
+        """
+        task = asyncio.current_task()
+        if task is not None and task.cancelling():
+            if isinstance(defect, Exception):
+                self.status.defect(defect)
+            raise asyncio.CancelledError
 
     async def _run_session(self) -> NoReturn:
         """Run one session until it ends; raise LinkError with the reason."""

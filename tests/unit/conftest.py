@@ -13,6 +13,7 @@ _IN_VIRTUAL_TIME: Final = {
     "test_automatic_streams.py",
     "test_daemon.py",
     "test_gateway.py",
+    "test_gateway_defects.py",
     "test_source.py",
     "test_source_parameters.py",
 }

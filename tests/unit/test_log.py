@@ -5,7 +5,16 @@ from collections.abc import Iterator
 
 import pytest
 
-from gateway.log import FIELDS, DefectLog, FailureLog, log_fields
+from gateway.log import (
+    FIELDS,
+    HOLD_S,
+    MAX_HOLD_S,
+    MAX_REPEATS,
+    DefectLog,
+    EventLog,
+    FailureLog,
+    log_fields,
+)
 from gateway.service.log_format import ContextFilter
 
 LOGGER = logging.getLogger("tests.failures")
@@ -176,3 +185,79 @@ def test_a_defect_is_an_error_with_its_traceback_once_for_each_place(
     assert first.exc_info is not None
     assert (again.levelname, again.exc_info) == ("DEBUG", None)
     assert again.message.endswith("'two'; report this with the log (again)")
+
+
+# What comes again and again ------------------------------------------------------------------
+
+
+class Clock:
+    """Replaces the clock of gateway.log."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_s = 0.0
+        monkeypatch.setattr("gateway.log.monotonic", lambda: self.now_s)
+
+
+def test_an_event_is_logged_some_times_and_then_as_debug(caplog: pytest.LogCaptureFixture) -> None:
+    events = EventLog(LOGGER, "lab")
+    for _ in range(3 * MAX_REPEATS):
+        events.log(logging.WARNING, "renamed", "renamed")
+    events.log(logging.INFO, "changed", "changed")
+    assert levels(caplog) == [
+        *[logging.WARNING] * MAX_REPEATS,
+        *[logging.DEBUG] * 2 * MAX_REPEATS,
+        logging.INFO,
+    ]
+
+
+def test_the_next_loud_event_says_how_many_were_hidden(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock(monkeypatch)
+    events = EventLog(LOGGER, "lab")
+    for _ in range(MAX_REPEATS + 3):
+        events.log(logging.INFO, "renamed", "renamed")
+    clock.now_s = 600.0
+    for _ in range(2):
+        events.log(logging.INFO, "renamed", "renamed")
+    assert caplog.messages[-2:] == ["lab: renamed (3 more like this since the last one)", "lab: renamed"]
+
+
+def test_failures_that_come_and_go_are_logged_some_times(caplog: pytest.LogCaptureFixture) -> None:
+    failures = FailureLog(LOGGER, "lab")
+    for _ in range(100):
+        failures.failed("no router")
+        failures.recovered("connected")
+    assert levels(caplog) == [
+        *[logging.WARNING, logging.INFO] * MAX_REPEATS,
+        *[logging.DEBUG] * 2 * (100 - MAX_REPEATS),
+    ]
+
+
+def test_the_hold_time_grows_while_failures_come_back_soon(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clock = Clock(monkeypatch)
+    failures = FailureLog(LOGGER, "lab", HOLD_S)
+    for second in range(3600):
+        clock.now_s = float(second)
+        if second % 20 == 0:
+            failures.failed("closed")
+        failures.recovered("streaming")
+    loud = [record for record in caplog.records if record.levelno > logging.DEBUG]
+    assert len(loud) == 5
+    clock.now_s += MAX_HOLD_S
+    failures.recovered("streaming")
+    assert not failures.failing
+
+
+def test_a_log_of_defects_can_continue_a_former_one(caplog: pytest.LogCaptureFixture) -> None:
+    former = DefectLog(LOGGER, "lab")
+    logs = [former, DefectLog(LOGGER, "lab (3d)", former)]
+    for defects in logs:
+        try:
+            int("x")
+        except ValueError as defect:
+            defects.log(defect)
+    assert levels(caplog) == [logging.ERROR, logging.DEBUG]
+    assert [defects.count for defects in logs] == [2, 2]

@@ -10,14 +10,17 @@ from typing import Any
 import pytest
 
 from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
-from gateway.log import current_log_fields
+from gateway.log import HOLD_S, current_log_fields
 from gateway.messages.stamp import Stamp
 from gateway.rtc3d.commands import StreamFrames
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.parameters_xml import ParsedParameters
+from gateway.stream.backoff import Backoff
+from gateway.stream.parameters import Connection
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
-from gateway.stream.supervisor import Callbacks, Listener, Supervisor, backoff_delays_s
+from gateway.stream.supervisor import Callbacks, Listener, Supervisor
 from tests.servers import packet
 from tests.unit.stream.collected_files import CollectedFiles
 from tests.unit.stream.scripted_server import ScriptedServer, read_parameters, refusing, silent_to
@@ -114,7 +117,10 @@ def assert_delays(delays_s: list[float], nominal_s: list[float]) -> None:
 
 def test_delays_double_up_to_the_maximum_and_are_shortened_at_random() -> None:
     reconnect = ReconnectSettings(first_delay_s=FIRST_DELAY_S, max_delay_s=MAX_DELAY_S)
-    runs = [[next(delays) for _ in range(9)] for delays in (backoff_delays_s(reconnect) for _ in range(50))]
+    runs = [
+        [backoff.delay_after(0.0, had_data=False) for _ in range(9)]
+        for backoff in (Backoff(reconnect) for _ in range(50))
+    ]
     for delays_s in runs:
         assert_delays(delays_s, [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10, 10, 10])
     assert len({run[0] for run in runs}) > 1
@@ -174,7 +180,11 @@ async def test_delays_continue_to_grow_if_connections_bring_nothing() -> None:
     assert lab.status.reconnects >= 7
 
 
-async def test_recovery_is_logged_once_with_its_duration(caplog: pytest.LogCaptureFixture) -> None:
+async def test_recovery_is_logged_once_with_its_duration_when_it_has_held(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 0.0
+    monkeypatch.setattr("gateway.log.monotonic", lambda: now_s)
     caplog.set_level(logging.INFO, "gateway.stream")
     lab = Lab()
     lab.server.refuses = True
@@ -183,11 +193,92 @@ async def test_recovery_is_logged_once_with_its_duration(caplog: pytest.LogCaptu
         lab.server.refuses = False
         await lab.ready()
         lab.server.connection.send_frames(1)
-    refused, connected, state, recovered = caplog.messages
+        lab.status.check()
+        now_s += HOLD_S
+        lab.status.check()
+    refused, connected, recovered = caplog.messages
     assert refused == "lab (3d): connection refused by the test"
     assert connected == "lab (3d): connected to 192.0.2.20:3020, which accepted StreamFrames AllFrames"
-    assert state == "lab (3d): idle → streaming: a frame arrived (192.0.2.20:3020)"
-    assert recovered.startswith("lab (3d): streaming again, after ")
+    assert recovered == "lab (3d): streaming again, after 5.0 s and 3 failures"
+
+
+async def test_a_server_that_breaks_again_and_again_is_logged_once(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO, "gateway.stream")
+    lab = Lab()
+    async with running(lab):
+        for connection in range(1, 6):
+            await lab.ready(connection)
+            lab.server.connection.send_frames(connection)
+            lab.status.check()
+            lab.server.connection.end()
+    assert [(record.levelname, record.getMessage()) for record in caplog.records] == [
+        ("INFO", "lab (3d): connected to 192.0.2.20:3020, which accepted StreamFrames AllFrames"),
+        ("INFO", "lab (3d): idle → streaming: a frame arrived (192.0.2.20:3020)"),
+        ("WARNING", "lab (3d): the connection to 192.0.2.20:3020 was closed by the server"),
+    ]
+
+
+async def test_a_server_that_sends_some_frames_and_breaks_is_tried_as_rarely_as_one_that_is_off() -> None:
+    lab = Lab()
+    async with running(lab):
+        for connection in range(1, 10):
+            await lab.ready(connection)
+            lab.server.connection.send_frames(1, 2, 3)
+            lab.server.connection.end()
+        await lab.tried(10)
+    assert_delays(lab.delays_s[:9], [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10, 10, 10])
+
+
+async def test_a_steady_connection_starts_the_delays_again() -> None:
+    lab = Lab()
+    async with running(lab):
+        for connection in range(1, 6):
+            await lab.ready(connection)
+            lab.server.connection.send_frames(1)
+            lab.server.connection.end()
+        await lab.ready(6)
+        for number in range(6):
+            lab.server.connection.send_frames(number)
+            await asyncio.sleep(2)
+        lab.server.connection.end()
+        ended_s = asyncio.get_running_loop().time()
+        await lab.ready(7)
+    assert_delays([lab.server.tried_s[-1] - ended_s], [0.2])
+
+
+async def test_a_defect_that_replaces_the_cancellation_does_not_keep_the_stream_running(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    lab = Lab()
+    async with running(lab) as task:
+        await lab.ready()
+        monkeypatch.setattr(lab.supervisor.session, "close", _raise_defect)
+        task.cancel()
+        await asyncio.wait([task], timeout=10)
+        assert task.cancelled()
+    assert [record.levelname for record in caplog.records if record.exc_info] == ["ERROR"]
+
+
+async def test_a_cancelled_future_that_a_session_waits_for_is_a_defect(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    lab = Lab()
+    cancelled: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+    cancelled.cancel()
+
+    async def read_cancelled(connection: Connection) -> ParsedParameters:
+        await cancelled
+        return await read_parameters(connection)
+
+    monkeypatch.setattr(
+        lab.supervisor, "_callbacks", lab.supervisor._callbacks._replace(read_parameters=read_cancelled)
+    )
+    async with running(lab):
+        await lab.tried(3)
+    assert "CancelledError" in lab.status.last_error
+    assert [record.levelname for record in caplog.records if record.exc_info] == ["ERROR"]
 
 
 async def test_a_silent_measurement_leads_to_a_new_connection() -> None:

@@ -1,0 +1,154 @@
+"""The last line of defence against a log that grows without limit: so many lines a minute, of bounded length.
+
+Each message is limited where it is logged, too (see ``gateway.log``). This limit is for what nobody expected,
+such as defects, and for many messages that come together.
+"""
+
+import logging
+import threading
+import traceback
+from collections.abc import Callable
+from time import monotonic
+from typing import Final
+
+from gateway.safe_text import safe_text
+
+BURST_LINES: Final = 25
+LINES_PER_MINUTE: Final = 20
+"""For each source, and for everything that belongs to none: so many lines at once, and so many a minute."""
+
+TOTAL_BURST_LINES: Final = 30
+TOTAL_LINES_PER_MINUTE: Final = 30
+"""The same for everything together."""
+
+OWN_BURST_LINES: Final = 6
+OWN_LINES_PER_MINUTE: Final = 2
+"""What each source may log even if others have used up what there is for everything together."""
+
+MAX_LINE_LENGTH: Final = 1500
+"""Longer lines are cut, in characters."""
+
+_MAX_TRACEBACK_LINES: Final = 30
+_FIRST_TRACEBACK_LINES: Final = 6
+"""Of longer tracebacks, the first lines and the last ones are logged."""
+
+_REPORT_S: Final = 60.0
+
+logger = logging.getLogger(__name__)
+
+
+class _Bucket:
+    """A token bucket: one token per line. A message passes if there is one token, and may use up more."""
+
+    def __init__(self, burst: int, per_minute: int, now_s: float) -> None:
+        self._burst = float(burst)
+        self._per_s = per_minute / 60
+        self._tokens = self._burst
+        self._filled_s = now_s
+
+    def fill(self, now_s: float) -> float:
+        """Add the tokens of the time since the last call; return how many there are."""
+        self._tokens = min(self._burst, self._tokens + self._per_s * (now_s - self._filled_s))
+        self._filled_s = now_s
+        return self._tokens
+
+    def take(self, lines: int) -> None:
+        self._tokens -= lines
+
+    def take_available(self, lines: int) -> None:
+        self._tokens = max(0.0, self._tokens - lines)
+
+
+class _Scope:
+    """The messages of one source, or of everything else."""
+
+    def __init__(self, now_s: float) -> None:
+        self.bucket = _Bucket(BURST_LINES, LINES_PER_MINUTE, now_s)
+        self.own = _Bucket(OWN_BURST_LINES, OWN_LINES_PER_MINUTE, now_s)
+        self.suppressed: dict[str, int] = {}  # by level
+        self.newest = ""
+        self.since_s = 0.0  # of the first suppressed message
+
+    def suppress(self, record: logging.LogRecord, now_s: float) -> None:
+        if not self.suppressed:
+            self.since_s = now_s
+        self.suppressed[record.levelname] = self.suppressed.get(record.levelname, 0) + 1
+        self.newest = record.getMessage()[:200]
+
+
+class LogLimit(logging.Filter):
+    """Limits how many lines pass a handler, and how long they are; see the constants of this module.
+
+    Attach it after ContextFilter, which knows the source. DEBUG is not limited. ``report`` logs how many
+    messages were suppressed.
+    """
+
+    def __init__(self, monotonic: Callable[[], float] = monotonic) -> None:
+        super().__init__()
+        self._monotonic = monotonic
+        self._lock = threading.Lock()  # any thread may log
+        self._total = _Bucket(TOTAL_BURST_LINES, TOTAL_LINES_PER_MINUTE, monotonic())
+        self._scopes: dict[str, _Scope] = {}  # by the source's name, from the configuration; "" for the rest
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Shorten the record; return whether it is within the limit."""
+        lines = _shorten(record)
+        if record.levelno <= logging.DEBUG or record.name == __name__:
+            return True
+        now_s = self._monotonic()
+        with self._lock:
+            name = str(getattr(record, "source", ""))
+            scope = self._scopes.get(name)
+            if scope is None:
+                scope = self._scopes[name] = _Scope(now_s)
+            tokens, own, total = (each.fill(now_s) for each in (scope.bucket, scope.own, self._total))
+            if tokens < 1 or max(own, total) < 1:
+                scope.suppress(record, now_s)
+                return False
+            scope.bucket.take(lines)
+            scope.own.take_available(lines)
+            self._total.take(lines)
+            return True
+
+    def report(self, *, at_once: bool = False) -> None:
+        """Log what was suppressed, a minute after it began unless ``at_once``. Call it once a second."""
+        now_s = self._monotonic()
+        with self._lock:
+            due = [
+                (name, scope.suppressed, scope.newest)
+                for name, scope in self._scopes.items()
+                if scope.suppressed and (at_once or now_s - scope.since_s >= _REPORT_S)
+            ]
+            for name, _, _ in due:
+                self._scopes[name].suppressed = {}
+        for name, suppressed, newest in due:
+            logger.warning(
+                "%s: %d further messages suppressed in the last minute (%s); the status has the counts; "
+                "the newest: %s",
+                name or "gateway",
+                sum(suppressed.values()),
+                ", ".join(f"{count} {level}" for level, count in suppressed.items()),
+                newest,
+            )
+
+
+def _shorten(record: logging.LogRecord) -> int:
+    """Bound the length of a record's lines; return how many it has. Its message is one line."""
+    text = record.getMessage()
+    if len(text) > MAX_LINE_LENGTH or not text.isprintable():
+        record.msg, record.args = safe_text(text, MAX_LINE_LENGTH), ()
+    if not record.exc_info:
+        return 1
+    record.exc_text = _traceback_text(record.exc_info[1])
+    return 1 + record.exc_text.count("\n") + 1
+
+
+def _traceback_text(error: BaseException | None) -> str:
+    """Return a traceback without the lines in the middle of a long one."""
+    text = "".join(traceback.format_exception(error)) if error is not None else ""
+    lines = [safe_text(line, MAX_LINE_LENGTH) for line in text.rstrip("\n").split("\n")]
+    left_out = len(lines) - _MAX_TRACEBACK_LINES
+    if left_out > 0:
+        first, last = lines[:_FIRST_TRACEBACK_LINES], lines[_FIRST_TRACEBACK_LINES + left_out :]
+        lines = [*first, f"  … {left_out} lines left out …", *last]
+    return "\n".join(lines)

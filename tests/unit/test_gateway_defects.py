@@ -1,0 +1,172 @@
+"""A whole gateway in virtual time: a defect ends what it concerns, and nothing else."""
+
+import asyncio
+import logging
+from typing import Any
+
+import pytest
+
+from gateway.log import current_log_fields
+from gateway.publish.fan_out import FanOut
+from gateway.queries.parameter_refresh import ParameterRefresh
+from gateway.rtc3d.client_protocol import ClientProtocol
+from gateway.rtc3d.components import ComponentType
+from gateway.source import Source
+from gateway.stream.ingest import Ingest
+from gateway.stream.session import Session
+from gateway.stream.state import StreamState
+from gateway.stream.status import StreamStatus
+from gateway.stream.streams import AutomaticStreams
+from gateway.stream.supervisor import Supervisor
+from tests.unit.scripted_sources import Servers
+from tests.unit.stream.virtual_time import settle
+from tests.unit.test_gateway import (
+    RecordingOutput,
+    connected,
+    events,  # noqa: F401 - a fixture
+    running,
+    settings,
+    subscribe,
+)
+
+pytestmark = pytest.mark.usefixtures("servers", "threads")
+
+
+def let_fail(monkeypatch: pytest.MonkeyPatch, owner: type, method: str) -> set[str]:
+    """Let a method raise in the sources whose names are in the set that is returned."""
+    failing: set[str] = set()
+    original = getattr(owner, method)
+
+    def call(self: Any, *args: Any, **options: Any) -> Any:
+        owners = [getattr(self, name, None) for name in ("name", "_source", "_status")]
+        names = {getattr(owner, "name", owner) for owner in owners} | {current_log_fields().get("source")}
+        if any(str(name).partition(" ")[0] in failing for name in names):
+            raise ZeroDivisionError("by the test")
+        return original(self, *args, **options)
+
+    monkeypatch.setattr(owner, method, call)
+    return failing
+
+
+DEFECTS = [
+    (StreamStatus, "disconnected"),
+    (StreamStatus, "connecting"),
+    (StreamStatus, "reconnecting"),
+    (StreamStatus, "check"),
+    (AutomaticStreams, "check"),
+    (Supervisor, "check_rate"),
+    (Source, "publish_status"),
+    (Source, "_encoded_status"),
+    (Source, "_read_parameters"),
+    (Source, "_on_state"),
+    (FanOut, "publish"),
+    (FanOut, "publish_clock"),
+    (FanOut, "check_losses"),
+    (Session, "_receive"),
+    (Session, "_report_change"),
+    (Session, "close"),
+    (ParameterRefresh, "_due_s"),
+    (Ingest, "receive"),
+    (ClientProtocol, "receive"),
+]
+
+
+@pytest.mark.interpreted
+@pytest.mark.parametrize(
+    ("owner", "method"), DEFECTS, ids=[f"{each[0].__name__}.{each[1]}" for each in DEFECTS]
+)
+async def test_a_defect_in_one_source_is_logged_once_and_the_source_recovers(
+    servers: Servers,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+    owner: type,
+    method: str,
+) -> None:
+    caplog.set_level(logging.INFO)
+    failing = let_fail(monkeypatch, owner, method)
+    async with running(settings("lab", "hall")) as (gateway, _):
+        await connected(gateway)
+        failing.add("lab")
+        for _ in range(60):  # the servers send frames, and that of lab breaks off
+            for name in ("lab", "hall"):
+                servers[name].connection.send_frames(1)
+            await asyncio.sleep(1)
+            servers["lab"].connection.end()
+            await asyncio.sleep(1)
+        assert len(servers["hall"].connections) == 1
+        errors = [record for record in caplog.records if record.levelno >= logging.ERROR]
+        assert len(errors) == len({record.getMessage().split("(")[0] for record in errors})
+        assert 1 <= len([record for record in errors if record.exc_info]) <= 2
+        assert {current.getMessage()[:3] for current in errors} == {"lab"}
+        failing.clear()
+        before = gateway.sources[0].fan_out.frames[ComponentType.MARKERS]
+        await asyncio.sleep(60)
+        await connected(gateway)
+        servers["lab"].connection.send_frames(1)
+        await settle()
+        assert gateway.sources[0].fan_out.frames[ComponentType.MARKERS] > before
+
+
+@pytest.mark.parametrize(
+    "method", ["start", "health", "maintain", "show_streaming", "publish_parameters", "stop_queries", "close"]
+)
+async def test_a_defect_in_one_output_does_not_stop_the_others(
+    servers: Servers, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, method: str
+) -> None:
+    def fail(*_: Any) -> None:
+        raise ZeroDivisionError("by the test")
+
+    async with running(settings(example="broken", other="elsewhere")) as (gateway, _):
+        monkeypatch.setattr(gateway.outputs[0], method, fail)
+        await connected(gateway)
+        messages = subscribe("elsewhere")
+        for _ in range(5):
+            servers["lab"].connection.send_frames(1)
+            await asyncio.sleep(1)
+        assert len(messages) == 5
+    assert len([record for record in caplog.records if record.exc_info]) <= 1
+    assert ("close", "elsewhere") in RecordingOutput.events
+
+
+async def test_the_tasks_of_a_source_that_end_or_are_cancelled_are_started_again(
+    servers: Servers, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    ends = iter([asyncio.sleep, asyncio.CancelledError])
+    run = AutomaticStreams.run
+
+    async def end(streams: AutomaticStreams) -> None:
+        match next(ends, None):
+            case None:
+                await run(streams)
+            case asyncio.CancelledError:
+                raise asyncio.CancelledError
+
+    monkeypatch.setattr(AutomaticStreams, "run", end)
+    async with running(settings()) as (gateway, _):
+        await asyncio.sleep(5)
+        await connected(gateway)
+        assert servers["lab"].connection.is_open
+    assert "the streams have ended, and nobody stopped them" in caplog.text
+    assert "the source has ended, and nobody stopped it" in caplog.text
+
+
+async def test_a_source_that_had_a_defect_continues_its_numbers_and_shows_why(
+    servers: Servers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    failing = let_fail(monkeypatch, AutomaticStreams, "check")
+    async with running(settings("lab", "hall")) as (gateway, _):
+        await connected(gateway)
+        messages = subscribe("local", source="lab")
+        servers["lab"].connection.send_frames(1)
+        failing.add("lab")
+        await asyncio.sleep(1.01)
+        failing.clear()
+        status = gateway.sources[0].statuses[0]
+        assert status.state is StreamState.WAITING
+        assert status.last_error.startswith(
+            "defect in the gateway: ZeroDivisionError: by the test; the source"
+        )
+        await connected(gateway)
+        servers["lab"].connection.send_frames(2)
+        await settle()
+    assert [(message.sequence, message.session) for message in messages] == [(0, 1), (1, 2)]
