@@ -66,6 +66,7 @@ class Client:
     async def drain(self) -> None:
         """Wait until the client has taken most of what was sent; raises ConnectionError if it disconnects."""
         await self._writer.drain()
+        await asyncio.sleep(0)  # while there is room, drain returns without letting other tasks run
 
     async def commands(self, answer: Callable[[str], bytes | None]) -> None:
         """Send what ``answer`` returns for each command, until the client disconnects."""

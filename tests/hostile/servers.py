@@ -15,6 +15,7 @@ from tests.servers import Client, Script, error, markers_frame, ok, packet
 from tests.spec_parameters import in_root
 
 MIB: Final = 1 << 20
+BLOCK_BYTES: Final = 20_000
 PARAMETERS: Final = in_root(
     "<The_3D><Frequency>200</Frequency><Unit>mm</Unit><Markers>"
     "<Marker id='1'><Label>elbow</Label></Marker></Markers></The_3D>"
@@ -177,12 +178,16 @@ def random_parameters(_command: str) -> bytes:
 async def damaged_frames(client: Client) -> None:
     """Random changes of good frames, behind a right size, as fast as TCP takes them."""
     chance = random.Random(3)
+    damaged = bytearray()
     for frame in good_frames():
-        damaged = bytearray(frame)
+        begin = len(damaged)
+        damaged += frame
         for _ in range(chance.randrange(1, 4)):
-            damaged[chance.randrange(8, len(damaged))] = chance.randrange(256)
-        client.send(bytes(damaged))
-        await client.drain()
+            damaged[chance.randrange(begin + 8, len(damaged))] = chance.randrange(256)
+        if len(damaged) > BLOCK_BYTES:
+            client.send(bytes(damaged))
+            damaged.clear()
+            await client.drain()
 
 
 async def changing_marker_counts(client: Client) -> None:
