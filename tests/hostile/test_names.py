@@ -1,6 +1,7 @@
 """Eight names that nobody resolves delay no other source, no reload, and not the end."""
 
 import asyncio
+import json
 import signal
 from pathlib import Path
 
@@ -35,5 +36,15 @@ async def test_eight_dead_names_and_a_dead_name_server(
             await wait_until_async(lambda: "configuration reloaded: source dead-0 changed" in gateway.log, 2)
             await asyncio.sleep(2)  # several attempts of each source
             assert num_threads(gateway) <= threads_before
+    gateway.report.check()
+    assert gateway.report.stop_s < 2
+
+
+async def test_dead_names_of_zenoh_peers(gateway_under_attack: GatewayUnderAttack, tmp_path: Path) -> None:
+    endpoints = [f"tcp/dead-{number}.example.org:7447" for number in range(4)]
+    environ = {"RTC3D_GATEWAY__ZENOH__CONFIG__CONNECT__ENDPOINTS": json.dumps(endpoints)}
+    with dead_name_server(tmp_path) as before_command:
+        async with gateway_under_attack(environ=environ, before_command=before_command) as gateway:
+            await asyncio.sleep(3)
     gateway.report.check()
     assert gateway.report.stop_s < 2
