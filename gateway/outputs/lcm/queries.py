@@ -47,7 +47,7 @@ REPEAT_S: Final = 5.0
 
 _POLL_MS: Final = 100
 _PAUSE_S: Final = 0.02
-_JOIN_S: Final = 1.0
+_JOIN_S: Final = 0.3
 
 _FINGERPRINT: Final[bytes] = rtc3d.parameters_request_t._get_packed_fingerprint()  # noqa: SLF001 - see decode.py
 
@@ -354,7 +354,7 @@ class LcmQueries:
             for subscription in self._subscriptions.values():
                 self._shared.unsubscribe(subscription)
         if self._reply_sender is not self._sender:
-            self._reply_sender.close()
+            await WorkerThread("close lcm replies").run(self._reply_sender.close)  # may wait for a peer
 
 
 def _reply_to(request: Any) -> Any:
