@@ -4,16 +4,16 @@ import asyncio
 from collections.abc import Callable
 from typing import Final
 
-_LONG_READ_BYTES: Final = 64 * 1024
+LONG_READ_BYTES: Final = 64 * 1024
 """After a read of this size, other sources have their turn. The event loop reads up to 256 KB at once. If a
 connection fills that, the loop reads from it up to 32 times before it looks at another one."""
 
 
 class Reading:
-    """Passes what arrives to ``process``, and reads on when that is done and no backlog waits.
+    """Reads from one server only when what has arrived is processed, and no backlog waits.
 
-    ``process`` takes the bytes of one read, and when they arrived (see HostClock.read), and works for a
-    limited time. If it returns True, it is called again with b"" when the other sources had their turn. It
+    ``process`` takes further bytes, here always b"", and when the read arrived (see HostClock.read). It works
+    for a limited time. While it returns True, it is called again when the other sources had their turn. It
     must not raise.
     """
 
@@ -37,11 +37,6 @@ class Reading:
         self._transport = transport
         self._pause_or_resume()  # data may have arrived already
 
-    def receive(self, data: bytes, utime: int, steady_us: int) -> None:
-        """Take the bytes of one read."""
-        if self._process(data, utime, steady_us) or len(data) >= _LONG_READ_BYTES:
-            self._wait_for_turn(utime, steady_us)
-
     def set_backlog(self, has_backlog: bool) -> None:
         """Read and process nothing while a backlog waits."""
         self._has_backlog = has_backlog
@@ -49,7 +44,8 @@ class Reading:
             self._continue_soon()
         self._pause_or_resume()
 
-    def _wait_for_turn(self, utime: int, steady_us: int) -> None:
+    def wait_for_turn(self, utime: int, steady_us: int) -> None:
+        """Let the other sources have their turn, then process what remains of a read, and read on."""
         self._arrival = (utime, steady_us)
         self._waits_for_turn = True
         self._continue_soon()
@@ -67,7 +63,7 @@ class Reading:
         self._waits_for_turn = False
         utime, steady_us = self._arrival
         if self._process(b"", utime, steady_us):
-            self._wait_for_turn(utime, steady_us)
+            self.wait_for_turn(utime, steady_us)
         self._pause_or_resume()
 
     def _pause_or_resume(self) -> None:

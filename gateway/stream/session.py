@@ -37,7 +37,7 @@ from gateway.safe_text import safe_text
 from gateway.stream.backlog import Backlog
 from gateway.stream.files import FileReceiver
 from gateway.stream.paced_frames import PacedFrames
-from gateway.stream.reading import Reading
+from gateway.stream.reading import LONG_READ_BYTES, Reading
 from gateway.stream.running_clock import running_clock
 from gateway.stream.running_time import running_timeout
 from gateway.stream.status import StreamStatus
@@ -297,8 +297,10 @@ class Session:
 
     def data_received(self, data: bytes) -> None:
         """Process the bytes of one read. From here to the outputs there are only plain calls, no tasks."""
+        utime, steady_us = self._read_clocks()
         self._status.bytes_received(len(data))
-        self._reading.receive(data, *self._read_clocks())
+        if self._process(data, utime, steady_us) or len(data) >= LONG_READ_BYTES:
+            self._reading.wait_for_turn(utime, steady_us)
 
     def _process(self, data: bytes, utime: int, steady_us: int) -> bool:
         """Process the bytes of one read for a limited time; return whether some of them remain."""
