@@ -45,7 +45,9 @@ class UnfinishedFile:
         self._descriptor, name = tempfile.mkstemp(suffix=_UNFINISHED, dir=directory)
         self._path = Path(name)
         self._num_bytes = 0
-        fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # Some network drives have no locks. There, nobody deletes the file if this gateway is killed.
+        with contextlib.suppress(OSError):
+            fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
 
     def write(self, piece: bytes) -> None:
         """Append a piece. Raises OSError."""

@@ -1,6 +1,7 @@
 """The folder of C3D files: names, limits for each source, leftovers, and a disk that refuses."""
 
 import errno
+import fcntl
 import os
 import re
 import threading
@@ -244,3 +245,17 @@ def test_a_file_is_locked_while_it_is_written(tmp_path: Path) -> None:
     os.close(unfinished._descriptor)  # what the end of a process does
     Spool(tmp_path, 1, 1).delete_abandoned()
     assert [*tmp_path.iterdir()] == []
+
+
+def test_a_drive_without_locks_stores_files_and_deletes_no_unfinished_ones(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_descriptor: int, _operation: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    spool = spool_in(tmp_path)
+    in_progress = spool.begin()
+    assert store(spool, "lab", b"x").path.read_bytes() == b"x"
+    in_progress.write(b"y")
+    assert spool.keep("hall", in_progress).path.read_bytes() == b"y"
