@@ -60,14 +60,17 @@ class UnfinishedFile:
         """Write everything to the disk, give the file its name, and return its size. Raises OSError."""
         os.fsync(self._descriptor)
         self._path.replace(path)
-        os.close(self._descriptor)
+        self._close()
         return self._num_bytes
 
     def discard(self) -> None:
         """Delete the file."""
         with contextlib.suppress(OSError):
             self._path.unlink()
-        with contextlib.suppress(OSError):
+        self._close()
+
+    def _close(self) -> None:
+        with contextlib.suppress(OSError):  # fsync has reported every error that matters
             os.close(self._descriptor)
 
 
