@@ -8,7 +8,15 @@ from typing import Any
 
 import rtc3d
 
-from gateway.cli.params_query import DISCOVERY_S, RETRY_S, ParametersReply, Replies, Sections, TimeLimits
+from gateway.cli.params_query import (
+    BUSY_CODES,
+    DISCOVERY_S,
+    RETRY_S,
+    ParametersReply,
+    Replies,
+    Sections,
+    TimeLimits,
+)
 from gateway.errors import OutputError, ProtocolError, QueryError
 from gateway.messages.decode import decode
 from gateway.messages.topics import lcm_channel
@@ -48,7 +56,7 @@ def query_lcm(
     if not sources:
         replies.problems.append(_no_gateway(prefix, url))
     for name in sources:
-        reply = client.replies.get(name)
+        reply = client.replies.get(name) or client.busy.get(name)
         if reply is not None and not reply.error:
             replies.received.append(ParametersReply(name, sections, reply.xml.encode(), reply.age_s))
         elif reply is not None:
@@ -75,6 +83,8 @@ class _LcmClient:
         """Sources that have sent a status message."""
         self.replies: dict[str, Any] = {}
         """``parameters_reply_t`` by source."""
+        self.busy: dict[str, Any] = {}
+        """The replies of gateways that get too many requests; the requests are repeated."""
         self._is_complete = threading.Event()
         channels = f"{re.escape(prefix)}_.+_"
         self._subscribers = [
@@ -93,7 +103,8 @@ class _LcmClient:
             case rtc3d.parameters_reply_t() if message.requester == self._request.requester:
                 source = self._sources_by_request_id.get(message.request_id)
                 if source is not None:
-                    self.replies.setdefault(source, message)
+                    replies = self.busy if message.error_code in BUSY_CODES else self.replies
+                    replies.setdefault(source, message)
                 if len(self.replies) == len(self._sources_by_request_id):
                     self._is_complete.set()
 

@@ -6,7 +6,10 @@ from typing import Final, NamedTuple
 from gateway.errors import QueryError
 
 RETRY_S: Final = 0.5
-"""How long to wait before repeating a query that got no reply."""
+"""How long to wait before repeating a query that got no reply, or came while there were too many."""
+
+BUSY_CODES: Final = frozenset({"busy", "rate"})
+"""The codes of a gateway that gets too many queries. They count as no reply as long as there is time."""
 
 DISCOVERY_S: Final = 2.5
 """How long it may take to find a gateway: Zenoh needs time to connect; LCM carries one status a second."""

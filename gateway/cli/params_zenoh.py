@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import zenoh
 
-from gateway.cli.params_query import RETRY_S, ParametersReply, Replies, Sections, TimeLimits
+from gateway.cli.params_query import BUSY_CODES, RETRY_S, ParametersReply, Replies, Sections, TimeLimits
 from gateway.errors import OutputError, QueryError
 from gateway.messages.topics import unique_name, zenoh_key
 from gateway.outputs.encodings import TEXT
@@ -52,6 +52,7 @@ class _ZenohClient:
         self._limits = limits
         self._replies = replies
         self._unique_names: dict[tuple[str, str], str] = {}  # by source and the gateway's Zenoh id
+        self._busy: QueryError | None = None  # what a gateway said that gets too many queries
 
     def query(self, keys: list[str], source: str | None, *, fresh: bool) -> None:
         """Query ``keys``, and repeat those without a reply; raises QueryError when time is up."""
@@ -61,12 +62,15 @@ class _ZenohClient:
             if left_s == 0 or self._limits.discovery_is_over:
                 self._require_gateway(source)
             if left_s == 0:
-                raise self._limits.no_reply(", ".join(unanswered))
+                raise self._busy or self._limits.no_reply(", ".join(unanswered))
             time.sleep(min(RETRY_S, left_s))
             unanswered = self._query_once(unanswered, fresh=fresh)
 
     def _query_once(self, keys: list[str], *, fresh: bool) -> list[str]:
-        """Query ``keys`` and return those without any reply, as happens while Zenoh reconnects."""
+        """Query ``keys`` and return those without any reply, as happens while Zenoh reconnects.
+
+        That a gateway gets too many queries is no reply either.
+        """
         options = "?fresh=true" if fresh else ""
         handlers = {
             # NONE keeps the replies of all gateways: several may serve sources of the same name.
@@ -83,11 +87,15 @@ class _ZenohClient:
         """Add the replies to one query; return whether there was any."""
         is_answered = False
         for reply in handler:
-            is_answered = True
             if reply.ok is not None:
                 self._replies.received.append(self._parameters_reply(reply.ok, str(reply.replier_id)))
             elif reply.err is not None:
-                self._replies.problems.append(self._problem(reply.err))
+                problem = self._problem(reply.err)
+                if problem.code in BUSY_CODES:
+                    self._busy = problem
+                    continue
+                self._replies.problems.append(problem)
+            is_answered = True
         return is_answered
 
     def _parameters_reply(self, sample: zenoh.Sample, gateway: str) -> ParametersReply:

@@ -10,10 +10,14 @@ from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
 
 import pytest
+import rtc3d
 import zenoh
 
 from gateway.outputs.encodings import json_bytes
 from gateway.outputs.lcm import queries as lcm_queries
+from gateway.outputs.lcm.connection import open_lcm
+from gateway.outputs.lcm.settings import lcm_queries_url
+from gateway.outputs.lcm.subscriber import LcmSubscriber
 from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
 from tests.queried_gateway import ParameterServer, ServerOfSections, run_gateway, wait_until_cached
 from tests.servers import ScriptedServer
@@ -273,8 +277,9 @@ async def test_several_sources_are_found_on_lcm() -> None:
     assert labels == {"lab": "of the first", "hall-2": "of the second"}
 
 
-async def test_a_query_without_a_reply_is_repeated() -> None:
-    """The first two queries get no reply, as while Zenoh reconnects; the third one does."""
+@pytest.mark.parametrize("code", ["", "rate", "busy"])
+async def test_a_query_without_a_reply_is_repeated(code: str) -> None:
+    """The first two queries get no reply, as while Zenoh reconnects, or an error; the third one does."""
     endpoint = free_endpoint()
     session = open_zenoh("peer", listen=endpoint)
     queries: list[zenoh.Query] = []
@@ -284,6 +289,8 @@ async def test_a_query_without_a_reply_is_repeated() -> None:
         with query:
             if len(queries) > 2:
                 query.reply("mocap/lab/parameters", spec_xml("3d"), attachment=json_bytes({"age_s": 3.5}))
+            elif code:
+                query.reply_err("too many queries", encoding=zenoh.Encoding("text/plain").with_schema(code))
 
     token = session.liveliness().declare_token("mocap/lab/alive")
     session.declare_queryable("mocap/lab/**", on_query)
@@ -295,6 +302,49 @@ async def test_a_query_without_a_reply_is_repeated() -> None:
     assert (done.status, done.stderr) == (0, "")
     assert json.loads(done.stdout)["lab"]["age_s"] == 3.5
     assert len(queries) == 3
+
+
+async def test_a_refusal_is_shown_if_there_is_no_time_left() -> None:
+    endpoint = free_endpoint()
+    session = open_zenoh("peer", listen=endpoint)
+
+    def on_query(query: zenoh.Query) -> None:
+        with query:
+            query.reply_err("too many queries", encoding=zenoh.Encoding("text/plain").with_schema("rate"))
+
+    token = session.liveliness().declare_token("mocap/lab/alive")
+    session.declare_queryable("mocap/lab/**", on_query)
+    try:
+        done = await run("params", "--connect", endpoint, "--timeout", "1")
+    finally:
+        token.undeclare()
+        session.close()
+    assert (done.status, done.stdout) == (1, "")
+    assert "too many queries" in done.stderr
+
+
+async def test_a_request_on_lcm_is_repeated_after_a_refusal() -> None:
+    url = lcm_url()
+    connection = open_lcm(lcm_queries_url(url))
+    requests: list[bytes] = []
+
+    def on_request(_channel: str, data: bytes) -> None:
+        requests.append(data)
+        request, reply = rtc3d.parameters_request_t.decode(data), rtc3d.parameters_reply_t()
+        reply.request_id, reply.requester = request.request_id, request.requester
+        if len(requests) < 3:
+            reply.error, reply.error_code = "too many requests", "rate"
+        else:
+            reply.xml, reply.age_s = spec_xml("3d").decode(), 3.5
+        connection.publish("MOCAP_LAB_PARAMETERS_REPLY", reply.encode())
+
+    gateway = LcmSubscriber(connection, "MOCAP_LAB_PARAMETERS_REQUEST", on_request)
+    try:
+        done = await run("params", "--json", "--lcm", "--url", url, "--source", "lab")
+    finally:
+        gateway.close()
+    assert (done.status, done.stderr) == (0, "")
+    assert json.loads(done.stdout)["lab"]["age_s"] == 3.5
 
 
 async def test_echo_prints_published_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
