@@ -5,7 +5,7 @@ import logging
 from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from gateway.errors import ParametersError
 from gateway.log import EventLog
@@ -28,6 +28,9 @@ from gateway.stream.parameters import XmlThread
 
 Sections = tuple[str, ...]
 """The parameter sections of a query, as in SECTIONS; () for all."""
+
+MAX_PARTS: Final = 16
+"""How many answers for some of the sections are kept. Peers can ask for 63 different ones."""
 
 logger = logging.getLogger(__name__)
 
@@ -52,7 +55,7 @@ class ServerAnswer:
     version: int
     is_readable: bool = True
     received_s: float = field(default_factory=now_s)
-    _single_sections: dict[Sections, "ServerAnswer | None"] = field(
+    _parts: dict[Sections, "ServerAnswer | None"] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
@@ -86,12 +89,13 @@ class ServerAnswer:
         Returns None if this answer lacks one of them, or if it is not well-formed. Then only the server
         itself can answer.
         """
-        if sections in self._single_sections:
-            return self._single_sections[sections]
+        if sections in self._parts:
+            return self._parts[sections]
         xml = await xml_thread.process(self.xml, lambda whole: extract_sections(whole, sections))
         answer = None if xml is None else replace(self, sections=sections, xml=xml)
-        if len(sections) == 1:
-            self._single_sections[sections] = answer
+        if len(self._parts) >= MAX_PARTS:
+            del self._parts[next(iter(self._parts))]
+        self._parts[sections] = answer
         return answer
 
 

@@ -2,14 +2,16 @@
 
 import asyncio
 import logging
+from itertools import combinations
 
 import pytest
 
 from gateway.errors import ClosedError, ParametersError, ReplyTimeoutError, ServerError
+from gateway.queries.known_parameters import MAX_PARTS
 from gateway.queries.parameter_cache import ParameterCache
 from gateway.rtc3d.packets import Packet, PacketType
 from gateway.rtc3d.parameters_xml import ParsedParameters, parse_parameters
-from gateway.stream.parameters import LONG_XML_BYTES
+from gateway.stream.parameters import LONG_XML_BYTES, XmlThread
 from tests.spec_parameters import in_root
 from tests.unit.queries.fake_source import FakeSource, parameters_xml
 
@@ -370,6 +372,20 @@ async def test_a_section_is_taken_from_all_parameters() -> None:
     fresh = await source.parameters("3d", fresh=True)
     assert b"<Unit>cm</Unit>" in fresh.xml
     assert source.server.commands == ["SendParameters"]
+
+
+async def test_answers_for_some_sections_are_kept_up_to_a_limit() -> None:
+    source = FakeSource()
+    await source.store_parameters(MM)
+    general = await source.parameters("general")
+    both = await source.parameters("general", "3d")
+    assert (await source.parameters("general", "3d")) is both
+    everything = await source.parameters()
+    for size in (1, 2, 3):
+        for sections in combinations(("3d", "6d", "analog", "force", "events"), size):
+            await everything.part(sections, XmlThread("test"))
+    assert len(everything._parts) == MAX_PARTS
+    assert (await source.parameters("general")) is not general
 
 
 async def test_a_section_that_is_missing_is_requested_once() -> None:
