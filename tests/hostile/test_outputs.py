@@ -63,6 +63,44 @@ async def test_subscribers_that_stop_reading(
     gateway.report.check()
 
 
+LCM_RECEIVER = """
+import sys
+from gateway.outputs.lcm.connection import open_lcm
+receiver = open_lcm(sys.argv[1])
+receiver.subscribe(".*", lambda channel, message: None)
+print("done", flush=True)
+while True:
+    receiver.handle()
+"""
+
+
+@asynccontextmanager
+async def lcm_receiver(url: str) -> AsyncIterator[Process]:
+    """Run a receiver of everything until the end of the block."""
+    process = await asyncio.create_subprocess_exec(sys.executable, "-c", LCM_RECEIVER, url, stdout=PIPE)
+    try:
+        yield process
+    finally:
+        process.kill()
+        await process.wait()
+
+
+async def test_routers_and_lcm_receivers_that_stop(
+    dense_server: int, gateway_under_attack: GatewayUnderAttack
+) -> None:
+    async with gateway_under_attack({"dense": dense_server}) as gateway:
+        for _ in range(2):  # restarted once
+            async with (
+                zenoh_peer("routers", gateway.zenoh_endpoint, 1) as router,
+                lcm_receiver(f"{gateway.lcm_url}&recv_buf_size=4096") as receiver,
+            ):
+                await asyncio.gather(done(router), done(receiver))
+                router.send_signal(signal.SIGSTOP)
+                receiver.send_signal(signal.SIGSTOP)
+                await asyncio.sleep(1)
+    gateway.report.check()
+
+
 async def test_subscribers_behind_a_slow_link(
     dense_server: int, gateway_under_attack: GatewayUnderAttack
 ) -> None:

@@ -29,6 +29,15 @@ def _open(endpoint: str) -> zenoh.Session:
     return zenoh.open(zenoh.Config.from_json5(json.dumps(keys)))
 
 
+def _routers(endpoint: str, count: int) -> Iterator[Any]:
+    """``count`` routers, for each of which the gateway is a peer, with a subscriber."""
+    for _ in range(count):
+        keys = zenoh_keys("router", connect=endpoint, listen="tcp/127.0.0.1:0")
+        keys["transport"]["link"] = {"tcp": {"so_rcvbuf": _BUFFER_BYTES}, "tx": {"lease": _LEASE_MS}}
+        session = zenoh.open(zenoh.Config.from_json5(json.dumps(keys)))
+        yield session, session.declare_subscriber("mocap/**", _ignore)
+
+
 def _ignore(_: Any) -> None:
     pass
 
@@ -78,6 +87,7 @@ def _puts(endpoint: str, count: int) -> Iterator[Any]:
 
 
 KINDS: Final[dict[str, Callable[[str, int], Iterator[Any]]]] = {
+    "routers": _routers,
     "subscribers": _subscribers,
     "connections": _connections,
     "keys": _keys,
