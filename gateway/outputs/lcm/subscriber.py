@@ -1,5 +1,6 @@
 """Subscribing to a gateway's messages on LCM, for ``echo``, the demo and tests."""
 
+import contextlib
 import logging
 import re
 import threading
@@ -7,9 +8,11 @@ from typing import Final
 
 import lcm
 
+from gateway.log import FailureLog
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.kind import Receive, SubscriptionRequest
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
+from gateway.outputs.lcm.sender import RETRY_S
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url
 
 QUEUE_MESSAGES: Final = 10_000
@@ -37,6 +40,7 @@ class LcmSubscriber:
         self._subscription = connection.subscribe(channels, receive)
         self._subscription.set_queue_capacity(QUEUE_MESSAGES)
         self._is_connected = True
+        self._failures = FailureLog(logger, "lcm")
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._receive, name="lcm-subscriber", daemon=True)
         self._thread.start()
@@ -46,8 +50,20 @@ class LcmSubscriber:
             try:
                 self._lcm.handle_timeout(_POLL_MS)
             except OSError as error:
-                logger.warning("lcm: the connection is lost, so no more messages arrive: %s", error)
                 self._is_connected = False
+                self._failures.failed(f"the connection is lost, so no more messages arrive: {error}")
+                self._reconnect()
+
+    def _reconnect(self) -> None:
+        """Connect to the relay (tcpq) again, with retries, until ``close``; LCM then subscribes again.
+
+        LCM does this when it publishes, so an empty message goes to a channel without subscribers.
+        """
+        while not self._stop.wait(RETRY_S):
+            with contextlib.suppress(OSError):
+                self._lcm.publish("RECONNECTED", b"")
+                self._is_connected = True
+                self._failures.recovered("connected again")
                 return
 
     def close(self) -> None:

@@ -101,3 +101,18 @@ def test_a_subscriber_logs_a_lost_relay_and_can_be_closed(
     relay.close()  # before LCM frees the connection: it would connect again, and hold up this process
     [message] = caplog.messages
     assert message.startswith("lcm: the connection is lost, so no more messages arrive: ")
+
+
+def test_a_subscriber_receives_again_when_the_relay_is_back(relay: LcmRelay) -> None:
+    received: list[bytes] = []
+    subscriber = LcmSubscriber(lcm.LCM(relay.url), ".*", lambda _channel, data: received.append(data))
+    wait_until(lambda: relay.subscribed)
+    relay.close()
+    wait_until(lambda: not relay.subscribed)
+    relay.open()
+    wait_until(lambda: relay.subscribed)
+    sender = lcm.LCM(relay.url)
+    sender.publish("CHANNEL", b"message")
+    wait_until(lambda: b"message" in received)
+    subscriber.close()
+    relay.close()
