@@ -10,7 +10,14 @@ from typing import Annotated, Final, TextIO
 import typer
 
 from gateway.cli.message_lines import json_line, text_line
-from gateway.cli.options import ConnectOption, PrefixOption, SourceOption, UrlOption, ZenohConfigOption
+from gateway.cli.options import (
+    ComponentOption,
+    ConnectOption,
+    PrefixOption,
+    SourceOption,
+    UrlOption,
+    ZenohConfigOption,
+)
 from gateway.outputs.kind import SubscriptionRequest
 from gateway.outputs.registry import OUTPUTS
 
@@ -33,10 +40,7 @@ def echo(
         typer.Option(metavar="NAME", help=f"Subscribe on this output, one of: {_output_names()}."),
     ] = None,
     source: SourceOption = None,
-    component: Annotated[
-        str | None,
-        typer.Option(help="Only this: 3d, 6d, analog, force, event, status, clock, parameters or c3d."),
-    ] = None,
+    component: ComponentOption = None,
     count: Annotated[int | None, typer.Option(min=1, help="Stop after this number of messages.")] = None,
     seconds: Annotated[float | None, typer.Option(min=0, help="Stop after this many seconds.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object per line.")] = False,

@@ -1,12 +1,19 @@
 """The command line ``rtc3d-gateway``.
 
-Exit status: 0 success, 1 failure, 2 wrong command line or configuration; ``params`` has three more.
+Exit status: 0 success, 1 failure, 2 wrong command line or configuration, 130 Ctrl-C.
+``params`` has three more.
 """
 
+import contextlib
+import errno
+import io
 import os
+import signal
 import sys
 import traceback
-from typing import Annotated, NoReturn
+from collections.abc import Callable
+from types import FrameType
+from typing import Annotated, Any, Final, NoReturn
 
 import typer
 
@@ -23,6 +30,9 @@ from gateway.errors import ConfigError, GatewayError
 from gateway.safe_text import safe_lines
 from gateway.service.process_end import end_process
 
+_OUTPUT_ERRORS: Final = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EBADF}
+"""Numbers of errors that writing to stdout raises, for example on a full disk."""
+
 app = typer.Typer(
     name="rtc3d-gateway",
     help="Publish data of RTC3D motion-capture servers (NDI First Principles, WaveFront) on Zenoh and LCM.",
@@ -36,32 +46,62 @@ app.add_typer(config.app, name="config")
 
 
 def main() -> NoReturn:
-    """Run the command line and end the process."""
-    end_process(_run_command())
+    """Run the command line and end the process, whatever happens, without a traceback.
+
+    Ctrl-C gives status 130. It is no failure if the reader of stdout is gone (… | head).
+    """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # for locales other than UTF-8
+    _handle_interrupts(signal.default_int_handler)
+    try:
+        status = _run()
+    except KeyboardInterrupt:
+        status = 130
+    _handle_interrupts(lambda *_: os._exit(status))
+    end_process(status)
 
 
-def _run_command() -> int:
-    """Return the exit status. Errors of the gateway are printed to stderr without a traceback."""
+def _handle_interrupts(handler: Callable[[int, FrameType | None], Any]) -> None:
+    if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # ignored by nohup, and by shells for `&`
+        signal.signal(signal.SIGINT, handler)
+
+
+def _run() -> int:
+    """Run the command, and return the exit status. Errors are printed to stderr."""
+    stdout = sys.stdout
     try:
         app()
     except SystemExit as end:
+        if sys.stdout is not stdout:  # typer replaces it if its reader is gone
+            return 0
         return end.code if isinstance(end.code, int) else int(end.code is not None)
     except ConfigError as error:
-        return _print_error(error, 2)
+        _print_error(str(error))
+        return 2
     except GatewayError as error:
-        return _print_error(error, 1)
+        _print_error(str(error))
     except BrokenPipeError:
-        # The reader of stdout is gone (… | head). Without this, flushing it fails again.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    except BaseException:  # noqa: BLE001 - a defect
-        traceback.print_exc()
-        return 1
-    return 0
+        return 0
+    except OSError as error:
+        _print_os_error(error)
+    except Exception as error:  # noqa: BLE001 - a traceback tells the user nothing
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        _print_error(
+            f"defect in rtc3d-gateway: {type(error).__name__}: {error} ({last.filename}:{last.lineno}); "
+            "report this with the command and its options"
+        )
+    return 1
 
 
-def _print_error(error: GatewayError, status: int) -> int:
-    print(safe_lines(str(error)), file=sys.stderr)
-    return status
+def _print_os_error(error: OSError) -> None:
+    what = "cannot write the output: " if error.errno in _OUTPUT_ERRORS and error.filename is None else ""
+    _print_error(f"{what}{error.strerror or error}" + (f": {error.filename}" if error.filename else ""))
+
+
+def _print_error(text: str) -> None:
+    with contextlib.suppress(OSError):
+        print(safe_lines(text), file=sys.stderr, flush=True)
 
 
 def _print_version(wanted: bool) -> None:

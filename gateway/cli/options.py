@@ -1,20 +1,26 @@
 """Options that several commands share."""
 
 import os
+import re
+from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
 
 import typer
 from pydantic import TypeAdapter, ValidationError
 
 from gateway.config.environment import VARIABLE_PREFIX
 from gateway.config.loading import Configuration, read, read_server
-from gateway.config.values import Host
+from gateway.config.section import describe, join_or
+from gateway.config.values import Host, SourceName
+from gateway.outputs.lcm.settings import LcmUrl
 from gateway.outputs.registry import settings_type
+from gateway.outputs.zenoh.settings import KeyPrefix
+from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
 from gateway.service.log_format import LogFormat, LogLevel
 
-_HOST: Final[TypeAdapter[str]] = TypeAdapter(Host)
+_COMPONENTS: Final = (*COMPONENTS_BY_KEY, "status", "clock", "parameters", "c3d")
 
 ConfigOption = Annotated[
     Path | None,
@@ -51,10 +57,49 @@ C3dOption = Annotated[
     Path | None, typer.Option("--c3d", help="Play this C3D file instead of a synthetic scene.")
 ]
 
-SourceOption = Annotated[str | None, typer.Option(help="Only this source; the default is all sources.")]
+
+def _checked(kind: Any) -> Callable[[str | None], str | None]:
+    """Return a callback for an option whose value must be valid as ``kind``, a type of the configuration."""
+    adapter = TypeAdapter(kind)
+
+    def check(text: str | None) -> str | None:
+        try:
+            return None if text is None else adapter.validate_python(text)
+        except ValidationError as error:
+            raise typer.BadParameter(error.errors(include_url=False)[0]["msg"]) from None
+
+    return check
+
+
+def _checked_component(text: str | None) -> str | None:
+    if text is not None and text not in _COMPONENTS:
+        raise typer.BadParameter(f"found {describe(text)}; expected {join_or(_COMPONENTS)}")
+    return text
+
+
+def _checked_endpoint(text: str | None) -> str | None:
+    if text is not None and not (text.isprintable() and re.fullmatch(r"[\w-]+/.{1,1000}", text)):
+        raise typer.BadParameter(f"found {describe(text)}; expected an endpoint such as tcp/192.0.2.5:7447")
+    return text
+
+
+SourceOption = Annotated[
+    str | None,
+    typer.Option(callback=_checked(SourceName), help="Only this source; the default is all sources."),
+]
+ComponentOption = Annotated[
+    str | None,
+    typer.Option(
+        callback=_checked_component,
+        help="Only this: 3d, 6d, analog, force, event, status, clock, parameters or c3d.",
+    ),
+]
 ConnectOption = Annotated[
     str | None,
-    typer.Option(help="Zenoh endpoint of the gateway or router, for example tcp/192.0.2.5:7447."),
+    typer.Option(
+        callback=_checked_endpoint,
+        help="Zenoh endpoint of the gateway or router, for example tcp/192.0.2.5:7447.",
+    ),
 ]
 ZenohConfigOption = Annotated[
     Path | None,
@@ -64,19 +109,30 @@ ZenohConfigOption = Annotated[
     ),
 ]
 UrlOption = Annotated[
-    str | None, typer.Option(help="LCM URL; the default is $LCM_DEFAULT_URL, else LCM's default URL.")
+    str | None,
+    typer.Option(
+        callback=_checked(LcmUrl), help="LCM URL; the default is $LCM_DEFAULT_URL, else LCM's default URL."
+    ),
 ]
 PrefixOption = Annotated[
-    str | None, typer.Option(help="The gateway's prefix; the default is mocap on Zenoh, MOCAP on LCM.")
+    str | None,
+    typer.Option(
+        callback=_checked(KeyPrefix),
+        help="The gateway's prefix; the default is mocap on Zenoh, MOCAP on LCM.",
+    ),
+]
+QueriesUrlOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="URL",
+        callback=_checked(LcmUrl),
+        help="LCM URL of requests and replies: the gateway's lcm.queries_url.",
+    ),
 ]
 
 
-def checked_host(host: str) -> str:
-    """Return ``host``; raise BadParameter if it is neither a host name nor an IP address."""
-    try:
-        return _HOST.validate_python(host)
-    except ValidationError as error:
-        raise typer.BadParameter(error.errors(include_url=False)[0]["msg"]) from None
+checked_host = _checked(Host)
+"""Checks that an option is a host name or an IP address."""
 
 
 def configuration_from_options(config: Path | None, server: str | None) -> Configuration:

@@ -5,7 +5,14 @@ from typing import Annotated, Final
 
 import typer
 
-from gateway.cli.options import ConnectOption, PrefixOption, SourceOption, UrlOption, ZenohConfigOption
+from gateway.cli.options import (
+    ConnectOption,
+    PrefixOption,
+    QueriesUrlOption,
+    SourceOption,
+    UrlOption,
+    ZenohConfigOption,
+)
 from gateway.cli.params_lcm import query_lcm
 from gateway.cli.params_output import write_replies
 from gateway.cli.params_zenoh import query_zenoh
@@ -37,10 +44,7 @@ def params(
     connect: ConnectOption = None,
     zenoh_config: ZenohConfigOption = None,
     url: UrlOption = None,
-    queries_url: Annotated[
-        str | None,
-        typer.Option(metavar="URL", help="LCM URL of requests and replies: the gateway's lcm.queries_url."),
-    ] = None,
+    queries_url: QueriesUrlOption = None,
     prefix: PrefixOption = None,
     timeout: Annotated[float, typer.Option(min=0.1, help="How many seconds to wait for replies.")] = 5.0,
 ) -> None:

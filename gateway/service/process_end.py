@@ -35,7 +35,8 @@ def end_process(status: int) -> NoReturn:
     except (BrokenPipeError, ValueError):
         pass  # nobody reads it any more, or it is closed
     except OSError as error:
-        print(f"the output is not complete: {error.strerror}", file=sys.stderr)
+        with suppress(OSError, ValueError):
+            print(f"cannot write the output: {error.strerror}", file=sys.stderr)
         status = status or 1
     with suppress(OSError, ValueError):
         sys.stderr.flush()

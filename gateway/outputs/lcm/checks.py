@@ -3,7 +3,7 @@
 import socket
 from collections.abc import Sequence
 from typing import Final
-from urllib.parse import parse_qs, urlsplit
+from urllib.parse import parse_qs
 
 from gateway.errors import OutputError
 from gateway.findings import Finding, MessageLoad, Subject
@@ -13,6 +13,7 @@ from gateway.outputs.lcm.connection import (
     multicast_problem,
     open_lcm,
     scheme_of,
+    split_url,
 )
 from gateway.outputs.lcm.settings import LcmSettings
 
@@ -61,11 +62,11 @@ def leaves_host(settings: LcmSettings) -> bool:
     scheme = scheme_of(url)
     if scheme in MULTICAST_SCHEMES:
         return _ttl(url) != "0"
-    return scheme == "tcpq" and urlsplit(url).hostname not in _LOOPBACK
+    return scheme == "tcpq" and split_url(url).hostname not in _LOOPBACK
 
 
 def _ttl(url: str) -> str:
-    return parse_qs(urlsplit(url).query).get("ttl", ["0"])[0]
+    return parse_qs(split_url(url).query).get("ttl", ["0"])[0]
 
 
 def _check_route(url: str) -> Finding:
@@ -77,7 +78,7 @@ def _check_route(url: str) -> Finding:
         open_lcm(url)
     except OutputError as error:
         return _lcm.failing("route", str(error).partition("; ")[0], "Correct lcm.url.")
-    address = urlsplit(url).netloc or "the default group"
+    address = split_url(url).netloc or "the default group"
     ttl = _ttl(url)
     if ttl == "0":
         return _lcm.passing("route", f"multicast to {address} works and stays on this computer (ttl=0)")
@@ -113,7 +114,7 @@ def _check_buffers(url: str, loads: Sequence[MessageLoad]) -> Finding:
     )
     if not needed:
         return _lcm.not_tested("buffers", "no frames arrived, so the sizes of messages are unknown")
-    requested = parse_qs(urlsplit(url).query).get("recv_buf_size", [""])[0]
+    requested = parse_qs(split_url(url).query).get("recv_buf_size", [""])[0]
     available = receive_buffer_bytes(int(requested) if requested.isdecimal() else None)
     largest = max(load.largest_bytes for load in loads)
     found = (

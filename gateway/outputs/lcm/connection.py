@@ -9,7 +9,7 @@ import struct
 import sys
 from pathlib import Path
 from typing import Final
-from urllib.parse import urlsplit, urlunsplit
+from urllib.parse import SplitResult, urlsplit, urlunsplit
 
 import lcm
 
@@ -71,6 +71,14 @@ def multicast_interface(url: str) -> str | None:
             return socket.if_indextoname(index)
         attribute += (max(length, 4) + 3) & ~3
     raise OSError(errno.ENODEV, os.strerror(errno.ENODEV))
+
+
+def split_url(url: str) -> SplitResult:
+    """Return the parts of an LCM URL; only the scheme if it is one that LCM itself rejects."""
+    try:
+        return urlsplit(url)
+    except ValueError:
+        return urlsplit(f"{scheme_of(url)}://")
 
 
 def _multicast_destination(url: str) -> tuple[str, int] | None:

@@ -26,11 +26,11 @@ def open_zenoh(connect: str | None, config_file: Path | None = None) -> zenoh.Se
     default. The file may be that of a running gateway.
     """
     config = command_config(config_file) if config_file else zenoh_config({})
-    if connect is not None:
-        config.insert_json5("mode", '"client"')
-        config.insert_json5("connect/endpoints", json.dumps([connect]))
-        config.insert_json5("scouting/multicast/enabled", "false")
     try:
+        if connect is not None:
+            config.insert_json5("mode", '"client"')
+            config.insert_json5("connect/endpoints", json.dumps([connect]))
+            config.insert_json5("scouting/multicast/enabled", "false")
         return zenoh.open(config)
     except zenoh.ZError as error:
         where = f" to {connect}" if connect else f" with {config_file}" if config_file else ""

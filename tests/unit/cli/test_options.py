@@ -98,3 +98,19 @@ def test_check_includes_environment_variables(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setenv("RTC3D_GATEWAY__LCM__PREFIXX", "HALL2")
     with pytest.raises(ConfigError, match=r"RTC3D_GATEWAY__LCM__PREFIXX: lcm\.prefixx: unknown key"):
         printed("check", str(DEMO))
+
+
+@pytest.mark.parametrize("name", ["", "#", "$*", "/", "a b", "x\n\x1b[31m", "\udcff", "a" * 100_000])
+@pytest.mark.parametrize("option", ["--source", "--prefix", "--component", "--connect", "--url"])
+def test_odd_names_are_mistakes(option: str, name: str) -> None:
+    result = CliRunner().invoke(app, ["echo", "--seconds", "0", option, name], catch_exceptions=False)
+    assert result.exit_code == 2
+    assert len(result.output) < 2000
+
+
+@pytest.mark.parametrize("name", ["**", "a/b", "@", "*"])
+@pytest.mark.parametrize("command", ["echo", "params"])
+def test_a_key_expression_is_no_name_of_a_source(command: str, name: str) -> None:
+    result = CliRunner().invoke(app, [command, "--source", name], catch_exceptions=False)
+    assert result.exit_code == 2
+    assert "letters" in result.output

@@ -64,7 +64,7 @@ def test_a_reader_that_is_gone_is_no_error() -> None:
 
 def test_a_full_device_is_an_error() -> None:
     ended = run("sys.stdout = open('/dev/full', 'w')\nprint('x')\nend_process(0)")
-    assert (ended.returncode, ended.stderr) == (1, "the output is not complete: No space left on device\n")
+    assert (ended.returncode, ended.stderr) == (1, "cannot write the output: No space left on device\n")
 
 
 def test_threads_in_calls_of_zenoh_do_not_abort_the_process() -> None:

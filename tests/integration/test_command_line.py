@@ -1,0 +1,107 @@
+"""The program under unusual conditions: no traceback, whatever the streams, locale and terminal."""
+
+import asyncio
+import os
+import signal
+from asyncio.subprocess import DEVNULL, PIPE
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+import pytest
+
+from gateway.cli.main import app
+from tests.gateway_process import PROGRAM
+
+ROOT: Final = Path(__file__).parents[2]
+COMMANDS: Final = ("run", "check", "doctor", "simulate", "demo", "echo", "params", "config", "config show")
+CONFIG: Final = str(ROOT / "config/gateway.yaml")
+_ASCII: Final = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
+_NARROW: Final = {"TERM": "dumb", "COLUMNS": "20"}
+
+
+class Ended(NamedTuple):
+    status: int
+    stdout: str
+    stderr: str
+
+
+async def end_of(process: asyncio.subprocess.Process) -> Ended:
+    """Wait for the end of a process, which must not write a traceback."""
+    stdout, stderr = await asyncio.wait_for(process.communicate(), 60)
+    ended = Ended(process.returncode or 0, (stdout or b"").decode(), (stderr or b"").decode())
+    for word in ("Traceback", "Exception ignored", "Error:", "defect", "panicked"):
+        assert word not in ended.stdout + ended.stderr
+    return ended
+
+
+async def run(*arguments: str, environ: dict[str, str] | None = None, **options: Any) -> Ended:
+    process = await asyncio.create_subprocess_exec(
+        *(*PROGRAM, *map(os.fsencode, arguments)),
+        env={**os.environ, **(environ or {})},
+        **{"stdin": DEVNULL, "stdout": PIPE, "stderr": PIPE, **options},
+    )
+    return await end_of(process)
+
+
+async def run_shell(script: str) -> Ended:
+    """Run a shell script, in which $PROGRAM is the program."""
+    environ = {**os.environ, "PROGRAM": " ".join(PROGRAM)}
+    process = await asyncio.create_subprocess_exec(
+        *("bash", "-c", script), env=environ, stdin=DEVNULL, stdout=PIPE, stderr=PIPE
+    )
+    return await end_of(process)
+
+
+def test_all_commands_are_tested() -> None:
+    names = {command.callback.__name__ for command in app.registered_commands if command.callback}
+    assert names | {"config"} == {command.split()[0] for command in COMMANDS}
+
+
+async def test_help_fits_every_locale_and_terminal() -> None:
+    for command in COMMANDS:
+        assert (await run(*command.split(), "--help", environ=_ASCII | _NARROW)).status == 0
+
+
+@pytest.mark.parametrize("command", ["echo", "check"])
+async def test_text_that_is_not_utf8_is_a_mistake(command: str) -> None:
+    assert (await run(*command.split(), "--nope\udcff\x1b[31m", environ=_ASCII)).status == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status"),
+    [
+        (("config", "schema"), 0),
+        (("check", CONFIG), 0),
+    ],
+)
+async def test_output_goes_nowhere(arguments: tuple[str, ...], status: int) -> None:
+    """A reader that leaves, a full device, and a closed stream."""
+    command = f"$PROGRAM {' '.join(arguments)}"
+    gone = await run_shell(f"set -o pipefail; {command} | true")
+    assert gone.status == 0
+    assert not gone.stderr
+    full = await run_shell(f"{command} >/dev/full")
+    assert full.status == 1
+    assert full.stderr == "cannot write the output: No space left on device\n"
+    assert (await run_shell(f"{command} 2>/dev/full")).status == status
+    for closed in (">&-", ">&- 2>&- <&-"):
+        ended = await run_shell(f"{command} {closed}")
+        assert (ended.status, ended.stderr) == (status, "")
+
+
+@pytest.mark.parametrize(("library", "delay_s"), [("pydantic_core", 0), ("zenoh", 0), ("zenoh", 1.5)])
+async def test_ctrl_c_is_quiet_at_any_moment(library: str, delay_s: float) -> None:
+    """During the imports and at the start, when a library is loaded, and while waiting."""
+    commands = (("echo", "--source", "nobody"), ("doctor", "--server", "127.0.0.1:1"))
+
+    async def interrupted(*arguments: str) -> Ended:
+        process = await asyncio.create_subprocess_exec(*PROGRAM, *arguments, stdout=PIPE, stderr=PIPE)
+        while library not in Path(f"/proc/{process.pid}/maps").read_text():  # noqa: ASYNC110, ASYNC240
+            await asyncio.sleep(0.002)
+        await asyncio.sleep(delay_s)
+        process.send_signal(signal.SIGINT)
+        return await end_of(process)
+
+    for ended in await asyncio.gather(*(interrupted(*arguments) for arguments in commands)):
+        assert ended.status in {130, 0, 1}  # 0 if echo is printing, 1 if the command ended before
+        assert "KeyboardInterrupt" not in ended.stderr
