@@ -36,7 +36,7 @@ async def end_of(process: asyncio.subprocess.Process) -> Ended:
 
 async def run(*arguments: str, environ: dict[str, str] | None = None, **options: Any) -> Ended:
     process = await asyncio.create_subprocess_exec(
-        *(*PROGRAM, *map(os.fsencode, arguments)),
+        *map(os.fsencode, (*PROGRAM, *arguments)),
         env={**os.environ, **(environ or {})},
         **{"stdin": DEVNULL, "stdout": PIPE, "stderr": PIPE, **options},
     )
