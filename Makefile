@@ -15,10 +15,10 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 # What a wheel is built from.
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
-.PHONY: demo test test-compiled check lint types contracts generated docs lcm-types fuzz soak stops mutants bench bench-quick zenohd \
+.PHONY: demo lock test test-compiled check lint types contracts generated docs lcm-types fuzz soak stops mutants bench bench-quick zenohd \
     wheel compiled wheelhouse install uninstall clean
 
-demo: .venv/installed
+demo: .venv/runtime
 	$(BIN)/rtc3d-gateway demo
 
 # Without MAKEFLAGS, a make that a test runs does not look for the job slots of this one.
@@ -103,7 +103,8 @@ install:
 	@$(PYTHON) -c 'import sys; home = sys.base_prefix.startswith(("/home/", "/root/")); \
 	    sys.exit(f"the service cannot read {sys.base_prefix}, which is in a home directory; run make with PYTHON=/usr/bin/python3" if home else 0)'
 	$(PYTHON) -m venv $(PREFIX)/venv
-	$(call pip,$(PREFIX)/venv/bin/python,install --quiet --upgrade,[systemd])
+	$(PREFIX)/venv/bin/pip install --quiet --require-hashes --requirement requirements.txt
+	$(call pip,$(PREFIX)/venv/bin/python,install --quiet --upgrade --no-deps)
 	install -d $(LIB)/systemd/system $(LIB)/sysusers.d $(LIB)/tmpfiles.d /usr/local/bin
 	for unit in $(UNITS); do sed 's|/opt/rtc3d-gateway|$(PREFIX)|' systemd/$$unit >$(LIB)/systemd/system/$$unit; done
 	install -m 644 systemd/sysusers.conf $(LIB)/sysusers.d/rtc3d-gateway.conf
@@ -134,18 +135,32 @@ BUILD_REQUIRES = import tomllib; project = tomllib.load(open("pyproject.toml", "
 
 wheelhouse: build/wheelhouse/complete
 
-build/wheelhouse/complete: pyproject.toml
+build/wheelhouse/complete: pyproject.toml requirements.txt
 	rm -rf build/wheelhouse build/wheelhouse-venv
 	$(SYSTEM_PYTHON) -m venv build/wheelhouse-venv
-	build/wheelhouse-venv/bin/pip wheel --quiet --wheel-dir build/wheelhouse pip '.[systemd]' \
+	build/wheelhouse-venv/bin/pip download --quiet --dest build/wheelhouse --require-hashes --requirement requirements.txt
+	build/wheelhouse-venv/bin/pip wheel --quiet --wheel-dir build/wheelhouse pip \
 	    $$(build/wheelhouse-venv/bin/python -c '$(BUILD_REQUIRES)')
 	touch $@
 
-.venv/installed: pyproject.toml
+# What running needs, in the versions of requirements.txt; .venv/installed adds the development tools.
+.venv/runtime: pyproject.toml requirements.txt
 	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --require-hashes --requirement requirements.txt
+	$(BIN)/pip install --quiet --no-deps --editable .
+	touch $@
+
+.venv/installed: .venv/runtime
 	$(BIN)/pip install --quiet --upgrade 'pip>=25.1'
 	$(BIN)/pip install --quiet --editable . --group dev
 	touch $@
+
+# Renew requirements.txt: the versions of all dependencies and extras for every supported Python and platform.
+lock:
+	$(PYTHON) -m venv build/lock-venv
+	build/lock-venv/bin/pip install --quiet uv
+	build/lock-venv/bin/uv pip compile --quiet --universal --python-version 3.11 --all-extras --upgrade --generate-hashes \
+	    --no-annotate --no-header --no-emit-index-url --output-file requirements.txt pyproject.toml
 
 # Coverage-guided fuzzing, FUZZ_SECONDS for each target; not part of the check.
 FUZZ_SECONDS ?= 60
