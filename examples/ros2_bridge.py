@@ -7,8 +7,11 @@ It needs rclpy (from a sourced ROS 2 environment), eclipse-zenoh and numpy. The 
 must contain ``zenoh: {tool_poses: true}``.
 """
 
+import argparse
+import contextlib
+import json
 import re
-import sys
+import struct
 from array import array
 from urllib.parse import unquote
 
@@ -38,14 +41,22 @@ class Bridge(Node):
         self._tools: dict[str, Publisher] = {}
 
     def on_markers(self, sample: zenoh.Sample) -> None:
-        cloud = ros2_values.cloud(sample.payload.to_bytes())
+        try:
+            cloud = ros2_values.cloud(sample.payload.to_bytes())
+        except (struct.error, ValueError) as error:
+            self.get_logger().warning(f"ignored a malformed message: {error}")
+            return
         message = PointCloud2(header=self._header(cloud.stamp), height=1, width=cloud.width, fields=FIELDS)
         message.point_step, message.row_step = 12, 12 * cloud.width
         message.is_bigendian, message.is_dense, message.data = False, False, array("B", cloud.data)
         self._markers.publish(message)
 
     def on_tool(self, sample: zenoh.Sample) -> None:
-        pose = ros2_values.pose(sample.payload.to_bytes())
+        try:
+            pose = ros2_values.pose(sample.payload.to_bytes())
+        except (struct.error, ValueError) as error:
+            self.get_logger().warning(f"ignored a malformed message: {error}")
+            return
         if pose is None:
             return
         message = PoseStamped(header=self._header(pose.stamp))
@@ -65,8 +76,14 @@ class Bridge(Node):
 
 
 def main() -> None:
-    endpoint, source = sys.argv[1:3]
-    config = zenoh.Config.from_json5(f'{{mode: "client", connect: {{endpoints: ["{endpoint}"]}}}}')
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("endpoint", help="endpoint of the gateway or a router, such as tcp/192.0.2.5:7447")
+    parser.add_argument("source", help="the source's name")
+    options = parser.parse_args()
+    source = options.source
+    config = zenoh.Config()
+    config.insert_json5("mode", '"client"')
+    config.insert_json5("connect/endpoints", json.dumps([options.endpoint]))
     rclpy.init()
     bridge = Bridge(source)
     with zenoh.open(config) as session:
@@ -76,4 +93,5 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

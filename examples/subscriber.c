@@ -9,6 +9,7 @@
 #include <math.h>
 #include <stdio.h>
 #include <stdlib.h>
+#include <string.h>
 
 #include "rtc3d_events_t.h"
 #include "rtc3d_markers_t.h"
@@ -47,6 +48,11 @@ static void on_events(const lcm_recv_buf_t *buffer, const char *channel, const r
 
 int main(int argc, char **argv)
 {
+    if (argc > 1 && argv[1][0] == '-') {
+        printf("Print the markers and events that a gateway publishes on LCM.\nUsage: %s [SOURCE [COUNT]]\n",
+               argv[0]);
+        return strcmp(argv[1], "--help") == 0 ? 0 : 2;
+    }
     const char *source = argc > 1 ? argv[1] : "LAB";
     char channel[64];
     frames_left = argc > 2 ? atol(argv[2]) : 0;

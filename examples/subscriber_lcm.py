@@ -5,7 +5,10 @@
 SOURCE is the name of the source in upper case. The program stops after COUNT frames.
 """
 
+import argparse
+import contextlib
 import math
+import struct
 import sys
 
 import lcm
@@ -13,12 +16,19 @@ from rtc3d import markers_t
 
 
 def main() -> None:
-    source = sys.argv[1] if len(sys.argv) > 1 else "LAB"
-    frames_left = int(sys.argv[2]) if len(sys.argv) > 2 else math.inf
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("source", nargs="?", default="LAB", help="the source's name in upper case")
+    parser.add_argument("count", nargs="?", type=int, default=math.inf, help="stop after this many frames")
+    options = parser.parse_args()
+    source, frames_left = options.source, options.count
 
     def on_markers(_channel: str, data: bytes) -> None:
         nonlocal frames_left
-        message = markers_t.decode(data)
+        try:
+            message = markers_t.decode(data)
+        except (struct.error, ValueError) as error:
+            print(f"ignored a malformed message: {error}", file=sys.stderr)
+            return
         visible = [marker for marker in message.markers if not math.isnan(marker.x)]
         position = ""
         if visible:
@@ -35,8 +45,9 @@ def main() -> None:
     subscription.set_queue_capacity(1000)  # the default of 30 loses frames whenever this program pauses
     print("listening", flush=True)
     while frames_left > 0:
-        connection.handle()
+        connection.handle_timeout(200)  # ms; handle() itself would not end at Ctrl-C
 
 
 if __name__ == "__main__":
-    main()
+    with contextlib.suppress(KeyboardInterrupt):
+        main()

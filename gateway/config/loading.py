@@ -110,7 +110,7 @@ def _text_of(path: Path, example: str) -> str:
 
 _Mistake = tuple[Position, ConfigError]
 
-_MAX_MISTAKES: Final = 50
+_MAX_MISTAKES: Final = 20
 """How many mistakes an error lists; nobody reads more, and at a reload each is a line in the log."""
 
 

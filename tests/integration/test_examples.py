@@ -3,18 +3,21 @@
 import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import lcm
 import numpy as np
 import pytest
 
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.synthetic import SyntheticScene
-from tests.networks import free_port
+from tests.networks import free_port, open_zenoh
 
 pytestmark = pytest.mark.netns
 
@@ -113,3 +116,34 @@ def test_the_python_example_prints_positions_from_zenoh(endpoint: str) -> None:
     ]
     with run_program(*command, ready="listening") as program:
         assert_positions_match_the_scene(program.communicate(timeout=30)[0], 15)
+
+
+@pytest.mark.parametrize("name", ["subscriber_lcm.py", "subscriber_zenoh.py"])
+def test_the_python_examples_ignore_malformed_messages_and_end_quietly_at_ctrl_c(name: str) -> None:
+    port = free_port()
+    options = ["--connect", f"tcp/127.0.0.1:{port}"] if "zenoh" in name else ["OTHER"]
+    command = [sys.executable, str(ROOT / "examples" / name)]
+    assert "usage:" in subprocess.check_output([*command, "--help"], text=True)
+    connection = lcm.LCM(LCM_URL)
+    with (
+        open_zenoh("peer", listen=f"tcp/127.0.0.1:{port}") as session,
+        run_program(*command, *options, ready="listening") as program,
+    ):
+        stop = threading.Event()
+
+        def send() -> None:
+            while not stop.wait(0.05):
+                session.put("mocap/lab/3d", b"x")
+                connection.publish("MOCAP_OTHER_3D", b"x")
+
+        sender = threading.Thread(target=send)
+        sender.start()
+        assert program.stdout is not None
+        line = program.stdout.readline()
+        program.send_signal(signal.SIGINT)
+        rest = program.communicate(timeout=30)[0]
+        stop.set()
+        sender.join()
+    assert line.startswith("ignored a malformed message: ")
+    assert "Traceback" not in rest
+    assert program.returncode == 0

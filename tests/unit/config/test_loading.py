@@ -340,9 +340,9 @@ def test_a_missing_file_and_a_folder_are_refused(file: Path) -> None:
 
 def test_only_the_first_mistakes_are_listed(file: Path) -> None:
     lines = refused(file, SERVER + "lcm:\n" + "".join(f"  key{number}: 1\n" for number in range(4000)))
-    assert len(lines) == 51
-    assert lines[49].startswith("lab.yaml:54:3: lcm.key49: unknown key")
-    assert lines[50] == "and 3950 more mistakes; correct these first"
+    assert len(lines) == 21
+    assert lines[19].startswith("lab.yaml:24:3: lcm.key19: unknown key")
+    assert lines[20] == "and 3980 more mistakes; correct these first"
 
 
 @pytest.mark.parametrize("name", ["zenoh.json5", "zenoh.yaml"])
