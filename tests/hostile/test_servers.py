@@ -12,7 +12,7 @@ from tests.servers import ScriptedServer
 
 pytestmark = pytest.mark.netns
 
-ATTACK_S: Final = 3.0
+ATTACK_S: Final = 2.5
 
 
 @pytest.mark.parametrize("group", SERVERS)
