@@ -4,6 +4,7 @@ Where something is missing, tests skip on a developer's machine and fail in CI.
 """
 
 import asyncio
+import gc
 import itertools
 import os
 from collections.abc import Callable, Mapping
@@ -14,6 +15,10 @@ import pytest
 import uvloop
 
 from gateway.log import HOLD_S
+
+# uvloop starts a process by a fork, after which Python runs in the child for a moment. A garbage collection
+# that finds a Zenoh session there waits for threads that the child does not have; the parent waits for it.
+os.register_at_fork(before=gc.disable, after_in_parent=gc.enable)
 
 _WHEELHOUSE: Final = Path(__file__).parents[1] / "build/wheelhouse/complete"
 
