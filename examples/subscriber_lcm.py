@@ -6,8 +6,8 @@ SOURCE is the name of the source in upper case. The program stops after COUNT fr
 """
 
 import argparse
-import contextlib
 import math
+import signal
 import struct
 import sys
 
@@ -40,14 +40,22 @@ def main() -> None:
         )
         frames_left -= 1
 
+    def stop(*_: object) -> None:
+        nonlocal frames_left
+        frames_left = 0
+
+    signal.signal(signal.SIGINT, stop)  # an exception inside LCM's handle would be printed with a traceback
     connection = lcm.LCM()
     subscription = connection.subscribe(f"MOCAP_{source}_3D", on_markers)
     subscription.set_queue_capacity(1000)  # the default of 30 loses frames whenever this program pauses
     print("listening", flush=True)
     while frames_left > 0:
-        connection.handle_timeout(200)  # ms; handle() itself would not end at Ctrl-C
+        try:
+            connection.handle_timeout(200)  # ms; handle() would not return at Ctrl-C
+        except OSError:  # a signal has interrupted it, or the connection is lost
+            if frames_left:
+                raise
 
 
 if __name__ == "__main__":
-    with contextlib.suppress(KeyboardInterrupt):
-        main()
+    main()
