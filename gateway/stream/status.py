@@ -119,7 +119,7 @@ class StreamStatus:
     _unknown_types: set[int] = field(default_factory=set, init=False)  # of this connection, those listed
     _unknown_text: str = field(default_factory=str, init=False)  # compiled, a default would not be assigned
     _logged_limitations: deque[str] = field(default_factory=lambda: deque(maxlen=MAX_LIMITATIONS), init=False)
-    _logged_request: str = field(default="", init=False)
+    _logged_request: str = field(init=False)
 
     def __post_init__(self) -> None:
         """Create the logs of losses, lost connections, defects and other events."""
@@ -128,6 +128,7 @@ class StreamStatus:
         self._failures = FailureLog(logger, self, HOLD_S)
         self._defects = DefectLog(logger, self, self.known_defects)
         self.losses = Losses(logger, self)
+        self._logged_request = ""  # here, because mypyc ignores the default of a field that __init__ lacks
 
     def __str__(self) -> str:
         """Return the name, which begins log messages."""

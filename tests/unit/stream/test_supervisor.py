@@ -248,6 +248,7 @@ async def test_a_steady_connection_starts_the_delays_again() -> None:
     assert_delays([lab.server.tried_s[-1] - ended_s], [0.2])
 
 
+@pytest.mark.interpreted
 async def test_a_defect_that_replaces_the_cancellation_does_not_keep_the_stream_running(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
