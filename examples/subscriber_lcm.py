@@ -40,21 +40,13 @@ def main() -> None:
         )
         frames_left -= 1
 
-    def stop(*_: object) -> None:
-        nonlocal frames_left
-        frames_left = 0
-
-    signal.signal(signal.SIGINT, stop)  # an exception inside LCM's handle would be printed with a traceback
+    signal.signal(signal.SIGINT, signal.SIG_DFL)  # LCM's handle() would turn Ctrl-C into an OSError
     connection = lcm.LCM()
     subscription = connection.subscribe(f"MOCAP_{source}_3D", on_markers)
     subscription.set_queue_capacity(1000)  # the default of 30 loses frames whenever this program pauses
     print("listening", flush=True)
     while frames_left > 0:
-        try:
-            connection.handle_timeout(200)  # ms; handle() would not return at Ctrl-C
-        except OSError:  # a signal has interrupted it, or the connection is lost
-            if frames_left:
-                raise
+        connection.handle()
 
 
 if __name__ == "__main__":

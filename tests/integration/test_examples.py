@@ -146,4 +146,4 @@ def test_the_python_examples_ignore_malformed_messages_and_end_quietly_at_ctrl_c
         sender.join()
     assert line.startswith("ignored a malformed message: ")
     assert "Traceback" not in rest
-    assert program.returncode == 0
+    assert program.returncode in {0, -signal.SIGINT}
