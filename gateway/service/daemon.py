@@ -5,7 +5,6 @@ import logging
 import os
 import signal
 from collections.abc import Callable
-from types import FrameType
 from typing import Any
 
 from gateway.config.settings import Settings
@@ -14,7 +13,7 @@ from gateway.gateway import Gateway
 from gateway.log import DefectLog, defect_text
 from gateway.monitoring.server import MonitoringServer
 from gateway.monitoring.status_line import status_lines
-from gateway.service.process_end import StopDeadline, named_tasks
+from gateway.service.process_end import Signals, named_tasks
 from gateway.service.systemd import SystemdNotifier
 from gateway.worker_thread import WorkerThread
 
@@ -29,7 +28,8 @@ async def serve(load: Callable[[], Settings], every_second: Callable[[], None] =
     Raises ConfigError if the settings cannot be used at the start.
     """
     daemon = Daemon(load, Gateway(load()), every_second)
-    daemon.on_stop_request = StopDeadline(daemon.unfinished).begin
+    in_loop = asyncio.get_running_loop().call_soon_threadsafe
+    Signals(lambda: in_loop(daemon.request_stop), lambda: in_loop(daemon.hang_up), daemon.unfinished)
     await daemon.run()
 
 
@@ -54,17 +54,10 @@ class Daemon:
         self._started_on_terminal = os.isatty(0)
         self._reload_problem = ""
         """Why the last reload was refused; "" if it succeeded."""
-        self.on_stop_request: Callable[[], None] = lambda: None
-        """Called for each request to stop, perhaps in a signal handler."""
 
     async def run(self) -> None:
-        """Run until SIGTERM, SIGINT or the end of the controlling terminal."""
-        loop = self._loop
-        for number in (signal.SIGINT, signal.SIGTERM):
-            # Unlike a handler of the event loop, this one is called while the event loop is busy or blocked.
-            signal.signal(number, self._on_stop_signal)
-        loop.add_signal_handler(signal.SIGHUP, self._on_hangup)
-        loop.set_exception_handler(self._on_loop_error)
+        """Run until ``request_stop`` is called."""
+        self._loop.set_exception_handler(self._on_loop_error)
         async with asyncio.TaskGroup() as tasks:
             background = [
                 tasks.create_task(self._notify_systemd()),
@@ -78,20 +71,15 @@ class Daemon:
                 for task in background:
                     task.cancel()
 
-    def _on_stop_signal(self, _number: int, _frame: FrameType | None) -> None:
-        self.on_stop_request()
-        self._loop.call_soon_threadsafe(self._request_stop)
-
-    def _request_stop(self) -> None:
+    def request_stop(self) -> None:
+        """Begin to stop. Called in the event loop."""
         self._systemd.notify_stopping()
         self._stop.set()
 
-    def _on_hangup(self) -> None:
-        """Stop if SIGHUP means that the terminal is gone; otherwise reload the configuration."""
+    def hang_up(self) -> None:
+        """Stop if the terminal is gone, which also sends SIGHUP; otherwise reload the configuration."""
         if self._started_on_terminal and not os.isatty(0):
-            if not self._stop.is_set():
-                self.on_stop_request()
-                self._request_stop()
+            os.kill(os.getpid(), signal.SIGTERM)  # Signals limits the time that the stop takes
         else:
             self._reload_requested.set()
 

@@ -7,9 +7,11 @@ import asyncio
 import atexit
 import logging
 import os
-import queue
+import signal
+import socket
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from types import FrameType
@@ -48,33 +50,54 @@ def end_at_once(_number: int, _frame: FrameType | None) -> NoReturn:
     os._exit(0)
 
 
-class StopDeadline:
-    """Ends the process STOP_S after the first call of ``begin``, or at the second call.
+class Signals:
+    """Receives the signals of the process, also while the main thread is in a call that does not return.
 
-    The exit status is 0, because the end was requested: systemd does not count it as a failure. What is not
-    finished then is logged; ``unfinished`` returns it. This runs in a thread, because the event loop may be
-    what does not finish.
+    Python runs signal handlers only in the main thread, and so does the event loop. But Python writes the
+    number of each signal to the wakeup descriptor at once, and a thread reads it here.
+
+    SIGTERM and SIGINT call ``request_stop``. The process ends STOP_S after the first one, or at the second
+    one. The exit status is then 0, because the end was requested: systemd does not count it as a failure.
+    What is not finished is logged; ``unfinished`` returns it. SIGHUP calls ``hang_up``. All three are called
+    in the thread. Create this object in the main thread, in the running event loop: the loop sets a wakeup
+    descriptor of its own when it starts.
     """
 
-    def __init__(self, unfinished: Callable[[], Sequence[str]]) -> None:
+    def __init__(
+        self,
+        request_stop: Callable[[], object],
+        hang_up: Callable[[], object],
+        unfinished: Callable[[], Sequence[str]],
+    ) -> None:
+        self._request_stop = request_stop
+        self._hang_up = hang_up
         self._unfinished = unfinished
-        self._calls: queue.SimpleQueue[None] = queue.SimpleQueue()
-        threading.Thread(target=self._run, name="stop-deadline", daemon=True).start()
-
-    def begin(self) -> None:
-        """Begin to count. This may be called in a signal handler."""
-        self._calls.put(None)  # SimpleQueue is reentrant, unlike most of threading
+        self._numbers, self._written = socket.socketpair()
+        self._written.setblocking(False)
+        signal.set_wakeup_fd(self._written.fileno(), warn_on_full_buffer=False)
+        for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(number, lambda *_: None)  # so that Python writes to the descriptor
+        threading.Thread(target=self._run, name="signals", daemon=True).start()
 
     def _run(self) -> None:
-        self._calls.get()
+        while self._next() == signal.SIGHUP:
+            self._hang_up()
+        self._request_stop()
         reason = f"it did not stop within {STOP_S:g} s"
-        with suppress(queue.Empty):
-            self._calls.get(timeout=STOP_S)
+        deadline_s = time.monotonic() + STOP_S
+        with suppress(TimeoutError):
+            while self._next(max(0.001, deadline_s - time.monotonic())) == signal.SIGHUP:
+                pass
             reason = "of a second signal"
         message = threading.Thread(target=self._log, args=(reason,), name="stop-log", daemon=True)
         message.start()
         message.join(_LOG_S)
         os._exit(0)
+
+    def _next(self, timeout_s: float | None = None) -> int:
+        """Return the number of the next signal; raise TimeoutError if there is none in time."""
+        self._numbers.settimeout(timeout_s)
+        return self._numbers.recv(1)[0]
 
     def _log(self, reason: str) -> None:
         logger.warning(

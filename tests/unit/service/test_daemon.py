@@ -70,15 +70,20 @@ class Configuration:
 
 @asynccontextmanager
 async def running(configuration: Configuration) -> AsyncIterator[tuple[Gateway, asyncio.Task[None]]]:
-    """Run a daemon, and stop it with SIGTERM at the end of the block."""
+    """Run a daemon, and stop it at SIGTERM or at the end of the block."""
     gateway = Gateway(settings("lab"), [MemoryOutput()])
-    task = asyncio.create_task(Daemon(configuration.load, gateway).run())
+    daemon = Daemon(configuration.load, gateway)
+    loop = asyncio.get_running_loop()
+    loop.add_signal_handler(signal.SIGTERM, daemon.request_stop)  # as Signals does in a process
+    loop.add_signal_handler(signal.SIGHUP, daemon.hang_up)
+    task = asyncio.create_task(daemon.run())
     await gateway.opened.wait()
     await settle()
     yield gateway, task
-    if not task.done():
-        os.kill(os.getpid(), signal.SIGTERM)
+    daemon.request_stop()
     await task
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        loop.remove_signal_handler(number)
 
 
 def names(gateway: Gateway) -> list[str]:
@@ -103,14 +108,11 @@ async def test_the_start_is_reported_with_a_status_and_then_repeated(systemd: No
         assert all(text.startswith("STATUS=lab: ") for text in systemd.sent)
 
 
-@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-async def test_a_signal_stops_the_gateway_and_all_tasks(
-    systemd: Notifications, servers: Servers, number: signal.Signals
-) -> None:
+async def test_a_request_stops_the_gateway_and_all_tasks(systemd: Notifications, servers: Servers) -> None:
     async with running(Configuration()) as (gateway, task):
         await until(lambda: gateway.sources[0].streams[0].session)
         await settle()
-        os.kill(os.getpid(), number)
+        os.kill(os.getpid(), signal.SIGTERM)
         await asyncio.wait([task], timeout=5)
         assert task.done()
         assert servers["server"].connection.commands[-1] == "Bye"

@@ -7,9 +7,11 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import pytest
+
 PROLOGUE = """
-import atexit, logging, os, sys, threading, time
-from gateway.service.process_end import StopDeadline, end_process
+import atexit, ctypes, logging, os, sys, threading, time
+from gateway.service.process_end import Signals, end_process
 logging.basicConfig(format="%(message)s")
 """
 
@@ -73,26 +75,61 @@ def test_threads_in_calls_of_zenoh_do_not_abort_the_process() -> None:
         assert (ended.returncode, ended.stderr) == (0, "")
 
 
-def test_the_deadline_logs_what_is_not_finished() -> None:
-    began_s = time.monotonic()
-    ended = run("StopDeadline(lambda: ['one', 'two']).begin()\ntime.sleep(60)")
-    assert ended.returncode == 0
-    assert ended.stderr == (
-        "the gateway ends at once, because it did not stop within 1.5 s; not finished: one, two\n"
-    )
-    assert 1.5 < time.monotonic() - began_s < 50
+# The main thread is in a call that never returns, not even for a signal: it locks a mutex twice.
+BLOCKED = """
+def say(word):
+    print(word, flush=True)
+Signals(lambda: say("stopping"), lambda: say("hung up"), lambda: ["one", "two"])
+say("ready")
+mutex = ctypes.create_string_buffer(64)
+while True:
+    ctypes.CDLL(None).pthread_mutex_lock(mutex)
+"""
 
 
-def test_a_second_request_ends_the_process_at_once() -> None:
-    ended = run("deadline = StopDeadline(list)\ndeadline.begin()\ndeadline.begin()\ntime.sleep(60)")
-    assert ended.returncode == 0
-    assert ended.stderr == (
-        "the gateway ends at once, because of a second signal; not finished: other tasks\n"
-    )
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_a_blocked_process_ends_at_the_deadline_and_logs_what_is_not_finished(number: int) -> None:
+    with running(BLOCKED) as process:
+        began_s = time.monotonic()
+        process.send_signal(number)
+        assert process.communicate(timeout=30) == (
+            "stopping\n",
+            "the gateway ends at once, because it did not stop within 1.5 s; not finished: one, two\n",
+        )
+        assert process.returncode == 0
+        assert time.monotonic() - began_s > 1.4
 
 
-def test_without_a_request_nothing_ends() -> None:
-    assert run("StopDeadline(list)\ntime.sleep(2)\nend_process(5)").returncode == 5
+def test_a_second_signal_ends_the_process_at_once() -> None:
+    with running(BLOCKED) as process:
+        process.send_signal(signal.SIGTERM)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "stopping\n"
+        process.send_signal(signal.SIGINT)
+        assert process.communicate(timeout=30)[1] == (
+            "the gateway ends at once, because of a second signal; not finished: one, two\n"
+        )
+        assert process.returncode == 0
+
+
+def test_sighup_is_received_before_a_stop_and_does_not_end_it() -> None:
+    with running(BLOCKED) as process:
+        assert process.stdout is not None
+        for _ in range(2):
+            process.send_signal(signal.SIGHUP)
+            assert process.stdout.readline() == "hung up\n"
+        process.send_signal(signal.SIGTERM)
+        assert process.stdout.readline() == "stopping\n"
+        process.send_signal(signal.SIGHUP)
+        assert "did not stop within 1.5 s" in process.communicate(timeout=30)[1]
+        assert process.returncode == 0
+
+
+def test_a_stop_in_time_has_its_own_status() -> None:
+    code = "stop = threading.Event()\nSignals(stop.set, list, list)\nprint(flush=True)\nstop.wait()\n"
+    with running(code + "end_process(5)") as process:
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 5
 
 
 def test_a_log_that_blocks_does_not_delay_the_deadline() -> None:
@@ -101,9 +138,7 @@ class Blocked(logging.Handler):
     def emit(self, record):
         time.sleep(60)
 logging.getLogger().handlers = [Blocked()]
-deadline = StopDeadline(list)
-import signal
-signal.signal(signal.SIGTERM, lambda *_: deadline.begin())
+Signals(lambda: None, lambda: None, list)
 print(flush=True)
 time.sleep(60)
 """
