@@ -1,6 +1,7 @@
 """Observation of one stream: rates, message sizes, and which markers and tools are in view."""
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -73,8 +74,7 @@ class ObservedComponent:
         intervals = self._num_frames - 1
         span_s = (self._last_us - self._first_us) / 1e6
         arrival_hz = intervals / span_s if intervals > 0 and span_s > 0 else 0.0
-        steps_us = np.diff(np.array(self._timestamps_us, np.int64))
-        if intervals < 1 or bool(np.any(steps_us <= 0)):
+        if intervals < 1 or any(later_us <= us for us, later_us in pairwise(self._timestamps_us)):
             return arrival_hz
         timestamp_hz = intervals * 1e6 / (self._timestamps_us[-1] - self._timestamps_us[0])
         is_plausible = not arrival_hz or 0.5 < timestamp_hz / arrival_hz < 2
