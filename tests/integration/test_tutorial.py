@@ -95,6 +95,7 @@ def folder(tmp_path: Path) -> Path:
             (tmp_path / path.name).symlink_to(path)
     (tmp_path / ".venv").mkdir()
     (tmp_path / ".venv/bin").symlink_to(Path(sys.executable).parent)
+    (tmp_path / ".venv/runtime").touch()
     (tmp_path / ".venv/installed").touch()
     return tmp_path
 

@@ -297,11 +297,15 @@ async def test_the_journal_entries_have_fields(service: Service) -> None:
     assert entries[0]["PRIORITY"] == "6"
 
 
+C3D_FILE = b"\x02\x50" + bytes(510)
+"""The header of a C3D file; the gateway refuses files without one."""
+
+
 def file_server() -> ScriptedServer:
     """Return a server that sends a C3D file without a request."""
 
     async def script(client: Client) -> None:
-        client.send(packet(5, b"a C3D file"))
+        client.send(packet(5, C3D_FILE))
         await client.commands(lambda command: ok(f"OK-{command}"))
 
     return ScriptedServer(script)
@@ -317,7 +321,7 @@ async def test_the_service_can_only_write_to_its_state_directory(service: Servic
     async with file_server() as server:
         service.configure({"lab": server.port})
         await service.start()
-        assert (await kept_file(service)).read_bytes() == b"a C3D file"
+        assert (await kept_file(service)).read_bytes() == C3D_FILE
         mounts = await service.machine.run("cat", f"/proc/{await service.main_pid()}/mountinfo")
     # All mounts, but the kernel's file systems and the private /tmp do not count.
     mount_points = [line.split(maxsplit=6)[4:6] for line in mounts.text.splitlines()]
