@@ -15,8 +15,8 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 # What a wheel is built from.
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-compiled check lint types contracts generated docs lcm-types fuzz soak stops mutants bench bench-quick zenohd \
-    wheel compiled wheelhouse install uninstall clean
+.PHONY: demo lock test test-hostile test-others test-compiled check lint types contracts generated docs lcm-types fuzz soak stops \
+    mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clean
 
 demo: .venv/runtime
 	$(BIN)/rtc3d-gateway demo
@@ -24,6 +24,12 @@ demo: .venv/runtime
 # Without MAKEFLAGS, a make that a test runs does not look for the job slots of this one.
 test: .venv/installed
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) tests/with-netns $(BIN)/pytest $(ARGS)
+
+# `make test` in two parts, which `make check` runs at the same time.
+test-hostile: ARGS := tests/hostile
+test-others: ARGS := --ignore=tests/hostile
+test-hostile test-others: .venv/installed
+	$(MAKE) --no-print-directory test ARGS=$(ARGS)
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.
@@ -38,7 +44,7 @@ test-compiled: build/compiled/complete
 # Two parts at a time. Each run of pytest has a network namespace of its own, so they do not disturb each other.
 check: .venv/installed
 	$(MAKE) --jobs=2 --output-sync=target --no-print-directory lint types contracts generated docs wheelhouse compiled
-	$(MAKE) --jobs=2 --output-sync=target --no-print-directory test test-compiled
+	$(MAKE) --jobs=2 --output-sync=target --no-print-directory test-others test-hostile test-compiled
 
 lint: .venv/installed
 	$(BIN)/ruff format --check
