@@ -13,7 +13,7 @@ from gateway.outputs.zenoh.config import zenoh_reason
 
 BURST_BYTES: Final = 128 * 1024
 BURST_S: Final = 0.002
-"""Zenoh gets at most BURST_BYTES in BURST_S, 65 MB per second; more has to wait.
+"""Zenoh gets at most BURST_BYTES for subscribers in BURST_S, 65 MB per second; more has to wait.
 
 Zenoh itself hardly waits for a subscriber (config.py), because it would wait for each that does not read. So
 without this pace, frames that arrive as fast as TCP delivers them would overflow the queue of a subscriber
@@ -94,9 +94,10 @@ class ZenohPublisher:
         link = self._link
         if self._publisher is None or link.is_cut_off:
             raise self._refusal()
-        link.burst_bytes_left -= len(message)
-        if link.burst_bytes_left < 0:
-            link.wait_for_pace()
+        if self.wanted:
+            link.burst_bytes_left -= len(message)
+            if link.burst_bytes_left < 0:
+                link.wait_for_pace()
         try:
             self._publisher.put(message)
         except zenoh.ZError as error:
