@@ -3,8 +3,6 @@
 import asyncio
 import json
 import logging
-import os
-import signal
 from collections import defaultdict
 from collections.abc import AsyncIterator, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager
@@ -337,13 +335,13 @@ async def test_metrics_move_to_another_port(caplog: pytest.LogCaptureFixture) ->
     daemon = Daemon(settings.pop, Gateway(first))
     task = asyncio.create_task(daemon.run())
     await wait_until_async(daemon._gateway.opened.is_set)
-    os.kill(os.getpid(), signal.SIGHUP)
+    daemon.hang_up()
     await wait_until_async(lambda: "configuration reloaded: metrics changed" in caplog.text)
     _, writer = await asyncio.open_connection("127.0.0.1", after)
     writer.close()
     with pytest.raises(ConnectionRefusedError):
         await asyncio.open_connection("127.0.0.1", before)
-    os.kill(os.getpid(), signal.SIGTERM)
+    daemon.request_stop()
     await task
 
 
