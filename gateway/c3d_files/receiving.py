@@ -9,6 +9,7 @@ from gateway.c3d_files.incoming import IncomingFile
 from gateway.c3d_files.spool import Spool, StoredFile
 from gateway.errors import SpoolError
 from gateway.rtc3d.packets import FilePiece
+from gateway.token_bucket import TokenBucket
 from gateway.worker_thread import WorkerThread
 
 _MAX_UNSTORED_FILES: Final = 4
@@ -42,8 +43,7 @@ class SourceFiles:
         self._thread = WorkerThread(f"c3d-{source}")
         self._unstored: dict[IncomingFile, Callable[[SpoolError], None]] = {}
         self._is_disk_silent = False
-        self._num_allowed = float(_MAX_FILES_AT_ONCE)
-        self._allowed_s = 0.0  # when _num_allowed was updated, on the event loop's clock
+        self._allowed = TokenBucket(1 / _FILE_PERIOD_S, _MAX_FILES_AT_ONCE)
 
     def receiver(self, on_lost: Callable[[SpoolError], None]) -> "FileReceiver":
         """Return what takes the files of one stream; ``on_lost`` is called with each one that is lost."""
@@ -67,11 +67,12 @@ class SourceFiles:
                 f"{name} is dropped: {len(self._unstored)} earlier files are still being written; "
                 "is the disk slow, or the server faulty?"
             )
-        if not self._is_allowed():
+        if self._allowed.left < 1:
             raise SpoolError(
                 f"{name} is dropped: {self._source} sends more than one file in {_FILE_PERIOD_S:g} s; "
                 "is the server faulty?"
             )
+        self._allowed.take()
         file = IncomingFile(self._source, file_bytes, spool, self._thread, self._end)
         self._unstored[file] = on_lost
         return file
@@ -91,16 +92,6 @@ class SourceFiles:
             return
         written = asyncio.wrap_future(self._thread.submit(lambda: None))
         await asyncio.wait([written], timeout=_FINISH_S)
-
-    def _is_allowed(self) -> bool:
-        now_s = asyncio.get_running_loop().time()
-        regained = (now_s - self._allowed_s) / _FILE_PERIOD_S
-        self._num_allowed = min(self._num_allowed + regained, _MAX_FILES_AT_ONCE)
-        self._allowed_s = now_s
-        if self._num_allowed < 1:
-            return False
-        self._num_allowed -= 1
-        return True
 
     def _end(self, file: IncomingFile, result: StoredFile | SpoolError) -> None:
         on_lost = self._unstored.pop(file)

@@ -11,6 +11,7 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from gateway.errors import QueryError
+from gateway.token_bucket import TokenBucket
 
 MAX_KEYS: Final = 256
 """Of how many keys the rate is known. The key that was asked for least recently is forgotten first."""
@@ -20,41 +21,6 @@ REFUSALS_PER_S: Final = 500.0
 
 NO_REPLY: Final = "no-reply"
 """The result of a question that got no reply."""
-
-
-class TokenBucket:
-    """Allows ``per_s`` a second on average, and the amount of one second at once.
-
-    An amount may be larger than what is left: then nothing more is allowed until it has been made up for,
-    which takes one second at most. Not safe for threads.
-    """
-
-    def __init__(self, per_s: float, monotonic: Callable[[], float] = time.monotonic) -> None:
-        self._per_s = per_s
-        self._capacity = max(per_s, 1.0)
-        self._monotonic = monotonic
-        self._left = self._capacity
-        self._updated_s = monotonic()
-
-    @property
-    def has_any(self) -> bool:
-        """Whether anything is allowed now."""
-        return self._now() > 0
-
-    def take(self, amount: float = 1.0) -> None:
-        """Use ``amount``."""
-        self._left = max(self._now() - amount, -self._capacity)
-        self._updated_s = self._monotonic()
-
-    def try_take(self, amount: float = 1.0) -> bool:
-        """Use ``amount`` if anything is allowed now; return whether it is."""
-        if not self.has_any:
-            return False
-        self.take(amount)
-        return True
-
-    def _now(self) -> float:
-        return min(self._left + (self._monotonic() - self._updated_s) * self._per_s, self._capacity)
 
 
 class QueryLimits(NamedTuple):
@@ -89,11 +55,11 @@ class Admission:
         self._limits = limits
         self._monotonic = monotonic
         self._lock = threading.Lock()
-        self._total = TokenBucket(limits.per_s, monotonic)
+        self._total = TokenBucket(limits.per_s, monotonic=monotonic)
         self._keys: OrderedDict[str, TokenBucket] = OrderedDict()
-        self._bytes = TokenBucket(limits.reply_bytes_per_s, monotonic)
-        self._long_bytes = TokenBucket(limits.reply_bytes_per_s, monotonic)
-        self._refusals = TokenBucket(REFUSALS_PER_S, monotonic)
+        self._bytes = TokenBucket(limits.reply_bytes_per_s, monotonic=monotonic)
+        self._long_bytes = TokenBucket(limits.reply_bytes_per_s, monotonic=monotonic)
+        self._refusals = TokenBucket(REFUSALS_PER_S, monotonic=monotonic)
         self._num_pending = 0
         self._results: Counter[str] = Counter()
 
@@ -156,7 +122,7 @@ class Admission:
             (self._total, self._limits.per_s, "max_queries_per_s", "in total"),
             (bucket, self._limits.per_key_per_s, self._limits.key_setting, "like this one"),
         ):
-            if not allowed.has_any:
+            if allowed.left <= 0:
                 text = (
                     f"the gateway answers {per_s:g} queries a second {what}; ask less often, subscribe "
                     f"instead, or raise {self._limits.output}.{setting} in the gateway's configuration"
@@ -169,7 +135,7 @@ class Admission:
         if bucket is None:
             if len(self._keys) >= MAX_KEYS:
                 self._keys.popitem(last=False)
-            bucket = self._keys[key] = TokenBucket(self._limits.per_key_per_s, self._monotonic)
+            bucket = self._keys[key] = TokenBucket(self._limits.per_key_per_s, monotonic=self._monotonic)
         else:
             self._keys.move_to_end(key)
         return bucket

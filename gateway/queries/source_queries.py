@@ -12,7 +12,6 @@ from gateway.messages.decode import prefix_of
 from gateway.messages.encode import encode_message
 from gateway.messages.host_time import now_utime
 from gateway.messages.stamp import NOT_PUBLISHED, Stamp
-from gateway.outputs.admission import TokenBucket
 from gateway.outputs.contract import Answer
 from gateway.outputs.encodings import JSON, XML, json_bytes
 from gateway.queries.answers import message_answer, schema_answer
@@ -26,6 +25,7 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY, Component, ComponentType
 from gateway.rtc3d.frames import detect_byte_order, split_frame
 from gateway.rtc3d.packets import PacketType
 from gateway.stream.state import StreamState
+from gateway.token_bucket import TokenBucket
 
 RECORDINGS_PER_S: Final = 4.0
 """How many commands a second to start or stop a recording reach the server."""

@@ -5,6 +5,7 @@ such as defects, and for many messages that come together.
 """
 
 import logging
+import math
 import threading
 import traceback
 from collections.abc import Callable
@@ -12,6 +13,7 @@ from time import monotonic
 from typing import Final
 
 from gateway.safe_text import safe_text
+from gateway.token_bucket import TokenBucket
 
 BURST_LINES: Final = 25
 LINES_PER_MINUTE: Final = 20
@@ -37,34 +39,12 @@ _REPORT_S: Final = 60.0
 logger = logging.getLogger(__name__)
 
 
-class _Bucket:
-    """A token bucket: one token per line. A message passes if there is one token, and may use up more."""
-
-    def __init__(self, burst: int, per_minute: int, now_s: float) -> None:
-        self._burst = float(burst)
-        self._per_s = per_minute / 60
-        self._tokens = self._burst
-        self._filled_s = now_s
-
-    def fill(self, now_s: float) -> float:
-        """Add the tokens of the time since the last call; return how many there are."""
-        self._tokens = min(self._burst, self._tokens + self._per_s * (now_s - self._filled_s))
-        self._filled_s = now_s
-        return self._tokens
-
-    def take(self, lines: int) -> None:
-        self._tokens -= lines
-
-    def take_available(self, lines: int) -> None:
-        self._tokens = max(0.0, self._tokens - lines)
-
-
 class _Scope:
     """The messages of one source, or of everything else."""
 
-    def __init__(self, now_s: float) -> None:
-        self.bucket = _Bucket(BURST_LINES, LINES_PER_MINUTE, now_s)
-        self.own = _Bucket(OWN_BURST_LINES, OWN_LINES_PER_MINUTE, now_s)
+    def __init__(self, monotonic: Callable[[], float]) -> None:
+        self.bucket = TokenBucket(LINES_PER_MINUTE / 60, BURST_LINES, monotonic)
+        self.own = TokenBucket(OWN_LINES_PER_MINUTE / 60, OWN_BURST_LINES, monotonic)
         self.suppressed: dict[str, int] = {}  # by level
         self.newest = ""
         self.since_s = 0.0  # of the first suppressed message
@@ -87,7 +67,7 @@ class LogLimit(logging.Filter):
         super().__init__()
         self._monotonic = monotonic
         self._lock = threading.Lock()  # any thread may log
-        self._total = _Bucket(TOTAL_BURST_LINES, TOTAL_LINES_PER_MINUTE, monotonic())
+        self._total = TokenBucket(TOTAL_LINES_PER_MINUTE / 60, TOTAL_BURST_LINES, monotonic)
         self._scopes: dict[str, _Scope] = {}  # by the source's name, from the configuration; "" for the rest
 
     def filter(self, record: logging.LogRecord) -> bool:
@@ -100,14 +80,14 @@ class LogLimit(logging.Filter):
             name = str(getattr(record, "source", ""))
             scope = self._scopes.get(name)
             if scope is None:
-                scope = self._scopes[name] = _Scope(now_s)
-            tokens, own, total = (each.fill(now_s) for each in (scope.bucket, scope.own, self._total))
-            if tokens < 1 or max(own, total) < 1:
+                scope = self._scopes[name] = _Scope(self._monotonic)
+            # A message passes if one line is left, and may use up more.
+            if scope.bucket.left < 1 or max(scope.own.left, self._total.left) < 1:
                 scope.suppress(record, now_s)
                 return False
-            scope.bucket.take(lines)
-            scope.own.take_available(lines)
-            self._total.take(lines)
+            scope.bucket.take(lines, least=-math.inf)
+            scope.own.take(lines, least=0.0)
+            self._total.take(lines, least=-math.inf)
             return True
 
     def report(self, *, at_once: bool = False) -> None:

@@ -22,13 +22,14 @@ from gateway.log import DefectLog, FailureLog, log_fields
 from gateway.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import lcm_channel
-from gateway.outputs.admission import Admission, QueryLimits, Refusal, TokenBucket
+from gateway.outputs.admission import Admission, QueryLimits, Refusal
 from gateway.outputs.contract import QueryService, ServerParameters
 from gateway.outputs.lcm.connection import open_lcm, scheme_of, send_problem
 from gateway.outputs.lcm.sender import RETRY_S, LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.thread_sender import LcmThreadSender, new_sender
 from gateway.outputs.send_thread import SendThread
+from gateway.token_bucket import TokenBucket
 from gateway.worker_thread import WorkerThread
 
 MAX_PENDING: Final = 64
@@ -150,7 +151,7 @@ class LcmQueries:
             self._reply_sender.open()
         while connection is not None and not self._closing.is_set():
             self._subscribe(connection)
-            if not self._received.has_any:
+            if self._received.left <= 0:
                 self._closing.wait(_PAUSE_S)  # or a flood would keep other threads from running
             try:
                 connection.handle_timeout(_POLL_MS)

@@ -221,7 +221,7 @@ async def test_a_flood_of_files_is_limited(tmp_path: Path) -> None:
     assert lab.lost == 2 * [
         "a C3D file of 2000 bytes is dropped: lab sends more than one file in 3 s; is the server faulty?"
     ]
-    lab.files._allowed_s -= 3.0
+    lab.files._allowed._updated_s -= 3.0
     for _ in range(2):
         lab.send(FILE)
     await lab.ended(receiving._MAX_FILES_AT_ONCE + 4)

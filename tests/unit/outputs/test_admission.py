@@ -6,7 +6,7 @@ import pytest
 
 from gateway.errors import QueryError
 from gateway.outputs import admission as admission_module
-from gateway.outputs.admission import MAX_KEYS, NO_REPLY, Admission, QueryLimits, TokenBucket
+from gateway.outputs.admission import MAX_KEYS, NO_REPLY, Admission, QueryLimits
 
 LIMITS = QueryLimits("zenoh", "max_queries_per_key_per_s", 100.0, 10.0, 1000.0, 40)
 
@@ -33,31 +33,6 @@ def asked(admission: Admission, key: str, times: int) -> Counter[str]:
         if refusal is None:
             admission.finished("ok")
     return results
-
-
-def test_a_bucket_allows_the_amount_of_a_second_at_once_and_then_its_rate(clock: Clock) -> None:
-    bucket = TokenBucket(10.0, clock)
-    assert [bucket.try_take() for _ in range(12)] == [True] * 10 + [False] * 2
-    clock.now_s += 0.55
-    assert [bucket.try_take() for _ in range(7)] == [True] * 6 + [False]
-    clock.now_s += 3600
-    assert sum(bucket.try_take() for _ in range(100)) == 10
-
-
-def test_a_large_amount_is_made_up_for_within_a_second(clock: Clock) -> None:
-    bucket = TokenBucket(10.0, clock)
-    assert bucket.try_take(1_000_000)
-    clock.now_s += 0.99
-    assert not bucket.has_any
-    clock.now_s += 0.02
-    assert bucket.has_any
-
-
-def test_a_rate_below_one_allows_one_at_once(clock: Clock) -> None:
-    bucket = TokenBucket(0.5, clock)
-    assert [bucket.try_take(), bucket.try_take()] == [True, False]
-    clock.now_s += 2.1
-    assert bucket.try_take()
 
 
 def test_each_key_has_its_rate(clock: Clock) -> None:
