@@ -4,7 +4,7 @@
 
     GatewayError                  base of all errors that this package raises on purpose
     ├── ConfigError               a configuration is invalid: every problem, with file and line
-    ├── TakeError                 a C3D file cannot be played
+    ├── TakeError                 a recording (.lcmlog, .c3d) cannot be read, written or converted
     ├── ProtocolError             bytes that violate RTC3D
     │   ├── PacketError           §4: a size out of bounds; the connection must end
     │   ├── FrameError            §7: sizes and counts contradict each other; the frame is rejected
@@ -37,7 +37,7 @@ class ConfigError(GatewayError):
 
 
 class TakeError(GatewayError):
-    """A C3D file cannot be played by the simulator."""
+    """A recording, an event log or a C3D file, cannot be read, played, written or converted."""
 
 
 class ProtocolError(GatewayError):

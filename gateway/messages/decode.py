@@ -23,9 +23,10 @@ MESSAGE_TYPES_BY_NAME: Final[dict[str, type[Any]]] = {
         rtc3d.parameters_t,
         rtc3d.parameters_request_t,
         rtc3d.parameters_reply_t,
+        rtc3d.take_t,
     )
 }
-"""The types of all messages that the gateway publishes, and of the requests that it receives on LCM."""
+"""The types of all messages that the gateway publishes, receives on LCM, or writes to recordings."""
 
 _MESSAGE_TYPES_BY_FINGERPRINT: Final = {
     message_type._get_packed_fingerprint(): message_type  # noqa: SLF001 - lcm-gen offers no other way

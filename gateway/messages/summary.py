@@ -18,21 +18,25 @@ def summarise(message: Any) -> str:
     """Return a line about a decoded LCM message, with what a person wants to see first."""
     match message:
         case rtc3d.status_t():
-            return _status(message)
+            text = _status(message)
         case rtc3d.clock_t():
-            return f"#{message.sequence} {_clock(message.clock)} ({message.components})"
+            text = f"#{message.sequence} {_clock(message.clock)} ({message.components})"
         case rtc3d.parameters_t():
             version = f"session {message.session}, version {message.parameters_version}"
-            return f"#{message.sequence} {version}: {summarise_xml(message.xml.encode())}"
+            text = f"#{message.sequence} {version}: {summarise_xml(message.xml.encode())}"
         case rtc3d.parameters_request_t():
             sections = " ".join(message.sections) or "all"
             fresh = ", fresh" if message.fresh else ""
-            return f"request {message.request_id} from {message.requester!r}: {sections}{fresh}"
+            text = f"request {message.request_id} from {message.requester!r}: {sections}{fresh}"
         case rtc3d.parameters_reply_t():
-            text = message.error or f"{summarise_xml(message.xml.encode())}, {message.age_s:.1f} s old"
-            return f"reply {message.request_id} to {message.requester!r}: {text}"
-    frame = f"#{message.sequence} frame {message.frame_number} at {message.timestamp / 1e6:.4f} s"
-    return f"{frame}: {_frame_content(message)}"
+            content = message.error or f"{summarise_xml(message.xml.encode())}, {message.age_s:.1f} s old"
+            text = f"reply {message.request_id} to {message.requester!r}: {content}"
+        case rtc3d.take_t():
+            text = f"take {message.name!r} of {message.source}, recorded on {message.host}"
+        case _:
+            frame = f"#{message.sequence} frame {message.frame_number} at {message.timestamp / 1e6:.4f} s"
+            text = f"{frame}: {_frame_content(message)}"
+    return text
 
 
 def summarise_xml(xml: bytes) -> str:

@@ -62,3 +62,14 @@ def parameter_messages() -> list[bytes]:
     parameters.xml = reply.xml = "<RT_Parameters/>"
     request.requester = reply.requester = "viewer"
     return [parameters.encode(), request.encode(), reply.encode()]
+
+
+def take_message() -> bytes:
+    """Return the description of a take."""
+    message = rtc3d.take_t()
+    message.utime = 1_700_000_000_000_000
+    message.name, message.source, message.channels = "walk-1", "lab", "MOCAP_LAB"
+    message.server, message.gateway_version = "192.0.2.20:3020", "1.0.0"
+    message.recorder, message.host = "rtc3d-gateway 1.0.0", "analysis-pc"
+    encoded: bytes = message.encode()
+    return encoded

@@ -9,6 +9,7 @@ from tests.unit.messages.samples import (
     component_message,
     parameter_messages,
     status_of,
+    take_message,
     tool_pose_messages,
     unknown_clock,
 )
@@ -22,6 +23,7 @@ EVERY_MESSAGE = [
     status_of(),
     unknown_clock(),
     *parameter_messages(),
+    take_message(),
 ]
 every_message = pytest.mark.parametrize(
     "message", EVERY_MESSAGE, ids=lambda message: type(decode(message)).__name__
@@ -30,7 +32,7 @@ every_message = pytest.mark.parametrize(
 
 def test_all_published_types_can_be_decoded() -> None:
     assert set(MESSAGE_TYPES_BY_NAME) == {type(decode(message)).__name__ for message in EVERY_MESSAGE}
-    assert len(MESSAGE_TYPES_BY_NAME) == 11
+    assert len(MESSAGE_TYPES_BY_NAME) == 12
 
 
 @every_message

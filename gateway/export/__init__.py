@@ -1,0 +1,1 @@
+"""Converting takes to the files of other programs: C3D, MCAP, CSV, TRC."""

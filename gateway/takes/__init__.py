@@ -1,0 +1,1 @@
+"""Takes: recordings of a gateway's messages as LCM event logs, written and read."""

@@ -1,0 +1,196 @@
+"""LCM event logs: their format, and a reader that survives damage.
+
+An event is a header (big-endian: sync word, number, time, sizes), the channel, and the message. lcm.EventLog
+reads the same format, but ends at the first damaged byte.
+"""
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import BinaryIO, Final, NamedTuple
+
+from gateway.config.files import check_is_file
+from gateway.errors import TakeError
+
+SYNC: Final = bytes.fromhex("eda1da01")
+_HEADER: Final = struct.Struct(">4sqqii")
+"""Sync word, event number, time in µs since the Unix epoch, size of the channel, size of the message."""
+
+MAX_CHANNEL_BYTES: Final = 255
+MAX_MESSAGE_BYTES: Final = 256 * 1024 * 1024
+"""An event with a longer channel or message is damage. LCM's own channels have at most 63 bytes."""
+
+MAX_LISTED_DAMAGE: Final = 100
+"""How many places of damage are listed; all are counted."""
+
+_READ_BYTES: Final = 4 * 1024 * 1024
+_MAX_FOREIGN_BYTES: Final = 64 * 1024 * 1024
+"""A file without an event in its first 64 MiB is no event log."""
+
+
+class Event(NamedTuple):
+    """One message in an event log. ``offset`` is where the event begins in the file, in bytes."""
+
+    number: int
+    utime: int
+    channel: str
+    message: bytes
+    offset: int
+
+
+class Damage(NamedTuple):
+    """Bytes of a file that belong to no readable event."""
+
+    offset: int
+    num_bytes: int
+
+
+def encode_event(number: int, utime: int, channel: bytes, message: bytes) -> bytes:
+    """Return an event as in a file; ``utime`` is its time in µs since the Unix epoch."""
+    header = _HEADER.pack(SYNC, number, utime, len(channel), len(message))
+    return b"%b%b%b" % (header, channel, message)
+
+
+class EventLogReader:
+    """Reads the events of one file, in their order; bytes that are damaged are skipped and counted.
+
+    ``events`` may be called again. ``damage`` and ``damaged_bytes`` describe the newest complete pass.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.damage: list[Damage] = []
+        """The first MAX_LISTED_DAMAGE places of damage."""
+        self.num_damaged = 0
+        """How many places of damage there are."""
+        self.damaged_bytes = 0
+        """How many bytes belong to no readable event."""
+
+    def events(self, start_offset: int = 0) -> Iterator[Event]:
+        """Yield the events from a place in the file on. Raises TakeError if it is no event log."""
+        self.damage, self.num_damaged, self.damaged_bytes = [], 0, 0
+        try:
+            check_is_file(self.path)
+            with self.path.open("rb") as file:
+                file.seek(start_offset)
+                yield from self._events(_Window(file, start_offset))
+        except OSError as error:
+            raise TakeError(f"{self.path} cannot be read: {error.strerror or error}") from error
+
+    def _events(self, window: "_Window") -> Iterator[Event]:
+        num_events = 0
+        damage_start: int | None = None
+        while window.has(1):
+            event = _event(window)
+            if event is None:
+                if damage_start is None:
+                    damage_start = window.offset
+                window.skip_to_sync()
+                if not num_events and window.offset - damage_start > _MAX_FOREIGN_BYTES:
+                    break
+                continue
+            if damage_start is not None:
+                self._add_damage(damage_start, event.offset)
+                damage_start = None
+            num_events += 1
+            yield event
+        if damage_start is not None:
+            self._add_damage(damage_start, window.offset)
+        if not num_events:
+            what = f"has {window.offset} bytes without an LCM event" if window.offset else "is empty"
+            raise TakeError(f"{self.path} {what}; choose a recording (.lcmlog)")
+
+    def _add_damage(self, start: int, stop: int) -> None:
+        if len(self.damage) < MAX_LISTED_DAMAGE:
+            self.damage.append(Damage(start, stop - start))
+        self.num_damaged += 1
+        self.damaged_bytes += stop - start
+
+
+class _Window:
+    """A part of a file in memory, which moves forward. ``offset`` is the present place in the file."""
+
+    def __init__(self, file: BinaryIO, offset: int) -> None:
+        self._file = file
+        self._data = b""
+        self._start = 0  # of the present place in _data
+        self.offset = offset
+
+    def has(self, num_bytes: int) -> bool:
+        """Whether the file has this many more bytes; they are in memory then."""
+        missing = self._start + num_bytes - len(self._data)
+        if missing > 0:
+            more = self._file.read(max(missing, _READ_BYTES))
+            self._data = self._data[self._start :] + more
+            self._start = 0
+        return len(self._data) - self._start >= num_bytes
+
+    def header(self, ahead: int = 0) -> tuple[bytes, int, int, int, int] | None:
+        """Return the fields of a plausible header ``ahead`` bytes from here; None if there is none."""
+        if not self.has(ahead + _HEADER.size):
+            return None
+        fields: tuple[bytes, int, int, int, int] = _HEADER.unpack_from(self._data, self._start + ahead)
+        sync, _, _, channel_bytes, message_bytes = fields
+        is_plausible = (
+            sync == SYNC
+            and 0 < channel_bytes <= MAX_CHANNEL_BYTES
+            and 0 <= message_bytes <= MAX_MESSAGE_BYTES
+        )
+        return fields if is_plausible else None
+
+    def bytes(self, ahead: int, num_bytes: int) -> bytes:
+        """Return bytes that ``has`` has found."""
+        start = self._start + ahead
+        return self._data[start : start + num_bytes]
+
+    def find_sync(self, ahead: int, stop: int) -> int:
+        """Return how many bytes from here the next sync word begins; -1 if none begins before ``stop``."""
+        self.has(stop + len(SYNC) - 1)
+        found = self._data.find(SYNC, self._start + ahead, self._start + stop + len(SYNC) - 1)
+        return found - self._start if found >= 0 else -1
+
+    def move(self, num_bytes: int) -> None:
+        """Go forward."""
+        self._start += num_bytes
+        self.offset += num_bytes
+
+    def skip_to_sync(self) -> None:
+        """Go forward by at least one byte, to the next sync word or the end of the file."""
+        self.has(_READ_BYTES)
+        rest = len(self._data) - self._start
+        found = self._data.find(SYNC, self._start + 1)
+        if found >= 0:
+            self.move(found - self._start)
+        elif rest < _READ_BYTES:
+            self.move(rest)
+        else:
+            self.move(rest - len(SYNC) + 1)
+
+
+def _event(window: _Window) -> Event | None:
+    """Return the event at the present place and move behind it; None, without moving, if it is damaged."""
+    header = window.header()
+    if header is None:
+        return None
+    _, number, utime, channel_bytes, message_bytes = header
+    size = _HEADER.size + channel_bytes + message_bytes
+    if not window.has(size):
+        return None
+    channel = window.bytes(_HEADER.size, channel_bytes)
+    # What follows confirms the size. If it is no event, and one begins inside of this event, the end of this
+    # one is lost, or its size is wrong.
+    if window.has(size + 1) and window.bytes(size, len(SYNC)) != SYNC[: len(window.bytes(size, len(SYNC)))]:
+        inside = window.find_sync(len(SYNC), size)
+        while inside >= 0:
+            if window.header(inside) is not None:
+                return None
+            inside = window.find_sync(inside + 1, size)
+    try:
+        name = channel.decode()
+    except UnicodeDecodeError:
+        return None
+    event = Event(
+        number, utime, name, window.bytes(_HEADER.size + channel_bytes, message_bytes), window.offset
+    )
+    window.move(size)
+    return event

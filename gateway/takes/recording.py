@@ -1,0 +1,166 @@
+"""Writing messages to event logs, by a thread from a bounded queue: a slow disk never delays the stream."""
+
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any, Final, Protocol, TypeVar
+
+from gateway.takes.event_log import encode_event
+
+MAX_QUEUED_BYTES: Final = 64 * 1024 * 1024
+"""How much may wait for the disk; at 1.3 MB/s, the disk may stand still for 50 s."""
+
+WRITE_PERIOD_S: Final = 0.1
+SYNC_PERIOD_S: Final = 0.5
+"""How often the thread writes, and how often it has the system store everything on the disk."""
+
+_UTIME: Final = slice(8, 16)
+"""Where a message of the gateway has its ``utime``, after the fingerprint."""
+
+_Result = TypeVar("_Result")
+
+
+class LogFile:
+    """A new event log. Its methods block: call them in a thread.
+
+    Raises OSError if the file exists or cannot be created.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.num_messages = 0
+        self.num_bytes = 0
+        self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
+
+    def append(self, messages: Sequence[tuple[bytes, bytes]]) -> None:
+        """Append messages of the gateway, each with its channel. The time of an event is their ``utime``.
+
+        Raises OSError; then none of them is in the file.
+        """
+        events = b"".join(
+            [
+                encode_event(number, int.from_bytes(message[_UTIME], "big", signed=True), channel, message)
+                for number, (channel, message) in enumerate(messages, start=self.num_messages)
+            ]
+        )
+        rest = memoryview(events)
+        try:
+            while rest:
+                rest = rest[os.write(self._descriptor, rest) :]
+        except OSError:
+            # A part of them may be there; the next event must follow a complete one.
+            os.ftruncate(self._descriptor, self.num_bytes)
+            os.lseek(self._descriptor, self.num_bytes, os.SEEK_SET)
+            raise
+        self.num_messages += len(messages)
+        self.num_bytes += len(events)
+
+    def sync(self) -> None:
+        """Store on the disk what was appended. Raises OSError."""
+        os.fdatasync(self._descriptor)
+
+    def close(self) -> None:
+        """Store everything and close the file. Raises OSError."""
+        try:
+            os.fsync(self._descriptor)
+        finally:
+            os.close(self._descriptor)
+
+
+class Sink(Protocol):
+    """What a Recorder writes to: it handles the errors of the disk, and raises nothing."""
+
+    def write(self, messages: Sequence[tuple[bytes, bytes]]) -> None:
+        """Write messages, each with its channel."""
+
+    def sync(self) -> None:
+        """Store on the disk what was written."""
+
+
+class Recorder:
+    """A thread that writes messages to sinks, in the order in which they were recorded.
+
+    The program does not wait for the thread when it ends; ``close`` does.
+    """
+
+    def __init__(self, name: str, max_queued_bytes: int = MAX_QUEUED_BYTES) -> None:
+        self._max_queued_bytes = max_queued_bytes
+        self._queue: deque[tuple[Sink, bytes, bytes] | Callable[[], None]] = deque()
+        # Each is changed by one thread only; the difference is what waits.
+        self._offered_bytes = 0
+        self._written_bytes = 0
+        self._wake = threading.Event()
+        self._is_closed = False
+        self._unsynced: dict[Sink, None] = {}
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+        self._thread.start()
+
+    @property
+    def queued_bytes(self) -> int:
+        """How many bytes wait for the disk."""
+        return self._offered_bytes - self._written_bytes
+
+    def record(self, sink: Sink, channel: bytes, message: bytes) -> bool:
+        """Queue a message; return False if the queue is full. Call it in one thread only."""
+        num_bytes = len(message)
+        if self._offered_bytes + num_bytes - self._written_bytes > self._max_queued_bytes:
+            return False
+        self._offered_bytes += num_bytes
+        self._queue.append((sink, channel, message))
+        return True
+
+    def call(self, function: Callable[[], _Result]) -> Future[_Result]:
+        """Call ``function`` in the thread, after everything recorded so far was written."""
+        done: Future[_Result] = Future()
+        self._queue.append(lambda: _make(done, function))
+        self._wake.set()
+        return done
+
+    def close(self, timeout_s: float) -> bool:
+        """Write what waits, and end the thread. Return False if the disk needs longer than ``timeout_s``."""
+        self._is_closed = True
+        self._wake.set()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        synced_s = time.monotonic()
+        while not (self._is_closed and not self._queue):
+            self._wake.wait(WRITE_PERIOD_S)
+            self._wake.clear()
+            self._write_queue()
+            if time.monotonic() - synced_s >= SYNC_PERIOD_S or self._is_closed:
+                for sink in self._unsynced:
+                    sink.sync()
+                self._unsynced.clear()
+                synced_s = time.monotonic()
+
+    def _write_queue(self) -> None:
+        batch: dict[Sink, list[tuple[bytes, bytes]]] = {}
+        for _ in range(len(self._queue)):
+            entry = self._queue.popleft()
+            if callable(entry):
+                self._write(batch)
+                batch = {}
+                entry()
+            else:
+                sink, channel, message = entry
+                batch.setdefault(sink, []).append((channel, message))
+        self._write(batch)
+
+    def _write(self, batch: dict[Sink, list[tuple[bytes, bytes]]]) -> None:
+        for sink, messages in batch.items():
+            sink.write(messages)
+            self._written_bytes += sum(len(message) for _, message in messages)
+            self._unsynced[sink] = None
+
+
+def _make(done: Future[Any], function: Callable[[], Any]) -> None:
+    try:
+        done.set_result(function())
+    except BaseException as error:  # noqa: BLE001 - it belongs to the caller
+        done.set_exception(error)
