@@ -13,6 +13,7 @@ import zenoh
 from gateway.outputs.contract import Answer, KeyPath, ServerParameters
 from gateway.outputs.zenoh import queries as zenoh_queries
 from gateway.outputs.zenoh.queries import ZenohQueries
+from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.queries.service import SourceQueryService
 from gateway.queries.source_queries import SourceQueries
 from tests.losses import amounts
@@ -57,7 +58,7 @@ async def test_queries_end_at_once_when_the_gateway_closes() -> None:
     endpoint = free_endpoint()
     router = open_zenoh("router", listen=endpoint)
     service = SilentService()
-    queries = ZenohQueries("mocap", service, asyncio.get_running_loop())
+    queries = ZenohQueries(ZenohSettings(), service, asyncio.get_running_loop())
     session = open_zenoh("client", connect=endpoint)
     try:
         queries.open(session, ["lab"])
@@ -84,7 +85,7 @@ async def test_without_time_stamps_the_log_says_how_to_enable_the_cache_for_late
     session = open_zenoh("peer", listen=endpoint)  # without time stamps, the default of Zenoh
     received: list[bytes] = []
     try:
-        queries = ZenohQueries("mocap", SilentService(), asyncio.get_running_loop())
+        queries = ZenohQueries(ZenohSettings(), SilentService(), asyncio.get_running_loop())
         queries.open(session, ["lab"])
         assert "set timestamping: {enabled: true} in Zenoh's configuration file" in caplog.text
         with zenoh_peer(endpoint) as peer:
@@ -117,7 +118,7 @@ class SilentService(SourceQueryService):
 async def test_publishing_parameters_after_zenoh_has_closed_is_ignored() -> None:
     endpoint = free_endpoint()
     session = open_zenoh("peer", listen=endpoint)
-    queries = ZenohQueries("mocap", SilentService(), asyncio.get_running_loop())
+    queries = ZenohQueries(ZenohSettings(), SilentService(), asyncio.get_running_loop())
     queries.open(session, ["lab"])
     session.close()
     queries.publish_parameters("lab", ServerParameters(b"<RT_Parameters/>", 3, 2))

@@ -18,7 +18,7 @@ import lcm
 import rtc3d
 
 from gateway.errors import OutputError, QueryError
-from gateway.log import DefectLog, FailureLog, log_fields
+from gateway.log import FailureLog, log_fields
 from gateway.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import lcm_channel
@@ -28,6 +28,7 @@ from gateway.outputs.lcm.connection import open_lcm, scheme_of, send_problem
 from gateway.outputs.lcm.sender import RETRY_S, LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.thread_sender import LcmThreadSender, new_sender
+from gateway.outputs.query_defects import QueryDefects
 from gateway.outputs.send_thread import SendThread
 from gateway.token_bucket import TokenBucket
 from gateway.worker_thread import WorkerThread
@@ -112,7 +113,7 @@ class LcmQueries:
         self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "lcm"))  # by source
         self._tasks: set[asyncio.Task[None]] = set()
         self._publications: dict[str, _Publication] = {}
-        self._defects: dict[str, DefectLog] = {}  # by source
+        self._defects = QueryDefects(logger)
 
     @property
     def results(self) -> Counter[str]:
@@ -265,10 +266,10 @@ class LcmQueries:
             self._admission.check_reply(len(parameters.xml))
         except QueryError as error:
             parameters, reply.error, reply.error_code = None, str(error), error.code
-        except Exception as error:  # noqa: BLE001 - every request gets a reply
-            log = self._defects.setdefault(source, DefectLog(logger, source))
-            log.log(error, text=f"LCM request {reply.request_id} of {reply.requester!r}")
-            reply.error, reply.error_code = f"a defect in the gateway: {error!r}", "defect"
+        except Exception as defect:  # noqa: BLE001 - every request gets a reply
+            query = f"LCM request {reply.request_id} of {reply.requester!r}"
+            answer = self._defects.log(source, defect, query)
+            reply.error, reply.error_code = str(answer), answer.code
         finally:
             # Before the reply is sent: its receiver may ask again at once. Cancelled, it has no result.
             has_result = parameters is not None or reply.error_code

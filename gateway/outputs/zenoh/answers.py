@@ -24,12 +24,13 @@ from typing import Final
 import zenoh
 
 from gateway.errors import QueryError
-from gateway.log import DefectLog, log_fields
+from gateway.log import log_fields
 from gateway.losses import Losses
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.admission import NO_REPLY, Admission, Refusal
 from gateway.outputs.contract import Answer, KeyPath, QueryService
 from gateway.outputs.encodings import TEXT, json_bytes
+from gateway.outputs.query_defects import QueryDefects
 from gateway.outputs.send_thread import SendThread
 from gateway.safe_text import safe_text
 
@@ -113,7 +114,7 @@ class ZenohAnswers:
         self._tasks: set[asyncio.Task[None]] = set()
         self._is_closed = False
         self._rest_until_s = 0.0
-        self._defects: dict[str, DefectLog] = {}  # by source
+        self._defects = QueryDefects(logger)
 
     # In Zenoh's threads.
 
@@ -187,8 +188,7 @@ class ZenohAnswers:
         except QueryError as error:
             outcome = error
         except Exception as defect:  # noqa: BLE001 - every query gets a reply
-            self._log_defect(question.source, question.selector, defect)
-            outcome = _defect_error(defect)
+            outcome = self._log_defect(question.source, question.selector, defect)
         finally:
             with self._lock:
                 self._open.pop(question.identity, None)
@@ -252,9 +252,8 @@ class ZenohAnswers:
         """Let the peers see that no reply follows."""
         self._sender.submit(functools.partial(self._drop_now, queries))
 
-    def _log_defect(self, source: str, selector: str, defect: Exception) -> None:
-        log = self._defects.setdefault(source, DefectLog(logger, source))
-        log.log(defect, text=f"query {safe_text(selector)}")
+    def _log_defect(self, source: str, selector: str, defect: Exception) -> QueryError:
+        return self._defects.log(source, defect, f"query {safe_text(selector)}")
 
     # In a thread that sends. Zenoh's calls may block.
 
@@ -327,10 +326,6 @@ def _reply_error(query: zenoh.Query, error: QueryError) -> None:
         query.reply_err(str(error), encoding=zenoh.Encoding(TEXT).with_schema(error.code))
     except zenoh.ZError as problem:
         logger.debug("zenoh: replying to %s: %s", query.selector, problem)
-
-
-def _defect_error(defect: Exception) -> QueryError:
-    return QueryError(f"a defect in the gateway: {defect!r}", code="defect")
 
 
 def _check(query: zenoh.Query, selected: str) -> None:

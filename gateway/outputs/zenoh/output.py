@@ -20,7 +20,7 @@ from gateway.outputs.contract import Output, QueryService, ServerParameters
 from gateway.outputs.status import OutputHealth
 from gateway.outputs.zenoh.config import prepare_threads, zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.publisher import ZenohLink, ZenohPublisher
-from gateway.outputs.zenoh.queries import ZenohQueries, query_limits
+from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.outputs.zenoh.settings import ZenohSettings
 
 _REMEDY: Final = "is the router running, are zenoh.config's endpoints right and free?"
@@ -227,9 +227,7 @@ class ZenohOutput(Output):
 
     def serve_queries(self, service: QueryService) -> None:
         """Answer queries below PREFIX/SOURCE/ for every announced source."""
-        self._queries = ZenohQueries(
-            *(self.settings.prefix, service, asyncio.get_running_loop(), query_limits(self.settings))
-        )
+        self._queries = ZenohQueries(self.settings, service, asyncio.get_running_loop())
 
     async def stop_queries(self) -> None:
         """Drop the pending queries. Their peers see at once that no reply follows."""

@@ -52,18 +52,6 @@ class _Declared(NamedTuple):
     subscriber_watch: zenoh.Publisher
 
 
-def query_limits(settings: ZenohSettings) -> QueryLimits:
-    """Return the limits of queries in the configuration."""
-    return QueryLimits(
-        output="zenoh",
-        key_setting="max_queries_per_key_per_s",
-        per_s=settings.max_queries_per_s,
-        per_key_per_s=settings.max_queries_per_key_per_s,
-        reply_bytes_per_s=settings.max_reply_bytes_per_s,
-        pending=MAX_PENDING,
-    )
-
-
 class ZenohQueries:
     """Answers queries below PREFIX/SOURCE/ with ``service``, and publishes parameters and files.
 
@@ -74,12 +62,11 @@ class ZenohQueries:
 
     def __init__(
         self,
-        prefix: str,
+        settings: ZenohSettings,
         service: QueryService,
         loop: asyncio.AbstractEventLoop,
-        limits: QueryLimits = query_limits(ZenohSettings()),  # noqa: B008 - it is immutable
     ) -> None:
-        self._prefix = prefix
+        self._prefix = settings.prefix
         self._loop = loop
         self._lock = threading.Lock()  # of what the thread that opens and Zenoh's threads share
         self._session: zenoh.Session | None = None
@@ -90,7 +77,16 @@ class ZenohQueries:
         self._published_s: dict[str, float] = {}  # when that was done last
         self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "zenoh"))  # by source
         self._sender = SendThread("zenoh-send")
-        self._admission = Admission(limits)
+        self._admission = Admission(
+            QueryLimits(
+                output="zenoh",
+                key_setting="max_queries_per_key_per_s",
+                per_s=settings.max_queries_per_s,
+                per_key_per_s=settings.max_queries_per_key_per_s,
+                reply_bytes_per_s=settings.max_reply_bytes_per_s,
+                pending=MAX_PENDING,
+            )
+        )
         self._answers = ZenohAnswers(
             *(self._prefix, service, loop, self._admission, self._sender, self._losses)
         )

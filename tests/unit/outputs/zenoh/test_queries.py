@@ -289,7 +289,7 @@ async def test_an_output_without_queries_has_no_results() -> None:
 async def test_an_event_loop_that_has_ended_is_no_error(lab: Lab) -> None:
     loop = asyncio.new_event_loop()
     loop.close()
-    queries = queries_module.ZenohQueries("mocap", lab.service, loop)  # type: ignore[arg-type]  # see Lab
+    queries = queries_module.ZenohQueries(ZenohSettings(), lab.service, loop)  # type: ignore[arg-type]  # see Lab
     queries.open(lab.peer, [])
     await queries.close()
 
@@ -299,7 +299,7 @@ async def test_what_zenoh_does_not_publish_is_counted_and_logged(
 ) -> None:
     session = open_zenoh("client", connect=lab.endpoint)
     loop = asyncio.get_running_loop()
-    queries = queries_module.ZenohQueries("mocap", lab.service, loop)  # type: ignore[arg-type]  # see Lab
+    queries = queries_module.ZenohQueries(ZenohSettings(), lab.service, loop)  # type: ignore[arg-type]  # see Lab
     losses = Losses(logging.getLogger("test"), "lab, zenoh")
     queries.count_losses("lab", losses)
     queries.open(session, ["lab"])
