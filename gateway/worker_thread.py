@@ -60,12 +60,18 @@ class WorkerThread:
                     self._is_running = False
                     return
                 done, call = self._calls.popleft()
-            with contextlib.suppress(CancelledError):
-                if done.set_running_or_notify_cancel():
-                    self._began_s = time.monotonic()
-                    try:
-                        done.set_result(call())
-                    except BaseException as error:  # noqa: BLE001 - whoever waits for the future gets it
-                        done.set_exception(error)
+            self._began_s = time.monotonic()
+            make_call(done, call)
             self._began_s = None
             del done, call  # or they would stay in memory until the next call
+
+
+def make_call(done: Future[_Result], call: Callable[[], _Result]) -> None:
+    """Make ``call`` unless ``done`` has been cancelled, and set its result or exception in ``done``."""
+    with contextlib.suppress(CancelledError):
+        if done.set_running_or_notify_cancel():
+            try:
+                done.set_result(call())
+            except BaseException as error:  # noqa: BLE001 - the future passes it on
+                done.set_exception(error)
+    del done, call  # or the traceback of the exception would keep them in memory

@@ -1,11 +1,13 @@
 """A thread for calls that may block in an output's library. The program does not wait for it when it ends."""
 
-import contextlib
+import functools
 import threading
 from collections import deque
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Future
+from concurrent.futures import Future
 from typing import Final
+
+from gateway.worker_thread import make_call
 
 MAX_CALLS: Final = 4096
 MAX_BYTES: Final = 64 * 1024 * 1024
@@ -78,18 +80,7 @@ class SendThread:
                 return None
             if self._first:
                 done, call = self._first.popleft()
-                return lambda: _make(done, call)
+                return functools.partial(make_call, done, call)
             num_bytes, offered = self._offered.popleft()
             self._offered_bytes -= num_bytes
             return offered
-
-
-def _make(done: Future[None], call: Callable[[], None]) -> None:
-    with contextlib.suppress(CancelledError):
-        if done.set_running_or_notify_cancel():
-            try:
-                call()
-            except BaseException as error:  # noqa: BLE001 - whoever waits for the future gets it
-                done.set_exception(error)
-            else:
-                done.set_result(None)
