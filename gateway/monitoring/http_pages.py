@@ -13,6 +13,8 @@ from collections.abc import Callable, Mapping, Sequence
 from http import HTTPStatus
 from typing import Final, NamedTuple
 
+from gateway.log import DefectLog
+
 logger = logging.getLogger(__name__)
 
 MAX_REQUEST_BYTES: Final = 8192
@@ -47,8 +49,7 @@ class HttpPages:
         self._server: asyncio.Server | None = None
         self._built: dict[str, tuple[float, Page]] = {}
         """The newest page of each path, and when it was built, on the monotonic clock in s."""
-        self._defective: set[str] = set()
-        """The paths whose defect is in the log."""
+        self._defects = DefectLog(logger, "metrics")
         self._connections: dict[asyncio.Task[None], asyncio.WriteTransport] = {}
         """The open connections, oldest first."""
 
@@ -116,12 +117,9 @@ class HttpPages:
         if page is None or now_s - built_s > MAX_PAGE_AGE_S:
             try:
                 page = self._pages[path]()
-            except Exception:
-                if path not in self._defective:  # clients could fill the log
-                    logger.exception(
-                        "metrics: defect in the gateway: no page %s; report this with the log", path
-                    )
-                self._defective.add(path)
+            except Exception as defect:  # noqa: BLE001 - the client gets an error page
+                text = f"defect in the gateway: no page {path}; report this with the log"
+                self._defects.log(defect, text)
                 page = _error_page(HTTPStatus.INTERNAL_SERVER_ERROR, "see the log")
             self._built[path] = now_s, page
         return page
