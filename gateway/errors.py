@@ -25,8 +25,6 @@
 A message says what happened, to which server or file, and what to do.
 """
 
-from gateway.safe_text import safe_text
-
 
 class GatewayError(Exception):
     """Base of all errors that this package raises on purpose."""
@@ -99,16 +97,6 @@ class RequestError(LinkError):
 
 class DefectError(LinkError):
     """A defect in this program ended the connection; ``__cause__`` is the exception."""
-
-    @staticmethod
-    def of(defect: BaseException) -> "DefectError":
-        """Return the error for an exception that nobody expected."""
-        error = DefectError(
-            f"defect in the gateway: {type(defect).__name__}: {safe_text(str(defect))}; connecting again; "
-            "report this with the log"
-        )
-        error.__cause__ = defect
-        return error
 
 
 class ClosedError(LinkError):

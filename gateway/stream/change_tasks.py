@@ -6,8 +6,9 @@ from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, Final
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.errors import DefectError, LinkError, RequestError
+from gateway.errors import LinkError, RequestError
 from gateway.rtc3d.components import ComponentType
+from gateway.stream.defects import defect_error
 from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
@@ -101,7 +102,7 @@ class ChangeTasks:
             logger.debug("%s: %s", self._status.name, error)  # the supervisor reports it
             self._session.fail(error)
         except Exception as defect:  # noqa: BLE001 - the supervisor logs it and connects again
-            self._session.fail(DefectError.of(defect))
+            self._session.fail(defect_error(defect))
 
     async def _apply_changes(self) -> None:
         refusals = 0

@@ -35,6 +35,7 @@ from gateway.rtc3d.packets import FilePiece, Packet, decode_text
 from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.safe_text import safe_text
 from gateway.stream.backlog import Backlog
+from gateway.stream.defects import defect_error
 from gateway.stream.files import FileReceiver
 from gateway.stream.paced_frames import PacedFrames
 from gateway.stream.reading import LONG_READ_BYTES, Reading
@@ -260,7 +261,7 @@ class Session:
 
     def _fail_by_defect(self, defect: Exception) -> None:
         if self._error is None:
-            self.fail(DefectError.of(defect))  # the supervisor logs it and connects again
+            self.fail(defect_error(defect))  # the supervisor logs it and connects again
         else:
             self._status.defect(defect)
 
@@ -450,7 +451,7 @@ class Session:
             else:
                 self._frames.finish()
         except Exception as defect:  # noqa: BLE001 - whoever waits for the end must not wait for ever
-            self._error = DefectError.of(defect)
+            self._error = defect_error(defect)
 
     def _flush(self) -> None:
         if self._transport is not None:

@@ -14,6 +14,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.stream.backoff import Backoff
 from gateway.stream.change_tasks import ChangeTasks
+from gateway.stream.defects import defect_error
 from gateway.stream.files import FileReceiver
 from gateway.stream.ingest import Ingest, Publish, Skip
 from gateway.stream.parameters import ReadParameters
@@ -162,10 +163,10 @@ class Supervisor:
             return error
         except Exception as defect:  # noqa: BLE001 - a defect in one stream must not stop the others
             self._check_cancelled(defect)
-            return DefectError.of(defect)
+            return defect_error(defect)
         except asyncio.CancelledError as defect:
             self._check_cancelled(defect)
-            return DefectError.of(defect)
+            return defect_error(defect)
 
     def _check_cancelled(self, defect: BaseException) -> None:
         """Raise CancelledError if somebody has cancelled the stream.
