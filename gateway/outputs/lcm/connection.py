@@ -164,6 +164,16 @@ def open_lcm(url: str) -> lcm.LCM:
         raise OutputError(f"LCM does not open {url}: {error}; check lcm.url", cause="not open") from error
 
 
+def reconnect(connection: lcm.LCM, channel: str) -> None:
+    """Connect to the relay (tcpq) again; LCM then renews its subscriptions. Raises OSError.
+
+    LCM does this when it publishes, but not when it waits for messages: so an empty message goes to
+    ``channel``, which has no subscribers. A new LCM object is no alternative, because freeing the lost one
+    would connect, too, and stop every other thread of the process meanwhile.
+    """
+    connection.publish(channel, b"")
+
+
 def open_lcm_to_send(url: str) -> lcm.LCM:
     """Return an LCM object that sends to a multicast URL without ever waiting. Raises OutputError.
 

@@ -24,7 +24,7 @@ from gateway.messages.host_time import now_utime
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.admission import Admission, QueryLimits, Refusal
 from gateway.outputs.contract import QueryService, ServerParameters
-from gateway.outputs.lcm.connection import open_lcm, scheme_of, send_problem
+from gateway.outputs.lcm.connection import open_lcm, reconnect, scheme_of, send_problem
 from gateway.outputs.lcm.sender import RETRY_S, LcmSender
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.thread_sender import LcmThreadSender, new_sender
@@ -176,15 +176,10 @@ class LcmQueries:
         return None
 
     def _reconnect(self, connection: lcm.LCM) -> None:
-        """Connect to the relay again; LCM then renews its subscriptions.
-
-        LCM does this when it publishes, but not when it waits for messages: so an empty message goes to a
-        channel without subscribers. A new LCM object is no alternative, because freeing the lost one would
-        connect, too, and stop every other thread of the gateway meanwhile.
-        """
+        """Connect to the relay again, with retries, until ``close``."""
         while not self._closing.is_set():
             try:
-                connection.publish(f"{self._prefix}_RECONNECTED", b"")
+                reconnect(connection, f"{self._prefix}_RECONNECTED")
             except OSError as error:
                 problem = send_problem(self._url, error)
                 self._opening.failed(f"no requests can be received: {problem} (this is lcm.queries_url)")

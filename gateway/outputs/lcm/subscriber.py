@@ -11,7 +11,7 @@ import lcm
 from gateway.log import FailureLog
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.kind import Receive, SubscriptionRequest
-from gateway.outputs.lcm.connection import open_lcm, receiving_url
+from gateway.outputs.lcm.connection import open_lcm, receiving_url, reconnect
 from gateway.outputs.lcm.sender import RETRY_S
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url
 
@@ -55,13 +55,10 @@ class LcmSubscriber:
                 self._reconnect()
 
     def _reconnect(self) -> None:
-        """Connect to the relay (tcpq) again, with retries, until ``close``; LCM then subscribes again.
-
-        LCM does this when it publishes, so an empty message goes to a channel without subscribers.
-        """
+        """Connect to the relay again, with retries, until ``close``."""
         while not self._stop.wait(RETRY_S):
             with contextlib.suppress(OSError):
-                self._lcm.publish("RECONNECTED", b"")
+                reconnect(self._lcm, "RECONNECTED")
                 self._is_connected = True
                 self._failures.recovered("connected again")
                 return
