@@ -1,12 +1,14 @@
 """A C3D recording as a scene: points, analog channels and force plates, read with ezc3d."""
 
 import logging
+import os
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 import numpy.typing as npt
 
+from gateway.c3d_files.format_check import HEAD_BYTES, problem_of_c3d
 from gateway.config.files import check_is_file
 from gateway.errors import TakeError
 from gateway.rtc3d.components import ITEM_DTYPES, MISSING, MISSING_RELIABILITY, ComponentType, Items
@@ -105,8 +107,8 @@ def _read(path: Path) -> Any:
     try:
         check_is_file(path)
         with path.open("rb") as file:
-            # Byte 2 of every C3D file is 0x50. ezc3d never returns from a folder or from GBs of zeros.
-            if file.read(2)[1:] != b"\x50":
+            # ezc3d never returns from a folder or from GBs of zeros.
+            if problem_of_c3d(file.read(HEAD_BYTES), os.fstat(file.fileno()).st_size):
                 raise TakeError(f"{path} is not a C3D file; choose another file")
     except OSError as error:
         raise TakeError(f"{path} cannot be read: {error.strerror}; give the path of a C3D file") from error
