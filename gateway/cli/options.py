@@ -89,10 +89,7 @@ SourceOption = Annotated[
 ]
 ComponentOption = Annotated[
     str | None,
-    typer.Option(
-        callback=_checked_component,
-        help="Only this: 3d, 6d, analog, force, event, status, clock, parameters or c3d.",
-    ),
+    typer.Option(callback=_checked_component, help=f"Only this: {join_or(_COMPONENTS)}."),
 ]
 ConnectOption = Annotated[
     str | None,
