@@ -1,0 +1,30 @@
+"""The names of takes, which come from peers, and the channels in their files."""
+
+import re
+import time
+from typing import Final
+
+from gateway.errors import QueryError
+
+MAX_NAME_LENGTH: Final = 100
+
+_NAME: Final = re.compile(r"[\w.+-][\w .+-]*")
+
+
+def check_name(name: str) -> None:
+    """Raise QueryError unless a take can have this name, which becomes that of a file."""
+    if not name or len(name) > MAX_NAME_LENGTH or not _NAME.fullmatch(name) or name[0] == ".":
+        raise QueryError(
+            f"{name[:MAX_NAME_LENGTH]!r} cannot be the name of a take: expected 1 to {MAX_NAME_LENGTH} "
+            "letters, digits, spaces and any of '_.-+', without a space or a dot at the beginning"
+        )
+
+
+def default_name(source: str) -> str:
+    """Return the name of a take that begins now: SOURCE-YYYYMMDD-hhmmss, in local time."""
+    return f"{source}-{time.strftime('%Y%m%d-%H%M%S')}"
+
+
+def numbered(name: str, number: int) -> str:
+    """Return NAME, NAME-2, NAME-3, … for the numbers from 1 on."""
+    return name if number == 1 else f"{name}-{number}"

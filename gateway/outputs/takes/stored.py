@@ -1,0 +1,44 @@
+"""What peers are told about takes."""
+
+from collections.abc import Sequence
+from typing import Final, NamedTuple
+
+MAX_PIECE_BYTES: Final = 1024 * 1024
+"""The most bytes of a take that one call reads."""
+
+
+class StoredTake(NamedTuple):
+    """A take in the folder.
+
+    ``begin_utime`` is the time of its first message in µs since the Unix epoch, ``seconds`` how long it
+    lasts, ``num_lost`` how many messages the disk did not accept, as far as this process knows. A take is
+    running until everything of it is in its files.
+    """
+
+    name: str
+    num_bytes: int
+    begin_utime: int
+    seconds: float
+    is_running: bool = False
+    num_lost: int = 0
+
+
+class SourceTakes(NamedTuple):
+    """The takes of a source, the newest first.
+
+    ``running`` is the one that was started and not stopped yet, ``kept_s`` how many seconds the rolling
+    segments hold, which ``save`` keeps.
+    """
+
+    running: StoredTake | None
+    takes: Sequence[StoredTake]
+    kept_s: float
+
+
+class TakePiece(NamedTuple):
+    """A part of the bytes of a take; the files of a saved take are read as one."""
+
+    name: str
+    num_bytes: int
+    offset: int
+    content: bytes
