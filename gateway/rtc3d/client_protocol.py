@@ -18,6 +18,7 @@ from gateway.rtc3d.components import LONG_EVENT, ByteOrder, ComponentType, encod
 from gateway.rtc3d.frame_reader import FrameReader
 from gateway.rtc3d.frames import Frame, announced_components, detect_byte_order, encode_frame
 from gateway.rtc3d.packets import (
+    ALL_PACKETS,
     DEFAULT_MAX_C3D_BYTES,
     DEFAULT_MAX_PACKET_BYTES,
     FilePiece,
@@ -31,7 +32,6 @@ from gateway.rtc3d.protocol_state import ProtocolInput, ProtocolState, next_stat
 from gateway.rtc3d.reply_matcher import Match, ReplyMatcher
 from gateway.safe_text import safe_text
 
-_ALL_PACKETS: Final = 0x7FFFFFFF
 _MAX_ERROR_BYTES: Final = 300  # of a server's error text, which goes into logs and status messages
 _UNUSED_PARAMETER: Final = -1  # of an event (§7.7)
 
@@ -186,9 +186,7 @@ class ClientProtocol:
         """Whether ``receive`` has not processed all bytes yet, because of ``max_packets``."""
         return self._packet_reader.has_more
 
-    def receive(
-        self, data: bytes, max_packets: int = _ALL_PACKETS
-    ) -> tuple[list[Frame], list[ProtocolEvent]]:
+    def receive(self, data: bytes, max_packets: int = ALL_PACKETS) -> tuple[list[Frame], list[ProtocolEvent]]:
         """Take bytes from the server; return the frames and the other events that they complete.
 
         Processes at most ``max_packets``. While ``has_more``, call it again, with b"" or with the next bytes.

@@ -12,7 +12,8 @@ DEFAULT_MAX_PACKET_BYTES: Final = 16 * 1024 * 1024
 DEFAULT_MAX_C3D_BYTES: Final = 256 * 1024 * 1024
 _MAX_SIZE: Final = 0xFFFFFFFF
 _MAX_BEGIN_BYTES: Final = 60  # of PacketError.begin
-_ALL: Final = 0x7FFFFFFF  # more packets than fit into memory
+ALL_PACKETS: Final = 0x7FFFFFFF
+"""More packets than fit into memory."""
 
 
 class PacketType(IntEnum):
@@ -143,7 +144,7 @@ class PacketReader:
         """Whether ``feed`` has not looked at all bytes yet, because it returned as many packets as wanted."""
         return bool(self._rest)
 
-    def feed(self, data: bytes, max_packets: int = _ALL) -> list[Packet]:
+    def feed(self, data: bytes, max_packets: int = ALL_PACKETS) -> list[Packet]:
         """Take the next bytes; return the packets that they complete and the pieces of files, in order.
 
         Returns at most ``max_packets``. While ``has_more``, call it again, with b"" or with the next bytes.
