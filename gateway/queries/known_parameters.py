@@ -65,23 +65,13 @@ class ServerAnswer:
         return now_s() - self.received_s
 
     @cached_property
-    def json(self) -> bytes | None:
-        """The parameters as JSON; None if the answer has none of them. It takes long: see ``lazy_json``."""
-        if not self.is_readable:
-            return None
-        return parameters_json(self.parsed.parameters, self._section)
-
-    @cached_property
-    def lazy_json(self) -> JsonPayload | None:
+    def json(self) -> JsonPayload | None:
         """The parameters as JSON, made once for all queries; None if the answer has none of them."""
-        section = self._section
-        if not self.is_readable or (section and SECTIONS[section].of(self.parsed.parameters) is None):
+        parameters = self.parsed.parameters
+        section = self.sections[0] if len(self.sections) == 1 else ""
+        if not self.is_readable or (section and SECTIONS[section].of(parameters) is None):
             return None
-        return JsonPayload(lambda: self.json or b"", len(self.xml))
-
-    @property
-    def _section(self) -> str:
-        return self.sections[0] if len(self.sections) == 1 else ""
+        return JsonPayload(lambda: parameters_json(parameters, section) or b"", len(self.xml))
 
     async def part(self, sections: Sections, xml_thread: XmlThread) -> "ServerAnswer | None":
         """Return the answer for some sections, taken from this one in ``xml_thread``.

@@ -116,7 +116,7 @@ class SourceQueries:
                 "the server's XML cannot be read; ask without format=json to see it as received",
                 code="unreadable",
             )
-        payload = cached.lazy_json
+        payload = cached.json
         if payload is None:
             raise QueryError(f"the server's answer has no section {question.name}", code="nothing-yet")
         return Answer(payload, JSON, attachment | {"recovered": list(cached.parsed.recovered)})
