@@ -77,6 +77,11 @@ class TakeReader:
             else:
                 yield TakeMessage(event.utime, *route, event.message)
 
+    @property
+    def source_names(self) -> list[str]:
+        """The names of the sources in what was read so far."""
+        return list(dict.fromkeys(route[0] for route in self._routes.values() if route is not None))
+
     def _named_sources(self) -> dict[str, str]:
         """Return the names of the sources by the beginning of their channels."""
         names: dict[str, str] = {}

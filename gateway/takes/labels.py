@@ -1,0 +1,128 @@
+"""What the items of a component are called, and their units and rates, from the server's parameters (§6)."""
+
+from collections.abc import Iterable
+from typing import Final, NamedTuple, TypeVar
+
+from gateway.messages.topics import MAX_LABEL_LENGTH
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import Parameters
+
+_Value = TypeVar("_Value")
+
+_MOMENT_CHANNEL: Final = 3
+"""The first channel of a plate that is a moment; those before it are forces (§6.5, §7.5)."""
+
+
+class Description(NamedTuple):
+    """What the parameters say about a component with a certain number of items.
+
+    ``labels`` has one different name per item. ``units`` has the unit of each item: for markers and tools
+    that of positions, for plates that of forces ("" if the server does not say it). ``moment_unit`` is for
+    plates only. ``rate_hz`` is the announced rate of frames; None if it is not announced, or if the items
+    have different rates.
+    """
+
+    labels: tuple[str, ...]
+    units: tuple[str, ...]
+    moment_unit: str
+    rate_hz: float | None
+
+    @property
+    def unit(self) -> str:
+        """The unit of all items; "" if they differ."""
+        return common(self.units) or ""
+
+
+def describe(component: ComponentType, parameters: Parameters | None, num_items: int) -> Description:
+    """Return the description of a component with ``num_items`` items, in the order of the items.
+
+    An item without a label is called by its position: "marker 1", "tool 1", "channel 1", "plate 1". A label
+    that another item has already gets _2, _3, …. The same rules hold for the keys of tools
+    (docs/reference/messages.md). Events have no labels: see ``event_labels``.
+    """
+    parameters = parameters or Parameters()
+    labels: Iterable[str] = ()
+    units: tuple[str, ...] = ()
+    rates: tuple[float | None, ...] = ()
+    moment_unit, default_unit = "", ""
+    match component:
+        case ComponentType.MARKERS:
+            default_unit = _length_unit(parameters)
+            if parameters.markers is not None:
+                labels = (marker.label for marker in parameters.markers.markers)
+                rates = (parameters.markers.frequency_hz,)
+        case ComponentType.TOOLS:
+            default_unit = _length_unit(parameters)
+            if parameters.tools is not None:
+                labels = (tool.label for tool in parameters.tools.tools)
+                rates = (parameters.tools.frequency_hz,)
+        case ComponentType.ANALOG:
+            default_unit = "mV"
+            if parameters.analog is not None:
+                channels = parameters.analog.channels[:num_items]
+                labels = (channel.label for channel in channels)
+                units = tuple(channel.unit for channel in channels)
+                rates = tuple(channel.frequency_hz for channel in channels)
+        case ComponentType.FORCE:
+            if parameters.force is not None:
+                plates = parameters.force.plates[:num_items]
+                labels = (plate.label for plate in plates)
+                units = tuple(plate.channels[0].unit if plate.channels else "" for plate in plates)
+                rates = tuple(plate.frequency_hz for plate in plates)
+                moments = [plate.channels[_MOMENT_CHANNEL:][:1] for plate in plates]
+                moment_unit = common(found[0].unit if found else "" for found in moments) or ""
+        case ComponentType.EVENT:
+            return Description((), (), "", None)
+    noun = component.item_noun.removesuffix("s")
+    units += (default_unit,) * (num_items - len(units))
+    return Description(_unique_labels(labels, noun, num_items), units, moment_unit, common(rates))
+
+
+def event_labels(parameters: Parameters | None) -> dict[int, str]:
+    """Return the labels of the events (§6.6) by their ids; ids that are not numbers are left out."""
+    labels: dict[int, str] = {}
+    definitions = parameters.events.events if parameters and parameters.events else ()
+    for definition in definitions:
+        number = event_number(definition.id)
+        if number is not None and definition.label.strip():
+            labels.setdefault(number, definition.label.strip())
+    return labels
+
+
+def event_number(event_id: str) -> int | None:
+    """Return an event's id in the parameters, decimal or 0x…, as in ``event_t``; None if it is no number."""
+    try:
+        number = int(event_id, 0) if event_id[:2].lower() == "0x" else int(event_id)
+    except ValueError:
+        return None
+    # The id is a signed 32-bit number in event_t, but servers write 0xFFFFFFFF.
+    return number - (1 << 32) if 1 << 31 <= number < 1 << 32 else number
+
+
+def common(values: Iterable[_Value]) -> _Value | None:
+    """Return the value that all ``values`` have; None if they differ, or if there are none."""
+    different = set(values)
+    return different.pop() if len(different) == 1 else None
+
+
+def _length_unit(parameters: Parameters) -> str:
+    """Return the unit of positions, also of tools: that of the 3D parameters (§6.2)."""
+    return "mm" if parameters.markers is None else parameters.markers.unit
+
+
+def _unique_labels(labels: Iterable[str], noun: str, num_items: int) -> tuple[str, ...]:
+    """Return ``num_items`` different labels, as ``topics.unique_name`` makes them for the keys of tools."""
+    given = [label.strip() for label, _ in zip(labels, range(num_items), strict=False)]
+    given += [""] * (num_items - len(given))
+    names: dict[str, None] = {}
+    numbers: dict[str, int] = {}  # tried last, by label; many items may have the same label
+    for position, label in enumerate(given, start=1):
+        base = (label or f"{noun} {position}")[:MAX_LABEL_LENGTH]
+        name, number = base, numbers.get(base, 1)
+        while name in names:
+            number += 1
+            suffix = f"_{number}"
+            name = base[: MAX_LABEL_LENGTH - len(suffix)] + suffix
+        numbers[base] = number
+        names[name] = None
+    return tuple(names)

@@ -1,0 +1,205 @@
+"""Reading a take into numpy arrays, for analysis and for conversion to other formats."""
+
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Final
+
+import rtc3d
+
+from gateway.errors import ParametersError, ProtocolError, TakeError
+from gateway.messages.decode import decode
+from gateway.rtc3d.components import COMPONENTS_BY_KEY
+from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters_changes import differ_in_statistics_only
+from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.takes.component_rows import decode_rows
+from gateway.takes.reader import TakeReader
+from gateway.takes.series import ParametersEntry, Series, SeriesBuilder
+
+_BATCH_BYTES: Final = 8 * 1024 * 1024
+"""So many bytes of messages are decoded at once."""
+
+
+@dataclass
+class TakeSource:
+    """One source (a server) of a take. A component that was not recorded is None.
+
+    ``server`` is HOST:PORT and ``gateway_version`` the version of the gateway that published the messages,
+    both "" if the take does not say. ``parameters`` has the server's parameters at the beginning and at each
+    change, in order. ``malformed`` is how many messages could not be read, by component.
+    """
+
+    name: str
+    server: str = ""
+    gateway_version: str = ""
+    markers: Series | None = None
+    tools: Series | None = None
+    analog: Series | None = None
+    forces: Series | None = None
+    events: Series | None = None
+    parameters: list[ParametersEntry] = field(default_factory=list)
+    malformed: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def series(self) -> dict[str, Series]:
+        """The recorded components by their keys: "3d", "6d", "analog", "force", "event"."""
+        by_key = {key: getattr(self, name) for key, name in _FIELDS.items()}
+        return {key: series for key, series in by_key.items() if series is not None}
+
+    def runs(self, key: str) -> list[Series]:
+        """Return the parts of a component with constant labels, one measurement each: see ``Series.runs``."""
+        found = self.series.get(key)
+        return [] if found is None else found.runs()
+
+
+_FIELDS: Final = {"3d": "markers", "6d": "tools", "analog": "analog", "force": "forces", "event": "events"}
+"""The fields of TakeSource by the keys of components."""
+
+
+@dataclass
+class Take:
+    """A take in memory: its sources by name.
+
+    ``start_utime`` is the time of the first event, in µs since 1970; all seconds count from it.
+    ``num_damaged`` places of the files, with ``damaged_bytes`` in all, could not be read. ``unknown`` is how
+    many messages have a type that is none of a gateway's, by channel.
+    """
+
+    path: Path
+    start_utime: int
+    sources: dict[str, TakeSource]
+    num_damaged: int = 0
+    damaged_bytes: int = 0
+    unknown: dict[str, int] = field(default_factory=dict)
+
+
+def open_take(
+    path: Path | str,
+    *,
+    sources: Collection[str] | None = None,
+    components: Collection[str] | None = None,
+    from_s: float | None = None,
+    to_s: float | None = None,
+) -> Take:
+    """Read a take (an event log, or the folder of a saved take) into numpy arrays.
+
+    ::
+
+        from gateway.takes import open_take
+
+        take = open_take("lab-20261122-101500.lcmlog")
+        markers = take.sources["lab"].markers
+        print(markers.labels, markers.unit, markers.rate_hz)
+        head = markers.positions[:, markers.labels.index("head")]  # (frames, 3), NaN where it is missing
+        plt.plot(markers.seconds, head)
+
+    ``sources`` (names) and ``components`` (of 3d, 6d, analog, force, event) limit what is loaded, ``from_s``
+    and ``to_s`` the time of the events, in seconds from the first event of the take. The arrays take as much
+    memory as their part of the file. Damage of the file is skipped and counted. Raises TakeError if there is
+    no take, or if a source or component is not in it.
+    """
+    wanted = _components(components)
+    reader = TakeReader(Path(path))
+    first_utime = reader.start_utime if from_s is None else reader.start_utime + round(from_s * 1e6)
+    end_utime = None if to_s is None else reader.start_utime + round(to_s * 1e6)
+    loader = _Loader(sources, wanted)
+    for message in reader.messages():
+        is_in_range = first_utime <= message.utime and (end_utime is None or message.utime < end_utime)
+        loader.add(message.source, message.key, message.message, is_in_range=is_in_range)
+    take = Take(Path(path), reader.start_utime, loader.finish(reader.start_utime))
+    take.num_damaged = sum(log.num_damaged for log in reader.logs)
+    take.damaged_bytes = sum(log.damaged_bytes for log in reader.logs)
+    take.unknown = dict(reader.unknown)
+    missing = set(sources or ()) - take.sources.keys()
+    if missing:
+        names = ", ".join(reader.source_names) or "none of a gateway"
+        raise TakeError(f"{path} has no source {min(missing)!r}; its sources are: {names}")
+    return take
+
+
+def _components(keys: Collection[str] | None) -> frozenset[str]:
+    known = frozenset(COMPONENTS_BY_KEY)
+    unknown = set(keys or ()) - known
+    if unknown:
+        raise TakeError(f"{min(unknown)!r} is no component; choose from {', '.join(COMPONENTS_BY_KEY)}")
+    return known if keys is None else frozenset(keys)
+
+
+class _Loader:
+    """Collects the messages of a take."""
+
+    def __init__(self, sources: Collection[str] | None, components: frozenset[str]) -> None:
+        self._wanted = None if sources is None else frozenset(sources)
+        self._components = components
+        self._sources: dict[str, TakeSource] = {}
+        self._xml: dict[str, bytes] = {}  # the newest parameters, by source
+        self._builders: dict[tuple[str, str], SeriesBuilder] = {}
+        self._batch: dict[tuple[str, str], list[bytes]] = {}
+        self._batch_bytes = 0
+
+    def add(self, name: str, key: str, message: bytes, *, is_in_range: bool) -> None:
+        """Take one message. Parameters are taken from the whole take."""
+        if self._wanted is not None and name not in self._wanted:
+            return
+        source = self._sources.get(name)
+        if source is None:
+            source = self._sources[name] = TakeSource(name)
+        if key in COMPONENTS_BY_KEY:
+            if is_in_range and key in self._components:
+                self._batch.setdefault((name, key), []).append(message)
+                self._batch_bytes += len(message)
+                if self._batch_bytes >= _BATCH_BYTES:
+                    self._decode_batch()
+        elif key == "parameters" or (key in ("take", "status") and not source.server):
+            self._describe(source, key, message)
+
+    def finish(self, start_utime: int) -> dict[str, TakeSource]:
+        """Return the sources with their arrays."""
+        self._decode_batch()
+        for (name, key), builder in self._builders.items():
+            source = self._sources[name]
+            setattr(source, _FIELDS[key], builder.build(source.parameters, start_utime))
+        return self._sources
+
+    def _decode_batch(self) -> None:
+        for (name, key), messages in self._batch.items():
+            component = COMPONENTS_BY_KEY[key]
+            rows = decode_rows(component, messages)
+            if rows.malformed:
+                _count(self._sources[name].malformed, key, rows.malformed)
+            if (name, key) not in self._builders:
+                self._builders[name, key] = SeriesBuilder(component)
+            self._builders[name, key].add(rows)
+        self._batch.clear()
+        self._batch_bytes = 0
+
+    def _describe(self, source: TakeSource, key: str, message: bytes) -> None:
+        try:
+            decoded = decode(message)
+        except ProtocolError:
+            _count(source.malformed, key, 1)
+            return
+        if key == "parameters":
+            self._add_parameters(source, decoded)
+        else:
+            source.server, source.gateway_version = decoded.server, decoded.gateway_version
+
+    def _add_parameters(self, source: TakeSource, decoded: rtc3d.parameters_t) -> None:
+        """Add the parameters if they differ from those before; they are repeated every few seconds."""
+        xml = decoded.xml.encode(errors="surrogatepass")
+        version = decoded.parameters_version
+        newest = source.parameters[-1] if source.parameters else None
+        if newest and newest.version == version and differ_in_statistics_only(self._xml[source.name], xml):
+            return
+        self._xml[source.name] = xml
+        try:
+            parameters = parse_parameters(xml).parameters if xml else Parameters()
+        except ParametersError:
+            _count(source.malformed, "parameters", 1)
+            parameters = Parameters()
+        source.parameters.append(ParametersEntry(decoded.utime, version, parameters))
+
+
+def _count(counts: dict[str, int], key: str, number: int) -> None:
+    counts[key] = counts.get(key, 0) + number

@@ -1,0 +1,86 @@
+"""Takes for tests: messages as a gateway publishes them, and event logs of them."""
+
+import struct
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rtc3d
+
+from gateway.messages.encode import encode_message
+from gateway.messages.stamp import Stamp
+from gateway.messages.topics import lcm_channel
+from gateway.rtc3d.components import ITEM_DTYPES, Component, ComponentType, encode_component
+from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters_xml import encode_parameters
+from gateway.takes.event_log import encode_event
+
+START_UTIME = 1_700_000_000_000_000
+
+Message = tuple[str, bytes]
+"""A channel and a message."""
+
+
+def frame(
+    component: ComponentType,
+    items: Sequence[Any],
+    sequence: int = 0,
+    *,
+    utime: int | None = None,
+    session: int = 1,
+    version: int = 1,
+    timestamp_us: int | None = None,
+    frame_number: int | None = None,
+    source: str = "lab",
+) -> Message:
+    """Return a message with these items; without times, it belongs to 100 frames per second."""
+    number = sequence if frame_number is None else frame_number
+    time_us = sequence * 10_000 if timestamp_us is None else timestamp_us
+    array = np.array(list(items), ITEM_DTYPES[component])
+    content = encode_component(component, number, time_us, array)[8:]
+    found = Component(component, number, time_us, len(array), array.itemsize, "big", content)
+    arrival = START_UTIME + sequence * 10_000 if utime is None else utime
+    message = encode_message(found, Stamp(arrival, arrival - 2000, session, version), sequence)
+    return lcm_channel("MOCAP", source, component.key), message
+
+
+def markers(labels_or_number: int, sequence: int = 0, **options: Any) -> Message:
+    """Return a message with markers whose x is their position, and y the sequence number."""
+    items = [(place, sequence, 0.5, 0.1) for place in range(labels_or_number)]
+    return frame(ComponentType.MARKERS, items, sequence, **options)
+
+
+def parameters(
+    content: Parameters | bytes, version: int = 1, *, utime: int = START_UTIME, source: str = "lab"
+) -> Message:
+    """Return a ``parameters_t``."""
+    message = rtc3d.parameters_t()
+    message.utime = message.capture_utime = utime
+    message.parameters_version = version
+    message.xml = (content if isinstance(content, bytes) else encode_parameters(content)).decode()
+    return lcm_channel("MOCAP", source, "parameters"), message.encode()
+
+
+def description(source: str = "lab", server: str = "192.0.2.20:3020") -> Message:
+    """Return a ``take_t``."""
+    message = rtc3d.take_t()
+    message.utime = START_UTIME
+    message.name, message.source, message.server = "take", source, server
+    message.channels = lcm_channel("MOCAP", source)
+    message.gateway_version = message.recorder = "1.0"
+    return lcm_channel("MOCAP", source, "take"), message.encode()
+
+
+def log_bytes(messages: Iterable[Message]) -> bytes:
+    """Return an event log; the time of an event is the ``utime`` of its message."""
+    return b"".join(
+        encode_event(number, struct.unpack_from(">q", message, 8)[0], channel.encode(), message)
+        for number, (channel, message) in enumerate(messages)
+    )
+
+
+def write_take(path: Path, messages: Iterable[Message]) -> Path:
+    """Write an event log; return its path."""
+    path.write_bytes(log_bytes(messages))
+    return path

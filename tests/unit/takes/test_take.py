@@ -1,0 +1,196 @@
+"""``open_take``: the arrays hold what was recorded, under the right labels."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+import rtc3d
+
+from gateway.errors import TakeError
+from gateway.messages.decode import decode
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import (
+    AnalogChannel,
+    EventDefinition,
+    ForceChannel,
+    Marker,
+    Parameters,
+    Parameters3D,
+    Parameters6D,
+    ParametersAnalog,
+    ParametersEvents,
+    ParametersForce,
+    Plate,
+    Tool,
+)
+from gateway.takes import open_take
+from tests.takes import START_UTIME, Message, description, frame, markers, parameters, write_take
+
+NAN = math.nan
+PARAMETERS = Parameters(
+    markers=Parameters3D(200.0, "m", (Marker("1", "head"), Marker("2", " left "))),
+    tools=Parameters6D(200.0, (Tool("1", "hand"),)),
+    analog=ParametersAnalog((AnalogChannel("1", "EMG", unit="V", frequency_hz=2000.0),)),
+    force=ParametersForce(
+        (
+            Plate(
+                "1",
+                "plate",
+                1000.0,
+                channels=(ForceChannel("1", unit="N"),) * 3 + (ForceChannel("4", unit="Nm"),),
+            ),
+        )
+    ),
+    events=ParametersEvents((EventDefinition("0x10", "jump"), EventDefinition("7", "land"))),
+)
+
+
+def labelled(*labels: str) -> Parameters:
+    return Parameters(
+        markers=Parameters3D(100.0, "mm", tuple(Marker(str(n), label) for n, label in enumerate(labels)))
+    )
+
+
+def test_each_component_has_its_values_labels_unit_and_rate(tmp_path: Path) -> None:
+    messages = [description(), parameters(PARAMETERS)]
+    for number in range(3):
+        messages += [
+            frame(ComponentType.MARKERS, [(1, 2, 3, 0.5), (NAN, NAN, NAN, 999)], number),
+            frame(ComponentType.TOOLS, [(1, 0, 0, 0, 4, 5, 6, 0.2)], number),
+            frame(ComponentType.ANALOG, [number], number),
+            frame(ComponentType.FORCE, [(1, 2, 3, 4, 5, 6)], number),
+        ]
+    messages += [frame(ComponentType.EVENT, [(16, 5, -1, -1, -1), (9, 6, 1, 2, 3)], 3)]
+    source = open_take(write_take(tmp_path / "a.lcmlog", messages)).sources["lab"]
+    found, tools, analog, forces, events = (
+        source.markers,
+        source.tools,
+        source.analog,
+        source.forces,
+        source.events,
+    )
+    assert found
+    assert tools
+    assert analog
+    assert forces
+    assert events
+    assert (source.server, source.gateway_version, source.malformed) == ("192.0.2.20:3020", "1.0", {})
+    assert (found.labels, found.unit, found.rate_hz, len(found)) == (("head", "left"), "m", 200.0, 3)
+    assert found.positions[0].tolist()[0] == [1, 2, 3]
+    assert np.isnan(found.positions[:, 1]).all()
+    assert found.is_visible.tolist() == [[True, False]] * 3
+    assert found.items["reliability"][0].tolist() == [0.5, 999]
+    assert found.seconds.tolist() == [-0.002, 0.008, 0.018]
+    assert found.sequence.tolist() == found.frame_number.tolist() == [0, 1, 2]
+    assert found.timestamp_us.tolist() == [0, 10_000, 20_000]
+    assert found.measured_rate_hz == 100.0
+    assert (tools.labels, tools.unit) == (("hand",), "m")
+    assert tools.positions[0].tolist() == [[4, 5, 6]]
+    assert tools.quaternions[0].tolist() == [[1, 0, 0, 0]]
+    assert (analog.labels, analog.units, analog.rate_hz) == (("EMG",), ("V",), 2000.0)
+    assert analog.values.tolist() == [[0], [1], [2]]
+    assert (forces.labels, forces.unit, forces.moment_unit) == (("plate",), "N", "Nm")
+    assert forces.items["mz"].tolist() == [[6], [6], [6]]
+    assert events.items["id"].tolist() == [16, 9]
+    assert events.event_labels == ("jump", "")
+    assert events.sequence.tolist() == [3, 3]
+
+
+def test_columns_are_the_union_of_labels_and_absent_values_are_nan(tmp_path: Path) -> None:
+    messages = [
+        parameters(labelled("a", "b"), 1),
+        markers(2, 0, version=1),
+        parameters(labelled("b", "c", ""), 2, utime=START_UTIME + 5000),
+        markers(3, 1, version=2),
+        markers(1, 2, version=2),
+    ]
+    found = open_take(write_take(tmp_path / "a.lcmlog", messages)).sources["lab"].markers
+    assert found
+    assert found.labels == ("a", "b", "c", "marker 3")
+    x = found.items["x"]
+    assert np.array_equal(x, [[0, 1, NAN, NAN], [NAN, 0, 1, 2], [NAN, 0, NAN, NAN]], equal_nan=True)
+    runs = found.runs()
+    assert [(run.labels, run.items["x"].tolist()) for run in runs] == [
+        (("a", "b"), [[0, 1]]),
+        (("b", "c", "marker 3"), [[0, 1, 2]]),
+        (("b",), [[0]]),
+    ]
+
+
+def test_runs_end_where_the_server_or_the_gateway_starts_again(tmp_path: Path) -> None:
+    steps: list[Message] = [
+        markers(1, 0),
+        markers(1, 1),
+        markers(1, 2, timestamp_us=0),  # the server plays its file again
+        markers(1, 3, timestamp_us=10_000, session=2),
+        markers(1, 5, timestamp_us=30_000, session=2),
+        markers(1, 4, timestamp_us=20_000, session=2),  # overtaken on the network
+        markers(1, 6, timestamp_us=40_000, session=2),
+    ]
+    source = open_take(write_take(tmp_path / "a.lcmlog", steps)).sources["lab"]
+    assert [run.sequence.tolist() for run in source.runs("3d")] == [[0, 1], [2], [3, 5, 4, 6]]
+    assert source.runs("6d") == []
+
+
+def test_versions_that_start_again_with_the_gateway_keep_their_own_labels(tmp_path: Path) -> None:
+    messages = [
+        parameters(labelled("a"), 1),
+        markers(1, 0),
+        parameters(labelled("b"), 1, utime=START_UTIME + 15_000),
+        markers(1, 2),
+    ]
+    found = open_take(write_take(tmp_path / "a.lcmlog", messages)).sources["lab"].markers
+    assert found
+    assert [run.labels for run in found.runs()] == [("a",), ("b",)]
+
+
+def test_limits_of_time_sources_and_components(tmp_path: Path) -> None:
+    messages = [
+        message for number in range(10) for message in (markers(1, number), markers(1, number, source="b"))
+    ]
+    path = write_take(tmp_path / "a.lcmlog", messages)
+    take = open_take(path, sources=["b"], from_s=0.02, to_s=0.05)
+    assert list(take.sources) == ["b"]
+    assert take.sources["b"].markers
+    assert take.sources["b"].markers.sequence.tolist() == [2, 3, 4]
+    assert open_take(path, components=["6d"]).sources["lab"].markers is None
+    with pytest.raises(TakeError, match="no source 'c'; its sources are: lab, b"):
+        open_take(path, sources=["c"])
+    with pytest.raises(TakeError, match="'3D' is no component"):
+        open_take(path, components=["3D"])
+
+
+def test_messages_whose_size_contradicts_their_count_are_counted(tmp_path: Path) -> None:
+    channel, message = markers(2, 1)
+    messages = [
+        markers(2, 0),
+        (channel, message[:-1]),
+        (channel, message + b"x"),
+        (channel, message[:20]),
+        markers(2, 2),
+    ]
+    source = open_take(write_take(tmp_path / "a.lcmlog", messages)).sources["lab"]
+    assert source.markers
+    assert source.markers.sequence.tolist() == [0, 2]
+    assert source.malformed == {"3d": 3}
+
+
+def test_labels_that_change_without_end_are_read_in_runs(tmp_path: Path) -> None:
+    many = [markers(10_000, 0)] + [markers(1, number) for number in range(1, 3000)]
+    found = open_take(write_take(tmp_path / "a.lcmlog", many)).sources["lab"].markers
+    assert found
+    with pytest.raises(TakeError, match="runs"):
+        _ = found.items
+    assert [(len(run), len(run.labels)) for run in found.runs()] == [(1, 10_000), (2999, 1)]
+
+
+def test_values_are_those_of_lcms_own_decoder(tmp_path: Path) -> None:
+    messages = [markers(number % 4, number) for number in range(20)]
+    found = open_take(write_take(tmp_path / "a.lcmlog", messages)).sources["lab"].markers
+    assert found
+    for row, (_, message) in enumerate(messages):
+        decoded: rtc3d.markers_t = decode(message)
+        assert [tuple(item) for item in found.items[row].tolist()][: decoded.num_markers] == [
+            (marker.x, marker.y, marker.z, marker.reliability) for marker in decoded.markers
+        ]
