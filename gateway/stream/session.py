@@ -7,15 +7,7 @@ from collections.abc import Awaitable, Callable
 from typing import Final, NoReturn
 
 from gateway.config.settings import SourceSettings, StreamSettings
-from gateway.errors import (
-    ClosedError,
-    DefectError,
-    GatewayError,
-    LinkError,
-    ReplyTimeoutError,
-    ServerError,
-    SilenceError,
-)
+from gateway.errors import ClosedError, DefectError, LinkError, SilenceError
 from gateway.messages.host_time import host_clock
 from gateway.rtc3d.client_protocol import (
     Answered,
@@ -39,6 +31,7 @@ from gateway.stream.defects import defect_error
 from gateway.stream.files import FileReceiver
 from gateway.stream.paced_frames import PacedFrames
 from gateway.stream.reading import LONG_READ_BYTES, Reading
+from gateway.stream.replies import Replies
 from gateway.stream.running_clock import running_clock
 from gateway.stream.running_time import running_timeout
 from gateway.stream.status import StreamStatus
@@ -52,9 +45,6 @@ _TURN_US: Final = 2000
 
 _MAX_PACKETS: Final = 64
 """How many packets are processed between two readings of the clock."""
-
-_FURTHER_REPLY_S: Final = 0.3
-"""How soon a slow server's next reply follows a late one. The replies that it owes leave it together."""
 
 OnFrames = Callable[[list[Frame], int, int], None]
 """Takes frames that arrived together, oldest first, and when, as ``HostClock.read`` returns it."""
@@ -99,7 +89,6 @@ class Session:
         self._read_clocks = read_clocks
         self._running = running_clock()
         self._protocol = ClientProtocol(source.max_packet_bytes, source.max_c3d_bytes)
-        self._loop = asyncio.get_running_loop()
         self._transport: asyncio.Transport | None = None
         self._error: LinkError | None = None  # why the session ended
         self._rejection = ""  # of the newest frame that was rejected: why, and when on the running clock
@@ -107,9 +96,7 @@ class Session:
         self._ended = asyncio.Event()  # _error is set
         self._lost = asyncio.Event()  # the transport is closed
         self._ask_lock = asyncio.Lock()  # held while a command is pending
-        self._reply: asyncio.Future[Packet] | None = None  # to the command that ``ask`` has sent
-        self._assume_timer: asyncio.TimerHandle | None = None  # runs after a PossibleReply
-        self._answered: dict[type[Command], Command] = {}  # the newest that was answered, by type
+        self.replies: Replies = Replies(source, self._blocked_until_s, self._assume_reply)
         self._state_changed = asyncio.Event()  # set when the protocol's state changes
         self._quiet_since_s = 0.0  # when the stall time-out last started, on the running clock
         self._last_piece_s = 0.0  # when the newest piece of a file arrived: nothing can arrive before its end
@@ -153,33 +140,12 @@ class Session:
             state_before = self._protocol.state
             self._protocol.send(command)
             self._report_change(state_before)
-            self._reply = self._loop.create_future()
-            self._flush()
             try:
-                packet = await self._wait_for_reply(self._reply)
-            except TimeoutError:
-                raise ReplyTimeoutError(
-                    f"{self.server} did not answer {command} within {self._source.reply_timeout_s:g} s"
-                ) from None
-            except ServerError:
-                self._answered[type(command)] = command
-                raise
+                return await self.replies.ask(command, self._flush)
             finally:
                 state_before = self._protocol.state
                 self._protocol.give_up()
                 self._report_change(state_before)
-                self._reply = None
-            self._answered[type(command)] = command
-            return packet
-
-    def answered(self, *kinds: type[Command]) -> Command | None:
-        """Return a command of the first of ``kinds`` that the server has answered or refused."""
-        return next((self._answered[kind] for kind in kinds if kind in self._answered), None)
-
-    @property
-    def has_answered(self) -> bool:
-        """Whether the server has answered, or refused, any command."""
-        return bool(self._answered)
 
     async def wait_for_data(self, timeout_s: float) -> bool:
         """Wait for frames or No Data; return whether the server sends either."""
@@ -191,21 +157,9 @@ class Session:
         self._check_open()
         return self.has_data
 
-    async def _wait_for_reply(self, reply: "asyncio.Future[Packet]") -> Packet:
-        """Wait for ``reply``; raise TimeoutError if the server does not answer within reply_timeout_s.
-
-        The time-out starts again when a backlog or a piece of a file ends: the reply may be behind it.
-        """
-        since_s = self._running.time()
-        while not reply.done():
-            since_s = max(since_s, self._frames.caught_up_s, self._last_piece_s)
-            wait_s = self._source.reply_timeout_s - (self._running.time() - since_s)
-            if wait_s <= 0:
-                raise TimeoutError
-            with contextlib.suppress(TimeoutError):
-                async with running_timeout(wait_s):
-                    await asyncio.wait({reply})
-        return reply.result()
+    def _blocked_until_s(self) -> float:
+        """Return when a backlog or a piece of a file last came before other packets, on the running clock."""
+        return max(self._frames.caught_up_s, self._last_piece_s)
 
     def control_recording(self, *, start: bool) -> None:
         """Start or stop the server's recording (field note 16). Raises LinkError if the session has ended."""
@@ -221,7 +175,7 @@ class Session:
         """
         while True:
             self._check_open()
-            quiet_since_s = max(self._quiet_since_s, self._frames.caught_up_s, self._last_piece_s)
+            quiet_since_s = max(self._quiet_since_s, self._blocked_until_s())
             wait_s = self._source.stall_timeout_s - (self._running.time() - quiet_since_s)
             if wait_s <= 0:
                 self._check_stall()
@@ -366,11 +320,11 @@ class Session:
     def _on_event(self, event: ProtocolEvent) -> None:
         match event:
             case Answered(_, packet):
-                self._end_ask(packet)
+                self.replies.end(packet)
             case Refused(_, error):
-                self._end_ask(error)
+                self.replies.end(error)
             case PossibleReply():
-                self._assume_reply_soon()
+                self.replies.assume_soon()
             case FrameRejected(frame_error, num_components):
                 self._rejection, self._rejected_s = str(frame_error), self._running.time()
                 self._status.frame_rejected(self._rejection, self._num_lost(num_components))
@@ -396,20 +350,6 @@ class Session:
         """Return how many messages a rejected frame would have had, according to its component count."""
         num_wanted = len(self._status.components.split())
         return min(announced, num_wanted) if 0 < announced <= len(ComponentType) else 1
-
-    def _end_ask(self, result: Packet | GatewayError) -> None:
-        if self._reply is None or self._reply.done():
-            return
-        if isinstance(result, Packet):
-            self._reply.set_result(result)
-        else:
-            self._reply.set_exception(result)
-
-    def _assume_reply_soon(self) -> None:
-        if self._assume_timer is not None:
-            self._assume_timer.cancel()
-        wait_s = min(_FURTHER_REPLY_S, self._source.reply_timeout_s / 4)
-        self._assume_timer = self._loop.call_later(wait_s, self._assume_reply)
 
     def _assume_reply(self) -> None:
         """No further reply has followed: the newest one answers the pending command."""
@@ -443,7 +383,7 @@ class Session:
         self._error = error
         self._ended.set()
         self._state_changed.set()
-        self._end_ask(error)
+        self.replies.end(error)
         try:
             self._files.interrupt(str(error))
             if isinstance(error, DefectError):  # which may be one in publishing

@@ -118,7 +118,7 @@ class StreamControl:
         if self._requested is not None and not self._session.has_data and not self._only_events:
             await self._ask_again(self._requested)
             return
-        probe = self._session.answered(Version, SendParameters, SetByteOrder, StopStreaming)
+        probe = self._session.replies.answered(Version, SendParameters, SetByteOrder, StopStreaming)
         if self._requested is not None and (probe is None or isinstance(probe, StopStreaming)):
             probe = self._requested  # the server accepted it, so it answers it again
         if probe is None:
@@ -144,7 +144,7 @@ class StreamControl:
 
     async def _request_any(self, forms: Sequence[StreamFrames]) -> None:
         """Request frames in one form after the other, until the server accepts one or sends frames."""
-        has_answered = self._session.has_answered
+        has_answered = self._session.replies.has_answered
         ignored: list[StreamFrames] = []
         for form in forms:
             outcome = await self._request(form)
@@ -171,7 +171,7 @@ class StreamControl:
             await self._request(self.accepted)
 
     def _request_error(self) -> RequestError:
-        if not self._session.has_answered:
+        if not self._session.replies.has_answered:
             return RequestError(
                 f"{self._session.server} accepts connections and answers no command; restart its application"
             )

@@ -1,0 +1,99 @@
+"""The replies of a server to the commands of one session."""
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from typing import Final
+
+from gateway.config.settings import SourceSettings
+from gateway.errors import GatewayError, ReplyTimeoutError, ServerError
+from gateway.rtc3d.commands import Command
+from gateway.rtc3d.packets import Packet
+from gateway.stream.running_clock import running_clock
+from gateway.stream.running_time import running_timeout
+
+_FURTHER_REPLY_S: Final = 0.3
+"""How soon a slow server's next reply follows a late one. The replies that it owes leave it together."""
+
+
+class Replies:
+    """Waits for the reply to one command at a time; ``end`` ends the wait.
+
+    ``blocked_until_s`` returns, on the running clock, until when other data kept replies from arriving.
+    ``assume`` is called when no other reply has followed a possible one soon.
+    """
+
+    def __init__(
+        self, source: SourceSettings, blocked_until_s: Callable[[], float], assume: Callable[[], None]
+    ) -> None:
+        self._server = f"{source.host}:{source.port}"
+        self._timeout_s = source.reply_timeout_s
+        self._blocked_until_s = blocked_until_s
+        self._assume = assume
+        self._running = running_clock()
+        self._reply: asyncio.Future[Packet] | None = None  # to the command that was sent
+        self._assume_timer: asyncio.TimerHandle | None = None  # runs after a possible reply
+        self._answered: dict[type[Command], Command] = {}  # the newest that was answered, by type
+
+    async def ask(self, command: Command, send: Callable[[], None]) -> Packet:
+        """Call ``send`` to send ``command``, and return the packet that answers it.
+
+        Raises ServerError with the server's text if the server refuses, ReplyTimeoutError if it does not
+        answer within reply_timeout_s, or the error with which the session ends.
+        """
+        self._reply = reply = self._running.loop.create_future()
+        send()
+        try:
+            packet = await self._wait(reply)
+        except TimeoutError:
+            raise ReplyTimeoutError(
+                f"{self._server} did not answer {command} within {self._timeout_s:g} s"
+            ) from None
+        except ServerError:
+            self._answered[type(command)] = command
+            raise
+        finally:
+            self._reply = None
+        self._answered[type(command)] = command
+        return packet
+
+    def end(self, result: Packet | GatewayError) -> None:
+        """End the wait with the answer, or with why there is none."""
+        if self._reply is None or self._reply.done():
+            return
+        if isinstance(result, Packet):
+            self._reply.set_result(result)
+        else:
+            self._reply.set_exception(result)
+
+    def assume_soon(self) -> None:
+        """Note a possible reply; it is assumed to be the answer if no other reply follows."""
+        if self._assume_timer is not None:
+            self._assume_timer.cancel()
+        wait_s = min(_FURTHER_REPLY_S, self._timeout_s / 4)
+        self._assume_timer = self._running.loop.call_later(wait_s, self._assume)
+
+    def answered(self, *kinds: type[Command]) -> Command | None:
+        """Return a command of the first of ``kinds`` that the server has answered or refused."""
+        return next((self._answered[kind] for kind in kinds if kind in self._answered), None)
+
+    @property
+    def has_answered(self) -> bool:
+        """Whether the server has answered, or refused, any command."""
+        return bool(self._answered)
+
+    async def _wait(self, reply: "asyncio.Future[Packet]") -> Packet:
+        """Wait for ``reply``; raise TimeoutError if the server does not answer within reply_timeout_s.
+
+        The time-out starts again when what blocks replies ends: the reply may be behind it.
+        """
+        since_s = self._running.time()
+        while not reply.done():
+            since_s = max(since_s, self._blocked_until_s())
+            wait_s = self._timeout_s - (self._running.time() - since_s)
+            if wait_s <= 0:
+                raise TimeoutError
+            with contextlib.suppress(TimeoutError):
+                async with running_timeout(wait_s):
+                    await asyncio.wait({reply})
+        return reply.result()
