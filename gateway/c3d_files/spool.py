@@ -15,7 +15,7 @@ from gateway.c3d_files.queue_memory import QueueMemory
 from gateway.worker_thread import WorkerThread
 
 # Files with other names do not belong to the gateway: it leaves them alone. The time has a fixed length, so
-# that "lab-2" and "lab" are told apart.
+# that a file of "lab-2" is not taken for one of "lab".
 _NAME: Final = re.compile(r"(?P<source>.+)-(?P<time>\d{8}T\d{6}\.\d{6}Z)\.c3d")
 _TIME: Final = "%Y%m%dT%H%M%S.%fZ"
 _UNFINISHED: Final = ".c3d.part"

@@ -390,7 +390,7 @@ class Session:
                 self._frames.drop()
             else:
                 self._frames.finish()
-        except Exception as defect:  # noqa: BLE001 - whoever waits for the end must not wait for ever
+        except Exception as defect:  # noqa: BLE001 - calls that wait for the end must return
             self._error = defect_error(defect)
 
     def _flush(self) -> None:

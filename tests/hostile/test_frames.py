@@ -66,7 +66,7 @@ CONTROL: Final = "\x1b[2J\r\n2026-01-01 00:00:00,000 ERROR forged\n\x07\x9b31m\u
 
 
 async def texts(client: Client) -> None:
-    """Send texts that try to control the terminal of whoever reads the log."""
+    """Send texts that try to control a terminal that shows the log."""
     for number in itertools.count():
         client.send(
             packet(0, f"{CONTROL} {number}".encode()) + packet(1, CONTROL * 1000) + packet(9, CONTROL)

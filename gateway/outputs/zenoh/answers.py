@@ -1,9 +1,9 @@
 """From a query that Zenoh delivers to its replies.
 
 A query is admitted or refused in Zenoh's thread. The event loop takes one question in a turn, and a thread
-sends the replies: to reply to a peer that has stopped reading blocks for 5 s, until Zenoh closes the link.
-To drop a query blocks, too, and to free one that has not been dropped, because both tell the peer that no
-further reply follows. So queries end in that thread only.
+sends the replies, because replying to a peer that has stopped reading blocks for 5 s, until Zenoh closes the
+link. Dropping a query can block in the same way, and so can freeing one that has not been dropped: both tell
+the peer that no further reply follows. So queries end in that thread only.
 
 Equal queries that arrive before there is an answer are one question.
 

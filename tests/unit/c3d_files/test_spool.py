@@ -116,7 +116,7 @@ def test_files_of_other_programs_are_left_alone(tmp_path: Path) -> None:
 
 
 def test_only_regular_files_count(tmp_path: Path) -> None:
-    """A FIFO would block whoever opens it."""
+    """Opening a FIFO would block."""
     spool = spool_in(tmp_path, max_files=1)
     spool.directory.mkdir()
     for number in range(3):
