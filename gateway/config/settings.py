@@ -165,7 +165,7 @@ class SourceSettings(Section):
     """How often to read the server's parameters again, for example for renamed markers. 0 means never."""
 
     remote_control: Switch = False
-    """Whether peers may start and stop a recording on the server."""
+    """Whether peers may start and stop recordings on the server, and takes."""
 
     @field_validator("streams")
     @classmethod

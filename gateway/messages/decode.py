@@ -23,6 +23,8 @@ MESSAGE_TYPES_BY_NAME: Final[dict[str, type[Any]]] = {
         rtc3d.parameters_t,
         rtc3d.parameters_request_t,
         rtc3d.parameters_reply_t,
+        rtc3d.command_request_t,
+        rtc3d.command_reply_t,
         rtc3d.take_t,
     )
 }

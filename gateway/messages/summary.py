@@ -31,6 +31,11 @@ def summarise(message: Any) -> str:
         case rtc3d.parameters_reply_t():
             content = message.error or f"{summarise_xml(message.xml.encode())}, {message.age_s:.1f} s old"
             text = f"reply {message.request_id} to {message.requester!r}: {content}"
+        case rtc3d.command_request_t():
+            command = " ".join([message.command, *message.options])
+            text = f"command {message.request_id} from {message.requester!r}: {command}"
+        case rtc3d.command_reply_t():
+            text = f"reply {message.request_id} to {message.requester!r}: {message.error or message.content}"
         case rtc3d.take_t():
             text = f"take {message.name!r} of {message.source}, recorded on {message.host}"
         case _:

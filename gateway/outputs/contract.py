@@ -20,6 +20,9 @@ from gateway.rtc3d.frames import Frame
 KeyPath = tuple[str, ...]
 """A key below PREFIX/SOURCE/, split at its slashes: ("parameters", "3d")."""
 
+CONTROL_OPTION: Final = "set"
+"""The option of queries that start, stop or change something. They need ``remote_control`` of the source."""
+
 NO_LIMITS: Final[Mapping[ComponentType, float]] = {}
 
 
@@ -109,7 +112,10 @@ class ServerParameters(NamedTuple):
 
 
 Command = Callable[[str, Mapping[str, str]], Awaitable[Answer]]
-"""A command of one output: takes the source's name and the options; raises QueryError."""
+"""A command of one output: takes the source's name and the options; raises QueryError.
+
+It changes something only with CONTROL_OPTION; the service has then checked that peers may control the source.
+"""
 
 
 class QueryService(Protocol):
@@ -119,13 +125,20 @@ class QueryService(Protocol):
         """Return whether the gateway has this source now."""
 
     def keys(self, source: str) -> list[KeyPath]:
-        """Return every key that a wildcard may select; not those of commands and recording control."""
+        """Return every key that a wildcard may select; not those of ``commands``."""
+
+    def commands(self) -> Sequence[str]:
+        """Return the keys that no wildcard selects: recording control, and the outputs' own commands."""
 
     def accepted_keys(self, source: str) -> str:
         """Return the keys that can be queried, as text for an error message."""
 
     async def answer(self, source: str, path: KeyPath, options: Mapping[str, str]) -> Answer:
-        """Return the answer for one key; raises QueryError."""
+        """Return the answer for one key; raises QueryError.
+
+        If the options have CONTROL_OPTION, peers must be allowed to control the source, and the rate of such
+        queries is limited.
+        """
 
     async def answer_all(
         self, source: str, paths: Sequence[KeyPath], options: Mapping[str, str]

@@ -2,9 +2,10 @@
 
 import asyncio
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 
 from gateway.errors import QueryError
-from gateway.outputs.contract import Answer, Command, KeyPath, ServerParameters
+from gateway.outputs.contract import CONTROL_OPTION, Answer, Command, KeyPath, ServerParameters
 from gateway.queries.questions import (
     RECORDING,
     accepted_keys,
@@ -39,8 +40,12 @@ class SourceQueryService:
         return source in self._sources()
 
     def keys(self, source: str) -> list[KeyPath]:
-        """See QueryService. Recording is left out, so that no wildcard starts one by accident."""
+        """See QueryService. Commands are left out, so that no wildcard starts anything by accident."""
         return [path for path in known_keys(self._sources()[source].components) if path != RECORDING]
+
+    def commands(self) -> list[str]:
+        """See QueryService."""
+        return ["/".join(RECORDING), *self._commands()]
 
     def accepted_keys(self, source: str) -> str:
         """See QueryService."""
@@ -48,11 +53,16 @@ class SourceQueryService:
 
     async def answer(self, source: str, path: KeyPath, options: Mapping[str, str]) -> Answer:
         """See QueryService."""
-        command = self._commands().get("/".join(path))
-        if command is not None:
-            return await command(source, options)
         queries = self._sources()[source]
-        return await queries.answer(parse_question(path, options, queries.components), self._output)
+        command = self._commands().get("/".join(path))
+        answer = (
+            partial(queries.answer, parse_question(path, options, queries.components), self._output)
+            if command is None
+            else partial(command, source, options)
+        )
+        if CONTROL_OPTION in options:
+            queries.check_control()
+        return await answer()
 
     async def answer_all(
         self, source: str, paths: Sequence[KeyPath], options: Mapping[str, str]

@@ -27,8 +27,8 @@ from gateway.rtc3d.packets import PacketType
 from gateway.stream.state import StreamState
 from gateway.token_bucket import TokenBucket
 
-RECORDINGS_PER_S: Final = 4.0
-"""How many commands a second to start or stop a recording reach the server."""
+CONTROLS_PER_S: Final = 4.0
+"""How many commands a second that start, stop or change something are carried out."""
 
 
 class SourceQueries:
@@ -60,7 +60,7 @@ class SourceQueries:
         self._record = record
         self._requests = ServerRequests(settings, streams)
         self._newest_json = NewestJson()
-        self._recordings = TokenBucket(RECORDINGS_PER_S)
+        self._controls = TokenBucket(CONTROLS_PER_S)
         self.parameters: ParameterCache = ParameterCache(
             settings, self._requests, announce_parameters, None if before is None else before.parameters
         )
@@ -79,6 +79,22 @@ class SourceQueries:
     def parameters_version(self) -> int:
         """The version of the server's parameters; 0 before the first."""
         return self._requests.parameters_version
+
+    def check_control(self) -> None:
+        """Raise QueryError unless peers may now start, stop or change something of this source."""
+        name = self._settings.name
+        if not self._settings.remote_control:
+            raise QueryError(
+                f"remote control is off for source {name!r}; to switch it on, set remote_control: true "
+                "for it in the gateway's configuration",
+                code="refused",
+            )
+        if not self._controls.try_take():
+            raise QueryError(
+                f"source {name!r} takes {CONTROLS_PER_S:g} commands a second that start or stop something; "
+                "try again",
+                code="rate",
+            )
 
     async def answer(self, question: Question, output: str = "") -> Answer:
         """Return the answer to a query on the output of this name; "" stands for any output.
@@ -176,19 +192,8 @@ class SourceQueries:
         raise QueryError(f"the current frame has no {component.key}", code="nothing-yet")
 
     def _recording(self, question: Question) -> Answer:
-        if not self._settings.remote_control:
-            raise QueryError(
-                f"recording control is off for source {self._settings.name!r}; to switch it on, set "
-                "remote_control: true for it in the gateway's configuration",
-                code="refused",
-            )
         if not question.set:
             raise QueryError("recording takes one option; accepted: set=start, set=stop")
-        if not self._recordings.try_take():
-            raise QueryError(
-                f"the server gets {RECORDINGS_PER_S:g} commands a second for recordings; try again",
-                code="rate",
-            )
         if not self._record(question.set == "start"):
             raise self._requests.no_connection_error()
         return Answer(json_bytes({"source": self._settings.name, "sent": question.set}), JSON)

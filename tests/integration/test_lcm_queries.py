@@ -12,7 +12,8 @@ import rtc3d
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.lcm.connection import open_lcm
-from gateway.outputs.lcm.queries import MAX_PENDING, MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES, LcmQueries
+from gateway.outputs.lcm.queries import LcmQueries
+from gateway.outputs.lcm.requests import MAX_PENDING, MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES
 from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.rtc3d.parameters import SECTIONS
@@ -265,7 +266,7 @@ async def test_requests_beyond_the_queue_are_dropped_and_counted() -> None:
         queries = output_queries(gateway)
 
         def waiting(count: int) -> bool:
-            return len(queries._tasks) == count
+            return len(queries._requests._tasks) == count
 
         server.may_answer.clear()
         for number in range(MAX_PENDING):
@@ -294,18 +295,18 @@ async def test_requests_beyond_the_queue_are_dropped_and_counted() -> None:
 async def test_a_requester_can_send_the_next_request_as_soon_as_it_has_a_reply(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr("gateway.outputs.lcm.queries.MAX_PENDING", 1)
+    monkeypatch.setattr("gateway.outputs.lcm.requests.MAX_PENDING", 1)
     async with gateway_with_lcm_peer() as (_, gateway, peer):
         queries = output_queries(gateway)
         assert isinstance(queries, LcmQueries)
-        publish, is_slot_free = queries._publish, []
+        requests, is_slot_free = queries._requests, []
+        send = requests._send
 
-        def publish_and_check(connection: Any, source: str, name: str, message: Any) -> None:
-            publish(connection, source, name, message)
-            if name == "PARAMETERS_REPLY":
-                is_slot_free.append(queries._admission.num_pending == 0)
+        def send_and_check(channel: str, reply: bytes) -> None:
+            send(channel, reply)
+            is_slot_free.append(requests._admission.num_pending == 0)
 
-        monkeypatch.setattr(queries, "_publish", publish_and_check)
+        monkeypatch.setattr(requests, "_send", send_and_check)
         assert (await peer.request(1)).error == ""
         assert is_slot_free == [True]
 
@@ -331,6 +332,6 @@ async def test_pending_requests_are_cancelled_when_the_gateway_stops() -> None:
         server.ignored_commands = ("SendParameters",)
         peer.send(encode_request(1, fresh=True))
         queries = output_queries(gateway)
-        await wait_until_async(lambda: queries._tasks)
-    assert queries._tasks == set()
+        await wait_until_async(lambda: queries._requests._tasks)
+    assert queries._requests._tasks == set()
     assert peer.replies == []

@@ -10,7 +10,7 @@ import rtc3d
 import zenoh
 
 from gateway.messages.decode import decode, prefix_of
-from gateway.outputs.lcm import queries as lcm_queries
+from gateway.outputs.lcm import parameters as lcm_parameters
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.rtc3d.components import ComponentType
@@ -133,7 +133,7 @@ async def test_renamed_markers_and_tools_reach_everyone_before_their_frames(
 async def test_a_server_that_gives_no_parameters_any_more_makes_them_void_for_everyone(
     router: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lcm_queries, "REPEAT_S", 0.05)
+    monkeypatch.setattr(lcm_parameters, "REPEAT_S", 0.05)
     server, url = ParameterServer(), lcm_url()
     with listeners(router, url) as (on_zenoh, on_lcm):
         async with (

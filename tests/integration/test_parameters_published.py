@@ -12,7 +12,7 @@ import zenoh.ext
 
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
-from gateway.outputs.lcm import queries as lcm_queries
+from gateway.outputs.lcm import parameters as lcm_parameters
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.rtc3d.components import ComponentType
@@ -140,7 +140,7 @@ async def test_parameters_are_published_again_after_a_restart_of_the_gateway(
 async def test_the_first_subscribers_get_the_parameters_although_they_are_late(
     router: str, url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(lcm_queries, "REPEAT_S", 0.05)
+    monkeypatch.setattr(lcm_parameters, "REPEAT_S", 0.05)
     server = ParameterServer()
     async with gateway_with_cache(server, router, url):
         commands = list(server.commands)

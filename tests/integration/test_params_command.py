@@ -14,7 +14,7 @@ import rtc3d
 import zenoh
 
 from gateway.outputs.encodings import json_bytes
-from gateway.outputs.lcm import queries as lcm_queries
+from gateway.outputs.lcm import parameters as lcm_parameters
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
@@ -348,7 +348,7 @@ async def test_a_request_on_lcm_is_repeated_after_a_refusal() -> None:
 
 
 async def test_echo_prints_published_parameters(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(lcm_queries, "REPEAT_S", 0.05)
+    monkeypatch.setattr(lcm_parameters, "REPEAT_S", 0.05)
     async with lab() as at:
         echo = asyncio.create_task(
             run(

@@ -212,8 +212,9 @@ class ZenohAnswers:
         return {base + "/".join(path): answer for path, answer in answers.items()}
 
     def _nothing_matches(self, selected: str, base: str, source: str) -> str:
-        if selected.rpartition("/")[2] == "recording":
-            return f"recording is controlled for one source at a time; accepted: {base}recording"
+        for command in self._service.commands():
+            if selected.endswith(f"/{command}"):
+                return f"{command} is controlled for one source at a time; accepted: {base}{command}"
         accepted = self._service.accepted_keys(source)
         return f"nothing of source {source!r} matches {selected}; accepted below {base}: {accepted}"
 

@@ -64,6 +64,16 @@ def parameter_messages() -> list[bytes]:
     return [parameters.encode(), request.encode(), reply.encode()]
 
 
+def command_messages() -> list[bytes]:
+    """Return a command and its reply, as on LCM."""
+    request, reply = rtc3d.command_request_t(), rtc3d.command_reply_t()
+    request.request_id = reply.request_id = 7
+    request.requester = reply.requester = "remote"
+    request.command, request.options, request.num_options = "take", ["set=start", "name=walk-1"], 2
+    reply.content = '{"source":"lab","name":"walk-1"}'
+    return [request.encode(), reply.encode()]
+
+
 def take_message() -> bytes:
     """Return the description of a take."""
     message = rtc3d.take_t()

@@ -6,6 +6,7 @@ import pytest
 from gateway.errors import ProtocolError
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME, decode, to_json
 from tests.unit.messages.samples import (
+    command_messages,
     component_message,
     parameter_messages,
     status_of,
@@ -23,6 +24,7 @@ EVERY_MESSAGE = [
     status_of(),
     unknown_clock(),
     *parameter_messages(),
+    *command_messages(),
     take_message(),
 ]
 every_message = pytest.mark.parametrize(
@@ -32,7 +34,7 @@ every_message = pytest.mark.parametrize(
 
 def test_all_published_types_can_be_decoded() -> None:
     assert set(MESSAGE_TYPES_BY_NAME) == {type(decode(message)).__name__ for message in EVERY_MESSAGE}
-    assert len(MESSAGE_TYPES_BY_NAME) == 12
+    assert len(MESSAGE_TYPES_BY_NAME) == 14
 
 
 @every_message

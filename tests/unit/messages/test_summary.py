@@ -10,7 +10,13 @@ from gateway.outputs.status import OutputHealth, OutputStatus
 from gateway.publish.status_messages import status_message
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
-from tests.unit.messages.samples import component_message, status_of, tool_pose_messages, unknown_clock
+from tests.unit.messages.samples import (
+    command_messages,
+    component_message,
+    status_of,
+    tool_pose_messages,
+    unknown_clock,
+)
 from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS
 
 
@@ -36,6 +42,8 @@ from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS
             "#41 frame 4 at 0.0075 s: position (0.1, -0.2, 1.6) m, orientation xyzw (-0.4, 0.4, 0.2, 0.8)",
         ),
         (tool_pose_messages()[1], "#42 frame 4 at 0.0075 s: out of view"),
+        (command_messages()[0], "command 7 from 'remote': take set=start name=walk-1"),
+        (command_messages()[1], """reply 7 to 'remote': {"source":"lab","name":"walk-1"}"""),
         (unknown_clock(), "#17 the server's time stamps cannot be used as a clock (3d 6d)"),
         (
             status_of(state=StreamState.STREAMING, frames_in=600, reconnects=1, last_error="gone"),
@@ -57,6 +65,8 @@ from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS
         "events",
         "pose",
         "pose out of view",
+        "command",
+        "reply to a command",
         "clock",
         "status while streaming",
         "status while waiting",

@@ -1,3 +1,4 @@
+import asyncio
 from collections.abc import Mapping
 
 import pytest
@@ -22,6 +23,43 @@ async def test_a_command_of_an_output_gets_the_source_and_the_options() -> None:
     answer = await service.answer("lab", ("record", "trim"), {"to": "5"})
     assert answer.payload == b"lab {'to': '5'}"
     assert service.accepted_keys("lab").endswith(", schema/TYPE, record/trim")
+
+
+@pytest.mark.parametrize(
+    ("path", "options"),
+    [
+        (("recording",), {"set": "start"}),
+        (("record", "trim"), {"set": "start"}),
+        (("record", "trim"), {"set": ""}),
+    ],
+)
+async def test_what_changes_something_needs_remote_control(
+    path: tuple[str, ...], options: dict[str, str]
+) -> None:
+    source = FakeSource()
+    with pytest.raises(QueryError, match="set remote_control: true for it in the gateway") as caught:
+        await service_of(source).answer("lab", path, options)
+    assert caught.value.code == "refused"
+    assert source.recorded == []
+
+
+async def test_four_commands_a_second_may_change_something() -> None:
+    service = service_of(FakeSource(remote_control=True))
+    for _ in range(4):
+        await service.answer("lab", ("record", "trim"), {"set": "start"})
+    with pytest.raises(QueryError, match="source 'lab' takes 4 commands a second") as caught:
+        await asyncio.gather(*(service.answer("lab", ("recording",), {"set": "start"}) for _ in range(4)))
+    assert caught.value.code == "rate"
+    await service.answer("lab", ("record", "trim"), {})
+
+
+async def test_a_wrong_command_is_no_command_that_changes_something() -> None:
+    service = service_of(FakeSource(remote_control=True))
+    for _ in range(10):
+        with pytest.raises(QueryError, match="accepted: start, stop"):
+            await service.answer("lab", ("recording",), {"set": "pause"})
+    with pytest.raises(QueryError, match="unknown option 'set' of status"):
+        await service.answer_all("lab", [("status",)], {"set": "start"})
 
 
 async def test_a_wildcard_selects_neither_recording_nor_commands_of_outputs() -> None:

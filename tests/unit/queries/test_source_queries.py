@@ -71,13 +71,6 @@ async def test_a_file_is_read_once_for_simultaneous_queries() -> None:
     assert source.num_file_reads == 1
 
 
-async def test_recording_is_refused_unless_remote_control_is_enabled() -> None:
-    source = FakeSource()
-    with pytest.raises(QueryError, match="remote_control: true"):
-        await source.answer("recording", set="start")
-    assert source.recorded == []
-
-
 async def test_recording_is_started_and_stopped() -> None:
     source = FakeSource(remote_control=True)
     answer = await source.answer("recording", set="start")

@@ -74,7 +74,7 @@ async def test_requests_are_answered_again_after_the_relay_restarts(
 async def test_a_lost_relay_is_logged_with_the_key_to_check(
     relay: LcmRelay, output: LcmOutput, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(logging.DEBUG, "gateway.outputs.lcm.queries")
+    caplog.set_level(logging.DEBUG, "gateway.outputs.lcm.receiver")
     await wait_until_async(lambda: output.health().connected and relay.subscribed)
     relay.close()
     await wait_until_async(lambda: len(caplog.messages) >= 2)

@@ -35,6 +35,9 @@ class Service:
     def keys(self, _source: str) -> list[KeyPath]:
         return [("status",)]
 
+    def commands(self) -> list[str]:
+        return ["recording", "take"]
+
     def accepted_keys(self, _source: str) -> str:
         return "status"
 

@@ -42,6 +42,9 @@ class Service:
     def keys(self, _source: str) -> list[KeyPath]:
         return [STATUS, C3D, ("parameters", "3d")]
 
+    def commands(self) -> list[str]:
+        return ["recording", "take"]
+
     def accepted_keys(self, _source: str) -> str:
         return "status, c3d"
 

@@ -1,0 +1,139 @@
+"""Receiving on LCM in a thread, on channels that are added while it runs."""
+
+import logging
+import threading
+from collections.abc import Callable
+from typing import Final
+
+import lcm
+
+from gateway.errors import OutputError
+from gateway.log import FailureLog
+from gateway.outputs.lcm.connection import open_lcm, reconnect, scheme_of, send_problem
+from gateway.outputs.lcm.sender import RETRY_S
+from gateway.token_bucket import TokenBucket
+from gateway.worker_thread import WorkerThread
+
+RECEIVED_PER_S: Final = 2000.0
+"""How many messages a second are received. LCM itself discards further ones, which cannot be counted."""
+
+_POLL_MS: Final = 100
+_PAUSE_S: Final = 0.02
+_JOIN_S: Final = 0.3
+
+Take = Callable[[bytes], None]
+"""Takes a message, in the receiving thread."""
+
+logger = logging.getLogger(__name__)
+
+
+class LcmReceiver:
+    """Receives requests on ``url``. ``prefix`` begins the name of a channel that nobody subscribes to.
+
+    If there is a ``shared`` LCM object (memq://), the owner of that object receives instead. Each
+    subscription has a queue of ``queue_messages``. ``on_open`` is called in the thread once LCM has opened.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        prefix: str,
+        shared: lcm.LCM | None,
+        queue_messages: int,
+        on_open: Callable[[], None],
+    ) -> None:
+        self._url = url
+        self._prefix = prefix
+        self._shared = shared
+        self._queue_messages = queue_messages
+        self._on_open = on_open
+        self._channels: dict[str, Take] = {}
+        self._subscriptions: dict[str, lcm.LCMSubscription] = {}  # by channel
+        self._thread = threading.Thread(target=self._run, name="lcm-requests", daemon=True)
+        self._closing = threading.Event()
+        self._opening = FailureLog(logger, "lcm")
+        self._received = TokenBucket(RECEIVED_PER_S)  # used in the receiving thread
+
+    def start(self) -> None:
+        """Receive. Called in any thread, after the output has opened."""
+        if self._shared is not None:
+            self._subscribe(self._shared)
+        else:
+            self._thread.start()
+
+    def add(self, channel: str, take: Take) -> None:
+        """Receive on one more channel, to the end.
+
+        LCM's Python module would free a subscription while the receiving thread may be using it.
+        """
+        self._channels.setdefault(channel, take)
+        if self._shared is not None:
+            self._subscribe(self._shared)
+
+    async def close(self) -> None:
+        """Stop receiving."""
+        self._closing.set()
+        if self._thread.is_alive():
+            await WorkerThread("join lcm-requests").run(lambda: self._thread.join(_JOIN_S))
+        if self._shared is not None:
+            for subscription in self._subscriptions.values():
+                self._shared.unsubscribe(subscription)
+
+    # In the receiving thread.
+
+    def _run(self) -> None:
+        connection = self._open()
+        if connection is not None:
+            self._on_open()
+        while connection is not None and not self._closing.is_set():
+            self._subscribe(connection)
+            if self._received.left <= 0:
+                self._closing.wait(_PAUSE_S)  # or a flood would keep other threads from running
+            try:
+                connection.handle_timeout(_POLL_MS)
+            except OSError as error:
+                logger.debug("receiving LCM requests: %s", error)
+                self._closing.wait(_POLL_MS / 1000)
+                if scheme_of(self._url) == "tcpq":
+                    self._reconnect(connection)
+
+    def _open(self) -> lcm.LCM | None:
+        """Return the LCM object that receives requests, with retries; None if ``close`` is called first."""
+        while not self._closing.is_set():
+            try:
+                connection = open_lcm(self._url)
+            except OutputError as error:
+                self._opening.failed(f"no requests can be received: {error} (this is lcm.queries_url)")
+                self._closing.wait(RETRY_S)
+                continue
+            self._opening.recovered("requests can be received")
+            return connection
+        return None
+
+    def _reconnect(self, connection: lcm.LCM) -> None:
+        """Connect to the relay again, with retries, until ``close``."""
+        while not self._closing.is_set():
+            try:
+                reconnect(connection, f"{self._prefix}_RECONNECTED")
+            except OSError as error:
+                problem = send_problem(self._url, error)
+                self._opening.failed(f"no requests can be received: {problem} (this is lcm.queries_url)")
+                self._closing.wait(RETRY_S)
+            else:
+                self._opening.recovered("requests can be received")
+                return
+
+    def _subscribe(self, connection: lcm.LCM) -> None:
+        """Subscribe to the channels that are new."""
+        channels = self._channels.copy()
+        for channel in channels.keys() - self._subscriptions.keys():
+            subscription = connection.subscribe(f"^{channel}$", self._handler(channels[channel]))
+            subscription.set_queue_capacity(self._queue_messages)
+            self._subscriptions[channel] = subscription
+
+    def _handler(self, take: Take) -> Callable[[str, bytes], None]:
+        def handle(_channel: str, data: bytes) -> None:
+            self._received.take()
+            take(data)
+
+        return handle

@@ -1,0 +1,191 @@
+"""Requests on LCM in memory: what peers receive, and what the output counts."""
+
+import asyncio
+from collections.abc import AsyncIterator
+
+import pytest
+
+from gateway.errors import QueryError
+from gateway.outputs.contract import ServerParameters
+from gateway.outputs.lcm import requests
+from gateway.outputs.lcm.queries import LcmQueries
+from gateway.outputs.lcm.requests import MAX_REQUEST_BYTES, MAX_REQUESTER_BYTES
+from gateway.outputs.lcm.sender import LcmSender
+from gateway.outputs.lcm.settings import LcmSettings
+from tests.unit.outputs.lcm.peer import XML, Lab, request
+from tests.waiting import wait_until_async
+
+
+@pytest.fixture
+async def lab() -> AsyncIterator[Lab]:
+    lab = Lab()
+    yield lab
+    lab.service.may_answer.set()
+    await lab.output.stop_queries()
+    lab.output.close()
+
+
+async def test_a_reply_has_the_answer_of_the_service(lab: Lab) -> None:
+    lab.open()
+    lab.send(request(7, "3d", "force", fresh=True))
+    [reply] = await lab.receive()
+    assert (reply.request_id, reply.requester) == (7, "test")
+    assert (reply.xml, reply.age_s, reply.error, reply.error_code) == (XML.decode(), 2.5, "", "")
+    assert reply.parameters_version == 4
+    assert lab.service.received == [("lab", ["3d", "force"], True)]
+    assert lab.service.log_fields == [{"source": "lab"}]
+    assert lab.output.query_results == {"ok": 1}
+
+
+async def test_sources_are_served_whenever_they_are_announced(lab: Lab) -> None:
+    lab.open()
+    lab.output.announce("hall")
+    lab.output.announce("hall")
+    lab.send(request(1), "HALL")
+    await lab.receive()
+    lab.send(request(2), "LAB")
+    await lab.receive(2)
+    assert [reply.request_id for reply in lab.replies] == [1, 2]
+    assert lab.service.received == [("hall", [], False), ("lab", [], False)]
+
+
+async def test_an_error_of_the_service_is_the_reply(lab: Lab) -> None:
+    lab.service.reply = QueryError("the server refuses", code="refused")
+    lab.open()
+    lab.send(request(7))
+    [reply] = await lab.receive()
+    assert (reply.request_id, reply.requester) == (7, "test")
+    assert (reply.xml, reply.error, reply.error_code) == ("", "the server refuses", "refused")
+    assert lab.output.query_results == {"refused": 1}
+
+
+async def test_a_defect_is_logged_and_reported_in_the_reply(
+    lab: Lab, caplog: pytest.LogCaptureFixture
+) -> None:
+    lab.service.reply = ZeroDivisionError("of the test")
+    lab.open()
+    lab.send(request(7))
+    [reply] = await lab.receive()
+    assert (reply.error, reply.error_code) == (
+        "a defect in the gateway: ZeroDivisionError('of the test')",
+        "defect",
+    )
+    assert lab.output.query_results == {"defect": 1}
+    [record] = caplog.records
+    assert record.message == "lab: LCM request 7 of 'test'"
+    assert record.exc_info is not None
+
+
+async def test_a_source_that_is_no_longer_served_gets_no_reply(
+    lab: Lab,
+) -> None:
+    lab.open()
+    lab.service.sources.clear()
+    lab.send(request(1))
+    await asyncio.sleep(0)  # the event loop rejects the request
+    lab.service.sources.add("lab")
+    lab.send(request(2))
+    assert [reply.request_id for reply in await lab.receive()] == [2]
+
+
+async def test_requests_beyond_the_limit_are_dropped_and_counted_by_source(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(requests, "MAX_PENDING", 2)
+    lab = Lab()
+    lab.open()
+    lab.output.announce("hall")
+    lab.service.may_answer.clear()
+    lab.service.sources.discard("hall")
+    for _ in range(3):
+        lab.send(request(0), "HALL")  # refused requests must not keep their places
+        await asyncio.sleep(0)
+    assert lab.lost("hall") == {}
+    for number in range(4):
+        lab.send(request(number))
+        await asyncio.sleep(0)
+    assert lab.lost("lab") == {"request beyond the queue": (2, 0)}
+    lab.service.may_answer.set()
+    assert [reply.request_id for reply in await lab.receive(2)] == [0, 1]
+    lab.send(request(5))
+    await lab.receive(3)
+    assert lab.lost("lab") == {"request beyond the queue": (2, 0)}
+    await lab.output.stop_queries()
+
+
+async def test_requests_beyond_the_rate_get_an_error_and_are_counted() -> None:
+    lab = Lab(max_queries_per_source_per_s=1.0)
+    lab.open()
+    for number in range(8):
+        lab.send(request(number))
+    replies = await lab.receive(8)
+    refused = [reply for reply in replies if reply.error_code == "rate"]
+    assert refused
+    assert len(refused) < 8
+    assert {reply.requester for reply in refused} == {"test"}
+    assert "raise lcm.max_queries_per_source_per_s" in refused[0].error
+    assert lab.lost("lab") == {"request beyond the rate": (len(refused), 0)}
+    assert lab.output.query_results == {"ok": 8 - len(refused), "rate": len(refused)}
+    await lab.output.stop_queries()
+
+
+async def test_replies_beyond_the_bytes_of_a_second_are_errors() -> None:
+    lab = Lab(max_reply_bytes_per_s=1024)
+    lab.service.reply = ServerParameters(b"x" * 4000, 3, 4)
+    lab.open()
+    lab.send(request(1))
+    lab.send(request(2))
+    assert [reply.error_code for reply in await lab.receive(2)] == ["", "rate"]
+    await lab.output.stop_queries()
+
+
+async def test_malformed_requests_are_counted_by_source(lab: Lab) -> None:
+    lab.open()
+    lab.output.announce("hall")
+    good = request(1)
+    for data in (b"", good[:-1], bytes(8) + good[8:]):
+        lab.send(data)
+    assert lab.lost("lab") == {"malformed request": (3, 0)}
+    assert lab.lost("hall") == {}
+
+
+async def test_the_limits_of_a_request_are_exact(lab: Lab) -> None:
+    lab.open()
+    lab.send(request(1, requester="ä" * (MAX_REQUESTER_BYTES // 2)))
+    lab.send(request(2) + bytes(MAX_REQUEST_BYTES - len(request(2))))
+    await lab.receive(2)
+    assert lab.lost("lab") == {}
+    lab.send(request(3, requester="ä" * (MAX_REQUESTER_BYTES // 2) + "x"))
+    lab.send(request(4) + bytes(MAX_REQUEST_BYTES + 1 - len(request(4))))
+    assert lab.lost("lab") == {"malformed request": (2, 0)}
+
+
+async def test_after_the_end_of_queries_no_request_is_answered() -> None:
+    lab = Lab()
+    lab.open()
+    lab.service.may_answer.clear()
+    lab.send(request(1))
+    await wait_until_async(lambda: lab.service.received)
+    await lab.output.stop_queries()
+    lab.service.may_answer.set()
+    lab.send(request(2))
+    await asyncio.sleep(0)
+    lab.deliver()
+    assert lab.replies == []
+    assert len(lab.service.received) == 1
+
+
+async def test_a_request_after_the_end_of_the_event_loop_is_ignored(lab: Lab) -> None:
+    loop = asyncio.new_event_loop()
+    loop.close()
+    sender = LcmSender("memq://", lab.lcm, lambda: None)
+    queries = LcmQueries(
+        LcmSettings(url="memq://"),
+        lab.service,  # type: ignore[arg-type]  # it has the methods that LCM calls
+        loop,
+        sender,
+        lab.lcm,
+    )
+    queries.add("lab")
+    lab.send(request())
+    await queries.close()
