@@ -45,8 +45,7 @@ class Workload:
         """Return the packet of one frame with all five components and one event, encoded by the simulator."""
         scene = self.scene()
         tick = round(_EVENT_US * self.rate_hz / 1e6)
-        events = scene.events(_EVENT_US, _EVENT_US + 1)
-        return FrameBuilder(scene, ()).packet("big", tick, events).packet
+        return FrameBuilder(scene, ()).packet("big", tick, _EVENT_US).packet
 
 
 LAB: Final = Workload(markers=55, tools=6, analog=69, plates=2, rate_hz=200, analog_rate_hz=2000)

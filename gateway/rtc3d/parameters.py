@@ -4,6 +4,7 @@ A text that the server did not send is "" (or its default in §6, such as mm), a
 server's own texts: numbers may start anywhere (field note 9), and an event's id may be hexadecimal.
 """
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 from math import nan
 from typing import Any, Final, NamedTuple
@@ -199,6 +200,14 @@ SECTIONS: Final = {
 def sections_of(parameters: Parameters) -> frozenset[str]:
     """Return the keys in SECTIONS of the sections that ``parameters`` has."""
     return frozenset(key for key, section in SECTIONS.items() if section.of(parameters) is not None)
+
+
+def only_sections(parameters: Parameters, sections: Collection[str]) -> Parameters:
+    """Return the parameters with only these sections (keys of SECTIONS); an empty collection means all."""
+    if not sections:
+        return parameters
+    omitted = {section.field: None for key, section in SECTIONS.items() if key not in sections}
+    return replace(parameters, **omitted)
 
 
 def without_statistics(parameters: Parameters) -> Parameters:

@@ -5,17 +5,15 @@ import logging
 import time
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Final, Protocol, cast
 
 import gateway
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet, PacketReader, PacketType
-from gateway.rtc3d.parameters import General, Parameters
+from gateway.rtc3d.parameters import General
 from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks, error_packet
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
-from gateway.rtc3d_server.frame_builder import FrameBuilder
-from gateway.rtc3d_server.scene import Scene
+from gateway.rtc3d_server.scene import FrameSource, Scene
 from gateway.rtc3d_server.sent_counts import SentCounts
 
 MAX_COMMAND_BYTES: Final = 64 * 1024
@@ -42,12 +40,12 @@ class ConnectionOwner(Protocol):
         """The scene that is served."""
         ...
 
-    def frame_builder(self, components: Sequence[ComponentType]) -> FrameBuilder:
-        """Return the frame builder of these components; an empty sequence means all."""
+    def frames(self, components: Sequence[ComponentType]) -> FrameSource:
+        """Return the frames with these components; an empty sequence means all."""
         ...
 
     def elapsed_us(self) -> int | None:
-        """Return the measurement's time in µs; None while no measurement runs."""
+        """Return the measurement's time in µs, negative before it begins; None while none runs."""
         ...
 
     def frames_requested(self) -> int | None:
@@ -101,7 +99,7 @@ class ClientConnection(asyncio.Protocol):
         self.sent_counts = SentCounts()
         """What was sent to this client."""
         self.session = ClientSession(
-            SessionCallbacks(owner.frame_builder, self._parameters, owner.frames_requested)
+            SessionCallbacks(owner.frames, self._parameters_xml, owner.frames_requested)
         )
 
     @property
@@ -233,7 +231,7 @@ class ClientConnection(asyncio.Protocol):
             )
             self.close()
 
-    def _parameters(self) -> Parameters:
+    def _parameters_xml(self, sections: Sequence[str]) -> bytes:
         address, port = self.transport.get_extra_info("sockname")[:2]
         frames = self.sent_counts.frames
         streaming_s = 0.0 if self._first_sent_s is None else self._last_sent_s - self._first_sent_s
@@ -245,7 +243,7 @@ class ClientConnection(asyncio.Protocol):
             frames_sent=frames,
             frames_per_s=round((frames - 1) / streaming_s, 2) if streaming_s > 0 else 0.0,
         )
-        return replace(self._owner.scene.parameters, general=general)
+        return self._owner.scene.parameters_xml(sections, general)
 
 
 def _described(packet: Packet) -> str:

@@ -3,7 +3,7 @@
 import logging
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 from gateway.errors import CommandError, FrameError
@@ -22,15 +22,11 @@ from gateway.rtc3d.commands import (
 from gateway.rtc3d.components import ByteOrder, ComponentType
 from gateway.rtc3d.frames import detect_byte_order, split_frame
 from gateway.rtc3d.packets import Packet, PacketType, decode_text, encode_packet
-from gateway.rtc3d.parameters import SECTIONS, Parameters
-from gateway.rtc3d.parameters_xml import encode_parameters
-from gateway.rtc3d_server.frame_builder import DataPacket, FrameBuilder
 from gateway.rtc3d_server.frame_schedule import FrameRequest, FrameSchedule
+from gateway.rtc3d_server.scene import NOT_YET_US, DataPacket, FrameSource
 
 VERSION: Final = "1.0"
 NO_DATA: Final = encode_packet(PacketType.NO_DATA)
-MAX_LATE_US: Final = 1_000_000
-"""Stream frames that are later than this are dropped; less late ones are still sent."""
 
 _log = logging.getLogger(__name__)
 
@@ -39,11 +35,11 @@ _log = logging.getLogger(__name__)
 class SessionCallbacks:
     """What a session needs from its server."""
 
-    frame_builder: Callable[[Sequence[ComponentType]], FrameBuilder]
-    """Returns the frame builder of these components; an empty sequence means all."""
+    frames: Callable[[Sequence[ComponentType]], FrameSource]
+    """Returns the frames with these components; an empty sequence means all."""
 
-    parameters: Callable[[], Parameters]
-    """Returns all sections of §6."""
+    parameters_xml: Callable[[Sequence[str]], bytes]
+    """Returns the XML of some sections of §6 (keys of SECTIONS); an empty sequence means all."""
 
     frames_requested: Callable[[], int | None]
     """Called when the client requests frames; returns the measurement's time in µs, None without one."""
@@ -78,9 +74,10 @@ class ClientSession:
 
     @property
     def due_us(self) -> int | None:
-        """When the next frame is due; None if none is requested or no measurement is running."""
+        """When the next frame is due; None without a request, a known frame, or a measurement."""
         waiting = (self._schedule, self._frame_requests[0] if self._frame_requests else None)
-        return min((frames.due_us for frames in waiting if frames is not None), default=None)
+        due_us = min((frames.due_us for frames in waiting if frames is not None), default=NOT_YET_US)
+        return None if due_us == NOT_YET_US else due_us
 
     def measurement_started(self) -> None:
         """Start the client's stream, if it requested one, with the measurement's first frame."""
@@ -97,10 +94,11 @@ class ClientSession:
         self._schedule = None
         return [NO_DATA] * num_waiting
 
-    def scene_changed(self) -> None:
+    def scene_changed(self, elapsed_us: int) -> None:
         """Continue the stream with frames of the new scene, from the next frame on."""
         if self._schedule is not None and self._stream_command is not None:
-            self._start_stream(self._stream_command, self._schedule.due_us)
+            due_us = self._schedule.due_us
+            self._start_stream(self._stream_command, elapsed_us if due_us == NOT_YET_US else due_us)
 
     def answer(self, packet: Packet) -> list[bytes]:
         """Execute a client's packet; return the replies, each one packet."""
@@ -121,26 +119,30 @@ class ClientSession:
 
     def due_frames(self, elapsed_us: int) -> Iterator[DataPacket]:
         """Yield the frames that are due, oldest first. Frames that the caller does not take stay due."""
-        self.drop_due_frames(elapsed_us - MAX_LATE_US)
+        if self._schedule is not None:
+            self._drop_frames(self._schedule, self._schedule.frames.oldest_us(elapsed_us))
         while self._schedule is not None and self._schedule.due_us <= elapsed_us:
             schedule = self._schedule
             tick = schedule.tick
             schedule.advance()
-            frame = self._build(schedule.builder, tick)
+            frame = self._build(schedule.frames, tick)
             if frame.components:
                 yield frame
         while self._frame_requests and self._frame_requests[0].due_us <= elapsed_us:
-            builder = self._frame_requests.popleft().builder
-            yield self._build(builder, builder.tick_after(elapsed_us) - 1)
+            frames = self._frame_requests.popleft().frames
+            yield self._build(frames, frames.tick_after(elapsed_us) - 1)
 
     def drop_due_frames(self, elapsed_us: int) -> None:
         """Drop the stream's frames that are due; their events go into the next frame."""
-        schedule = self._schedule
-        if schedule is None or schedule.due_us > elapsed_us:
+        if self._schedule is not None:
+            self._drop_frames(self._schedule, elapsed_us)
+
+    def _drop_frames(self, schedule: FrameSchedule, until_us: int) -> None:
+        if schedule.due_us > until_us:
             return
-        count = schedule.num_due(elapsed_us)
+        count = schedule.num_due(until_us)
         schedule.advance(count)
-        if schedule.builder.measured:  # a stream that has only events loses nothing
+        if schedule.frames.measured:  # a stream that has only events loses nothing
             self.frames_dropped += count
 
     def _execute(self, command: Command, body: bytes) -> list[bytes]:
@@ -153,7 +155,7 @@ class ClientSession:
             case SetByteOrder(byte_order):
                 self.byte_order = byte_order
             case SendParameters(sections):
-                return [encode_packet(PacketType.XML, encode_parameters(self._parameters(sections)))]
+                return [encode_packet(PacketType.XML, self._callbacks.parameters_xml(sections))]
             case SendCurrentFrame() | StreamFrames():
                 return [acknowledgement, *self._request_frames(command)]
             case StopStreaming():
@@ -167,13 +169,6 @@ class ClientSession:
                 return [encode_packet(PacketType.COMMAND, b"bye")]  # exactly these bytes: field note 14
         return [acknowledgement]
 
-    def _parameters(self, sections: Sequence[str]) -> Parameters:
-        parameters = self._callbacks.parameters()
-        if not sections:
-            return parameters
-        omitted = {section.field: None for key, section in SECTIONS.items() if key not in sections}
-        return replace(parameters, **omitted)
-
     def _request_frames(self, command: SendCurrentFrame | StreamFrames) -> list[bytes]:
         """Store a request for frames; return a No Data packet if no measurement is running."""
         elapsed_us = self._callbacks.frames_requested()
@@ -185,29 +180,28 @@ class ClientSession:
             self._start_stream(command, elapsed_us)
         else:
             self._frame_requests.append(
-                FrameRequest(self._callbacks.frame_builder(command.components), self._newest_us)
+                FrameRequest(self._callbacks.frames(command.components), self._newest_us)
             )
         if self._events_from_us is None:
             self._events_from_us = elapsed_us
         return []
 
     def _start_stream(self, command: StreamFrames, elapsed_us: int) -> None:
-        builder = self._callbacks.frame_builder(command.components)
+        frames = self._callbacks.frames(command.components)
         # A frame that is due right now is sent, unless the client already has it. A request during a stream
         # continues that stream, so frames that are overdue are sent, too.
         start_us = elapsed_us if self._schedule is None else min(elapsed_us, self._schedule.due_us)
-        first_tick = builder.tick_after(max(start_us - 1, self._newest_us))
-        self._schedule = FrameSchedule(builder, command.rate, first_tick)
+        first_tick = frames.tick_after(max(start_us - 1, self._newest_us))
+        self._schedule = FrameSchedule(frames, command.rate, first_tick)
 
-    def _build(self, builder: FrameBuilder, tick: int) -> DataPacket:
-        time_us = builder.time_us(tick)
+    def _build(self, frames: FrameSource, tick: int) -> DataPacket:
+        time_us = frames.time_us(tick)
         self._newest_us = max(self._newest_us, time_us)
-        if not builder.has_events:
-            return builder.packet(self.byte_order, tick)
-        start_us = time_us if self._events_from_us is None else self._events_from_us
-        events = builder.events(start_us, time_us + 1)
-        self._events_from_us = max(start_us, time_us + 1)
-        return builder.packet(self.byte_order, tick, events)
+        if not frames.has_events:
+            return frames.packet(self.byte_order, tick)
+        events_from_us = time_us if self._events_from_us is None else self._events_from_us
+        self._events_from_us = max(events_from_us, time_us + 1)
+        return frames.packet(self.byte_order, tick, events_from_us)
 
     def _set_recording(self, *, start: bool) -> None:
         self.is_recording = start

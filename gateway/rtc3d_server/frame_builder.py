@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from fractions import Fraction
 from functools import lru_cache
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from gateway.rtc3d.components import (
 )
 from gateway.rtc3d.frames import encode_frame
 from gateway.rtc3d.packets import PacketType, encode_packet
-from gateway.rtc3d_server.scene import NO_EVENTS, Scene
+from gateway.rtc3d_server.scene import NO_EVENTS, DataPacket, SceneFunction
 
 _BLOCK_FRAMES: Final = 64
 """The scene computes this many frames in one call, because a call of numpy costs much more than a value."""
@@ -26,12 +26,8 @@ _CACHED_PACKETS: Final = 64  # clients with equal streams share them
 _SECOND_US: Final = 1_000_000
 _FRAME_NUMBERS: Final = 2**31  # the field is a signed 32-bit integer
 
-
-class DataPacket(NamedTuple):
-    """A type-3 packet's bytes and the components in it."""
-
-    packet: bytes
-    components: tuple[ComponentType, ...]
+MAX_LATE_US: Final = 1_000_000
+"""Frames that are later than this are dropped; less late ones are still sent."""
 
 
 def exact_rate(rate_hz: float) -> Fraction:
@@ -40,7 +36,7 @@ def exact_rate(rate_hz: float) -> Fraction:
 
 
 class FrameBuilder:
-    """Builds the frames that have certain components of a scene.
+    """Builds the frames that have certain components of a scene (see FrameSource).
 
     There is one frame for each tick of ``rate``, the rate of the slowest measured component in them
     (§5.3.5); ticks are counted from 0 at the start of the measurement. A frame has the newest sample
@@ -52,7 +48,9 @@ class FrameBuilder:
     as in §7.7 (field note 6).
     """
 
-    def __init__(self, scene: Scene, requested: Sequence[ComponentType], event_bytes: int = 24) -> None:
+    def __init__(
+        self, scene: SceneFunction, requested: Sequence[ComponentType], event_bytes: int = 24
+    ) -> None:
         chosen = [component for component in WIRE_ORDER if not requested or component in requested]
         rates = {c: exact_rate(scene.rates_hz[c]) for c in chosen if c in scene.rates_hz}
         measurement_rate = exact_rate(scene.measurement_rate_hz)
@@ -77,15 +75,17 @@ class FrameBuilder:
         """Return the first tick whose time is later than ``elapsed_us``."""
         return -(-(elapsed_us + 1) * self.rate.numerator // (_SECOND_US * self.rate.denominator))
 
-    def events(self, start_us: int, stop_us: int) -> Items:
-        """Return the events with time stamps in [start_us, stop_us); none if events were not requested."""
-        return self._scene.events(start_us, stop_us) if self.has_events else NO_EVENTS
+    def oldest_us(self, elapsed_us: int) -> int:
+        """See FrameSource."""
+        return elapsed_us - MAX_LATE_US
 
-    def packet(self, byte_order: ByteOrder, tick: int, events: Items = NO_EVENTS) -> DataPacket:
-        """Return the frame of a tick; it has an event component if there are ``events``."""
-        if not len(events):
-            return self._packet(byte_order, tick)
-        return self._build_packet(byte_order, tick, events)
+    def packet(self, byte_order: ByteOrder, tick: int, events_from_us: int | None = None) -> DataPacket:
+        """See FrameSource. The frame has an event component if there are events."""
+        if events_from_us is not None and self.has_events:
+            events = self._scene.events(events_from_us, self.time_us(tick) + 1)
+            if len(events):
+                return self._build_packet(byte_order, tick, events)
+        return self._packet(byte_order, tick)
 
     def _build_packet(self, byte_order: ByteOrder, tick: int, events: Items = NO_EVENTS) -> DataPacket:
         timestamp_us = self.time_us(tick)

@@ -4,20 +4,20 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 from gateway.rtc3d.commands import Frequency, FrequencyDivisor, Rate
-from gateway.rtc3d_server.frame_builder import FrameBuilder
+from gateway.rtc3d_server.scene import FrameSource
 
 
 @dataclass(frozen=True, slots=True)
 class FrameRequest:
     """A SendCurrentFrame that waits for a frame later than ``after_us``."""
 
-    builder: FrameBuilder
+    frames: FrameSource
     after_us: int
 
     @property
     def due_us(self) -> int:
-        """When the frame is due, in µs since the measurement's start."""
-        return self.builder.time_us(self.builder.tick_after(self.after_us))
+        """When the frame is due, in µs since the measurement's start; NOT_YET_US if this is not known."""
+        return self.frames.time_us(self.frames.tick_after(self.after_us))
 
 
 class FrameSchedule:
@@ -26,26 +26,28 @@ class FrameSchedule:
     Frame j of the stream (from 0) is the frame of tick ``first_tick`` + ⌈j · stride⌉.
     """
 
-    def __init__(self, builder: FrameBuilder, rate: Rate | None, first_tick: int) -> None:
-        self.builder = builder
+    def __init__(self, frames: FrameSource, rate: Rate | None, first_tick: int) -> None:
+        self.frames = frames
         self._first_tick = first_tick
-        stride = _stride(rate, builder.rate)
+        stride = _stride(rate, frames.rate)
         self._numerator, self._denominator = stride.numerator, stride.denominator
         self._num_passed = 0  # frames of this stream that were sent or dropped
         self.tick = first_tick
         """The tick of the next frame."""
-        self.due_us = builder.time_us(first_tick)
-        """When the next frame is due."""
+
+    @property
+    def due_us(self) -> int:
+        """When the next frame is due; NOT_YET_US if this is not known."""
+        return self.frames.time_us(self.tick)
 
     def advance(self, count: int = 1) -> None:
         """Advance by ``count`` frames, which were sent or dropped."""
         self._num_passed += count
         self.tick = self._first_tick - (-self._num_passed * self._numerator // self._denominator)
-        self.due_us = self.builder.time_us(self.tick)
 
     def num_due(self, elapsed_us: int) -> int:
         """Return how many frames are due at ``elapsed_us``."""
-        ticks = self.builder.tick_after(elapsed_us) - 1 - self._first_tick
+        ticks = self.frames.tick_after(elapsed_us) - 1 - self._first_tick
         return max(0, ticks * self._denominator // self._numerator + 1 - self._num_passed)
 
 

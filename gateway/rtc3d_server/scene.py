@@ -1,13 +1,14 @@
 """The contract between a scene and the RT server that serves it."""
 
-from collections.abc import Mapping
-from typing import Final, Protocol
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 import numpy.typing as npt
 
-from gateway.rtc3d.components import LONG_EVENT, ComponentType, Items
-from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.components import LONG_EVENT, ByteOrder, ComponentType, Items
+from gateway.rtc3d.parameters import General, Parameters
 
 SampleNumbers = npt.NDArray[np.int64]
 """Numbers of samples of one component, shape (count,), counted from 0 at the start of the measurement."""
@@ -15,33 +16,111 @@ SampleNumbers = npt.NDArray[np.int64]
 NO_EVENTS: Final = np.zeros(0, LONG_EVENT)
 """An empty array of events."""
 
+NOT_YET_US: Final = 2**63 - 1
+"""The time of a frame whose time is not known yet."""
+
+
+class DataPacket(NamedTuple):
+    """A type-3 packet's bytes and the components in it."""
+
+    packet: bytes
+    components: tuple[ComponentType, ...]
+
+
+class FrameSource(Protocol):
+    """The frames that have certain components, during one measurement.
+
+    Frames have numbers (ticks) that grow with time; all times are in µs since the measurement's start.
+    """
+
+    @property
+    def measured(self) -> Sequence[ComponentType]:
+        """The requested components except events."""
+        ...
+
+    @property
+    def has_events(self) -> bool:
+        """Whether events were requested and can occur."""
+        ...
+
+    @property
+    def rate(self) -> Fraction:
+        """Frames per second: the rate of the slowest measured component (§5.3.5)."""
+        ...
+
+    def time_us(self, tick: int) -> int:
+        """Return when a frame is due; NOT_YET_US if this is not known yet."""
+        ...
+
+    def tick_after(self, elapsed_us: int) -> int:
+        """Return the first frame that is due later than ``elapsed_us``."""
+        ...
+
+    def oldest_us(self, elapsed_us: int) -> int:
+        """Return the time of the oldest frame that is still sent; older ones are dropped."""
+        ...
+
+    def packet(self, byte_order: ByteOrder, tick: int, events_from_us: int | None = None) -> DataPacket:
+        """Return a frame; it has the events from ``events_from_us`` to its own time, both included."""
+        ...
+
 
 class Scene(Protocol):
-    """The content of a measurement: a function of time alone.
+    """The content of a measurement. Its methods never block."""
+
+    @property
+    def parameters(self) -> Parameters:
+        """All sections of §6 that are valid now; the server fills in General if it is None."""
+        ...
+
+    @property
+    def length_us(self) -> int | None:
+        """The time of one pass in µs; None if the scene has no end, or if it is not known yet."""
+        ...
+
+    def parameters_xml(self, sections: Sequence[str], general: General) -> bytes:
+        """Return the XML of some sections (keys of SECTIONS; empty means all), with the server's General."""
+        ...
+
+    def start(self) -> None:
+        """Begin a measurement: its first pass."""
+        ...
+
+    def advance(self, elapsed_us: int) -> int | None:
+        """Prepare the frames around this time; return when to call this again, None for never."""
+        ...
+
+    def stop(self) -> None:
+        """End the measurement."""
+        ...
+
+    def frames(self, components: Sequence[ComponentType], event_bytes: int) -> FrameSource:
+        """Return the frames with these components; an empty sequence means all.
+
+        ``event_bytes`` is the size of an event: 24 as NDI's code writes events, or 16 as in §7.7 (field
+        note 6).
+        """
+        ...
+
+
+class SceneFunction(Protocol):
+    """A scene that is a function of time alone.
 
     Its methods never block, and always return the same values for the same arguments, so that all clients
     see the same scene even if their streams differ.
     """
 
-    @property
-    def parameters(self) -> Parameters:
-        """All sections of §6 except General, which the server fills in."""
-        ...
+    parameters: Parameters
+    """All sections of §6 except General."""
 
-    @property
-    def rates_hz(self) -> Mapping[ComponentType, float]:
-        """The rate in Hz of each measured component of the scene; components without items are missing."""
-        ...
+    rates_hz: Mapping[ComponentType, float]
+    """The rate in Hz of each measured component of the scene; components without items are missing."""
 
-    @property
-    def measurement_rate_hz(self) -> float:
-        """The rate of frames in a measurement, and of streams that have only events."""
-        ...
+    measurement_rate_hz: float
+    """The rate of frames in a measurement, and of streams that have only events."""
 
-    @property
-    def num_frames(self) -> int | None:
-        """The number of frames in one pass, at ``measurement_rate_hz``; None if the scene has no end."""
-        ...
+    num_frames: int | None
+    """The number of frames in one pass, at ``measurement_rate_hz``; None if the scene has no end."""
 
     def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
         """Return a measured component's items, shape (len(samples), number of items).

@@ -11,9 +11,8 @@ from gateway.errors import GatewayError
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d_server.client_connection import ClientConnection
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
-from gateway.rtc3d_server.frame_builder import FrameBuilder
 from gateway.rtc3d_server.measurement import Measurement
-from gateway.rtc3d_server.scene import Scene
+from gateway.rtc3d_server.scene import FrameSource, Scene
 from gateway.rtc3d_server.sent_counts import SentCounts
 from gateway.rtc3d_server.timers import call_after_us
 
@@ -26,9 +25,10 @@ class RtServer:
 
     With ``port`` 0 the system chooses a free port, which ``port`` contains after ``start``.
     ``event_bytes`` is the size of an event: 24 as NDI's code writes events, or 16 as in §7.7 (field
-    note 6). The measurement starts with ``start``; with ``once``, it starts with the first request
-    for frames and ends after one pass of the scene. ``name`` is the server's name in the General
-    parameters. ``new_filter`` returns the filter of a new connection; the default changes nothing.
+    note 6). The measurement starts with ``start``; with ``once``, it starts a second after the first
+    request for frames (LEAD_US) and ends after one pass of the scene. ``name`` is the server's name in
+    the General parameters. ``new_filter`` returns the filter of a new connection; the default changes
+    nothing.
 
     Use it as an asynchronous context manager, or call ``start`` and ``close``.
     """
@@ -178,7 +178,7 @@ class RtServer:
         """Serve another scene from now on; a running measurement and its time stamps continue."""
         self._measurement.change_scene(scene)
         for connection in self.connections:
-            connection.session.scene_changed()
+            connection.session.scene_changed(self.elapsed_us() or 0)
         self.schedule()
 
     def elapsed_us(self) -> int | None:
@@ -187,15 +187,16 @@ class RtServer:
 
     # For connections ------------------------------------------------------------------------
 
-    def frame_builder(self, components: Sequence[ComponentType]) -> FrameBuilder:
+    def frames(self, components: Sequence[ComponentType]) -> FrameSource:
         """See ConnectionOwner."""
-        return self._measurement.frame_builder(components)
+        return self._measurement.frames(components)
 
     def frames_requested(self) -> int | None:
         """See ConnectionOwner."""
         if self._starts_on_request:
             self.start_measurement()
-            return 0
+        else:
+            self._measurement.postpone()
         return self.elapsed_us()
 
     def new_filter(self, connection: FilteredConnection) -> ConnectionFilter:
@@ -224,12 +225,18 @@ class RtServer:
         elapsed_us = self.elapsed_us()
         if elapsed_us is None:
             return
-        due_us = [self._measurement.last_us, *(connection.due_us for connection in self.connections)]
+        measurement = self._measurement
+        due_us = [
+            measurement.last_us,
+            measurement.advance_us,
+            *(connection.due_us for connection in self.connections),
+        ]
         next_us = min((time_us for time_us in due_us if time_us is not None), default=None)
         if next_us is not None:
             self._timer = call_after_us(next_us - elapsed_us, self._send_due_frames)
 
     def _send_due_frames(self) -> None:
+        self._measurement.advance()
         elapsed_us = self.elapsed_us()
         if elapsed_us is None:
             return

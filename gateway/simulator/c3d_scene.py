@@ -25,6 +25,7 @@ from gateway.rtc3d.parameters import (
     Plate,
     Point,
 )
+from gateway.rtc3d_server.computed_scene import ComputedScene
 from gateway.rtc3d_server.scene import NO_EVENTS, SampleNumbers
 
 _FORCE_LABELS: Final = ("Force X", "Force Y", "Force Z", "Moment X", "Moment Y", "Moment Z")
@@ -32,7 +33,7 @@ _INSTALL: Final = "pip install 'rtc3d-gateway[c3d]'"
 _log = logging.getLogger(__name__)
 
 
-class C3dScene:
+class C3dScene(ComputedScene):
     """The scene in a C3D file, which starts again after its last frame.
 
     Every value is what ezc3d reads, as float32. A marker with any NaN or with a residual of -1 is
@@ -56,12 +57,12 @@ class C3dScene:
             raise TakeError(f"{path} has no rate for its data (POINT:RATE, ANALOG:RATE); export it again")
 
     def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
-        """See Scene."""
+        """See SceneFunction."""
         items = self._items[component]
         return items.take(samples, axis=0, mode="wrap")
 
     def events(self, start_us: int, stop_us: int) -> Items:  # noqa: ARG002 - a take has no events
-        """See Scene. A take has none."""
+        """See SceneFunction. A take has none."""
         return NO_EVENTS
 
     def _load(self, content: Any) -> None:
@@ -83,7 +84,7 @@ class C3dScene:
         self.rates_hz = {component: rates_hz[component] for component in self._items}
         slowest = min(self._items, key=lambda component: rates_hz[component], default=ComponentType.MARKERS)
         self.measurement_rate_hz = rates_hz[slowest]
-        self.num_frames: int | None = len(items[slowest])
+        self.num_frames = len(items[slowest])
         self.parameters = Parameters(
             markers=_describe_markers(point, data["points"].shape[1], point_rate_hz),
             tools=Parameters6D(),

@@ -1,11 +1,12 @@
 """A scene whose markers and tools have other names than another scene's."""
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import replace
 
-from gateway.rtc3d.components import ComponentType, Items
-from gateway.rtc3d.parameters import Parameters
-from gateway.rtc3d_server.scene import SampleNumbers, Scene
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import General, Parameters, only_sections
+from gateway.rtc3d.parameters_xml import encode_parameters
+from gateway.rtc3d_server.scene import FrameSource, Scene
 
 
 class RenamedScene:
@@ -13,18 +14,40 @@ class RenamedScene:
 
     def __init__(self, scene: Scene, prefix: str) -> None:
         self._scene = scene
-        self.rates_hz: Mapping[ComponentType, float] = scene.rates_hz
-        self.measurement_rate_hz = scene.measurement_rate_hz
-        self.num_frames = scene.num_frames
-        self.parameters = _renamed(scene.parameters, prefix)
+        self._prefix = prefix
 
-    def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
+    @property
+    def parameters(self) -> Parameters:
         """See Scene."""
-        return self._scene.items(component, samples)
+        return _renamed(self._scene.parameters, self._prefix)
 
-    def events(self, start_us: int, stop_us: int) -> Items:
+    @property
+    def length_us(self) -> int | None:
         """See Scene."""
-        return self._scene.events(start_us, stop_us)
+        return self._scene.length_us
+
+    def parameters_xml(self, sections: Sequence[str], general: General) -> bytes:
+        """See Scene."""
+        parameters = self.parameters
+        return encode_parameters(
+            only_sections(replace(parameters, general=parameters.general or general), sections)
+        )
+
+    def start(self) -> None:
+        """See Scene."""
+        self._scene.start()
+
+    def advance(self, elapsed_us: int) -> int | None:
+        """See Scene."""
+        return self._scene.advance(elapsed_us)
+
+    def stop(self) -> None:
+        """See Scene."""
+        self._scene.stop()
+
+    def frames(self, components: Sequence[ComponentType], event_bytes: int) -> FrameSource:
+        """See Scene."""
+        return self._scene.frames(components, event_bytes)
 
 
 def _renamed(parameters: Parameters, prefix: str) -> Parameters:

@@ -6,7 +6,6 @@ from typing import Annotated, Self
 from pydantic import Field
 
 from gateway.config.section import Section, expects
-from gateway.rtc3d_server.scene import Scene
 from gateway.simulator.synthetic import SyntheticScene
 
 Size = Annotated[int, Field(strict=True, ge=0, le=10_000), expects("a whole number from 0 to 10000")]
@@ -50,7 +49,7 @@ class SceneSettings(Section):
         """Return these settings with the values that ``changes`` sets."""
         return self.model_copy(update={name: getattr(changes, name) for name in changes.model_fields_set})
 
-    def build(self) -> Scene:
+    def build(self) -> SyntheticScene:
         """Return the scene."""
         scene = SyntheticScene(**self.model_dump(exclude={"marker_label"}))
         parameters_3d = scene.parameters.markers

@@ -19,6 +19,7 @@ from gateway.rtc3d.parameters import (
     ParametersEvents,
     Tool,
 )
+from gateway.rtc3d_server.computed_scene import ComputedScene
 from gateway.rtc3d_server.scene import NO_EVENTS, SampleNumbers
 from gateway.simulator.bodies import RigidBodies
 from gateway.simulator.force_plates import ForcePlates
@@ -34,15 +35,13 @@ _PRESSED_US: Final = 500_000  # after the start of each period
 _RELEASED_US: Final = 800_000  # likewise
 
 
-class SyntheticScene:
+class SyntheticScene(ComputedScene):
     """A scene of any size that never ends, always the same for the same arguments.
 
     ``markers``, ``tools``, ``analog`` (channels) and ``plates`` are numbers of items and can be 0.
     ``rate_hz`` is the rate of markers and tools, ``analog_rate_hz`` that of analog channels and force
     plates. Another ``seed`` gives another scene of the same size.
     """
-
-    num_frames: int | None = None
 
     def __init__(
         self,
@@ -80,11 +79,11 @@ class SyntheticScene:
         )
 
     def items(self, component: ComponentType, samples: SampleNumbers) -> Items:
-        """See Scene."""
+        """See SceneFunction."""
         return self._items[component](samples)
 
     def events(self, start_us: int, stop_us: int) -> Items:
-        """See Scene. Once a second, a button is pressed and released."""
+        """See SceneFunction. Once a second, a button is pressed and released."""
         first, stop = _events_before(start_us), _events_before(stop_us)
         if first >= stop:
             return NO_EVENTS

@@ -21,7 +21,7 @@ from gateway.simulator.synthetic import SyntheticScene
 from tests.integration.faulty import FAST_HZ, NEVER_MS, VERSION, clear_and_check, only_connection, playing
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import COMMAND, DATA, MARKERS, NO_DATA, WireComponent, command
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, NO_DATA, WireComponent, command
 
 # The server ---------------------------------------------------------------------------------
 
@@ -184,7 +184,8 @@ async def test_a_changed_scene_keeps_the_scenarios_other_settings() -> None:
     async with playing() as (simulator, _):
         simulator.faults.play([], scene=SceneSettings(markers=3, tools=1, rate_hz=50))
         simulator.faults.begin(ChangeScene(scene=SceneSettings(markers=7)))
-        assert simulator.scene.rates_hz[MARKERS] == 50  # type: ignore[index] # its keys are integers
+        assert simulator.scene.parameters.markers is not None
+        assert simulator.scene.parameters.markers.frequency_hz == 50
         assert simulator.scene.parameters.tools is not None
         assert len(simulator.scene.parameters.tools.tools) == 1
 

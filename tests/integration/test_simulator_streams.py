@@ -178,6 +178,19 @@ async def test_once_plays_the_scene_from_the_first_request_to_its_end() -> None:
         assert await client.read() == (NO_DATA, b"")
 
 
+async def test_once_a_second_connection_gets_the_first_frames_too() -> None:
+    scene = CountingScene(FAST_HZ, num_frames=80)
+    async with (
+        Simulator(scene, once=True) as simulator,
+        connected(simulator) as first,
+        connected(simulator) as second,
+    ):
+        await first.ask("StreamFrames Analog")
+        await second.ask("StreamFrames 3D")
+        assert numbers(await first.frames(800)) == list(range(1, 801))
+        assert numbers(await second.frames(80)) == list(range(1, 81))
+
+
 # Real recordings ----------------------------------------------------------------------------
 
 

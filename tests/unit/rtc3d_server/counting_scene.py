@@ -4,12 +4,13 @@ import numpy as np
 
 from gateway.rtc3d.components import ITEM_DTYPES, LONG_EVENT, ComponentType, Items
 from gateway.rtc3d.parameters import EventDefinition, Marker, Parameters, Parameters3D, ParametersEvents
+from gateway.rtc3d_server.computed_scene import ComputedScene
 from gateway.rtc3d_server.scene import SampleNumbers
 
 EVENT_EVERY_US = 70_000
 
 
-class CountingScene:
+class CountingScene(ComputedScene):
     """Markers and one tool at ``rate_hz``, two analog channels at ten times that rate, event k at k · 70 ms.
 
     The first value of each item is its sample number, from 0.

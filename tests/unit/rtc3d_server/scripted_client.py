@@ -1,12 +1,8 @@
 """A session of the RT server with one client; the test sets the measurement's time."""
 
-from collections.abc import Sequence
-
-from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import General
 from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks
-from gateway.rtc3d_server.frame_builder import FrameBuilder
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import COMMAND, DATA, ByteOrder, WireComponent, components_in, packets_in
 
@@ -18,17 +14,13 @@ class ScriptedClient:
         self.scene = CountingScene(rate_hz)
         self.elapsed_us: int | None = 0
         general = General(name="server under test")
-        parameters = self.scene.parameters
         self.session = ClientSession(
             SessionCallbacks(
-                frame_builder=self._frame_builder,
-                parameters=lambda: type(parameters)(general, parameters.markers, events=parameters.events),
+                frames=lambda components: self.scene.frames(components, 24),
+                parameters_xml=lambda sections: self.scene.parameters_xml(sections, general),
                 frames_requested=lambda: self.elapsed_us,
             )
         )
-
-    def _frame_builder(self, components: Sequence[ComponentType]) -> FrameBuilder:
-        return FrameBuilder(self.scene, components)
 
     def send(self, text: bytes | str, packet_type: int = COMMAND) -> list[tuple[int, bytes]]:
         body = text.encode() if isinstance(text, str) else text
