@@ -73,11 +73,16 @@ def description(source: str = "lab", server: str = "192.0.2.20:3020") -> Message
 
 
 def log_bytes(messages: Iterable[Message]) -> bytes:
-    """Return an event log; the time of an event is the ``utime`` of its message."""
+    """Return an event log; the time of an event is the ``utime`` of its message, if it is long enough."""
     return b"".join(
-        encode_event(number, struct.unpack_from(">q", message, 8)[0], channel.encode(), message)
+        encode_event(number, _utime(message), channel.encode(), message)
         for number, (channel, message) in enumerate(messages)
     )
+
+
+def _utime(message: bytes) -> int:
+    utime: int = struct.unpack_from(">q", message, 8)[0] if len(message) >= 16 else START_UTIME
+    return utime
 
 
 def write_take(path: Path, messages: Iterable[Message]) -> Path:

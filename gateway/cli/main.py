@@ -18,7 +18,7 @@ from typing import Annotated, Any, Final, NoReturn
 import typer
 
 from gateway import version_text
-from gateway.cli import config
+from gateway.cli import config, take
 from gateway.cli.check import check
 from gateway.cli.demo import demo
 from gateway.cli.doctor import doctor
@@ -43,6 +43,7 @@ app = typer.Typer(
 for command in (run, check, doctor, simulate, demo, echo, params):
     app.command()(command)
 app.add_typer(config.app, name="config")
+app.add_typer(take.app, name="take")
 
 
 def main() -> NoReturn:

@@ -12,11 +12,9 @@ from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.component_rows import HEAD, NATIVE_ITEM_DTYPES, Array, Rows
 from gateway.takes.labels import Description, common, describe, event_labels
+from gateway.takes.restarts import find_restarts
 
 _COLUMNS: Final = tuple(name for name in HEAD.names or () if name != "fingerprint")
-
-_MAX_REORDERED: Final = 1000
-"""If a sequence number goes back by more, it starts again; by less, another message has overtaken this."""
 
 _MAX_PADDING: Final = 4
 """How many times as large as what was recorded ``items`` may become, when the labels change."""
@@ -222,16 +220,13 @@ class Series:
     def runs(self) -> "list[Series]":
         """Return the parts with constant labels, units and rates, in their order; they share the memory.
 
-        A part also ends where the server's time stamps start again (a new measurement, or a new start of the
-        server), where another session begins, and where the gateway starts again.
+        A part also ends where the server's time stamps or frame numbers start again (a new measurement, or a
+        new start of the server), where another session begins, and where the gateway starts again.
         """
         if not len(self):
             return []
-        is_start = np.diff(self.session) != 0
-        back = np.diff(self.sequence)
-        # A message that another one has overtaken has an earlier time stamp and an earlier number.
-        is_start |= (np.diff(self.timestamp_us) < 0) & (back > 0)
-        is_start |= back < -_MAX_REORDERED
+        restarts = find_restarts(self.utime, self.sequence, self.timestamp_us, self.frame_number)
+        is_start = (np.diff(self.session) != 0) | restarts.sequence | restarts.server
         if self.component is not ComponentType.EVENT:
             is_start |= np.diff(self._layout_numbers()) != 0
         starts = [0, *(np.flatnonzero(is_start) + 1).tolist(), len(self)]

@@ -123,13 +123,25 @@ def test_runs_end_where_the_server_or_the_gateway_starts_again(tmp_path: Path) -
         markers(1, 0),
         markers(1, 1),
         markers(1, 2, timestamp_us=0),  # the server plays its file again
-        markers(1, 3, timestamp_us=10_000, session=2),
-        markers(1, 5, timestamp_us=30_000, session=2),
-        markers(1, 4, timestamp_us=20_000, session=2),  # overtaken on the network
-        markers(1, 6, timestamp_us=40_000, session=2),
+        markers(1, 3, timestamp_us=5_000),
+        markers(1, 4, timestamp_us=10_000, session=2),
+        markers(1, 6, timestamp_us=30_000, session=2),
+        markers(1, 5, timestamp_us=20_000, session=2),  # overtaken on the network
+        markers(1, 7, timestamp_us=0, session=2),  # has no time
+        markers(1, 8, timestamp_us=(1 << 32) - 10_000, session=2),
+        markers(1, 9, timestamp_us=0, session=2),
+        markers(1, 10, timestamp_us=10_000, session=2),  # wrapped around
+        markers(1, 11, timestamp_us=20_000, frame_number=3, session=2),
+        markers(1, 2, utime=START_UTIME + 1_000_000, timestamp_us=30_000, frame_number=4, session=2),
     ]
     source = open_take(write_take(tmp_path / "a.lcmlog", steps)).sources["lab"]
-    assert [run.sequence.tolist() for run in source.runs("3d")] == [[0, 1], [2], [3, 5, 4, 6]]
+    assert [run.sequence.tolist() for run in source.runs("3d")] == [
+        [0, 1],
+        [2, 3],
+        [4, 6, 5, 7, 8, 9, 10],
+        [11],
+        [2],
+    ]
     assert source.runs("6d") == []
 
 

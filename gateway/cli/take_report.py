@@ -1,0 +1,230 @@
+"""The report of ``take info``: tables for people."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from datetime import datetime
+from typing import Final
+
+from rich.columns import Columns
+from rich.console import Console, RenderableType
+from rich.table import Table
+from rich.text import Text
+
+from gateway.rtc3d.components import COMPONENTS_BY_KEY
+from gateway.safe_text import safe_text
+from gateway.takes.component_statistics import ComponentStatistics, MessageStatistics
+from gateway.takes.source_statistics import SourceStatistics
+from gateway.takes.statistics import TakeStatistics
+
+_MAX_SHOWN: Final = 10
+"""How many changes, clock steps, channels and places of damage are shown."""
+
+_MAX_LABELS: Final = 200
+
+
+def write_report(statistics: TakeStatistics, console: Console) -> None:
+    """Write the report to ``console``."""
+    _print(console, *_head(statistics))
+    for source in statistics.sources.values():
+        console.print()
+        _print(console, *_source_lines(statistics, source))
+        console.print(_components_table(statistics, source))
+        for part in _item_lists(source):
+            console.print(part)
+        _print(console, *_details(statistics, source))
+    problems = list(_problems(statistics))
+    if problems:
+        console.print()
+        _print(console, *problems)
+
+
+def _print(console: Console, *lines: str) -> None:
+    for line in lines:
+        console.print(Text(line), soft_wrap=True)
+
+
+def _head(statistics: TakeStatistics) -> Iterator[str]:
+    files = f", {len(statistics.files)} files" if len(statistics.files) > 1 else ""
+    yield f"{safe_text(str(statistics.path))}: {_bytes(statistics.num_bytes)}{files}"
+    yield (
+        f"{_local_time(statistics.start_utime)}, {_duration(statistics.seconds)}, "
+        f"{statistics.num_messages} messages"
+    )
+
+
+def _source_lines(statistics: TakeStatistics, source: SourceStatistics) -> Iterator[str]:
+    servers = ", ".join(source.servers) or "unknown server"
+    versions = ", ".join(source.gateway_versions)
+    yield safe_text(f"Source {source.name}: {servers}" + (f", gateway {versions}" if versions else ""))
+    if source.take_name:
+        host = f" on {source.host}" if source.host else ""
+        yield safe_text(f"Take {source.take_name!r}, recorded by {source.recorder}{host}")
+    texts = [_count(source.sessions, "connection")]
+    if source.server_restarts:
+        texts.append(f"the server's time started again {_times(source.server_restarts)}")
+    if source.gateway_restarts:
+        texts.append(f"the gateway started again {_times(source.gateway_restarts)}")
+    texts += [
+        f"the clock was set by {step.step_us / 1e6:+.1f} s at {_at(statistics, step.utime)}"
+        for step in source.clock_steps.steps[:_MAX_SHOWN]
+    ]
+    yield "; ".join(texts)
+
+
+def _components_table(statistics: TakeStatistics, source: SourceStatistics) -> Table:
+    headings = ("", "messages", "items", "Hz", "seconds", "missing", "gaps, largest")
+    poses = [part for key, part in source.others.items() if "/" in key]
+    components = {key: source.components[key] for key in COMPONENTS_BY_KEY if key in source.components}
+    parts: dict[str, MessageStatistics] = {**components, **source.others}
+    rows = [
+        _row(statistics, source, key, [part])
+        for key, part in parts.items()
+        if "/" not in key and key != "take"
+    ]
+    if poses:
+        rows.insert(len(source.components), _row(statistics, source, _count(len(poses), "pose"), poses))
+    return _table(headings, rows)
+
+
+def _row(
+    statistics: TakeStatistics, source: SourceStatistics, name: str, parts: Sequence[MessageStatistics]
+) -> tuple[object, ...]:
+    """Return the row of a component, or of all poses together."""
+    part = parts[0]
+    items = rate = ""
+    if isinstance(part, ComponentStatistics):
+        items = _items(part)
+        rate = "" if name == "event" else _rate(part.rate_hz, source.announced_hz(name))
+    gaps = [part.gaps for part in parts]
+    largest = max((gap.largest for gap in gaps if gap.largest), key=lambda gap: gap.missing, default=None)
+    gap_text = ""
+    if largest is not None:
+        number = sum(gap.num_gaps for gap in gaps)
+        gap_text = f"{number}, {largest.missing} at {_at(statistics, largest.utime)}"
+    return (
+        name,
+        sum(part.num_messages for part in parts),
+        items,
+        rate,
+        f"{(part.last_utime - part.first_utime) / 1e6:.3f}" if part.first_utime else "",
+        sum(gap.missing for gap in gaps),
+        gap_text,
+    )
+
+
+def _item_lists(source: SourceStatistics) -> Iterator[RenderableType]:
+    for key, noun in (("3d", "marker"), ("6d", "tool")):
+        part = source.components.get(key)
+        if part is not None and part.visibility:
+            texts = [f"{label}  {100 * share:.1f} %" for label, share in part.visibility.items()]
+            yield Text(f"{_count(len(texts), noun)}, visible in % of the frames:")
+            yield _columns(texts)
+    events = source.components.get("event")
+    if events is not None and events.event_counts:
+        labels = source.event_labels
+        texts = [
+            f"{labels.get(number, '')} ({number:#x})  {count}".lstrip()
+            for number, count in sorted(events.event_counts.items())
+        ]
+        yield Text(f"{_count(sum(events.event_counts.values()), 'event')}:")
+        yield _columns(texts)
+
+
+def _columns(texts: Sequence[str]) -> Columns:
+    shown = [Text("  " + safe_text(text)) for text in texts[:_MAX_LABELS]]
+    if len(texts) > len(shown):
+        shown.append(Text(f"  … and {len(texts) - len(shown)} more"))
+    return Columns(shown, equal=True, column_first=True)
+
+
+def _details(statistics: TakeStatistics, source: SourceStatistics) -> Iterator[str]:
+    changes = source.parameters_changes
+    if not changes:
+        yield "No parameters: labels, units and rates are not known"
+    for change in changes[:_MAX_SHOWN]:
+        yield safe_text(f"Parameters {change.version} at {_at(statistics, change.utime)}: {change.text}")
+    if source.num_parameters_changes > len(changes[:_MAX_SHOWN]):
+        yield f"… and {source.num_parameters_changes - len(changes[:_MAX_SHOWN])} more changes of parameters"
+
+
+def _problems(statistics: TakeStatistics) -> Iterator[str]:
+    """Yield what is missing, and what could not be read."""
+    for source in statistics.sources.values():
+        for text in _source_problems(source):
+            yield safe_text(f"{source.name}: {text}")
+    if statistics.num_damaged:
+        places = _count(statistics.num_damaged, "place")
+        yield f"Damage: {statistics.damaged_bytes} bytes at {places} could not be read"
+        for damage in statistics.damage[:_MAX_SHOWN]:
+            yield safe_text(f"  {damage.file.name}: {damage.num_bytes} bytes from {damage.offset} on")
+    if statistics.unknown:
+        yield f"{_count(sum(statistics.unknown.values()), 'message')} of other programs or other versions:"
+        for channel, number in sorted(statistics.unknown.items(), key=lambda item: -item[1])[:_MAX_SHOWN]:
+            yield safe_text(f"  {channel}: {number}")
+
+
+def _source_problems(source: SourceStatistics) -> Iterator[str]:
+    for (place, cause), number in source.drops.items():
+        yield f"the gateway lost {_count(number, 'message')} ({place}: {cause})"
+    parts: dict[str, MessageStatistics] = {**source.components, **source.others}
+    for key, part in parts.items():
+        for number, what in (
+            (part.malformed, "could not be read"),
+            (part.gaps.late, "arrived late"),
+            (part.gaps.repeated, "arrived again"),
+        ):
+            if number:
+                yield f"{_count(number, f'{key} message')} {what}"
+
+
+def _table(headings: Sequence[str], rows: Iterable[Sequence[object]]) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for column, heading in enumerate(headings):
+        table.add_column(
+            heading, justify="right" if 0 < column < len(headings) - 1 else "left", overflow="fold"
+        )
+    for row in rows:
+        # Text objects, because rich would read square brackets in a string as markup.
+        table.add_row(*(Text(safe_text(str(value))) for value in row))
+    return table
+
+
+def _items(part: ComponentStatistics) -> str:
+    if part.min_items == part.max_items:
+        return str(part.min_items if part.min_items is not None else "")
+    return f"{part.min_items} to {part.max_items}"
+
+
+def _rate(rate_hz: float | None, announced_hz: float | None) -> str:
+    texts = [f"{hz:.5g}" for hz in (rate_hz, announced_hz) if hz is not None]
+    return " of ".join(texts)
+
+
+def _at(statistics: TakeStatistics, utime: int) -> str:
+    return f"{statistics.seconds_at(utime):.3f} s"
+
+
+def _times(number: int) -> str:
+    return "once" if number == 1 else f"{number} times"
+
+
+def _count(number: int, noun: str) -> str:
+    return f"{number} {noun}{'' if number == 1 else 's'}"
+
+
+def _bytes(number: int) -> str:
+    return f"{number / 1e6:.1f} MB" if number >= 100_000 else f"{number} bytes"
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(seconds, 60)
+    hours, minutes = divmod(int(minutes), 60)
+    if hours:
+        return f"{hours} h {minutes} min {rest:.0f} s"
+    return f"{minutes} min {rest:.1f} s" if minutes else f"{rest:.3f} s"
+
+
+def _local_time(utime: int) -> str:
+    try:
+        return datetime.fromtimestamp(utime / 1e6).astimezone().strftime("%Y-%m-%d %H:%M:%S %Z")
+    except (OverflowError, OSError, ValueError):
+        return f"{utime} µs after 1970"

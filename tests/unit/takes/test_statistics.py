@@ -1,0 +1,156 @@
+"""``take_statistics``: what a take contains, and what is missing."""
+
+import math
+from pathlib import Path
+
+import rtc3d
+
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import (
+    EventDefinition,
+    Marker,
+    Parameters,
+    Parameters3D,
+    ParametersEvents,
+)
+from gateway.takes.component_statistics import ComponentStatistics
+from gateway.takes.source_statistics import SourceStatistics
+from gateway.takes.statistics import take_statistics
+from tests.takes import START_UTIME, Message, description, frame, log_bytes, markers, parameters, write_take
+
+NAN = math.nan
+
+
+def labelled(*labels: str) -> Parameters:
+    all_markers = tuple(Marker(str(number), label) for number, label in enumerate(labels))
+    return Parameters(markers=Parameters3D(100.0, "mm", all_markers))
+
+
+def lab(path: Path, messages: list[Message]) -> SourceStatistics:
+    return take_statistics(write_take(path / "take.lcmlog", messages)).sources["lab"]
+
+
+def markers_of(path: Path, messages: list[Message]) -> ComponentStatistics:
+    return lab(path, messages).components["3d"]
+
+
+def status(sequence: int, lost: int) -> Message:
+    message = rtc3d.status_t()
+    message.utime, message.sequence = START_UTIME + sequence * 1_000_000, sequence
+    message.source, message.server, message.gateway_version = "lab", "192.0.2.20:3020", "2.0"
+    output = rtc3d.output_status_t()
+    output.name = "zenoh"
+    loss = rtc3d.loss_t()
+    loss.cause, loss.messages = "closed", lost
+    output.drops, output.num_drops = [loss], 1
+    message.outputs, message.num_outputs = [output], 1
+    return "MOCAP_LAB_STATUS", message.encode()
+
+
+def test_a_complete_take(tmp_path: Path) -> None:
+    messages = [description(), parameters(labelled("a", "b"))]
+    messages += [
+        frame(
+            ComponentType.MARKERS,
+            [(1, 2, 3, 0.5), (NAN, NAN, NAN, 999) if number % 4 else (1, 2, 3, 0)],
+            number,
+        )
+        for number in range(201)
+    ]
+    statistics = take_statistics(write_take(tmp_path / "take.lcmlog", messages))
+    source = statistics.sources["lab"]
+    found = source.components["3d"]
+    assert statistics.is_complete
+    assert (statistics.seconds, statistics.num_messages) == (2.0, 203)
+    assert (source.servers, source.gateway_versions, source.take_name) == (
+        ["192.0.2.20:3020"],
+        ["1.0"],
+        "take",
+    )
+    assert (source.sessions, source.server_restarts, source.gateway_restarts) == (1, 0, 0)
+    assert (found.num_messages, found.min_items, found.max_items, found.rate_hz) == (201, 2, 2, 100.0)
+    assert source.announced_hz("3d") == 100.0
+    assert found.visibility == {"a": 1.0, "b": 51 / 201}
+    assert [change.text for change in source.parameters_changes] == ["first: 3d"]
+
+
+def test_gaps_are_counted_and_the_largest_is_found(tmp_path: Path) -> None:
+    gaps = markers_of(tmp_path, [markers(1, number) for number in (5, 6, 8, 9, 20, 21)]).gaps
+    assert (gaps.missing, gaps.num_gaps, gaps.late, gaps.repeated, gaps.restarts) == (11, 2, 0, 0, 0)
+    assert gaps.largest
+    assert (gaps.largest.missing, gaps.largest.utime) == (10, START_UTIME + 200_000)
+
+
+def test_messages_that_arrive_late_or_twice_are_not_missing(tmp_path: Path) -> None:
+    gaps = markers_of(tmp_path, [markers(1, number) for number in (0, 1, 4, 2, 3, 3, 5, 7)]).gaps
+    assert (gaps.missing, gaps.num_gaps, gaps.late, gaps.repeated, gaps.restarts) == (1, 1, 2, 1, 0)
+
+
+def test_restarts_of_server_and_gateway(tmp_path: Path) -> None:
+    messages = [
+        markers(1, 0),
+        markers(1, 1),
+        markers(1, 2, timestamp_us=5, session=2),
+        markers(1, 3, session=2),
+    ]
+    messages += [markers(1, 0, utime=START_UTIME + 10**6, timestamp_us=50_000, frame_number=5)]
+    source = lab(tmp_path, messages)
+    assert (source.sessions, source.server_restarts, source.gateway_restarts) == (2, 1, 1)
+    assert source.components["3d"].gaps.missing == 0
+
+
+def test_changes_of_parameters_say_what_changed(tmp_path: Path) -> None:
+    messages = [
+        parameters(labelled("a", "b")),
+        markers(2, 0),
+        parameters(labelled("a", "c"), 2),
+        parameters(labelled("a", "c"), 2),
+        markers(2, 1, version=2),
+        parameters(b"", 3),
+        markers(1, 2, version=3),
+    ]
+    source = lab(tmp_path, messages)
+    texts = [(change.version, change.text) for change in source.parameters_changes]
+    assert texts == [(1, "first: 3d"), (2, "3d 'b' to 'c'"), (3, "the server gives no parameters now")]
+    assert source.components["3d"].visibility == {"a": 1, "b": 1, "c": 1, "marker 1": 1}
+
+
+def test_events_are_counted_by_id_with_their_labels(tmp_path: Path) -> None:
+    events = [(7, 0, -1, -1, -1), (16, 0, -1, -1, -1), (7, 0, -1, -1, -1)]
+    definition = Parameters(events=ParametersEvents((EventDefinition("0x10", "jump"),)))
+    source = lab(tmp_path, [parameters(definition), frame(ComponentType.EVENT, events)])
+    assert source.components["event"].event_counts == {7: 2, 16: 1}
+    assert source.event_labels == {16: "jump"}
+
+
+def test_what_the_gateway_lost_during_the_take_is_counted_from_its_beginning(tmp_path: Path) -> None:
+    # It lost 10 before the take, 3 during it, and 2 after it started again.
+    source = lab(tmp_path, [status(0, 10), status(1, 10), status(2, 13), status(3, 2)])
+    assert source.drops == {("zenoh", "closed"): 5}
+    assert (source.servers, source.gateway_versions) == (["192.0.2.20:3020"], ["2.0"])
+
+
+def test_steps_of_the_clock_are_found_and_pauses_of_the_network_are_not(tmp_path: Path) -> None:
+    def utime(number: int) -> int:
+        time_us = START_UTIME + number * 10_000
+        if 1000 <= number < 1300:  # everything arrives at once, up to 3 s late
+            return START_UTIME + 13_000_000 + number
+        return time_us - 3_600_000_000 if number >= 2500 else time_us
+
+    messages = [markers(1, number, utime=utime(number)) for number in range(4000)]
+    steps = lab(tmp_path, messages).clock_steps
+    assert [(step.step_us, step.utime) for step in steps.steps] == [(-3_600_000_000, utime(2500))]
+
+
+def test_damage_and_foreign_messages_are_reported(tmp_path: Path) -> None:
+    log = log_bytes([markers(1, number) for number in range(4)] + [("OTHER", bytes(8)), ("OTHER", b"x")])
+    size = len(log_bytes([markers(1, 0)]))
+    path = tmp_path / "take.lcmlog"
+    path.write_bytes(log[:size] + b"garbage" + log[size:-1])
+    statistics = take_statistics(path)
+    assert statistics.unknown == {"OTHER": 1}
+    assert [(place.offset, place.num_bytes) for place in statistics.damage] == [
+        (size, 7),
+        (len(log) + 7 - 28 - 5 - 1, 33),
+    ]
+    assert (statistics.num_damaged, statistics.damaged_bytes, statistics.is_complete) == (2, 40, False)
