@@ -102,13 +102,16 @@ class Answer(NamedTuple):
 class ServerParameters(NamedTuple):
     """A server's parameters (§6): the XML as received, empty if the server gives none any more.
 
-    ``session`` is the number of its session, ``version`` grows whenever the parameters change.
+    ``session`` is the number of its session, ``version`` grows whenever the parameters change. ``message``
+    is the recorded ``parameters_t`` if a take is replayed: an output that publishes this type sends it
+    unchanged.
     """
 
     xml: bytes
     session: int
     version: int
     age_s: float = 0.0
+    message: bytes = b""
 
 
 Command = Callable[[str, Mapping[str, str]], Awaitable[Answer]]

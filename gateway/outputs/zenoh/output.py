@@ -42,17 +42,18 @@ logger = logging.getLogger(__name__)
 class ZenohOutput(Output):
     """One Zenoh session and everything declared on it.
 
-    Creating it raises ConfigError if Zenoh does not accept the configuration.
+    ``config`` is Zenoh's own configuration, if it is not that of ``settings``. Creating it raises
+    ConfigError if Zenoh does not accept the configuration.
     """
 
     name = "zenoh"
     drop_causes = ("not open", "no router", "put failed")
 
-    def __init__(self, settings: ZenohSettings) -> None:
+    def __init__(self, settings: ZenohSettings, config: zenoh.Config | None = None) -> None:
         self.settings = settings
         self.max_rate_hz = settings.max_rate_hz
         self.has_tool_poses = settings.tool_poses
-        self.config = zenoh_config(settings.config)
+        self.config = zenoh_config(settings.config) if config is None else config
         self._is_client = json.loads(self.config.get_json("mode") or "null") == "client"
         self._link = ZenohLink(self._refusal)
         # Protects what the opening thread shares: session, publishers, tokens and queries.

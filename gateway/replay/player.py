@@ -1,0 +1,208 @@
+"""The thread that replays a take: it reads each message, waits until it is due, and publishes it."""
+
+import threading
+import time
+from collections.abc import Callable, Generator
+from contextlib import closing
+from functools import partial
+from typing import Final
+
+from gateway.errors import TakeError
+from gateway.replay.pace import Lateness, Pace
+from gateway.replay.play_list import Entry, Selection, play_list
+from gateway.replay.publication import Publication
+from gateway.replay.timeline import MAX_GAP_S, Jump, Timeline
+from gateway.takes.reader import TakeReader
+
+_FINE_S: Final = 0.005
+"""A wait for a condition may end so much too late; the rest is slept."""
+
+STALL_S: Final = 1.0
+"""A process that was stopped for longer does not catch up: the rest of the take is played later."""
+
+_PASS_S: Final = 0.01
+"""A repeated take begins again at the earliest after so long, however short it is."""
+
+
+class Player:
+    """Replays a take with ``publication``, in a thread, until its end or ``stop``.
+
+    ``rate`` is how many times as fast as recorded; None is as fast as possible. ``on_jump`` is called in the
+    thread where the time of the messages jumps. The same thread reads the take, which takes 3 µs per message:
+    two threads that run Python would keep each other waiting. The system reads the file ahead.
+    """
+
+    def __init__(
+        self,
+        reader: TakeReader,
+        selection: Selection,
+        publication: Publication,
+        *,
+        rate: float | None = 1.0,
+        is_repeated: bool = False,
+        max_gap_s: float = MAX_GAP_S,
+        on_jump: Callable[[Jump], None] = lambda _jump: None,
+    ) -> None:
+        self.lateness = Lateness()
+        self.position_us = selection.start_us
+        """Where in the take the newest message is."""
+        self.num_messages = 0
+        """How many messages were replayed."""
+        self.num_passes = 0
+        """How often the take was replayed to its end."""
+        self.stalled_s = 0.0
+        """For how long the process was stopped, or a disk or an output did not return."""
+        self.error: BaseException | None = None
+        """What ended the replay, if it did not end by itself."""
+        self._reader = reader
+        self._selection = selection
+        self._publication = publication
+        self._pace = None if rate is None else Pace(rate)
+        self._is_repeated = is_repeated
+        self._max_gap_s = max_gap_s
+        self._on_jump = on_jump
+        self._begun_s = 0.0  # when the present wait, or the present message, was to begin
+        self._changed = threading.Condition()  # of these four
+        self._is_paused = False
+        self._is_stopping = False
+        self._seek_us: int | None = None
+        self._must_attend = False  # to one of these three
+        self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the thread runs."""
+        return self._thread.is_alive()
+
+    @property
+    def is_paused(self) -> bool:
+        """Whether the replay pauses."""
+        return self._is_paused
+
+    def pause(self, is_paused: bool) -> None:
+        """Pause, or continue at the same place."""
+        with self._changed:
+            self._is_paused = is_paused
+            self._notify()
+
+    def seek(self, delta_us: int) -> None:
+        """Continue at another place, so far from the present one."""
+        with self._changed:
+            self._seek_us = max(self._selection.start_us, self.position_us + delta_us)
+            self._notify()
+
+    def stop(self) -> None:
+        """End the thread soon; ``join`` waits for it."""
+        with self._changed:
+            self._is_stopping = True
+            self._notify()
+
+    def _notify(self) -> None:
+        self._must_attend = self._is_stopping or self._is_paused or self._seek_us is not None
+        self._changed.notify()
+
+    def join(self, timeout_s: float) -> None:
+        """Wait for the end of the thread."""
+        self._thread.join(timeout_s)
+
+    # In the thread.
+
+    def _run(self) -> None:
+        try:
+            start_us: int | None = self._selection.start_us
+            while start_us is not None:
+                start_us = self._next_start(start_us)
+        except BaseException as error:  # noqa: BLE001 - it belongs to whoever waits for the thread
+            self.error = error
+
+    def _next_start(self, start_us: int) -> int | None:
+        """Replay from a position on; return where to go on, None if this was the end."""
+        timeline = Timeline(self._max_gap_s, partial(self._report, start_us))
+        with closing(play_list(self._reader, self._selection, timeline, start_us)) as entries:
+            is_complete = self._play(entries, start_us)
+        with self._changed:
+            if self._is_stopping:
+                return None
+            seek_us, self._seek_us = self._seek_us, None
+            self._notify()
+        if not is_complete:
+            self.position_us = seek_us or 0
+            return seek_us
+        self.num_passes += 1
+        if not self.num_messages:
+            raise TakeError(
+                f"{self._reader.path} has no messages to replay with these options; "
+                "check --source, --component, --from and --to"
+            )
+        if not self._is_repeated:
+            return None
+        time.sleep(_PASS_S)
+        return self._selection.start_us
+
+    def _report(self, start_us: int, jump: Jump) -> None:
+        if not self.num_passes and jump.position_us >= start_us:
+            self._on_jump(jump)
+
+    def _play(self, entries: Generator[Entry], start_us: int) -> bool:
+        """Publish messages when they are due; return False if something else is to be done before the end."""
+        publish, pace = self._publication.publish, self._pace
+        is_begun = False
+        for position_us, source, key, message in entries:
+            if self._must_attend and not self._attend():
+                return False
+            if pace is not None:
+                if not is_begun and key != "parameters":
+                    is_begun = True
+                    pace.start(start_us)
+                    self._begun_s = time.monotonic()
+                if is_begun and not self._wait(pace, position_us):
+                    return False
+            publish(source, key, message)
+            self.position_us = position_us
+            self.num_messages += 1
+        return True
+
+    def _wait(self, pace: Pace, position_us: int) -> bool:
+        """Wait until a position is due; return False if something else is to be done first."""
+        now_s = self._now_s(pace)
+        while (wait_s := pace.due_s(position_us) - now_s) > 0:
+            if wait_s <= _FINE_S:
+                time.sleep(wait_s)
+            else:
+                with self._changed:
+                    if not self._must_attend:
+                        self._changed.wait(wait_s - _FINE_S / 2)
+                if self._must_attend and not self._attend():
+                    return False
+            self._begun_s = max(self._begun_s, min(pace.due_s(position_us), time.monotonic()))
+            now_s = self._now_s(pace)
+        self.lateness.add(-wait_s)
+        return True
+
+    def _now_s(self, pace: Pace) -> float:
+        """Return the time; if the process stood still since ``_begun_s``, let all the rest be due later."""
+        now_s = time.monotonic()
+        stalled_s = now_s - self._begun_s
+        if stalled_s > STALL_S:
+            pace.shift(stalled_s)
+            self.stalled_s += stalled_s
+        self._begun_s = now_s
+        return now_s
+
+    def _attend(self) -> bool:
+        """Pause until the replay is to continue; return False if it is to stop or to go elsewhere."""
+        began_s = time.monotonic()
+        with self._changed:
+            self._changed.wait_for(
+                lambda: self._is_stopping or self._seek_us is not None or not self._is_paused
+            )
+            is_continued = not self._is_stopping and self._seek_us is None
+        paused_s = time.monotonic() - began_s
+        if self._pace is not None:
+            self._pace.shift(paused_s)
+        self._begun_s += paused_s
+        return is_continued
