@@ -24,6 +24,7 @@ from gateway.cli.demo import demo
 from gateway.cli.doctor import doctor
 from gateway.cli.echo import echo
 from gateway.cli.params import params
+from gateway.cli.replay import replay
 from gateway.cli.run import run
 from gateway.cli.simulate import simulate
 from gateway.errors import ConfigError, GatewayError
@@ -40,7 +41,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (run, check, doctor, simulate, demo, echo, params):
+for command in (run, check, doctor, simulate, demo, echo, params, replay):
     app.command()(command)
 app.add_typer(config.app, name="config")
 app.add_typer(take.app, name="take")

@@ -77,6 +77,19 @@ def _checked_component(text: str | None) -> str | None:
     return text
 
 
+def _checked_each(
+    check: Callable[[str | None], str | None],
+) -> Callable[[list[str] | None], list[str] | None]:
+    """Return a callback for an option that can be repeated."""
+
+    def check_each(texts: list[str] | None) -> list[str] | None:
+        for text in texts or ():
+            check(text)
+        return texts
+
+    return check_each
+
+
 def _checked_endpoint(text: str | None) -> str | None:
     if text is not None and not (text.isprintable() and re.fullmatch(r"[\w-]+/.{1,1000}", text)):
         raise typer.BadParameter(f"found {describe(text)}; expected an endpoint such as tcp/192.0.2.5:7447")
@@ -91,11 +104,34 @@ ComponentOption = Annotated[
     str | None,
     typer.Option(callback=_checked_component, help=f"Only this: {join_or(_COMPONENTS)}."),
 ]
+SourcesOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--source",
+        callback=_checked_each(_checked(SourceName)),
+        help="Only this source; can be repeated. The default is all sources.",
+    ),
+]
+ComponentsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--component",
+        callback=_checked_each(_checked_component),
+        help=f"Only this: {join_or(_COMPONENTS)}; can be repeated.",
+    ),
+]
 ConnectOption = Annotated[
     str | None,
     typer.Option(
         callback=_checked_endpoint,
         help="Zenoh endpoint of the gateway or router, for example tcp/192.0.2.5:7447.",
+    ),
+]
+ListenOption = Annotated[
+    str | None,
+    typer.Option(
+        callback=_checked_endpoint,
+        help="Zenoh endpoint to listen on, for example tcp/127.0.0.1:7448.",
     ),
 ]
 ZenohConfigOption = Annotated[
@@ -130,6 +166,9 @@ QueriesUrlOption = Annotated[
 
 checked_host = _checked(Host)
 """Checks that an option is a host name or an IP address."""
+
+checked_key_prefix = _checked(KeyPrefix)
+"""Checks that an option is the beginning of a Zenoh key."""
 
 
 def configuration_from_options(config: Path | None, server: str | None) -> Configuration:

@@ -12,7 +12,7 @@ _DESCRIPTION: Final = "take"
 
 
 class Entry(NamedTuple):
-    """A message to replay; ``position_us`` counts from the first one of the take, ``key`` as in TakeMessage."""
+    """A message; ``position_us`` counts from the first one of the take, ``key`` is that of TakeMessage."""
 
     position_us: int
     source: str

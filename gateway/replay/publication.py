@@ -40,7 +40,7 @@ _Publishers = list[tuple[str, Callable[[bytes], None]]]
 
 
 class Publication:
-    """Publishes the messages of a take in one thread. What the outputs do not allow there is done in ``loop``.
+    """Publishes the messages of a take in one thread; what outputs do not allow there is done in ``loop``.
 
     ``sources`` gets the sources, by name.
     """
@@ -57,7 +57,7 @@ class Publication:
         self.refusals: Counter[Refusal] = Counter()
         """What the outputs did not accept."""
         self.num_unreadable: Counter[str] = Counter()
-        """How many messages without a whole prefix, and unreadable parameters, were left out, by source."""
+        """How many messages without a whole prefix, and parameters, could not be read, by source."""
         self.without_parameters: set[str] = set()
         """The sources of which a component came before any parameters."""
         self._outputs = outputs

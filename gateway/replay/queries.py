@@ -1,7 +1,7 @@
 """Answers to queries of peers about the sources of a replay: what a gateway would have answered."""
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from gateway.errors import ParametersError, QueryError
@@ -30,10 +30,10 @@ _NOT_IN_A_REPLAY: Final = ("c3d", "recording")
 class ReplayQueries:
     """Implements QueryService (outputs/contract.py) for the sources of a replay.
 
-    ``sources`` returns them by name.
+    ``sources`` are those that have been replayed so far, by name.
     """
 
-    def __init__(self, sources: Callable[[], Mapping[str, ReplayedSource]]) -> None:
+    def __init__(self, sources: Mapping[str, ReplayedSource]) -> None:
         self._sources = sources
         self._xml_thread = XmlThread("replay")
         self._answers: dict[str, tuple[ServerParameters, ServerAnswer]] = {}  # by source
@@ -41,7 +41,7 @@ class ReplayQueries:
 
     def serves(self, source: str) -> bool:
         """See QueryService."""
-        return source in self._sources()
+        return source in self._sources
 
     def keys(self, source: str) -> list[KeyPath]:
         """See QueryService."""
@@ -78,11 +78,11 @@ class ReplayQueries:
 
     def _components(self, source: str) -> frozenset[ComponentType]:
         return frozenset(
-            COMPONENTS_BY_KEY[key] for key in list(self._sources()[source].newest) if key in COMPONENTS_BY_KEY
+            COMPONENTS_BY_KEY[key] for key in list(self._sources[source].newest) if key in COMPONENTS_BY_KEY
         )
 
     def _age_s(self, source: str) -> float:
-        return time.monotonic() - self._sources()[source].published_s
+        return time.monotonic() - self._sources[source].published_s
 
     async def _answer(self, source: str, question: Question) -> Answer:
         match question.kind:
@@ -104,7 +104,7 @@ class ReplayQueries:
         }
         if not question.as_json:
             return Answer(answer.xml, XML, attachment)
-        payload = answer.lazy_json
+        payload = answer.json
         if payload is None:
             raise QueryError(
                 "the recorded XML cannot be read, or has no such section; ask without format=json to see it",
@@ -114,7 +114,7 @@ class ReplayQueries:
 
     async def _known(self, source: str, sections: tuple[str, ...]) -> tuple[ServerParameters, ServerAnswer]:
         """Return the parameters that were published last, and their part for some sections."""
-        known = self._sources()[source].parameters
+        known = self._sources[source].parameters
         if known is None or not known.xml:
             raise QueryError(f"no parameters of source {source!r} have been replayed", code="nothing-yet")
         before = self._answers.get(source)
@@ -137,7 +137,7 @@ class ReplayQueries:
 
     def _message_answer(self, source: str, question: Question) -> Answer:
         key = question.name or question.kind
-        message = self._sources()[source].newest.get(key)
+        message = self._sources[source].newest.get(key)
         if message is None:
             raise QueryError(f"no {key} of source {source!r} has been replayed", code="nothing-yet")
         prefix = prefix_of(message)
