@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -20,7 +20,10 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
 from gateway.service.log_format import LogFormat, LogLevel
 
-_COMPONENTS: Final = (*COMPONENTS_BY_KEY, "status", "clock", "parameters", "c3d")
+_RECORDED: Final = (*COMPONENTS_BY_KEY, "status", "clock", "parameters")
+"""What recordings have."""
+
+_COMPONENTS: Final = (*_RECORDED, "c3d")
 
 ConfigOption = Annotated[
     Path | None,
@@ -71,10 +74,13 @@ def _checked(kind: Any) -> Callable[[str | None], str | None]:
     return check
 
 
-def _checked_component(text: str | None) -> str | None:
-    if text is not None and text not in _COMPONENTS:
-        raise typer.BadParameter(f"found {describe(text)}; expected {join_or(_COMPONENTS)}")
-    return text
+def _one_of(components: Sequence[str]) -> Callable[[str | None], str | None]:
+    def check(text: str | None) -> str | None:
+        if text is not None and text not in components:
+            raise typer.BadParameter(f"found {describe(text)}; expected {join_or(components)}")
+        return text
+
+    return check
 
 
 def _checked_each(
@@ -102,7 +108,7 @@ SourceOption = Annotated[
 ]
 ComponentOption = Annotated[
     str | None,
-    typer.Option(callback=_checked_component, help=f"Only this: {join_or(_COMPONENTS)}."),
+    typer.Option(callback=_one_of(_COMPONENTS), help=f"Only this: {join_or(_COMPONENTS)}."),
 ]
 SourcesOption = Annotated[
     list[str] | None,
@@ -116,8 +122,8 @@ ComponentsOption = Annotated[
     list[str] | None,
     typer.Option(
         "--component",
-        callback=_checked_each(_checked_component),
-        help=f"Only this: {join_or(_COMPONENTS)}; can be repeated.",
+        callback=_checked_each(_one_of(_RECORDED)),
+        help=f"Only this: {join_or(_RECORDED)}; can be repeated.",
     ),
 ]
 ConnectOption = Annotated[

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
-from gateway.errors import OutputError
+from gateway.errors import OutputError, TakeError
 from gateway.outputs.contract import Output
 from gateway.outputs.kind import OutputKind, SubscriptionRequest
 from gateway.outputs.lcm.kind import LCM
@@ -92,7 +92,7 @@ async def until_open(destination: Destination) -> None:
 
 
 async def require_silence(destinations: Sequence[Destination]) -> None:
-    """Listen for LISTENING_S, and raise OutputError if somebody publishes under one of the prefixes.
+    """Listen for LISTENING_S, and raise TakeError if somebody publishes under one of the prefixes.
 
     Otherwise subscribers would take recorded data for live data, or mix two replays.
     """
@@ -112,8 +112,7 @@ async def require_silence(destinations: Sequence[Destination]) -> None:
     if heard:
         names = sorted(heard)
         more = f" and {len(names) - _MAX_NAMED} more" if len(names) > _MAX_NAMED else ""
-        raise OutputError(
+        raise TakeError(
             f"somebody else publishes {', '.join(names[:_MAX_NAMED])}{more}: a gateway or another replay; "
-            "stop it, or choose another --prefix",
-            cause="in use",
+            "stop it, or choose another --prefix"
         )

@@ -12,6 +12,7 @@ from gateway.queries.answers import message_answer, schema_answer
 from gateway.queries.known_parameters import ServerAnswer, unreadable
 from gateway.queries.payloads import NewestJson
 from gateway.queries.questions import (
+    RECORDING,
     Question,
     accepted_keys,
     check_sections,
@@ -46,6 +47,10 @@ class ReplayQueries:
     def keys(self, source: str) -> list[KeyPath]:
         """See QueryService."""
         return [path for path in known_keys(self._components(source)) if path[0] not in _NOT_IN_A_REPLAY]
+
+    def commands(self) -> list[str]:
+        """See QueryService."""
+        return ["/".join(RECORDING)]
 
     def accepted_keys(self, source: str) -> str:
         """See QueryService."""

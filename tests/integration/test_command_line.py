@@ -13,7 +13,18 @@ from gateway.cli.main import app
 from tests.gateway_process import PROGRAM
 
 ROOT: Final = Path(__file__).parents[2]
-COMMANDS: Final = ("run", "check", "doctor", "simulate", "demo", "echo", "params", "config", "config show")
+COMMANDS: Final = (
+    "run",
+    "check",
+    "doctor",
+    "simulate",
+    "demo",
+    "echo",
+    "params",
+    "replay",
+    "config",
+    "config show",
+)
 CONFIG: Final = str(ROOT / "config/gateway.yaml")
 _ASCII: Final = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
 _NARROW: Final = {"TERM": "dumb", "COLUMNS": "20"}

@@ -40,7 +40,7 @@ class LcmParameters:
     def __init__(
         self,
         loop: asyncio.AbstractEventLoop,
-        publish: Callable[[str, Any], None],
+        publish: Callable[[str, bytes], None],
         long_sender: SendThread,
     ) -> None:
         self._loop = loop
@@ -86,11 +86,9 @@ class LcmParameters:
     def _publish_newest(self, source: str, publication: _Publication) -> None:
         if publication.newest is None:
             return
-        parameters, message = publication.newest[0], rtc3d.parameters_t()
-        message.utime, message.capture_utime = now_utime(), publication.newest[1]
-        message.sequence, publication.sequence = publication.sequence, publication.sequence + 1
-        message.session, message.parameters_version = parameters.session, parameters.version
-        message.xml = _text(parameters.xml)
+        parameters, arrived_utime = publication.newest
+        message = parameters.message or _encoded(parameters, arrived_utime, publication.sequence)
+        publication.sequence += 1
         self._publish(source, message)
 
 
@@ -107,6 +105,15 @@ def parameter_requests(service: QueryService) -> RequestKind:
         return ReplyContent(len(parameters.xml), fill)
 
     return RequestKind("PARAMETERS", rtc3d.parameters_request_t, rtc3d.parameters_reply_t, answer)
+
+
+def _encoded(parameters: ServerParameters, arrived_utime: int, sequence: int) -> bytes:
+    message = rtc3d.parameters_t()
+    message.utime, message.capture_utime, message.sequence = now_utime(), arrived_utime, sequence
+    message.session, message.parameters_version = parameters.session, parameters.version
+    message.xml = _text(parameters.xml)
+    encoded: bytes = message.encode()
+    return encoded
 
 
 def _text(xml: bytes) -> str:

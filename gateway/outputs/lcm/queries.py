@@ -2,7 +2,6 @@
 
 import asyncio
 from collections import Counter
-from typing import Any
 
 import lcm
 
@@ -83,9 +82,9 @@ class LcmQueries:
         """Publish a source's parameters: see LcmParameters."""
         return self._parameters.publish(source, parameters)
 
-    def _publish_parameters(self, source: str, message: Any) -> None:
+    def _publish_parameters(self, source: str, message: bytes) -> None:
         try:
-            self._sender.send(lcm_channel(self._prefix, source, "PARAMETERS"), message.encode())
+            self._sender.send(lcm_channel(self._prefix, source, "PARAMETERS"), message)
         except OutputError as error:
             self._requests.losses[source].lost(error.cause, str(error), frames=0)
 
