@@ -222,13 +222,16 @@ async def test_a_server_that_breaks_again_and_again_is_logged_once(
 
 async def test_a_server_that_sends_some_frames_and_breaks_is_tried_as_rarely_as_one_that_is_off() -> None:
     lab = Lab()
+    ended_s = []
     async with running(lab):
         for connection in range(1, 10):
             await lab.ready(connection)
             lab.server.connection.send_frames(1, 2, 3)
             lab.server.connection.end()
+            ended_s.append(asyncio.get_running_loop().time())
         await lab.tried(10)
-    assert_delays(lab.delays_s[:9], [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10, 10, 10])
+    delays_s = [tried_s - end_s for end_s, tried_s in zip(ended_s, lab.server.tried_s[1:10], strict=True)]
+    assert_delays(delays_s, [0.2, 0.4, 0.8, 1.6, 3.2, 6.4, 10, 10, 10])
 
 
 async def test_a_steady_connection_starts_the_delays_again() -> None:
