@@ -120,7 +120,8 @@ class QueryError(GatewayError):
 
     The gateway's replies have these codes: bad-request (change the query), no-connection (the server is
     not connected), refused (by the server), timeout (the server did not answer), unreadable (its answer
-    cannot be read), nothing-yet (no data so far), busy (too many queries) and defect (in the gateway).
+    cannot be read), nothing-yet (no data so far), busy and rate (too many queries), disabled (in the
+    configuration), disk (the folder of the takes cannot be used) and defect (in the gateway).
     The command ``params`` adds no-gateway and zenoh for problems of its own.
     """
 

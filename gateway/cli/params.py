@@ -1,10 +1,11 @@
 """``rtc3d-gateway params``: query the parameters of servers through their gateways."""
 
 import sys
-from typing import Annotated, Final
+from typing import Annotated
 
 import typer
 
+from gateway.cli.gateway_queries import exit_with
 from gateway.cli.options import (
     ConnectOption,
     PrefixOption,
@@ -19,10 +20,6 @@ from gateway.cli.params_zenoh import query_zenoh
 from gateway.outputs.lcm.settings import effective_lcm_url
 from gateway.outputs.zenoh.subscriber import open_zenoh
 from gateway.rtc3d.parameters import SECTIONS
-from gateway.safe_text import safe_lines
-
-EXIT_STATUSES: Final = {"no-gateway": 3, "no-connection": 4, "timeout": 5}
-"""Exit status by the code of the first problem; 1 for every other code."""
 
 
 def params(
@@ -81,7 +78,4 @@ def params(
             timeout_s=timeout,
         )
     problems += write_replies(replies, "json" if as_json else "xml" if as_xml else "table", sys.stdout)
-    for problem in problems:
-        print(safe_lines(str(problem)), file=sys.stderr)
-    if problems:
-        raise typer.Exit(EXIT_STATUSES.get(problems[0].code, 1))
+    exit_with(problems)

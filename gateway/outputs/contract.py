@@ -23,6 +23,9 @@ KeyPath = tuple[str, ...]
 CONTROL_OPTION: Final = "set"
 """The option of queries that start, stop or change something. They need ``remote_control`` of the source."""
 
+READ_OPTION: Final = "read"
+"""The option of queries for a piece of a file. They are answered only on outputs with flow control."""
+
 NO_LIMITS: Final[Mapping[ComponentType, float]] = {}
 
 

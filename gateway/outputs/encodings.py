@@ -6,6 +6,7 @@ from typing import Any, Final
 XML: Final = "application/xml"
 JSON: Final = "application/json"
 C3D: Final = "application/octet-stream"
+LOG: Final = "application/octet-stream"
 TEXT: Final = "text/plain"
 LCM: Final = "application/x-lcm"
 """The encoding of every message; its schema is the LCM type: ``application/x-lcm;rtc3d.markers_t``."""

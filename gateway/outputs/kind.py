@@ -70,6 +70,9 @@ class OutputKind:
     If it is None, the doctor checks that the output opens.
     """
 
+    commands: Sequence[str] = ()
+    """The names of the output's commands, for the error that peers get while it is off."""
+
     leaves_host: Callable[[Any], bool] = lambda _settings: True
     """Takes the settings; returns whether messages may leave this computer. The doctor needs it."""
 

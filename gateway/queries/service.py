@@ -6,6 +6,7 @@ from functools import partial
 
 from gateway.errors import QueryError
 from gateway.outputs.contract import CONTROL_OPTION, Answer, Command, KeyPath, ServerParameters
+from gateway.outputs.registry import OUTPUTS
 from gateway.queries.questions import (
     RECORDING,
     accepted_keys,
@@ -54,7 +55,10 @@ class SourceQueryService:
     async def answer(self, source: str, path: KeyPath, options: Mapping[str, str]) -> Answer:
         """See QueryService."""
         queries = self._sources()[source]
-        command = self._commands().get("/".join(path))
+        name = "/".join(path)
+        command = self._commands().get(name)
+        if command is None:
+            _check_no_output_is_off(name)
         answer = (
             partial(queries.answer, parse_question(path, options, queries.components), self._output)
             if command is None
@@ -96,3 +100,14 @@ class SourceQueryService:
             () if ordered == tuple(SECTIONS) else ordered, fresh=fresh, stale_ok=False
         )
         return ServerParameters(cached.xml, cached.session, cached.version, cached.age_s)
+
+
+def _check_no_output_is_off(command: str) -> None:
+    """Raise QueryError if this is the command of an output that is not enabled."""
+    for kind in OUTPUTS.values():
+        if command in kind.commands:
+            raise QueryError(
+                f"the output {kind.name} is off; to use {command}, set {kind.name}.enabled: true in the "
+                "gateway's configuration",
+                code="disabled",
+            )

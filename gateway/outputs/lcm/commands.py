@@ -7,7 +7,7 @@ from typing import Any, Final
 import rtc3d
 
 from gateway.errors import QueryError
-from gateway.outputs.contract import CONTROL_OPTION, QueryService
+from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION, QueryService
 from gateway.outputs.encodings import JSON
 from gateway.outputs.lcm.requests import ReplyContent, RequestKind
 from gateway.safe_text import quoted
@@ -59,13 +59,15 @@ class LcmCommands:
         if command not in self._service.commands():
             accepted = ", ".join(self._service.commands())
             raise QueryError(f"unknown command {quoted(command)}; accepted on LCM: {accepted}")
+        if READ_OPTION in options:
+            raise QueryError(
+                f"{command} with {READ_OPTION}= is not answered on LCM; ask on Zenoh (a take: rtc3d-gateway "
+                "take fetch, without --lcm)"
+            )
         answer = await self._service.answer(source, tuple(command.split("/")), options)
         content = answer.content
         if answer.encoding != JSON or not isinstance(content, bytes):
-            raise QueryError(
-                f"the answer to {command} with these options is not sent on LCM; ask for it on Zenoh "
-                "(a take: rtc3d-gateway take fetch, without --lcm)"
-            )
+            raise QueryError(f"the answer to {command} with these options is no JSON; ask on Zenoh")
 
         def fill(reply: Any) -> None:
             reply.content = content.decode()

@@ -75,3 +75,11 @@ def subscribe(request: SubscriptionRequest, receive: Receive) -> LcmSubscriber:
     """Subscribe with a new LCM object; ``request.address`` is its URL. Raises OutputError."""
     channels = channel_pattern(request.prefix or DEFAULT_LCM_PREFIX, request.source, request.component)
     return LcmSubscriber(open_lcm(receiving_url(effective_lcm_url(request.address))), channels, receive)
+
+
+def no_gateway(name: str, url: str) -> str:
+    """Return why nothing may arrive; ``name`` is the prefix or what the channels of the source begin with."""
+    return (
+        f"no gateway found on LCM ({name}, {url}); check that it is running with this prefix and URL, and "
+        "that its ttl reaches this computer"
+    )

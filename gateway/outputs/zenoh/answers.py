@@ -48,8 +48,8 @@ MAX_PAYLOAD_BYTES: Final = 4096
 MAX_PART_WILDCARDS: Final = 2
 """How many ``$*`` a selector may have: Zenoh's time to match grows with its power."""
 
-LONG_ANSWER_BYTES: Final = 1024 * 1024
-"""A second thread sends longer answers (C3D files), so that other answers need not wait."""
+LONG_ANSWER_BYTES: Final = 512 * 1024
+"""A second thread sends longer answers (C3D files, takes), so that other answers need not wait."""
 
 _REST: Final = 3.0
 """How long the threads rest after they have made a payload, as a multiple of the time that this took.

@@ -1,6 +1,7 @@
 """Subscribing to a gateway's messages on Zenoh, for ``echo``, the demo and tests."""
 
 import json
+from collections.abc import Collection
 from pathlib import Path
 
 import zenoh
@@ -64,3 +65,23 @@ def subscribe(request: SubscriptionRequest, receive: Receive) -> ZenohSubscriber
     """Subscribe with a new session; ``request.address`` is the endpoint to connect to. Raises OutputError."""
     keys = key_pattern(request.prefix or DEFAULT_ZENOH_PREFIX, request.source, request.component)
     return ZenohSubscriber(open_zenoh(request.address, request.config), keys, receive, owns_session=True)
+
+
+def served_sources(session: zenoh.Session, prefix: str) -> list[str]:
+    """Return the sources that gateways serve, by their liveliness tokens. It takes 1 s at most."""
+    tokens = session.liveliness().get(zenoh_key(prefix, "*", "alive"), timeout=1.0)
+    keys = [str(reply.ok.key_expr) for reply in tokens if reply.ok is not None]
+    return sorted({key.removeprefix(f"{prefix}/").partition("/")[0] for key in keys})
+
+
+def no_gateway(prefix: str, wanted: Collection[str], served: Collection[str]) -> str:
+    """Return why nothing arrives of the ``wanted`` sources (of all, if empty) if these are ``served``."""
+    if not served:
+        return (
+            f"no gateway found on Zenoh ({prefix}/*/alive); check that it is running with this "
+            "prefix, and that --connect (or, without it, multicast) reaches the gateway or its router"
+        )
+    missing = [source for source in wanted if source not in served]
+    if missing:
+        return f"no gateway serves source {missing[0]!r}; sources found: {', '.join(served)}"
+    return ""

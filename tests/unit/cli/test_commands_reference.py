@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import typer.core
 
+from gateway.cli.gateway_queries import EXIT_STATUSES
 from gateway.cli.main import app
-from gateway.cli.params import EXIT_STATUSES
 
 REFERENCE = (Path(__file__).parents[3] / "docs/reference/commands.md").read_text(encoding="utf-8")
 

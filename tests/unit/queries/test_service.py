@@ -3,10 +3,14 @@ from collections.abc import Mapping
 
 import pytest
 
+from gateway.config.settings import OutputSettings
 from gateway.errors import QueryError, ServerError
 from gateway.outputs.contract import Answer
+from gateway.outputs.kind import OutputKind
+from gateway.outputs.registry import OUTPUTS
 from gateway.queries.service import SourceQueryService
 from gateway.rtc3d.parameters import SECTIONS
+from tests.toy_output import ToyOutput
 from tests.unit.queries.fake_source import FakeSource, parameters_xml
 
 
@@ -60,6 +64,15 @@ async def test_a_wrong_command_is_no_command_that_changes_something() -> None:
             await service.answer("lab", ("recording",), {"set": "pause"})
     with pytest.raises(QueryError, match="unknown option 'set' of status"):
         await service.answer_all("lab", [("status",)], {"set": "start"})
+
+
+async def test_the_command_of_an_output_that_is_off_is_an_error_that_says_what_to_set(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(OUTPUTS, "toy", OutputKind("toy", OutputSettings, ToyOutput, commands=("play",)))
+    with pytest.raises(QueryError, match=r"to use play, set toy\.enabled: true in the gateway") as caught:
+        await service_of(FakeSource()).answer("lab", ("play",), {"set": "start"})
+    assert caught.value.code == "disabled"
 
 
 async def test_a_wildcard_selects_neither_recording_nor_commands_of_outputs() -> None:

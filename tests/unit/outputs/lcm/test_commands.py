@@ -60,12 +60,20 @@ async def test_an_option_without_a_value_is_an_error(lab: Lab, option: str) -> N
     assert "accepted: NAME=VALUE" in reply.error
 
 
-async def test_an_answer_that_is_no_json_is_refused_with_what_to_do(lab: Lab) -> None:
-    lab.service.answers["take"] = Answer(b"\0" * 100, C3D)
+async def test_takes_are_not_read_on_lcm_and_the_error_says_what_to_do(lab: Lab) -> None:
     lab.send(command_request(7, "take", "read=walk-1", "offset=0"), kind="COMMAND")
     [reply] = await lab.receive()
     assert reply.error_code == "bad-request"
-    assert "ask for it on Zenoh (a take: rtc3d-gateway take fetch" in reply.error
+    assert "ask on Zenoh (a take: rtc3d-gateway take fetch, without --lcm)" in reply.error
+    assert lab.service.commands_received == []
+
+
+async def test_an_answer_that_is_no_json_is_refused(lab: Lab) -> None:
+    lab.service.answers["take"] = Answer(b"\0" * 100, C3D)
+    lab.send(command_request(7, "take"), kind="COMMAND")
+    [reply] = await lab.receive()
+    assert (reply.content, reply.error_code) == ("", "bad-request")
+    assert "is no JSON; ask on Zenoh" in reply.error
 
 
 async def test_a_repeated_command_is_carried_out_once(lab: Lab) -> None:

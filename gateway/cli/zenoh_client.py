@@ -1,0 +1,134 @@
+"""Queries of commands on Zenoh: to one source or to all, repeated until there is a reply."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import zenoh
+
+from gateway.cli.gateway_queries import BUSY_CODES, RETRY_S, TimeLimits
+from gateway.errors import QueryError
+from gateway.messages.topics import unique_name
+from gateway.outputs.encodings import TEXT
+from gateway.outputs.zenoh.subscriber import no_gateway, served_sources
+
+
+class ZenohReply(NamedTuple):
+    """A reply about ``source``.
+
+    ``path`` is the rest of its key, ``gateway`` the id of the gateway's session. If several gateways serve
+    sources of one name, the second one is called ``lab_2``.
+    """
+
+    source: str
+    path: tuple[str, ...]
+    payload: bytes
+    attachment: bytes
+    gateway: str
+
+
+class ZenohClient:
+    """Sends queries over ``session``; ``problems`` has what gateways replied instead of an answer.
+
+    ``subject`` is what the queries are about, for error messages.
+    """
+
+    def __init__(self, session: zenoh.Session, prefix: str, subject: str) -> None:
+        self._session = session
+        self._prefix = prefix
+        self._subject = subject
+        self.problems: list[QueryError] = []
+        self._unique_names: dict[tuple[str, str], str] = {}  # by source and the gateway's Zenoh id
+        self._busy: QueryError | None = None  # what a gateway said that gets too many queries
+
+    def sources(self, limits: TimeLimits) -> list[str]:
+        """Return the sources that gateways serve, sorted. Raises QueryError if none is found in time."""
+        while not (served := served_sources(self._session, self._prefix)):
+            if limits.discovery_is_over:
+                self._require_gateway(None)
+            time.sleep(RETRY_S)
+        return served
+
+    def query(
+        self,
+        selectors: Sequence[str],
+        source: str | None,
+        limits: TimeLimits,
+        on_reply: Callable[[ZenohReply], None],
+    ) -> None:
+        """Send queries, and repeat those without a reply. ``on_reply`` gets each reply.
+
+        Raises QueryError when time is up: that no gateway serves ``source`` (None: any), or does not reply.
+        """
+        unanswered = self._query_once(selectors, limits, on_reply)
+        while unanswered:
+            left_s = limits.left_s
+            if left_s == 0 or limits.discovery_is_over:
+                self._require_gateway(source)
+            if left_s == 0:
+                raise self._busy or limits.no_reply(", ".join(unanswered))
+            time.sleep(min(RETRY_S, left_s))
+            unanswered = self._query_once(unanswered, limits, on_reply)
+
+    def _query_once(
+        self, selectors: Sequence[str], limits: TimeLimits, on_reply: Callable[[ZenohReply], None]
+    ) -> list[str]:
+        """Send queries and return those without any reply, as happens while Zenoh reconnects.
+
+        That a gateway gets too many queries is no reply either.
+        """
+        handlers = {
+            # NONE keeps the replies of all gateways: several may serve sources of the same name.
+            selector: self._session.get(
+                selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=max(0.1, limits.left_s)
+            )
+            for selector in selectors
+        }
+        return [
+            selector for selector, handler in handlers.items() if not self._receive(handler, limits, on_reply)
+        ]
+
+    def _receive(
+        self,
+        handler: zenoh.handlers.Handler[zenoh.Reply],
+        limits: TimeLimits,
+        on_reply: Callable[[ZenohReply], None],
+    ) -> bool:
+        """Pass on the replies to one query; return whether there was any."""
+        is_answered = False
+        for reply in handler:
+            if reply.ok is not None:
+                on_reply(self._reply(reply.ok, str(reply.replier_id)))
+            elif reply.err is not None:
+                problem = self._problem(reply.err, limits)
+                if problem.code in BUSY_CODES:
+                    self._busy = problem
+                    continue
+                self.problems.append(problem)
+            is_answered = True
+        return is_answered
+
+    def _reply(self, sample: zenoh.Sample, gateway: str) -> ZenohReply:
+        source, *path = str(sample.key_expr).removeprefix(f"{self._prefix}/").split("/")
+        if (source, gateway) not in self._unique_names:
+            self._unique_names[source, gateway] = unique_name(source, set(self._unique_names.values()))
+        attachment = b"" if sample.attachment is None else sample.attachment.to_bytes()
+        name = self._unique_names[source, gateway]
+        return ZenohReply(name, tuple(path), sample.payload.to_bytes(), attachment, gateway)
+
+    def _problem(self, reply: zenoh.ReplyError, limits: TimeLimits) -> QueryError:
+        text = reply.payload.to_bytes().decode("utf-8", "replace")
+        media_type, _, code = str(reply.encoding).partition(";")
+        if media_type == TEXT and code:
+            return QueryError(text, code=code)
+        # Any other error is Zenoh's own. "Timeout" means that a gateway received the query and did not reply.
+        if text == "Timeout":
+            return limits.no_reply(self._subject)
+        return QueryError(f"Zenoh: {text}", code="zenoh")
+
+    def _require_gateway(self, source: str | None) -> None:
+        """Raise QueryError unless the liveliness token of a gateway that serves ``source`` is found."""
+        served = served_sources(self._session, self._prefix)
+        problem = no_gateway(self._prefix, () if source is None else (source,), served)
+        if problem:
+            raise QueryError(problem, code="no-gateway")

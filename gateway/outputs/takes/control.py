@@ -1,0 +1,130 @@
+"""The key ``take`` of each source: peers start, stop, save, list and read takes with its options."""
+
+import re
+from collections.abc import Mapping
+from typing import Any, Final
+
+from gateway.errors import QueryError
+from gateway.outputs.contract import CONTROL_OPTION, READ_OPTION, Answer
+from gateway.outputs.encodings import JSON, LOG, json_bytes
+from gateway.outputs.takes.stored import StoredTake
+from gateway.outputs.takes.takes import Takes
+from gateway.safe_text import quoted
+from gateway.token_bucket import TokenBucket
+
+MAX_LISTED: Final = 1000
+"""How many takes a list has, the newest."""
+
+READS_PER_S: Final = 100.0
+"""How many pieces of takes a second are read from the disk, for all peers."""
+
+MAX_SAVED_S: Final = 3600.0
+"""The most seconds that one command saves, of the past and of the future."""
+
+_OPTIONS: Final[Mapping[str, tuple[str, ...]]] = {
+    "": (),
+    "start": ("name",),
+    "stop": (),
+    "save": ("last", "after", "name"),
+    READ_OPTION: (READ_OPTION, "offset"),
+}
+"""What peers can ask for, with the options that each takes; "" is the list."""
+
+_ACCEPTED: Final = (
+    "none for a list, set=start;name=NAME, set=stop, set=save;last=SECONDS;after=SECONDS;name=NAME, "
+    "read=NAME;offset=BYTES"
+)
+
+
+class TakeCommand:
+    """The command ``take`` of the output: checks the options, and asks ``takes``."""
+
+    def __init__(self, takes: Takes) -> None:
+        self._takes = takes
+        self._reads = TokenBucket(READS_PER_S)
+
+    async def __call__(self, source: str, options: Mapping[str, str]) -> Answer:
+        """Implement Command (outputs/contract.py)."""
+        action = _action(options)
+        match action:
+            case "start":
+                take = await self._takes.start(source, options.get("name", ""))
+            case "stop":
+                take = await self._takes.stop(source)
+            case "save":
+                take = await self._takes.save(
+                    source,
+                    _seconds(options, "last", MAX_SAVED_S, default=MAX_SAVED_S),
+                    _seconds(options, "after", MAX_SAVED_S, default=0.0),
+                    options.get("name", ""),
+                )
+            case "read":
+                return await self._read(source, options[READ_OPTION], _offset(options))
+            case _:
+                return await self._list(source)
+        return Answer(json_bytes({"source": source, **_fields(take)}), JSON)
+
+    async def _list(self, source: str) -> Answer:
+        found = await self._takes.list(source)
+        content = {
+            "source": source,
+            "running": None if found.running is None else _fields(found.running),
+            "takes": [_fields(take) for take in found.takes[:MAX_LISTED]],
+            "num_takes": len(found.takes),
+            "kept_s": round(found.kept_s, 3),
+        }
+        return Answer(json_bytes(content), JSON)
+
+    async def _read(self, source: str, name: str, offset: int) -> Answer:
+        if not self._reads.try_take():
+            raise QueryError(
+                f"the gateway reads {READS_PER_S:g} pieces of takes a second; try again", code="rate"
+            )
+        piece = await self._takes.read(source, name, offset)
+        return Answer(
+            piece.content, LOG, {"name": piece.name, "bytes": piece.num_bytes, "offset": piece.offset}
+        )
+
+
+def _fields(take: StoredTake) -> dict[str, Any]:
+    return {
+        "name": take.name,
+        "bytes": take.num_bytes,
+        "begin_utime": take.begin_utime,
+        "seconds": round(take.seconds, 3),
+        "is_running": take.is_running,
+        "lost": take.num_lost,
+    }
+
+
+def _action(options: Mapping[str, str]) -> str:
+    """Return start, stop, save, read, or "" for the list. Raises QueryError for wrong options."""
+    if READ_OPTION in options and CONTROL_OPTION not in options:
+        action = READ_OPTION
+    else:
+        action = options.get(CONTROL_OPTION, "")
+        if CONTROL_OPTION in options and action not in {"start", "stop", "save"}:
+            raise QueryError(f"set={quoted(action)} is not accepted; accepted: start, stop, save")
+    for option in options.keys() - {CONTROL_OPTION}:
+        if option not in _OPTIONS[action]:
+            what = f"take with set={action}" if CONTROL_OPTION in options else "take"
+            raise QueryError(f"unknown option {quoted(option)} of {what}; accepted: {_ACCEPTED}")
+    return action
+
+
+def _seconds(options: Mapping[str, str], option: str, maximum_s: float, *, default: float) -> float:
+    text = options.get(option)
+    if text is None:
+        return default
+    if not re.fullmatch(r"[0-9]{1,9}(\.[0-9]{0,9})?", text) or float(text) > maximum_s:
+        raise QueryError(
+            f"{option}={quoted(text)} is not accepted; accepted: a number of seconds up to {maximum_s:g}"
+        )
+    return float(text)
+
+
+def _offset(options: Mapping[str, str]) -> int:
+    text = options.get("offset", "0")
+    if not re.fullmatch("[0-9]{1,18}", text):
+        raise QueryError(f"offset={quoted(text)} is not accepted; accepted: a number of bytes")
+    return int(text)

@@ -1,0 +1,154 @@
+"""The command take: what it asks of the takes, and what peers get."""
+
+import asyncio
+import json
+from typing import Any
+
+import pytest
+
+from gateway.errors import QueryError
+from gateway.outputs.takes.control import MAX_LISTED, MAX_SAVED_S, READS_PER_S, TakeCommand
+from gateway.outputs.takes.stored import SourceTakes, StoredTake, TakePiece
+
+WALK = StoredTake("walk-1", 4096, 1_700_000_000_000_000, 12.34567, is_running=True, num_lost=2)
+WALK_FIELDS = {
+    "name": "walk-1",
+    "bytes": 4096,
+    "begin_utime": 1_700_000_000_000_000,
+    "seconds": 12.346,
+    "is_running": True,
+    "lost": 2,
+}
+
+
+class FakeTakes:
+    """Records the calls, and returns ``walk-1``."""
+
+    def __init__(self, num_takes: int = 1) -> None:
+        self.calls: list[tuple[Any, ...]] = []
+        self._num_takes = num_takes
+
+    async def start(self, *arguments: Any) -> StoredTake:
+        self.calls.append(("start", *arguments))
+        return WALK
+
+    async def stop(self, *arguments: Any) -> StoredTake:
+        self.calls.append(("stop", *arguments))
+        return WALK
+
+    async def save(self, *arguments: Any) -> StoredTake:
+        self.calls.append(("save", *arguments))
+        return WALK
+
+    async def list(self, *arguments: Any) -> SourceTakes:
+        self.calls.append(("list", *arguments))
+        return SourceTakes(WALK, [WALK] * self._num_takes, 59.9999)
+
+    async def read(self, source: str, name: str, offset: int) -> TakePiece:
+        self.calls.append(("read", source, name, offset))
+        return TakePiece(name, 4096, offset, b"\xed\xa1")
+
+
+@pytest.mark.parametrize(
+    ("options", "call"),
+    [
+        ({"set": "start"}, ("start", "lab", "")),
+        ({"set": "start", "name": "walk-1"}, ("start", "lab", "walk-1")),
+        ({"set": "stop"}, ("stop", "lab")),
+        ({"set": "save"}, ("save", "lab", MAX_SAVED_S, 0.0, "")),
+        (
+            {"set": "save", "last": "120", "after": "1.5", "name": "fall"},
+            ("save", "lab", 120.0, 1.5, "fall"),
+        ),
+    ],
+)
+async def test_takes_are_started_stopped_and_saved(options: dict[str, str], call: tuple[Any, ...]) -> None:
+    takes = FakeTakes()
+    answer = await TakeCommand(takes)("lab", options)
+    assert takes.calls == [call]
+    assert answer.encoding == "application/json"
+    assert json.loads(answer.payload) == {"source": "lab"} | WALK_FIELDS
+
+
+async def test_without_options_the_takes_are_listed() -> None:
+    takes = FakeTakes()
+    answer = await TakeCommand(takes)("lab", {})
+    assert takes.calls == [("list", "lab")]
+    assert json.loads(answer.payload) == {
+        "source": "lab",
+        "running": WALK_FIELDS,
+        "takes": [WALK_FIELDS],
+        "num_takes": 1,
+        "kept_s": 60.0,
+    }
+
+
+async def test_a_list_has_a_limit_and_says_how_many_there_are() -> None:
+    answer = await TakeCommand(FakeTakes(MAX_LISTED + 5))("lab", {})
+    listed = json.loads(answer.payload)
+    assert (len(listed["takes"]), listed["num_takes"]) == (MAX_LISTED, MAX_LISTED + 5)
+
+
+@pytest.mark.parametrize(
+    ("options", "offset"), [({}, 0), ({"offset": "0"}, 0), ({"offset": "9" * 18}, 10**18 - 1)]
+)
+async def test_a_piece_is_read_with_its_place_in_the_attachment(options: dict[str, str], offset: int) -> None:
+    takes = FakeTakes()
+    answer = await TakeCommand(takes)("lab", {"read": "walk-1"} | options)
+    assert takes.calls == [("read", "lab", "walk-1", offset)]
+    assert answer.payload == b"\xed\xa1"
+    assert answer.attachment == {"name": "walk-1", "bytes": 4096, "offset": offset}
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"set": "pause"}, "set='pause' is not accepted; accepted: start, stop, save"),
+        ({"set": ""}, "set='' is not accepted"),
+        ({"set": "s" * 1_000_000}, "…' is not accepted"),
+        (
+            {"set": "stop", "name": "walk-1"},
+            "unknown option 'name' of take with set=stop; accepted: none",
+        ),
+        ({"set": "start", "last": "5"}, "unknown option 'last' of take with set=start"),
+        ({"set": "start", "read": "walk-1"}, "unknown option 'read' of take with set=start"),
+        ({"name": "walk-1"}, "unknown option 'name' of take; accepted"),
+        ({"x" * 1_000_000: ""}, "unknown option 'xxx"),
+        ({"offset": "0"}, "unknown option 'offset' of take"),
+        ({"read": "walk-1", "offset": "-1"}, "offset='-1' is not accepted; accepted: a number of bytes"),
+        ({"read": "walk-1", "offset": "nan"}, "offset='nan' is not accepted"),
+        ({"read": "walk-1", "offset": ""}, "offset='' is not accepted"),
+        ({"read": "walk-1", "offset": "9" * 19}, "is not accepted"),
+        ({"read": "walk-1", "offset": "٣"}, "is not accepted"),
+        ({"read": "walk-1", "offset": "1\n"}, "is not accepted"),
+        (
+            {"set": "save", "last": "nan"},
+            "last='nan' is not accepted; accepted: a number of seconds up to",
+        ),
+        ({"set": "save", "last": "inf"}, "last='inf' is not accepted"),
+        ({"set": "save", "last": "-1"}, "last='-1' is not accepted"),
+        ({"set": "save", "last": "3601"}, "last='3601' is not accepted"),
+        ({"set": "save", "after": "1e3"}, "after='1e3' is not accepted"),
+        ({"set": "save", "after": "9" * 1_000_000}, "is not accepted"),
+    ],
+)
+async def test_a_wrong_option_is_an_error_that_says_what_is_accepted(
+    options: dict[str, str], text: str
+) -> None:
+    takes = FakeTakes()
+    with pytest.raises(QueryError) as caught:
+        await TakeCommand(takes)("lab", options)
+    assert text in str(caught.value)
+    assert caught.value.code == "bad-request"
+    assert len(str(caught.value)) < 400
+    assert takes.calls == []
+
+
+async def test_a_flood_of_reads_is_refused() -> None:
+    takes = FakeTakes()
+    command = TakeCommand(takes)
+    with pytest.raises(QueryError, match="reads 100 pieces of takes a second; try again") as caught:
+        await asyncio.gather(*(command("lab", {"read": "walk-1"}) for _ in range(10_000)))
+    assert caught.value.code == "rate"
+    assert len(takes.calls) >= READS_PER_S
+    await command("lab", {})
