@@ -22,9 +22,11 @@ from gateway.cli.options import (
     checked_host,
 )
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
+from gateway.rtc3d_server.scene import Scene
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.faults.kinds import describe_kinds, parse_fault
+from gateway.simulator.recorded.take_scene import TakeScene
 from gateway.simulator.scenario import Scenario, load_scenario
 from gateway.simulator.simulator import Simulator
 
@@ -52,7 +54,26 @@ def simulate(
     rate: RateOption = 200.0,
     analog_rate: AnalogRateOption = 2000.0,
     c3d: C3dOption = None,
-    once: Annotated[bool, typer.Option("--once", help="Play the C3D file once, then send No Data.")] = False,
+    take: Annotated[
+        Path | None,
+        typer.Option(
+            help="Play this recording (.lcmlog, or the folder of a saved take) as its server sent it."
+        ),
+    ] = None,
+    source: Annotated[
+        str | None,
+        typer.Option(help="The source of the take to play; needed if it has several."),
+    ] = None,
+    from_s: Annotated[
+        float | None,
+        typer.Option("--from", min=0, help="Begin this many seconds after the take's beginning."),
+    ] = None,
+    to_s: Annotated[
+        float | None, typer.Option("--to", min=0, help="End this many seconds after the take's beginning.")
+    ] = None,
+    once: Annotated[
+        bool, typer.Option("--once", help="Play the C3D file or the take once, then send No Data.")
+    ] = False,
     scenario: Annotated[
         Path | None,
         typer.Option(help="A YAML file with a scene and faults; see config/scenarios/bad-day.yaml."),
@@ -71,9 +92,15 @@ def simulate(
     log_level: LogLevelOption = LogLevel.INFO,
     log_format: LogFormatOption = LogFormat.AUTO,
 ) -> None:
-    """Simulate an RTC3D server that plays a synthetic scene or a C3D file, with faults on request."""
-    if once and c3d is None:
-        raise typer.BadParameter("--once needs --c3d: a synthetic scene has no end")
+    """Simulate an RTC3D server that plays a synthetic scene, a C3D file or a take, with faults on request."""
+    if once and c3d is None and take is None:
+        raise typer.BadParameter("--once needs --c3d or --take: a synthetic scene has no end")
+    if c3d is not None and take is not None:
+        raise typer.BadParameter("give either --c3d or --take")
+    if take is None and not (source is None and from_s is None and to_s is None):
+        raise typer.BadParameter("--source, --from and --to need --take")
+    if from_s is not None and to_s is not None and to_s <= from_s:
+        raise typer.BadParameter(f"--to {to_s:g} is not after --from {from_s:g}")
     set_up_log(log_level, log_format)
     scene_options: dict[str, float] = {
         "markers": markers,
@@ -91,7 +118,13 @@ def simulate(
     }
     base = Scenario(faults=()) if scenario is None else load_scenario(scenario)
     extended = base.with_overrides(overrides, map(parse_fault, fault or ()), seed)
-    scene = extended.scene.build() if c3d is None else C3dScene(c3d)
+    scene: Scene
+    if take is not None:
+        scene = TakeScene(take, source, from_s=from_s, to_s=to_s)
+    elif c3d is not None:
+        scene = C3dScene(c3d)
+    else:
+        scene = extended.scene.build()
     uvloop.run(_run_simulator(Simulator(scene, host=host, port=port, once=once), extended, seconds))
 
 

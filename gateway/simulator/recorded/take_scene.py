@@ -1,0 +1,298 @@
+"""A take as a scene: read ahead from its files, while it is played."""
+
+import logging
+import weakref
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future
+from itertools import islice, pairwise
+from pathlib import Path
+from statistics import median_low
+from typing import Final, NamedTuple
+
+from gateway.errors import TakeError
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
+from gateway.rtc3d.parameters import General, Parameters
+from gateway.simulator.recorded import frame_contents
+from gateway.simulator.recorded.moments import Moment
+from gateway.simulator.recorded.parameters import RecordedParameters, derived_parameters
+from gateway.simulator.recorded.recorded_frames import LATE_US, RecordedFrames
+from gateway.simulator.recorded.take_pass import TakePass
+from gateway.takes.reader import TakeReader
+from gateway.worker_thread import WorkerThread
+
+_AHEAD_US: Final = 8_000_000
+_MAX_AHEAD_BYTES: Final = 64 * 1024 * 1024
+"""So much of a take is read ahead, whichever is less."""
+
+_BATCH_BYTES: Final = 4 * 1024 * 1024
+_BATCH_MOMENTS: Final = 2000
+"""So much is read at once, whichever is less."""
+
+_KEPT_US: Final = 1_000_000
+"""Moments of the past that a new client may need: the newest frame, and those of a stream that goes on."""
+
+_ADVANCE_US: Final = 100_000
+_WAITING_US: Final = 10_000
+"""How often the scene is advanced, and how often while it waits for the disk."""
+
+_PREVIEW_MOMENTS: Final = 3000
+"""The numbers and rates of components without parameters are those of so many moments at the beginning."""
+
+_SOURCES_WITHIN: Final = 20_000
+"""All sources of a take have a message among so many at its beginning."""
+
+_DEFAULT_PERIOD_US: Final = 10_000
+
+_log = logging.getLogger(__name__)
+
+
+class _Batch(NamedTuple):
+    """Moments that follow each other; ``is_end`` if the pass ends with them, because of ``error`` or not."""
+
+    moments: list[Moment]
+    is_end: bool
+    error: TakeError | None = None
+
+
+class TakeScene:
+    """One source of a take (see Scene), which starts again after its end.
+
+    ``from_s`` and ``to_s`` limit the time of the events, in seconds from the first event of the take. Only
+    some seconds of a take are in memory; a thread reads ahead. If the disk is too slow, the rest of the take
+    waits for it.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        source: str | None = None,
+        *,
+        from_s: float | None = None,
+        to_s: float | None = None,
+    ) -> None:
+        """Read the beginning of the take. Raises TakeError if it cannot be played."""
+        self._reader = TakeReader(path)
+        self._source = _chosen_source(self._reader, source)
+        self._first_utime = None if from_s is None else self._reader.start_utime + round(from_s * 1e6)
+        self._end_utime = None if to_s is None else self._reader.start_utime + round(to_s * 1e6)
+        self._default: RecordedParameters | None = None
+        first_pass = self._new_pass()
+        preview = list(islice(first_pass.moments(), _PREVIEW_MOMENTS))
+        if not preview:
+            raise TakeError(
+                f"{path} has no frames of {self._source}"
+                f"{_range_text(from_s, to_s)}; rtc3d-gateway take info shows what is in it"
+            )
+        self._rates_hz = _rates_hz(preview)
+        self._default = first_pass.first_parameters
+        if self._default is None:
+            self._default = _derived(preview, self._rates_hz)
+            _log.warning(
+                "%s has no parameters of %s at its beginning; the simulator serves minimal ones, with the "
+                "numbers of items and the rates of the first frames, and numbers as labels",
+                *(path, self._source),
+            )
+        self._is_reported = False
+        self._frames: weakref.WeakSet[RecordedFrames] = weakref.WeakSet()
+        self._thread = WorkerThread("take")
+        self._reset()
+
+    def _reset(self) -> None:
+        """Go to the beginning of the first pass."""
+        self._pass = self._new_pass()
+        self._moments: Iterator[Moment] = self._pass.moments()
+        self._reading: Future[_Batch] | None = None
+        self._is_at_end = False  # of all passes, because the take cannot be read any more
+        self._is_pass_begun = False
+        self._pass_start_us = 0
+        self._last_us = 0  # the newest moment that has been read
+        self._length_us: int | None = None
+        self._ahead: deque[Moment] = deque()
+        self._ahead_bytes = 0
+        self._past: deque[Moment] = deque()
+        self._parameters = self._default or RecordedParameters(b"")
+
+    # Scene ----------------------------------------------------------------------------------
+
+    @property
+    def parameters(self) -> Parameters:
+        """See Scene."""
+        return self._parameters.parsed
+
+    @property
+    def length_us(self) -> int | None:
+        """See Scene."""
+        return self._length_us
+
+    def parameters_xml(self, sections: Sequence[str], general: General) -> bytes:  # noqa: ARG002 - as recorded
+        """See Scene. General is that of the recorded server."""
+        return self._parameters.xml_of(sections)
+
+    def start(self) -> None:
+        """See Scene."""
+        self._reset()
+        self._frames.clear()
+        self._read_on(0)
+
+    def advance(self, elapsed_us: int) -> int | None:
+        """See Scene."""
+        reading = self._reading
+        if reading is not None and reading.done():
+            self._reading = None
+            self._take_batch(reading.result(), elapsed_us)
+        while self._ahead and self._ahead[0].due_us <= elapsed_us:
+            moment = self._ahead.popleft()
+            self._ahead_bytes -= moment.num_bytes
+            self._past.append(moment)
+            self._parameters = moment.parameters
+        while len(self._past) > 1 and self._past[1].due_us < elapsed_us - _KEPT_US:
+            self._past.popleft()
+        for frames in self._frames:
+            frames.forget(elapsed_us - 2 * LATE_US)
+        self._read_on(elapsed_us)
+        is_waiting = self._reading is not None and self._last_us < elapsed_us + _ADVANCE_US
+        return elapsed_us + (_WAITING_US if is_waiting else _ADVANCE_US)
+
+    def stop(self) -> None:
+        """See Scene."""
+        self._reset()
+
+    def frames(self, components: Sequence[ComponentType], event_bytes: int) -> RecordedFrames:
+        """See Scene."""
+        frames = RecordedFrames(components, event_bytes, self._rates_hz)
+        frames.add([*self._past, *self._ahead], is_end=False)
+        self._frames.add(frames)
+        return frames
+
+    # Reading --------------------------------------------------------------------------------
+
+    def _new_pass(self) -> TakePass:
+        return TakePass(self._reader, self._source, self._first_utime, self._end_utime, self._default)
+
+    def _read_on(self, elapsed_us: int) -> None:
+        """Let the thread read the next batch, if there is room for it."""
+        is_short = self._last_us < elapsed_us + _AHEAD_US and self._ahead_bytes < _MAX_AHEAD_BYTES
+        if self._reading is None and is_short and not self._is_at_end:
+            moments = self._moments
+            self._reading = self._thread.submit(lambda: _read_batch(moments))
+
+    def _take_batch(self, batch: _Batch, elapsed_us: int) -> None:
+        """Put a batch that has been read into its place in time."""
+        if batch.moments:
+            late_us = elapsed_us - (self._pass_start_us + batch.moments[0].due_us)
+            if late_us > 0 and not (self._is_pass_begun and late_us < LATE_US // 2):
+                self._pass_start_us += late_us  # the take waits for the disk
+            self._is_pass_begun = True
+            for moment in batch.moments:
+                moment.due_us += self._pass_start_us
+                self._ahead_bytes += moment.num_bytes
+            self._last_us = batch.moments[-1].due_us
+            self._ahead.extend(batch.moments)
+        for frames in self._frames:
+            frames.add(batch.moments, is_end=batch.is_end)
+        if batch.is_end:
+            self._end_pass(batch.error)
+
+    def _end_pass(self, error: TakeError | None) -> None:
+        length_us = self._last_us + _period_us(self._rates_hz)
+        if self._length_us is None:
+            self._length_us = length_us
+        if error is not None:
+            _log.error("The take cannot be read any further, and ends here: %s", error)
+        elif not self._is_reported:
+            self._is_reported = True
+            self._report()
+        self._is_at_end = error is not None or not self._is_pass_begun
+        self._pass = self._new_pass()
+        self._moments = self._pass.moments()
+        self._pass_start_us = length_us
+        self._is_pass_begun = False
+
+    def _report(self) -> None:
+        """Log what the first complete pass could not play."""
+        logs = self._reader.logs
+        num_damaged, num_bytes = sum(log.num_damaged for log in logs), sum(log.damaged_bytes for log in logs)
+        num_unknown = self._reader.unknown.total()
+        if num_damaged or num_unknown or self._pass.num_malformed:
+            _log.warning(
+                "%s is not complete: %d damaged places (%d bytes), %d messages of an unknown type, and %d "
+                "malformed messages are left out",
+                *(self._reader.path, num_damaged, num_bytes, num_unknown, self._pass.num_malformed),
+            )
+
+
+def _read_batch(moments: Iterator[Moment]) -> _Batch:
+    batch: list[Moment] = []
+    num_bytes = 0
+    try:
+        for moment in moments:
+            batch.append(moment)
+            num_bytes += moment.num_bytes
+            if num_bytes > _BATCH_BYTES or len(batch) == _BATCH_MOMENTS:
+                return _Batch(batch, is_end=False)
+    except TakeError as error:
+        return _Batch(batch, is_end=True, error=error)
+    return _Batch(batch, is_end=True)
+
+
+def _chosen_source(reader: TakeReader, source: str | None) -> str:
+    """Return the source to play. Raises TakeError if the take has several, or others only."""
+    names = list(
+        dict.fromkeys(
+            message.source
+            for message in islice(reader.messages(), _SOURCES_WITHIN)
+            if message.key in COMPONENTS_BY_KEY
+        )
+    )
+    if source is None:
+        if len(names) > 1:
+            raise TakeError(
+                f"{reader.path} has several sources: {', '.join(names)}; choose one with --source"
+            )
+        if not names:
+            raise TakeError(f"{reader.path} has no frames; choose another recording")
+        return names[0]
+    if source not in names:
+        is_later = any(message.source == source for message in reader.messages())
+        if not is_later:
+            listed = ", ".join(names) or "none"
+            raise TakeError(f"{reader.path} has no source {source!r}; its sources are: {listed}")
+    return source
+
+
+def _rates_hz(moments: Sequence[Moment]) -> dict[ComponentType, float]:
+    """Return the rate of each measured component in these moments that has at least three of them."""
+    times_us: dict[ComponentType, list[int]] = {}
+    for moment in moments:
+        for component in moment.contents:
+            times_us.setdefault(component, []).append(moment.due_us)
+    return {
+        component: 1e6 / median_low([later - earlier for earlier, later in pairwise(times)])
+        for component, times in times_us.items()
+        if component is not ComponentType.EVENT and len(times) > 2
+    }
+
+
+def _period_us(rates_hz: Mapping[ComponentType, float]) -> int:
+    """Return the time from the last moment of a pass to the first one of the next."""
+    return round(1e6 / min(rates_hz.values())) if rates_hz else _DEFAULT_PERIOD_US
+
+
+def _derived(moments: Sequence[Moment], rates_hz: Mapping[ComponentType, float]) -> RecordedParameters:
+    """Return minimal parameters for these moments."""
+    counts: dict[ComponentType, int] = {}
+    event_ids: set[int] = set()
+    for moment in moments:
+        for component, content in moment.contents.items():
+            counts[component] = max(counts.get(component, 0), frame_contents.num_items(content))
+            if component is ComponentType.EVENT:
+                event_ids.update(frame_contents.items(component, content)["id"].tolist())
+    return derived_parameters(counts, rates_hz, event_ids)
+
+
+def _range_text(from_s: float | None, to_s: float | None) -> str:
+    if from_s is None and to_s is None:
+        return ""
+    begin = "the beginning" if from_s is None else f"{from_s:g} s"
+    return f" from {begin} to {'its end' if to_s is None else f'{to_s:g} s'}"
