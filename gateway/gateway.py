@@ -4,13 +4,13 @@ import asyncio
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 from gateway.c3d_files.spool import Spool
 from gateway.config.settings import Settings, SourceSettings, SpoolSettings
 from gateway.log import defect_text, log_fields
 from gateway.messages.host_time import host_clock
-from gateway.outputs.contract import Command, Output, ServerParameters
+from gateway.outputs.contract import Command, Output, ServerFile, ServerParameters
 from gateway.outputs.guard import guarded, health, log_defect
 from gateway.outputs.registry import build_outputs
 from gateway.publish.fan_out import FanOut
@@ -149,8 +149,8 @@ class Gateway:
         """Apply ``settings`` and return a text for each change. Call it after ``opened`` is set.
 
         Sources and outputs with unchanged settings keep running. A source that differs sends Bye and connects
-        again; an output that differs is closed and opened again, unless only the poses per tool are switched
-        on or off. Session and sequence numbers continue.
+        again; an output that differs is closed and opened again, unless it can take over the new settings.
+        Session and sequence numbers continue.
         Raises ConfigError, and changes nothing, if an output refuses its configuration.
         """
         async with self._reload_lock:
@@ -159,9 +159,10 @@ class Gateway:
                 next((running for running in self._outputs if running.is_configured_like(output)), output)
                 for output in built
             ]
+            kept = [pair for pair in zip(outputs, built, strict=True) if pair[0] is not pair[1]]
             before, self.settings = self.settings, settings
             changes = [
-                *_switch_tool_poses(outputs, built),
+                *(f"output {output.name} changed" for output, like in kept if output.take_over(like)),
                 *await self._change_outputs(outputs),
                 *await self._change_sources(settings.sources),
             ]
@@ -243,9 +244,9 @@ class Gateway:
         if pending:
             await asyncio.wait(pending, timeout=_SENDING_TIMEOUT_S)
 
-    def _announce_file(self, source: str, description: Mapping[str, Any]) -> None:
+    def _announce_file(self, source: str, file: ServerFile) -> None:
         for output in self._outputs:
-            guarded(output, partial(output.announce_file, source, description), None)
+            guarded(output, partial(output.announce_file, source, file), None)
 
 
 async def _run_to_defect(source: Source) -> BaseException:
@@ -275,18 +276,6 @@ async def _close(output: Output) -> None:
             await close()
         except Exception as defect:  # noqa: BLE001 - the others are closed nevertheless
             log_defect(output, defect)
-
-
-def _switch_tool_poses(outputs: Sequence[Output], wanted: Sequence[Output]) -> list[str]:
-    """Let each output publish poses per tool as the wanted one does; return a text for each change."""
-    switched = [
-        (output, like)
-        for output, like in zip(outputs, wanted, strict=True)
-        if output.has_tool_poses is not like.has_tool_poses
-    ]
-    for output, like in switched:
-        output.has_tool_poses = like.has_tool_poses
-    return [f"output {output.name} changed" for output, _ in switched]
 
 
 def _changes(what: str, removed: Collection[str], new: Collection[str]) -> list[str]:

@@ -4,7 +4,6 @@ import asyncio
 import logging
 import math
 from collections.abc import Awaitable, Callable, Sequence
-from typing import Any
 
 from gateway.c3d_files.receiving import SourceFiles
 from gateway.c3d_files.spool import Spool, StoredFile
@@ -12,7 +11,7 @@ from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import LinkError, QueryError
 from gateway.log import HOLD_S, DefectLog, FailureLog, log_fields
 from gateway.messages.limits import encode_within_limits
-from gateway.outputs.contract import Answer, ServerParameters
+from gateway.outputs.contract import Answer, ServerFile, ServerParameters
 from gateway.outputs.encodings import C3D
 from gateway.outputs.guard import health
 from gateway.publish.fan_out import FanOut
@@ -37,8 +36,8 @@ class Source:
     """Runs the streams of one source, publishes their data through ``fan_out``, and answers queries.
 
     ``publish_parameters`` is called with the source's name and its parameters, for every connection and when
-    they change, and returns when they have been sent; ``announce_file`` with the name and the description of
-    every C3D file that was stored. ``before`` is the source that this one replaces after a reload; its
+    they change, and returns when they have been sent; ``announce_file`` with the name and every C3D file
+    that was stored. ``before`` is the source that this one replaces after a reload; its
     session and sequence numbers and its parameters continue.
     """
 
@@ -48,7 +47,7 @@ class Source:
         fan_out: FanOut,
         spool: Spool,
         publish_parameters: Callable[[str, ServerParameters], Awaitable[None]],
-        announce_file: Callable[[str, dict[str, Any]], None],
+        announce_file: Callable[[str, ServerFile], None],
         before: "Source | None" = None,
     ) -> None:
         self.settings = settings
@@ -272,7 +271,7 @@ class Source:
             self._spool_problems.failed(f"old C3D files are not deleted: {stored.problem}")
         else:
             self._spool_problems.recovered("old C3D files can be deleted again")
-        self._announce_file(self.name, {"name": stored.path.name, "bytes": stored.num_bytes})
+        self._announce_file(self.name, ServerFile(stored.path, stored.num_bytes))
 
     async def _last_c3d(self) -> Answer:
         spool, timeout_s = self.spool, self.settings.query_timeout_s

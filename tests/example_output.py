@@ -14,7 +14,7 @@ from gateway.errors import OutputError
 from gateway.losses import Losses
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import Answer, Command, Output, QueryService, ServerParameters
+from gateway.outputs.contract import Answer, Command, Output, QueryService, ServerFile, ServerParameters
 from gateway.outputs.encodings import TEXT
 from gateway.outputs.kind import DemoSide, OutputKind, Receive, SubscriptionRequest
 from gateway.outputs.status import OutputHealth
@@ -190,9 +190,9 @@ class ExampleOutput(Output):
         """Record the parameters."""
         self.parameters.append((source, parameters))
 
-    def announce_file(self, source: str, description: Mapping[str, Any]) -> None:
+    def announce_file(self, source: str, file: ServerFile) -> None:
         """Record the file."""
-        self.files.append((source, description))
+        self.files.append((source, file.description))
 
     def serve_queries(self, service: QueryService) -> None:
         """Answer ``query``."""

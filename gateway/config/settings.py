@@ -22,8 +22,9 @@ from pydantic import (
     model_validator,
 )
 
-from gateway.config.section import Effective, Section, expects, join_or, validation_error
+from gateway.config.section import Effective, Section, expects, validation_error
 from gateway.config.values import (
+    AbsoluteDirectory,
     Backlog,
     ByteLimit,
     Components,
@@ -36,7 +37,6 @@ from gateway.config.values import (
     ServerByteOrder,
     SourceName,
     Speed,
-    SpoolDirectory,
     StreamRate,
     Switch,
     not_empty,
@@ -207,10 +207,19 @@ class OutputSettings(Section):
     """Whether to publish on this output."""
 
 
+def state_directory() -> Path:
+    """Return the folder for what the gateway keeps: that of the service, or of the user without systemd."""
+    state = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
+    if state:
+        return Path(state)
+    home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+    return Path(home) / "rtc3d-gateway"
+
+
 class SpoolSettings(Section):
     """Storage for complete C3D files from the servers."""
 
-    directory: SpoolDirectory | None = None
+    directory: AbsoluteDirectory | None = None
     """The folder. null means c3d in the state directory of the service, or of the user without systemd."""
 
     max_files: FileLimit = 100
@@ -229,13 +238,7 @@ class SpoolSettings(Section):
     @property
     def effective_directory(self) -> Path:
         """``directory``, or the default folder if it is None."""
-        if self.directory is not None:
-            return Path(self.directory)
-        state = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
-        if state:
-            return Path(state) / "c3d"
-        home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-        return Path(home) / "rtc3d-gateway" / "c3d"
+        return state_directory() / "c3d" if self.directory is None else Path(self.directory)
 
 
 class MetricsSettings(Section):
@@ -298,7 +301,7 @@ class Settings(Section):
         outputs = self.outputs
         if outputs and not any(section.enabled for section in outputs.values()):
             *others, last = (f"{name}.enabled" for name in outputs)
-            found = f"found false here and in {join_or(others)}" if others else "found false"
+            found = f"found false here and in {' and '.join(others)}" if others else "found false"
             raise validation_error(f"{found}; expected true in at least one of them", *last.split("."))
         return self
 

@@ -101,7 +101,9 @@ ByteLimit = Annotated[
 FileLimit = Annotated[
     int, Field(strict=True, ge=1, le=100_000), expects("a whole number of files from 1 to 100000")
 ]
-SpoolDirectory = Annotated[str, AfterValidator(_absolute_path), expects("a folder's absolute path, or null")]
+AbsoluteDirectory = Annotated[
+    str, AfterValidator(_absolute_path), expects("a folder's absolute path, or null")
+]
 Host = Annotated[
     str, AfterValidator(_host), expects("a host name or an IP address; the port has its own key")
 ]

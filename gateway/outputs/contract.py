@@ -8,6 +8,7 @@ caller checks the class of an output.
 import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
 from gateway.losses import Losses
@@ -117,6 +118,18 @@ class ServerParameters(NamedTuple):
     message: bytes = b""
 
 
+class ServerFile(NamedTuple):
+    """A C3D file that the server sent. It is at ``path`` until newer files replace it."""
+
+    path: Path
+    num_bytes: int
+
+    @property
+    def description(self) -> dict[str, Any]:
+        """What peers are told about it."""
+        return {"name": self.path.name, "bytes": self.num_bytes}
+
+
 Command = Callable[[str, Mapping[str, str]], Awaitable[Answer]]
 """A command of one output: takes the source's name and the options; raises QueryError.
 
@@ -129,6 +142,9 @@ class QueryService(Protocol):
 
     def serves(self, source: str) -> bool:
         """Return whether the gateway has this source now."""
+
+    def server(self, source: str) -> str:
+        """Return HOST:PORT of the server of a source; "" if the gateway does not have the source."""
 
     def keys(self, source: str) -> list[KeyPath]:
         """Return every key that a wildcard may select; not those of ``commands``."""
@@ -204,17 +220,32 @@ class Output(ABC):
         """Do periodic work without blocking. Called once a second in the event loop."""
 
     def is_configured_like(self, other: "Output") -> bool:
-        """Return whether a reload can keep this output because ``other`` would behave the same.
-
-        ``has_tool_poses`` may differ: the gateway changes it without opening the output again.
-        """
+        """Return whether a reload can keep this output: ``take_over`` makes it behave like ``other``."""
         return self is other
+
+    def take_over(self, other: "Output") -> bool:
+        """Apply the settings of ``other``, which is configured like this output; return whether any differ.
+
+        Called in the event loop by a reload that keeps this output. What was published goes on.
+        """
+        differs = self.has_tool_poses is not other.has_tool_poses
+        self.has_tool_poses = other.has_tool_poses
+        return differs
 
     def count_losses(self, source: str, losses: Losses) -> None:
         """Count in ``losses`` what the output itself loses of ``source``, such as requests of peers.
 
         Called before ``announce``. Messages that ``publish`` refuses are counted by the gateway.
         """
+
+    def watch_wanted(self, source: str, on_change: Callable[[], None]) -> bool:
+        """Return whether ``wanted`` of the publishers of ``source`` is exact; by default, it may be late.
+
+        If it is exact, the gateway publishes only what is wanted, and counts nothing else as sent. The output
+        must call ``on_change`` in the event loop whenever ``wanted`` of a publisher changes. Called before
+        ``announce``.
+        """
+        return False
 
     # Liveliness.
 
@@ -243,8 +274,8 @@ class Output(ABC):
         """
         return None
 
-    def announce_file(self, source: str, description: Mapping[str, Any]) -> None:
-        """Announce a C3D file that the server sent: ``name``, and ``bytes``, its size."""
+    def announce_file(self, source: str, file: ServerFile) -> None:
+        """Announce a C3D file that the server sent."""
 
     # Queries of peers.
 

@@ -6,9 +6,10 @@ from gateway.config.settings import Settings, settings_model
 from gateway.outputs.contract import Output
 from gateway.outputs.kind import OutputKind
 from gateway.outputs.lcm.kind import LCM
+from gateway.outputs.takes.kind import TAKES
 from gateway.outputs.zenoh.kind import ZENOH
 
-OUTPUTS: Final[dict[str, OutputKind]] = {kind.name: kind for kind in (ZENOH, LCM)}
+OUTPUTS: Final[dict[str, OutputKind]] = {kind.name: kind for kind in (ZENOH, LCM, TAKES)}
 
 
 def settings_type() -> type[Settings]:

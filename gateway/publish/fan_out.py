@@ -125,7 +125,9 @@ class FanOut:
         self.forget_layouts()
 
     def _open_route(self, output: Output) -> OutputRoute:
-        route = OutputRoute(self._source, output, self.frames, self._last_routes.get(output.name))
+        route = OutputRoute(
+            self._source, output, self.frames, self._last_routes.get(output.name), self.forget_layouts
+        )
         self._last_routes[output.name] = route
         if self._is_streaming:
             output.show_streaming(self._source, True)
@@ -207,7 +209,12 @@ class FanOut:
                 self._components[component.type],
                 layout,
                 index,
-                [route.components[component.type] for route in self._routes if route.frame_route is None],
+                [
+                    component_route
+                    for route in self._routes
+                    if (component_route := route.components.get(component.type)) is not None
+                    and not component_route.is_idle
+                ],
             )
             for index, component in indexed
         ]
@@ -215,7 +222,7 @@ class FanOut:
         return _Plan(layout, wanted, plans, tools if self._tool_poses.is_used else [])
 
     def forget_layouts(self) -> None:
-        """Forget how to publish earlier frames, because the connection that sent them has ended."""
+        """Forget how to publish earlier frames: the connection ended, or an output wants something else."""
         self._plan_for.cache_clear()
         self._plan = None
 
@@ -248,12 +255,14 @@ class FanOut:
     def publish_status(self, message: bytes) -> None:
         """Publish an encoded ``status_t``."""
         for route in self._routes:
-            route.status_route.send(message)
+            if not route.status_route.is_idle:
+                route.status_route.send(message)
 
     def publish_clock(self, message: bytes) -> None:
         """Publish an encoded ``clock_t``."""
         for route in self._routes:
-            route.clock_route.send(message)
+            if not route.clock_route.is_idle:
+                route.clock_route.send(message)
 
     def set_parameters(self, parameters: Parameters) -> None:
         """Set the labels (§6.3) and the unit of length (§6.2) for the poses per tool."""

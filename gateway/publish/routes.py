@@ -3,7 +3,7 @@
 import logging
 import time
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import rtc3d
@@ -39,7 +39,8 @@ class OutputRoute:
     """Everything that one source publishes on one output.
 
     ``sequences`` are the next sequence number of each component. The route continues the counters of
-    ``predecessor``, an earlier route to an output of the same name.
+    ``predecessor``, an earlier route to an output of the same name. ``on_wanted_changed`` is called when
+    ``is_idle`` of a topic may have changed.
     """
 
     def __init__(
@@ -48,6 +49,7 @@ class OutputRoute:
         output: Output,
         sequences: Mapping[ComponentType, int],
         predecessor: "OutputRoute | None" = None,
+        on_wanted_changed: Callable[[], None] = lambda: None,
     ) -> None:
         self.source = source
         self.output = output
@@ -68,6 +70,8 @@ class OutputRoute:
                 self.components[component] = ComponentRoute(self, component, sequence, before.get(component))
         self.status_route = TopicRoute(self, ("status",), rtc3d.status_t, "status")
         self.clock_route = TopicRoute(self, ("clock",), rtc3d.clock_t, "clock")
+        self.is_selective: bool = output.watch_wanted(source, on_wanted_changed)
+        """Whether to publish only what is wanted."""
         output.count_losses(source, self.losses)
         self._opening_until_s = time.monotonic() + OPENING_S
         output.announce(source)
@@ -112,6 +116,11 @@ class TopicRoute:
         self._publish = self.publisher.publish  # saves looking it up for every message
         self._output_route = output_route
         self._sent = output_route.sent.setdefault(counted_as, SentCounter())
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether to publish nothing now, because the output wants nothing."""
+        return self._output_route.is_selective and not self.publisher.wanted
 
     def send(self, message: bytes, frame: object | None = None) -> None:
         """Publish and count one message; never raises, because outputs must not disturb each other.

@@ -40,6 +40,11 @@ class SourceQueryService:
         """See QueryService."""
         return source in self._sources()
 
+    def server(self, source: str) -> str:
+        """See QueryService."""
+        queries = self._sources().get(source)
+        return "" if queries is None else queries.server
+
     def keys(self, source: str) -> list[KeyPath]:
         """See QueryService. Commands are left out, so that no wildcard starts anything by accident."""
         return [path for path in known_keys(self._sources()[source].components) if path != RECORDING]

@@ -66,6 +66,11 @@ class SourceQueries:
         )
 
     @property
+    def server(self) -> str:
+        """HOST:PORT of the server."""
+        return f"{self._settings.host}:{self._settings.port}"
+
+    @property
     def components(self) -> frozenset[ComponentType]:
         """The components of all streams."""
         return frozenset(component for stream in self._streams() for component in stream.components)

@@ -44,6 +44,10 @@ class ReplayQueries:
         """See QueryService."""
         return source in self._sources
 
+    def server(self, source: str) -> str:  # noqa: ARG002 - the contract's argument
+        """See QueryService."""
+        return ""
+
     def keys(self, source: str) -> list[KeyPath]:
         """See QueryService."""
         return [path for path in known_keys(self._components(source)) if path[0] not in _NOT_IN_A_REPLAY]

@@ -43,7 +43,7 @@ class LogFile:
         """
         events = b"".join(
             [
-                encode_event(number, int.from_bytes(message[_UTIME], "big", signed=True), channel, message)
+                encode_event(number, utime_of(message), channel, message)
                 for number, (channel, message) in enumerate(messages, start=self.num_messages)
             ]
         )
@@ -62,6 +62,14 @@ class LogFile:
     def sync(self) -> None:
         """Store on the disk what was appended. Raises OSError."""
         os.fdatasync(self._descriptor)
+
+    def is_in_place(self) -> bool:
+        """Return whether the file still has its path: it or its folder may have been moved or deleted."""
+        try:
+            there = self.path.stat()
+        except OSError:
+            return False
+        return os.path.samestat(there, os.fstat(self._descriptor))
 
     def close(self) -> None:
         """Store everything and close the file. Raises OSError."""
@@ -157,6 +165,11 @@ class Recorder:
             sink.write(messages)
             self._written_bytes += sum(len(message) for _, message in messages)
             self._unsynced[sink] = None
+
+
+def utime_of(message: bytes) -> int:
+    """Return the ``utime`` of a message of the gateway, in µs since the Unix epoch."""
+    return int.from_bytes(message[_UTIME], "big", signed=True)
 
 
 def _make(done: Future[Any], function: Callable[[], Any]) -> None:

@@ -13,12 +13,13 @@ from asyncio.subprocess import PIPE
 from collections import Counter
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import pytest
 
 from gateway.errors import OutputError
-from gateway.outputs.contract import Output, ServerParameters
+from gateway.outputs.contract import Output, ServerFile, ServerParameters
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.output import ZenohOutput
@@ -192,7 +193,7 @@ async def test_no_call_of_the_event_loop_blocks(peer: StalledPeer) -> None:
         output.announce("lab")
         output.show_streaming("lab", True)
         output.publish_parameters("lab", ServerParameters(bytes(100_000), 1, 1))
-        output.announce_file("lab", {"name": "take.c3d", "bytes": 7})
+        output.announce_file("lab", ServerFile(Path("take.c3d"), 7))
         output.publisher(MARKERS).close()
         output.show_streaming("lab", False)
         output.withdraw("lab")

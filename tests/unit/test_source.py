@@ -16,7 +16,7 @@ from gateway.errors import QueryError
 from gateway.log import current_log_fields
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import ServerParameters
+from gateway.outputs.contract import ServerFile, ServerParameters
 from gateway.publish.fan_out import FanOut
 from gateway.queries.questions import Question
 from gateway.rtc3d.components import ComponentType
@@ -51,7 +51,7 @@ class Lab:
         self.server: ScriptedServer = servers[HOST]
         self.output = output or ToyOutput()
         self.parameters: list[tuple[str, ServerParameters]] = []
-        self.files: list[tuple[str, dict[str, Any]]] = []
+        self.files: list[tuple[str, ServerFile]] = []
         self.source = Source(
             # An interval of 0 cannot be configured. Here, a refresh always reaches the server.
             SourceSettings(name="lab", host=HOST, **settings).model_copy(update={"fresh_interval_s": 0.0}),
@@ -208,11 +208,12 @@ async def test_a_file_is_stored_and_announced(
         await lab.connected()
         lab.server.connection.send(packet(5, content))
         await settle()
-        [(source, description)] = lab.files
-        assert (source, description["bytes"]) == ("lab", 600)
+        [(source, file)] = lab.files
+        assert (source, file.num_bytes) == ("lab", 600)
         answer = await lab.source.queries.answer(Question("c3d"))
-        assert (answer.payload, answer.attachment) == (content, description)
-    path = tmp_path / description["name"]
+        assert (answer.payload, answer.attachment) == (content, file.description)
+    path = tmp_path / file.description["name"]
+    assert file.path == path
     assert spool.newest("lab") == path
     assert f"lab: the server sent a C3D file of 600 bytes, kept as {path}" in caplog.messages
 
@@ -227,7 +228,7 @@ async def test_the_files_that_a_new_one_displaces_are_logged_with_it(
         for _ in range(2):
             lab.server.connection.send(packet(5, c3d_file(b"", 600)))
             await settle()
-    path = tmp_path / lab.files[1][1]["name"]
+    path = lab.files[1][1].path
     [line] = [message for message in caplog.messages if path.name in message]
     assert line.endswith(f"kept as {path}; deleted the oldest (1)")
 

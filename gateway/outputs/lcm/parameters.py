@@ -12,6 +12,7 @@ import rtc3d
 from gateway.messages.host_time import now_utime
 from gateway.outputs.contract import QueryService, ServerParameters
 from gateway.outputs.lcm.requests import LONG_REPLY_BYTES, ReplyContent, RequestKind
+from gateway.outputs.parameters_message import encode_parameters, xml_text
 from gateway.outputs.send_thread import SendThread
 
 REPEAT_S: Final = 5.0
@@ -87,7 +88,9 @@ class LcmParameters:
         if publication.newest is None:
             return
         parameters, arrived_utime = publication.newest
-        message = parameters.message or _encoded(parameters, arrived_utime, publication.sequence)
+        message = parameters.message or encode_parameters(
+            parameters, utime=now_utime(), arrived_utime=arrived_utime, sequence=publication.sequence
+        )
         publication.sequence += 1
         self._publish(source, message)
 
@@ -99,27 +102,9 @@ def parameter_requests(service: QueryService) -> RequestKind:
         parameters = await service.parameters(source, request.sections, fresh=request.fresh)
 
         def fill(reply: Any) -> None:
-            reply.xml, reply.age_s = _text(parameters.xml), parameters.age_s
+            reply.xml, reply.age_s = xml_text(parameters.xml), parameters.age_s
             reply.parameters_version = parameters.version
 
         return ReplyContent(len(parameters.xml), fill)
 
     return RequestKind("PARAMETERS", rtc3d.parameters_request_t, rtc3d.parameters_reply_t, answer)
-
-
-def _encoded(parameters: ServerParameters, arrived_utime: int, sequence: int) -> bytes:
-    message = rtc3d.parameters_t()
-    message.utime, message.capture_utime, message.sequence = now_utime(), arrived_utime, sequence
-    message.session, message.parameters_version = parameters.session, parameters.version
-    message.xml = _text(parameters.xml)
-    encoded: bytes = message.encode()
-    return encoded
-
-
-def _text(xml: bytes) -> str:
-    """Return XML as text (UTF-8, otherwise Latin-1), without the NULs at its end (field note 9)."""
-    body = xml.rstrip(b"\0")
-    try:
-        return body.decode()
-    except UnicodeDecodeError:
-        return body.decode("latin-1")

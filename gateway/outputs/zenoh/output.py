@@ -8,7 +8,7 @@ import json
 import logging
 import threading
 from collections.abc import Mapping
-from typing import Any, Final
+from typing import Final
 
 import zenoh
 
@@ -16,7 +16,7 @@ from gateway.errors import OutputError
 from gateway.log import FailureLog
 from gateway.losses import Losses
 from gateway.messages.topics import Topic, zenoh_key
-from gateway.outputs.contract import Output, QueryService, ServerParameters
+from gateway.outputs.contract import Output, QueryService, ServerFile, ServerParameters
 from gateway.outputs.status import OutputHealth
 from gateway.outputs.zenoh.config import prepare_threads, zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.publisher import ZenohLink, ZenohPublisher
@@ -221,10 +221,10 @@ class ZenohOutput(Output):
         """Publish the XML on PREFIX/SOURCE/parameters, now and for each later subscriber."""
         return None if self._queries is None else self._queries.publish_parameters(source, parameters)
 
-    def announce_file(self, source: str, description: Mapping[str, Any]) -> None:
+    def announce_file(self, source: str, file: ServerFile) -> None:
         """Publish the description of a C3D file on PREFIX/SOURCE/c3d, the key that returns it."""
         if self._queries is not None:
-            self._queries.announce_file(source, description)
+            self._queries.announce_file(source, file.description)
 
     def serve_queries(self, service: QueryService) -> None:
         """Answer queries below PREFIX/SOURCE/ for every announced source."""

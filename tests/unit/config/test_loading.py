@@ -136,10 +136,10 @@ MISTAKES: list[tuple[str, str]] = [
     (
         "sorces: 1",
         "lab.yaml:4:1: sorces: unknown key (did you mean 'sources'?); "
-        "known keys: sources, spool, metrics, zenoh, lcm",
+        "known keys: sources, spool, metrics, zenoh, lcm, takes",
     ),
-    ("on: 1", "lab.yaml:4:1: on: unknown key; known keys: sources, spool, metrics, zenoh, lcm"),
-    ("a b: 1", "lab.yaml:4:1: 'a b': unknown key; known keys: sources, spool, metrics, zenoh, lcm"),
+    ("on: 1", "lab.yaml:4:1: on: unknown key; known keys: sources, spool, metrics, zenoh, lcm, takes"),
+    ("a b: 1", "lab.yaml:4:1: 'a b': unknown key; known keys: sources, spool, metrics, zenoh, lcm, takes"),
     (
         "    byte_order: bigendian",
         "lab.yaml:4:17: sources[0].byte_order: found 'bigendian'; expected big or little",
@@ -294,7 +294,7 @@ def test_an_empty_file_is_refused(file: Path, content: str) -> None:
 def test_a_file_that_is_no_mapping_is_refused(file: Path, content: str, found: str) -> None:
     assert refused(file, content) == [
         f"lab.yaml:1:1: found {found}; expected a mapping with any of the keys "
-        "sources, spool, metrics, zenoh, lcm"
+        "sources, spool, metrics, zenoh, lcm, takes"
     ]
 
 

@@ -17,6 +17,7 @@ from gateway.config.settings import (
     StreamSettings,
 )
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.configurations import MODEL
 
@@ -28,6 +29,7 @@ SECTIONS: dict[str, type[Section]] = {
     "sources[].reconnect": ReconnectSettings,
     "zenoh": ZenohSettings,
     "lcm": LcmSettings,
+    "takes": TakesSettings,
     "spool": SpoolSettings,
     "metrics": MetricsSettings,
 }

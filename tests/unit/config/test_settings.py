@@ -133,7 +133,10 @@ def test_requests_use_the_next_port_only_for_multicast_urls(url: str, queries_ur
 def test_at_least_one_output_must_be_enabled() -> None:
     off = {"enabled": False}
     assert mistakes(MODEL, {"sources": [source()], "zenoh": off, "lcm": off}) == [
-        ("lcm.enabled", "found false here and in zenoh.enabled; expected true in at least one of them")
+        (
+            "takes.enabled",
+            "found false here and in zenoh.enabled and lcm.enabled; expected true in at least one of them",
+        )
     ]
     assert MODEL.model_validate({"sources": [source()], "zenoh": off}).lcm.enabled
     assert MODEL.model_validate({"sources": [source()], "lcm": off}).zenoh.enabled
@@ -150,7 +153,8 @@ def test_all_mistakes_are_reported_together() -> None:
         "lcm": "found nothing; expected a mapping with any of the keys enabled, prefix, url, queries, "
         "queries_url, max_rate_hz, tool_poses, max_queries_per_s, max_queries_per_source_per_s, "
         "max_reply_bytes_per_s",
-        "zenho": "unknown key (did you mean 'zenoh'?); known keys: sources, spool, metrics, zenoh, lcm",
+        "zenho": "unknown key (did you mean 'zenoh'?); "
+        "known keys: sources, spool, metrics, zenoh, lcm, takes",
     }
 
 

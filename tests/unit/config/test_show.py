@@ -76,9 +76,13 @@ def test_the_output_is_an_equivalent_configuration(file: Path) -> None:
     again.write_text(shown_configuration(configuration), encoding="utf-8")
     directory = configuration.settings.spool.effective_directory
     spool = configuration.settings.spool.model_copy(update={"directory": str(directory)})
+    takes = configuration.settings.takes
+    takes = takes.model_copy(update={"directory": str(takes.effective_directory)})
     before = configuration.settings.lcm
     lcm = before.model_copy(update={"queries_url": before.effective_queries_url})
-    assert load(again, {}) == configuration.settings.model_copy(update={"spool": spool, "lcm": lcm})
+    assert load(again, {}) == configuration.settings.model_copy(
+        update={"spool": spool, "lcm": lcm, "takes": takes}
+    )
 
 
 def test_unusual_keys_and_values_are_quoted(file: Path) -> None:

@@ -4,6 +4,7 @@ from gateway.config.settings import SourceSettings
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.registry import OUTPUTS, build_outputs
+from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.components import ComponentType
@@ -17,6 +18,7 @@ def test_every_output_has_its_section() -> None:
     assert {name: type(section) for name, section in settings.outputs.items()} == {
         "zenoh": ZenohSettings,
         "lcm": LcmSettings,
+        "takes": TakesSettings,
     }
     assert list(OUTPUTS) == list(settings.outputs)
 

@@ -4,6 +4,7 @@ import asyncio
 import json
 import logging
 from collections.abc import AsyncIterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -12,7 +13,7 @@ import zenoh
 from gateway.errors import QueryError
 from gateway.log import current_log_fields
 from gateway.losses import Losses
-from gateway.outputs.contract import Answer, KeyPath, ServerParameters
+from gateway.outputs.contract import Answer, KeyPath, ServerFile, ServerParameters
 from gateway.outputs.zenoh import answers as answers_module
 from gateway.outputs.zenoh import queries as queries_module
 from gateway.outputs.zenoh.output import ZenohOutput
@@ -237,16 +238,16 @@ async def test_parameters_are_published_with_their_encoding_and_a_low_priority(
 async def test_files_are_announced_as_json_on_the_key_that_returns_them(lab: Lab) -> None:
     lab.subscribe("mocap/lab/*")
     await lab.query("mocap/lab/status")
-    description = {"name": "Käfig.c3d", "bytes": 7}
+    file = ServerFile(Path("/spool/Käfig.c3d"), 7)
 
     def announced() -> list[bytes]:
-        lab.output.announce_file("lab", description)
+        lab.output.announce_file("lab", file)
         return lab.payloads("mocap/lab/c3d")
 
     await wait_until_async(announced)
     [sample, *_] = lab.samples
     assert sample.payload.to_bytes() == '{"name":"Käfig.c3d","bytes":7}'.encode()
-    assert json.loads(sample.payload.to_bytes()) == description
+    assert json.loads(sample.payload.to_bytes()) == file.description
     assert str(sample.encoding) == "application/json"
     assert sample.congestion_control == zenoh.CongestionControl.BLOCK
     assert sample.priority == zenoh.Priority.DATA_LOW
@@ -256,7 +257,7 @@ async def test_parameters_published_before_opening_follow_when_the_session_opens
     lab = Lab()
     lab.output.publish_parameters("lab", ServerParameters(b"<old/>", 1, 4))
     lab.output.publish_parameters("lab", ServerParameters(XML, 1, 4))
-    lab.output.announce_file("lab", {"name": "early.c3d"})
+    lab.output.announce_file("lab", ServerFile(Path("early.c3d"), 7))
     await lab.open()
     lab.subscribe("mocap/lab/*")
     await wait_until_async(lambda: lab.payloads("mocap/lab/parameters"))
@@ -282,7 +283,7 @@ async def test_a_source_that_returns_does_not_publish_its_old_parameters(lab: La
 async def test_an_output_without_queries_has_no_results() -> None:
     output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer")))
     output.publish_parameters("lab", ServerParameters(XML, 1, 4))
-    output.announce_file("lab", {"name": "early.c3d"})
+    output.announce_file("lab", ServerFile(Path("early.c3d"), 7))
     output.withdraw("lab")
     assert output.query_results is None
     await output.stop_queries()

@@ -1,0 +1,342 @@
+"""The folder of takes: what is in it, and its limits. Everything here blocks: call it in a thread."""
+
+import contextlib
+import errno
+import fcntl
+import logging
+import os
+import shutil
+import stat
+import time
+from collections.abc import Collection
+from pathlib import Path
+from typing import Final
+
+from gateway.errors import QueryError, TakeError
+from gateway.outputs.takes.disk import disk_problem
+from gateway.outputs.takes.names import check_name, default_name, numbered
+from gateway.outputs.takes.stored import MAX_PIECE_BYTES, StoredTake, TakePiece
+from gateway.takes.event_log import EventLogReader
+from gateway.takes.new_file import NewFiles
+from gateway.takes.reader import SUFFIX, log_paths
+
+ROLLING: Final = ".rolling"
+"""The folder of the rolling segments, in that of the takes."""
+
+C3D_SUFFIX: Final = ".c3d"
+
+_LOCK: Final = ".rtc3d-gateway.lock"
+_TAIL_BYTES: Final = 256 * 1024
+_COPIED_BYTES: Final = 1024 * 1024
+_MAX_REMEMBERED: Final = 10_000
+
+_FRESH_S: Final = 5.0
+"""A take that was written so recently is not deleted: it may have been started a moment ago."""
+
+logger = logging.getLogger(__name__)
+
+FileId = tuple[int, int]
+"""Device and inode: links to the same file count once."""
+
+
+class TakeEntry:
+    """A take in the folder: a log or a folder of logs, and the C3D files of the same name."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        """The path without the extension."""
+        self.logs: list[tuple[Path, os.stat_result]] = []
+        self.c3d_files: list[tuple[Path, os.stat_result]] = []
+
+    @property
+    def source(self) -> str:
+        """The name of the source."""
+        return self.path.parent.name
+
+    @property
+    def end_s(self) -> float:
+        """When it was written last, in s since the Unix epoch."""
+        return max(status.st_mtime for _, status in self.logs)
+
+    @property
+    def num_bytes(self) -> int:
+        """The size of the logs."""
+        return sum(status.st_size for _, status in self.logs)
+
+    @property
+    def sizes(self) -> dict[FileId, int]:
+        """The size of each file."""
+        files = (*self.logs, *self.c3d_files)
+        return {(status.st_dev, status.st_ino): status.st_size for _, status in files}
+
+
+class TakesFolder:
+    """The folder of the takes of all sources: DIRECTORY/SOURCE/NAME.lcmlog, or a folder NAME of saved logs.
+
+    Other files do not belong to the gateway: it leaves them alone. ``is_own`` says that the gateway may
+    create the folder. One that is configured may be on a disk that is not mounted now.
+    """
+
+    def __init__(self, directory: Path, *, is_own: bool) -> None:
+        self.directory = directory
+        self._is_own = is_own
+        self._lock: int | None = None
+        self._times: dict[tuple[Path, int, int], tuple[int, float]] = {}  # of takes, by path, size and time
+
+    # The folder itself.
+
+    def open(self) -> str:
+        """Check whether takes can be written here; return what is wrong, or "". May be called again."""
+        try:
+            check_directory(self.directory, is_own=self._is_own)
+            return self._take_lock()
+        except OSError as error:
+            return disk_problem(self.directory, error)
+
+    def _take_lock(self) -> str:
+        """Lock the folder for this gateway: two would delete each other's segments."""
+        path = self.directory / _LOCK
+        if self._lock is not None:
+            with contextlib.suppress(OSError):
+                if os.path.samestat(os.fstat(self._lock), path.stat()):
+                    return ""
+            self.close()
+        descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            os.close(descriptor)
+            return f"another gateway records in {self.directory}; give each its own takes.directory"
+        except OSError:
+            logger.debug("%s has no locks", self.directory)  # as some network drives
+        self._lock = descriptor
+        return ""
+
+    def close(self) -> None:
+        """Let another gateway use the folder."""
+        lock, self._lock = self._lock, None
+        if lock is not None:
+            os.close(lock)
+
+    def recover(self) -> None:
+        """Keep the segments that a gateway has left behind, which was killed, as a take. Raises OSError."""
+        rolling = self.directory / ROLLING
+        for folder in sorted(rolling.iterdir()) if rolling.is_dir() else ():
+            segments = log_paths_or_none(folder)
+            if segments:
+                take = self._new_folder(folder.name, default_name(folder.name))
+                for number, segment in enumerate(segments, start=1):
+                    segment.replace(take / f"{take.name}-{number:03}{SUFFIX}")
+                logger.warning(
+                    "takes: the last seconds of %s before the gateway was killed are kept as %s",
+                    *(folder.name, take),
+                )
+            with contextlib.suppress(OSError):
+                folder.rmdir()
+
+    def _new_folder(self, source: str, name: str) -> Path:
+        (self.directory / source).mkdir(exist_ok=True)
+        number = 1
+        while True:
+            with contextlib.suppress(FileExistsError):
+                folder = self.directory / source / numbered(name, number)
+                folder.mkdir()
+                return folder
+            number += 1
+
+    # Takes.
+
+    def entries(self, source: str | None = None) -> list[TakeEntry]:
+        """Return all takes, or those of one source. Raises OSError."""
+        entries: list[TakeEntry] = []
+        if source is not None:
+            return _source_entries(self.directory / source)
+        for folder in os.scandir(self.directory):
+            if folder.is_dir(follow_symlinks=False) and not folder.name.startswith("."):
+                entries += _source_entries(Path(folder.path))
+        return entries
+
+    def takes(self, source: str, running: Collection[str]) -> list[StoredTake]:
+        """Return the takes of a source, the newest first; those named in ``running`` are. Raises OSError."""
+        entries = sorted(self.entries(source), key=lambda entry: entry.end_s, reverse=True)
+        return [self._stored(entry, entry.path.name in running) for entry in entries]
+
+    def take_at(self, path: Path) -> StoredTake:
+        """Return the take with this path, without extension. Raises OSError, and QueryError if it is gone."""
+        for entry in _source_entries(path.parent, path.name):
+            return self._stored(entry, is_running=False)
+        raise QueryError(f"there is no take {path} any more; somebody has removed it")
+
+    def _stored(self, entry: TakeEntry, is_running: bool) -> StoredTake:
+        begin_utime, seconds = self._times_of(entry)
+        return StoredTake(entry.path.name, entry.num_bytes, begin_utime, seconds, is_running)
+
+    def _times_of(self, entry: TakeEntry) -> tuple[int, float]:
+        """Return when a take begins, in µs since the Unix epoch, and how many seconds it lasts."""
+        newest_ns = max(status.st_mtime_ns for _, status in entry.logs)
+        identity = (entry.path, entry.num_bytes, newest_ns)
+        if identity not in self._times:
+            if len(self._times) > _MAX_REMEMBERED:
+                self._times.clear()
+            self._times[identity] = _times(entry)
+        return self._times[identity]
+
+    def read(self, source: str, name: str, offset: int) -> TakePiece:
+        """Return a part of a take; its files are read as one. Raises OSError, QueryError."""
+        check_name(name)
+        path = self.directory / source / name
+        log = path.with_name(f"{name}{SUFFIX}")
+        paths = [log] if log.is_file() else log_paths_or_none(path)
+        if not paths:
+            raise QueryError(f"source {source!r} has no take {name!r}; ask for take to see which there are")
+        sizes = [each.stat().st_size for each in paths]
+        pieces, rest = [], MAX_PIECE_BYTES
+        start = offset
+        for each, size in zip(paths, sizes, strict=True):
+            if 0 <= start < size and rest > 0:
+                with each.open("rb") as file:
+                    file.seek(start)
+                    pieces.append(file.read(min(rest, size - start)))
+                rest -= len(pieces[-1])
+                start = 0
+            else:
+                start -= size if start >= size else 0
+        return TakePiece(name, sum(sizes), offset, b"".join(pieces))
+
+    # Limits.
+
+    def delete_old(self, *, max_bytes: int, max_age_s: float | None, protected: Collection[Path]) -> int:
+        """Delete the oldest takes beyond the limits, except the ``protected`` ones (paths without extension).
+
+        If there are none of those, the newest take of each source stays: it may be the one that has just
+        ended because of this limit. Returns how many bytes are still too many. Raises OSError.
+        """
+        entries = sorted(self.entries(), key=lambda entry: entry.end_s)
+        newest = {} if protected else {entry.source: entry.path for entry in entries}
+        users: dict[FileId, int] = {}
+        sizes = self._rolling_sizes()
+        rolling = set(sizes)
+        for entry in entries:
+            sizes |= entry.sizes
+            for file in entry.sizes:
+                users[file] = users.get(file, 0) + 1
+        total = sum(sizes.values())
+        now_s = time.time()
+        for entry in entries:
+            age_s = now_s - entry.end_s
+            if entry.path in protected or age_s < _FRESH_S:
+                continue
+            if max_age_s is not None and age_s > max_age_s:
+                reason = f"it is older than takes.max_age_days ({max_age_s / 86_400:g})"
+            elif total > max_bytes and entry.path not in newest.values():
+                reason = f"the folder has {total} bytes, and takes.max_bytes is {max_bytes}"
+            else:
+                continue
+            _delete(entry)
+            logger.info("takes: deleted %s, the oldest one: %s", entry.path, reason)
+            for file, size in entry.sizes.items():
+                users[file] -= 1
+                if not users[file] and file not in rolling:
+                    total -= size
+        return max(0, total - max_bytes)
+
+    def _rolling_sizes(self) -> dict[FileId, int]:
+        sizes: dict[FileId, int] = {}
+        with contextlib.suppress(FileNotFoundError):
+            for folder in os.scandir(self.directory / ROLLING):
+                for _, status in _files(Path(folder.path)):
+                    sizes[status.st_dev, status.st_ino] = status.st_size
+        return sizes
+
+
+def add_c3d(take: Path, c3d_file: Path) -> Path:
+    """Link or copy a C3D file beside a take, under its name, and return its path. Raises TakeError."""
+    number = 1
+    while (path := take.with_name(f"{numbered(take.name, number)}{C3D_SUFFIX}")).exists():
+        number += 1
+    try:
+        os.link(c3d_file, path)
+    except OSError:  # on another file system
+        with NewFiles() as files:
+            copy = files.create(path)
+            with c3d_file.open("rb") as original:
+                shutil.copyfileobj(original, copy, _COPIED_BYTES)
+    return path
+
+
+def check_directory(directory: Path, *, is_own: bool) -> None:
+    """Check that files can be created in a folder; create it if it ``is_own``. Raises OSError."""
+    if is_own:
+        directory.mkdir(parents=True, exist_ok=True)
+    if not stat.S_ISDIR(directory.stat().st_mode):
+        raise NotADirectoryError(errno.ENOTDIR, "it is not a folder")
+    if not os.access(directory, os.W_OK | os.X_OK):
+        raise PermissionError(errno.EACCES, "no permission to write in it")
+
+
+def log_paths_or_none(folder: Path) -> list[Path]:
+    """Return the logs in a folder, none if it is no folder of logs."""
+    try:
+        return log_paths(folder) if folder.is_dir() else []
+    except TakeError:
+        return []
+
+
+def _source_entries(folder: Path, only: str = "") -> list[TakeEntry]:
+    """Return the takes in the folder of a source, or only the one of this name. Raises OSError."""
+    takes: dict[str, TakeEntry] = {}
+    c3d_files = []
+    try:
+        children = [*os.scandir(folder)]
+    except FileNotFoundError:
+        return []
+    for child in children:
+        path = Path(child.path)
+        if child.name.startswith(only or ".") != bool(only):
+            continue
+        with contextlib.suppress(FileNotFoundError):
+            if child.is_dir(follow_symlinks=False):
+                logs = [each for each in _files(path) if each[0].suffix == SUFFIX]
+                if logs:
+                    takes.setdefault(path.name, TakeEntry(path)).logs += logs
+            elif path.suffix == SUFFIX and child.is_file(follow_symlinks=False):
+                log = (path, child.stat(follow_symlinks=False))
+                takes.setdefault(path.stem, TakeEntry(path.with_suffix(""))).logs.append(log)
+            elif path.suffix == C3D_SUFFIX and child.is_file(follow_symlinks=False):
+                c3d_files.append((path, child.stat(follow_symlinks=False)))
+    for path, status in c3d_files:
+        base, _, number = path.stem.rpartition("-")
+        name = path.stem if path.stem in takes or not number.isdecimal() else base
+        if name in takes:
+            takes[name].c3d_files.append((path, status))
+    return [take for name, take in takes.items() if only in {"", name}]
+
+
+def _files(folder: Path) -> list[tuple[Path, os.stat_result]]:
+    files = []
+    for entry in os.scandir(folder):
+        with contextlib.suppress(FileNotFoundError):
+            if entry.is_file(follow_symlinks=False):
+                files.append((Path(entry.path), entry.stat(follow_symlinks=False)))
+    return sorted(files, key=lambda file: file[0].name)
+
+
+def _times(entry: TakeEntry) -> tuple[int, float]:
+    """Read when a take begins, and how long it is; 0, 0.0 if it has no messages."""
+    logs = sorted(entry.logs, key=lambda log: log[0].name)
+    try:
+        first = next(EventLogReader(logs[0][0]).events())
+        path, status = logs[-1]
+        newest = first
+        for event in EventLogReader(path).events(max(0, status.st_size - _TAIL_BYTES)):
+            newest = event
+    except TakeError:
+        return 0, 0.0
+    return first.utime, max(0.0, (newest.utime - first.utime) / 1e6)
+
+
+def _delete(entry: TakeEntry) -> None:
+    for path, _ in (*entry.logs, *entry.c3d_files):
+        path.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):  # a file, or a folder in which somebody has put other files
+        entry.path.rmdir()

@@ -1,0 +1,91 @@
+"""Writing messages to event logs until the disk accepts them, or until nobody wants to wait any longer."""
+
+import threading
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from gateway.losses import Losses
+from gateway.outputs.takes.disk import RETRY_S, Disk
+from gateway.outputs.takes.header import FileHeader
+from gateway.takes.recording import LogFile, utime_of
+
+Messages = Sequence[tuple[bytes, bytes]]
+"""Messages of the gateway, each with its channel."""
+
+_CHUNK_BYTES: Final = 256 * 1024
+"""How much is written at once: the disk accepts all of it, or nothing."""
+
+
+class LogSink(ABC):
+    """Writes the messages of one source to event logs; what the disk does not accept is written again.
+
+    Meanwhile, the queue before it fills, and then the output refuses further messages. Its methods are called
+    in the thread that writes, except for ``give_up``.
+    """
+
+    def __init__(self, header: FileHeader, disk: Disk, losses: Losses) -> None:
+        self.header = header
+        self.disk = disk
+        self.num_lost = 0
+        """How many messages the disk did not accept."""
+        self._losses = losses
+        self._gives_up = threading.Event()
+
+    @property
+    @abstractmethod
+    def path(self) -> Path:
+        """The file or folder that is written, for messages."""
+
+    @abstractmethod
+    def log_for(self, utime: int) -> LogFile:
+        """Return the log for messages from ``utime`` on, in µs since the Unix epoch. Raises OSError."""
+
+    @abstractmethod
+    def sync(self) -> None:
+        """Store on the disk what was written."""
+
+    def give_up(self) -> None:
+        """Lose what the disk does not accept at once from now on. Any thread may call it."""
+        self._gives_up.set()
+
+    def write(self, messages: Messages) -> None:
+        """Write messages; wait while the disk does not accept them."""
+        for chunk in _chunks(messages):
+            self._write(chunk)
+
+    def _write(self, messages: Messages) -> None:
+        while True:
+            try:
+                log = self.log_for(utime_of(messages[0][1]))
+                log.append(messages)
+            except OSError as error:
+                self.disk.failed(self.path, error)
+                if self._gives_up.wait(RETRY_S):
+                    self.lose(messages)
+                    break
+            else:
+                self.disk.succeeded()
+                break
+        for channel, message in messages:
+            if channel == self.header.parameters_channel:
+                self.header.parameters = message
+
+    def lose(self, messages: Messages) -> None:
+        """Count messages that are not written."""
+        self.num_lost += len(messages)
+        num_frames = max(Counter(channel for channel, _ in messages).values())
+        self._losses.lost("not written", self.disk.problem, messages=len(messages), frames=num_frames)
+
+
+def _chunks(messages: Messages) -> Iterator[Messages]:
+    start = num_bytes = 0
+    for index, (_, message) in enumerate(messages):
+        if num_bytes + len(message) > _CHUNK_BYTES and index > start:
+            yield messages[start:index]
+            start, num_bytes = index, 0
+        num_bytes += len(message)
+    if start < len(messages):
+        yield messages[start:]

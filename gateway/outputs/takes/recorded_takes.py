@@ -1,0 +1,460 @@
+"""The takes of all sources: what peers ask for, and what the output records."""
+
+import asyncio
+import logging
+import math
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from functools import partial
+from pathlib import Path
+from typing import Final, TypeVar
+
+from gateway.errors import OutputError, QueryError, TakeError
+from gateway.messages.host_time import now_utime
+from gateway.outputs.takes.disk import Disk, disk_problem
+from gateway.outputs.takes.folder import ROLLING, TakesFolder, add_c3d
+from gateway.outputs.takes.header import FileHeader, SourceDescription
+from gateway.outputs.takes.names import check_name, default_name
+from gateway.outputs.takes.segments import RollingSegments, Save
+from gateway.outputs.takes.settings import TakesSettings
+from gateway.outputs.takes.source_recording import SourceRecording
+from gateway.outputs.takes.stored import SourceTakes, StoredTake, TakePiece
+from gateway.outputs.takes.take_file import TakeFile
+from gateway.takes.recording import MAX_QUEUED_BYTES, Recorder
+from gateway.worker_thread import WorkerThread
+
+MAX_AFTER_S: Final = 3600.0
+"""How long a take that is saved may go on."""
+
+_TIMEOUT_S: Final = 4.0
+"""How long a peer waits for the disk."""
+
+_SILENT_S: Final = 5.0
+"""How long a check of the folder may take; after that, the disk does not respond."""
+
+_CLOSE_S: Final = 1.0
+"""How long the end of the gateway waits for the disk."""
+
+_DAY_S: Final = 86_400.0
+
+_REST: Final = 50
+"""The folder is not checked for this many times as long as the newest check took."""
+
+_Result = TypeVar("_Result")
+
+logger = logging.getLogger(__name__)
+
+
+class RecordedTakes:
+    """The takes of all sources. Call it in the event loop; no call waits for the disk for long.
+
+    The methods for peers raise QueryError: bad-request for a name or number that cannot be, a take that
+    exists or is running already, or does not exist; nothing-yet if there is nothing to stop or save; disk if
+    the folder cannot be used. The text is for the peer. ``server`` returns HOST:PORT of a source's server.
+    """
+
+    def __init__(self, settings: TakesSettings, max_queued_bytes: int = MAX_QUEUED_BYTES) -> None:
+        self.settings = settings
+        self.server: Callable[[str], str] = lambda _source: ""
+        self.disk = Disk()
+        self._folder = _folder(settings)
+        self._max_queued_bytes = max_queued_bytes
+        self._recorder: Recorder | None = None
+        self._is_closed = False
+        self._recordings: dict[str, SourceRecording] = {}
+        self._folder_thread = WorkerThread("takes-folder")
+        self._read_thread = WorkerThread("takes-read")
+        self._copy_thread = WorkerThread("takes-copy")
+        self._check: Future[tuple[str, int]] | None = None
+        self._next_check_s = 0.0
+        self._folder_problem = self._unchecked_problem()
+
+    def _unchecked_problem(self) -> str:
+        return f"{self._folder.directory} is not checked yet; does its disk respond?"
+
+    # For peers.
+
+    async def start(self, source: str, name: str = "") -> StoredTake:
+        """Start a take and return it; everything that is published after this call is in it.
+
+        "" means a name of source and time. A source has one running take.
+        """
+        recording, recorder = self._announced(source), self._open_recorder()
+        if name:
+            check_name(name)
+        if recording.take is not None:
+            raise QueryError(
+                f"take {recording.take.name!r} of source {source!r} is running already; stop it first"
+            )
+        take = TakeFile(
+            self._folder.directory / source,
+            name or default_name(source),
+            now_utime(),
+            has_free_name=not name,
+            header=self._header(recording),
+            disk=self.disk,
+            losses=recording.losses,
+        )
+        recording.take = take
+        created = recorder.call(take.create)  # first, because what is recorded from now on follows it
+        recording.add(recorder, take, self.settings.components)
+        try:
+            await self._done(created, take.path)
+        except QueryError:
+            take.cancel()
+            recorder.call(take.discard)
+            self._detach(recording, take)
+            raise
+        logger.info("takes: recording %s", take.path)
+        return StoredTake(take.name, 0, take.utime, 0.0, is_running=True)
+
+    async def stop(self, source: str) -> StoredTake:
+        """End the running take, and return it when everything is on the disk."""
+        recording, recorder = self._announced(source), self._started_recorder()
+        take = recording.take
+        if take is None:
+            raise QueryError(f"no take of source {source!r} is running", code="nothing-yet")
+        await self._done(self._end_take(recorder, recording, take), take.path)
+        stored = await self._read(partial(self._folder.take_at, take.stem), take.path)
+        return stored._replace(num_lost=take.num_lost)
+
+    async def save(
+        self, source: str, last_s: float = math.inf, after_s: float = 0.0, name: str = ""
+    ) -> StoredTake:
+        """Keep the last ``last_s`` seconds as a take, which goes on for ``after_s`` seconds.
+
+        Returns it at once; it is running until it is complete.
+        """
+        recording, recorder = self._announced(source), self._open_recorder()
+        if name:
+            check_name(name)
+        if not last_s > 0 or not 0 <= after_s <= MAX_AFTER_S:
+            raise QueryError(
+                f"expected last above 0 and after from 0 to {MAX_AFTER_S:g}, both in s; "
+                f"found {last_s:g} and {after_s:g}"
+            )
+        segments = recording.segments
+        if segments is None:
+            raise QueryError(
+                "the gateway keeps no messages to save, because takes.keep_last_s is 0 in its configuration",
+                code="nothing-yet",
+            )
+        now_s = time.monotonic()
+        folder = self._folder.directory / source / (name or default_name(source))
+        since_s = now_s - last_s
+        call = partial(segments.save, folder, since_s, has_free_name=not name, goes_on=after_s > 0)
+        save = await self._done(recorder.call(call), folder)
+        if after_s > 0:
+            loop = asyncio.get_running_loop()
+            delay_s = max(0.0, now_s + after_s - time.monotonic())
+            recording.saves[save] = loop.call_later(delay_s, self._end_save, recorder, recording, save)
+        else:
+            recording.ended(save.folder)
+        logger.info("takes: saving %s", save.folder)
+        stored = await self._read(partial(self._folder.take_at, save.folder), folder)
+        return stored._replace(is_running=after_s > 0)
+
+    async def list(self, source: str) -> SourceTakes:
+        """Return the takes of a source."""
+        recording = self._announced(source)
+        folder, running = self._folder, recording.running_names
+        takes = await self._read(partial(folder.takes, source, running), folder.directory)
+        current: StoredTake | None = None
+        if recording.take is not None:
+            stored = await self._read(partial(folder.take_at, recording.take.stem), recording.take.path)
+            current = stored._replace(is_running=True, num_lost=recording.take.num_lost)
+            takes = [current if take.name == current.name else take for take in takes]
+        kept_s = 0.0 if recording.segments is None else recording.segments.kept_s()
+        return SourceTakes(current, takes, kept_s)
+
+    async def read(self, source: str, name: str, offset: int) -> TakePiece:
+        """Return up to MAX_PIECE_BYTES of a take; an empty piece at its end."""
+        self._announced(source)
+        check_name(name)
+        if offset < 0:
+            raise QueryError(f"expected an offset of 0 or more; found {offset}")
+        return await self._read(partial(self._folder.read, source, name, offset), self._folder.directory)
+
+    def _announced(self, source: str) -> SourceRecording:
+        recording = self._recordings.get(source)
+        if recording is None or not recording.is_announced:
+            raise QueryError(f"the gateway has no source {source!r}")
+        return recording
+
+    def _started_recorder(self) -> Recorder:
+        if self._recorder is None or self._is_closed:
+            raise QueryError(self.problem, code="disk")
+        return self._recorder
+
+    def _open_recorder(self) -> Recorder:
+        recorder, problem = self._started_recorder(), self.problem
+        if problem:
+            raise QueryError(problem, code="disk")
+        return recorder
+
+    async def _read(self, call: Callable[[], _Result], path: Path) -> _Result:
+        return await self._done(self._read_thread.submit(call), path)
+
+    async def _done(self, future: Future[_Result], path: Path) -> _Result:
+        """Return the result of a call in a thread. Raises QueryError in place of errors of the disk."""
+        try:
+            async with asyncio.timeout(_TIMEOUT_S):
+                return await asyncio.wrap_future(future)
+        except TimeoutError:
+            text = f"the disk of {path} did not respond within {_TIMEOUT_S:g} s; check it"
+            raise QueryError(text, code="disk") from None
+        except OSError as error:
+            raise QueryError(disk_problem(path, error), code="disk") from error
+        except TakeError as error:
+            raise QueryError(str(error), code="disk") from error
+
+    # Sources.
+
+    def recording(self, source: str) -> SourceRecording:
+        """Return the recording of a source, a new one the first time."""
+        return self._recordings.setdefault(source, SourceRecording(source))
+
+    def announce(self, source: str) -> None:
+        """Accept takes of a source."""
+        recording = self.recording(source)
+        recording.is_announced = True
+        self._keep(recording)
+
+    def withdraw(self, source: str) -> None:
+        """End everything that is recorded of a source, and accept no takes of it."""
+        recording = self._recordings.pop(source, None)
+        if recording is not None:
+            self._end(recording)
+
+    def _keep(self, recording: SourceRecording) -> None:
+        """Begin rolling segments of a source if they are switched on."""
+        recorder = self._recorder
+        if recorder is None or self._is_closed or not recording.is_announced or not self.settings.keep_last_s:
+            return
+        segments = RollingSegments(
+            self._folder.directory / ROLLING / recording.source,
+            self.settings.keep_last_s,
+            header=self._header(recording),
+            disk=self.disk,
+            losses=recording.losses,
+        )
+        recording.segments = segments
+        recording.add(recorder, segments, self.settings.components)
+
+    def _header(self, recording: SourceRecording) -> FileHeader:
+        source = recording.source
+        description = SourceDescription(source, self.settings.prefix, self.server(source))
+        return FileHeader(description, recording.parameters)
+
+    def _detach(self, recording: SourceRecording, take: TakeFile) -> None:
+        recording.remove(take)
+        if recording.take is take:
+            recording.take = None
+
+    def _end_take(self, recorder: Recorder, recording: SourceRecording, take: TakeFile) -> Future[None]:
+        self._detach(recording, take)
+        recording.ended(take.stem)
+        take.give_up()
+        return recorder.call(take.end)
+
+    def _end_save(self, recorder: Recorder, recording: SourceRecording, save: Save) -> None:
+        timer = recording.saves.pop(save, None)
+        if timer is not None:
+            timer.cancel()
+        recording.ended(save.folder)
+        if recording.segments is not None:
+            recorder.call(partial(recording.segments.end_save, save))
+
+    def _end_segments(self, recorder: Recorder, recording: SourceRecording) -> None:
+        for save in [*recording.saves]:
+            self._end_save(recorder, recording, save)
+        segments, recording.segments = recording.segments, None
+        if segments is not None:
+            recording.remove(segments)
+            segments.give_up()
+            recorder.call(segments.close)
+
+    def _end(self, recording: SourceRecording) -> None:
+        recorder = self._recorder
+        if recorder is not None:
+            if recording.take is not None:
+                self._end_take(recorder, recording, recording.take)
+            self._end_segments(recorder, recording)
+
+    def add_c3d(self, source: str, c3d_file: Path) -> None:
+        """Link or copy a C3D file beside the take to which it belongs, if there is one."""
+        take = self.recording(source).take_of_c3d()
+        if take is not None:
+            self._copy_thread.submit(partial(_add_c3d, take, c3d_file))
+
+    # The output.
+
+    def open(self) -> None:
+        """Start to write, and to check the folder."""
+        if self._recorder is not None or self._is_closed:
+            return
+        self._recorder = recorder = Recorder("takes", self._max_queued_bytes)
+        folder = self._folder
+        recorder.call(partial(self._recover, folder))
+        self._start_check()
+        for recording in self._recordings.values():
+            self._keep(recording)
+
+    def _recover(self, folder: TakesFolder) -> None:
+        if folder.open():
+            return
+        try:
+            folder.recover()
+        except OSError as error:
+            logger.warning("takes: %s", disk_problem(folder.directory / ROLLING, error))
+
+    @property
+    def problem(self) -> str:
+        """What is wrong and what to do; "" if takes can be recorded."""
+        if self._is_closed:
+            return "the output takes is closed; start the gateway again"
+        if self._recorder is None:
+            return "the output takes is not open; start it first"
+        if self._folder_thread.call_age_s > _SILENT_S:
+            return (
+                f"the disk of {self._folder.directory} does not respond; check it, and whether it is mounted"
+            )
+        return self._folder_problem or self.disk.problem
+
+    def refusal(self) -> OutputError | None:
+        """Return the error for a message that is published while the output is not open."""
+        problem = self.problem
+        return OutputError(problem, cause="not open") if problem else None
+
+    def queue_full(self) -> OutputError:
+        """Return the error for a message that does not fit into the queue."""
+        waiting_mib = self._max_queued_bytes / 2**20
+        slow = (
+            f"the disk of {self._folder.directory} is too slow: {waiting_mib:.0f} MiB wait for it; "
+            "check what else writes to it"
+        )
+        return OutputError(self.problem or slow, cause="disk too slow")
+
+    def maintain(self) -> None:
+        """Check the folder and its limits. Called once a second."""
+        for recording in self._recordings.values():
+            recording.maintain()
+        check = self._check
+        if check is not None and check.done():
+            self._check = None
+            self._folder_problem, excess_bytes = check.result()
+            if excess_bytes:
+                self._end_because_full(excess_bytes)
+        if self._check is None and time.monotonic() >= self._next_check_s:
+            self._start_check()
+
+    def _start_check(self) -> None:
+        if self._recorder is None or self._is_closed:
+            return
+        folder, settings = self._folder, self.settings
+        protected = {path for each in self._recordings.values() for path in each.running_paths}
+        age_s = None if settings.max_age_days is None else settings.max_age_days * _DAY_S
+
+        def check() -> tuple[str, int]:
+            began_s = time.monotonic()
+            problem, excess = folder.open(), 0
+            if not problem:
+                try:
+                    excess = folder.delete_old(
+                        max_bytes=settings.max_bytes, max_age_s=age_s, protected=protected
+                    )
+                except OSError as error:
+                    problem = disk_problem(folder.directory, error)
+            # With thousands of takes, this would keep a disk busy.
+            ended_s = time.monotonic()
+            self._next_check_s = ended_s + _REST * (ended_s - began_s)
+            return problem, excess
+
+        self._check = self._folder_thread.submit(check)
+
+    def _end_because_full(self, excess_bytes: int) -> None:
+        recorder = self._recorder
+        if recorder is None:
+            return
+        limit = f"the folder {self._folder.directory} has {excess_bytes} bytes more than takes.max_bytes"
+        recordings = [each for each in self._recordings.values() if each.running_names]
+        for recording in recordings:
+            names = ", ".join(sorted(recording.running_names))
+            recording.losses.lost(
+                "folder full",
+                f"{names} ends, because {limit}, and no other take can be deleted; raise takes.max_bytes",
+                frames=0,
+            )
+            if recording.take is not None:
+                self._end_take(recorder, recording, recording.take)
+            for save in [*recording.saves]:
+                self._end_save(recorder, recording, save)
+        if not recordings:
+            for recording in self._recordings.values():
+                if recording.segments is not None:
+                    recorder.call(recording.segments.shorten)
+
+    def change(self, settings: TakesSettings) -> None:
+        """Apply settings: limits at once, everything else to the next take and to the rolling segments."""
+        before, self.settings = self.settings, settings
+        if settings.effective_directory != before.effective_directory:
+            old, self._folder = self._folder, _folder(settings)
+            self._check, self._folder_problem = None, self._unchecked_problem()
+            self._read_thread.submit(old.close)
+            self._next_check_s = 0.0
+            self._start_check()
+        recorder = self._recorder
+        if recorder is None:
+            return
+        for recording in self._recordings.values():
+            segments = recording.segments
+            if segments is not None and settings.keep_last_s and _same_files(settings, before):
+                recorder.call(partial(segments.keep, settings.keep_last_s))
+            elif segments is not None or settings.keep_last_s:
+                self._end_segments(recorder, recording)
+                self._keep(recording)
+
+    def cancel_timers(self) -> None:
+        """Forget when takes that are being saved would end, because the gateway stops."""
+        for recording in self._recordings.values():
+            for timer in recording.saves.values():
+                if timer is not None:
+                    timer.cancel()
+
+    def close(self) -> None:
+        """End all takes and wait for the disk, but not for long. Called in a thread."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        recorder = self._recorder
+        if recorder is not None:
+            for recording in self._recordings.values():
+                self._end(recording)
+            if not recorder.close(_CLOSE_S):
+                logger.warning(
+                    "takes: the disk of %s does not respond; %d bytes are not written",
+                    *(self._folder.directory, recorder.queued_bytes),
+                )
+                return
+        self._folder.close()
+
+
+def _add_c3d(take: Path, c3d_file: Path) -> None:
+    try:
+        path = add_c3d(take, c3d_file)
+    except TakeError as error:
+        logger.warning("takes: the C3D file of %s is not kept beside it: %s", take, error)
+    else:
+        logger.info("takes: %s is the C3D file of this take from the server", path)
+
+
+def _folder(settings: TakesSettings) -> TakesFolder:
+    return TakesFolder(settings.effective_directory, is_own=settings.directory is None)
+
+
+def _same_files(settings: TakesSettings, before: TakesSettings) -> bool:
+    """Return whether segments of both settings are the same files."""
+    return (settings.effective_directory, settings.prefix, settings.components) == (
+        *(before.effective_directory, before.prefix, before.components),
+    )

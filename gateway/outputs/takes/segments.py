@@ -1,0 +1,243 @@
+"""The last seconds of a source on the disk, in segments: event logs that are saved by links, or deleted."""
+
+import contextlib
+import logging
+import os
+import shutil
+import time
+from collections import deque
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from gateway.errors import QueryError
+from gateway.losses import Losses
+from gateway.outputs.takes.disk import Disk
+from gateway.outputs.takes.header import FileHeader
+from gateway.outputs.takes.log_sink import LogSink
+from gateway.outputs.takes.names import default_name, numbered
+from gateway.takes.reader import SUFFIX
+from gateway.takes.recording import LogFile
+
+SEGMENT_S: Final = 10.0
+"""How long a segment is, unless that would be more than MAX_SEGMENTS."""
+
+MAX_SEGMENTS: Final = 360
+_MAX_FILES: Final = 999
+"""A saved take has at most so many files, which have numbers of three digits."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class _Segment:
+    """A segment that is complete. The times are on the monotonic clock."""
+
+    path: Path
+    begin_s: float
+    end_s: float
+
+
+class Save:
+    """A take that is being saved: a folder with a link to each segment."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.name: str = folder.name
+        """The name of the take."""
+        self._num_files = 0
+
+    def link(self, segment: Path) -> None:
+        """Add a segment. Raises OSError."""
+        self._num_files += 1
+        os.link(segment, self.folder / f"{self.name}-{self._num_files:03}{SUFFIX}")
+
+    @property
+    def is_full(self) -> bool:
+        """Whether no further segment fits."""
+        return self._num_files >= _MAX_FILES
+
+
+class RollingSegments(LogSink):
+    """Keeps the last ``keep_s`` seconds of a source, rounded up to whole segments, in ``folder``.
+
+    Segments are on the same file system as the takes, so saving them is a matter of hard links. All methods
+    are called in the thread that writes, except for ``kept_s``.
+    """
+
+    def __init__(
+        self, folder: Path, keep_s: float, *, header: FileHeader, disk: Disk, losses: Losses
+    ) -> None:
+        super().__init__(header, disk, losses)
+        self._keep_s = keep_s
+        self._folder = folder
+        self._segments: deque[_Segment] = deque()
+        self._log: LogFile | None = None
+        self._log_began_s = 0.0
+        self._is_in_place = True
+        self._saves: list[Save] = []
+
+    @property
+    def path(self) -> Path:
+        """The folder of the segments."""
+        return self._folder
+
+    def kept_s(self) -> float:
+        """Return how many seconds of the past could be saved now."""
+        with contextlib.suppress(IndexError):  # the thread may take the last one
+            return time.monotonic() - self._segments[0].begin_s
+        return 0.0 if self._log is None else time.monotonic() - self._log_began_s
+
+    def keep(self, keep_s: float) -> None:
+        """Keep another number of seconds from now on."""
+        self._keep_s = keep_s
+        self._delete_expired()
+
+    # Writing.
+
+    def log_for(self, utime: int) -> LogFile:
+        """See LogSink: begins another segment when it is time."""
+        now_s = time.monotonic()
+        if self._log is not None and (
+            now_s - self._log_began_s >= max(SEGMENT_S, self._keep_s / MAX_SEGMENTS)
+            or (not self._is_in_place and not self._log.is_in_place())
+        ):
+            self._end_segment()
+        self._is_in_place = True
+        if self._log is None:
+            self._log = self._new_log(utime)
+            self._log_began_s = now_s
+            for save in [*self._saves]:
+                self._add_to_save(save)
+        return self._log
+
+    def _new_log(self, utime: int) -> LogFile:
+        self._folder.mkdir(parents=True, exist_ok=True)
+        name = default_name(self.header.description.source)
+        number = 1
+        while True:
+            path = self._folder / f"{numbered(name, number)}{SUFFIX}"
+            try:
+                log = LogFile(path)
+            except FileExistsError:
+                number += 1
+                continue
+            try:
+                log.append(self.header.messages(path.stem, utime))
+            except OSError:
+                log.close()
+                path.unlink()
+                raise
+            return log
+
+    def sync(self) -> None:
+        """See LogSink."""
+        if self._log is not None:
+            try:
+                self._log.sync()
+            except OSError as error:
+                self.disk.failed(self.path, error)
+            self._is_in_place = self._log.is_in_place()
+
+    def _end_segment(self) -> None:
+        log, self._log = self._log, None
+        if log is None:
+            return
+        try:
+            log.close()
+        except OSError as error:
+            self.disk.failed(self.path, error)
+        self._segments.append(_Segment(log.path, self._log_began_s, time.monotonic()))
+        self._delete_expired()
+
+    def _delete_expired(self) -> None:
+        oldest_s = time.monotonic() - self._keep_s
+        while self._segments and self._segments[0].end_s < oldest_s:
+            self._delete_oldest()
+
+    def _delete_oldest(self) -> None:
+        segment = self._segments.popleft()
+        try:
+            segment.path.unlink(missing_ok=True)
+        except OSError as error:
+            self.disk.failed(segment.path, error)
+
+    def shorten(self) -> bool:
+        """Delete the older half of the segments, to make room. Return False if there are none."""
+        num_segments = len(self._segments)
+        for _ in range(-(-num_segments // 2)):
+            self._delete_oldest()
+        return bool(num_segments)
+
+    # Saving.
+
+    def save(self, folder: Path, since_s: float, *, has_free_name: bool, goes_on: bool) -> Save:
+        """Keep the segments since a time on the monotonic clock as a take in a new ``folder``.
+
+        If it ``goes_on``, further segments are added until ``end_save``. Otherwise, the present segment ends
+        now, so that the take does, too. Raises OSError, and QueryError if there is such a take already.
+        """
+        if self._log is None and not self._segments:
+            raise QueryError("no messages are kept yet, so there is nothing to save", code="nothing-yet")
+        save = Save(_new_folder(folder, has_free_name=has_free_name))
+        try:
+            for segment in self._segments:
+                if segment.end_s >= since_s:
+                    save.link(segment.path)
+            if self._log is not None:
+                save.link(self._log.path)
+        except OSError:
+            shutil.rmtree(save.folder, ignore_errors=True)
+            raise
+        self._saves.append(save)
+        if not goes_on:
+            self.end_save(save)
+        return save
+
+    def _add_to_save(self, save: Save) -> None:
+        """Add the present segment to a take."""
+        if self._log is None:
+            return
+        if save.is_full:
+            self._saves.remove(save)
+            logger.warning("takes: %s ends, because it has %d files", save.folder, _MAX_FILES)
+            return
+        try:
+            save.link(self._log.path)
+        except OSError as error:
+            self.disk.failed(save.folder, error)
+
+    def end_save(self, save: Save) -> None:
+        """End a take here: the present segment ends."""
+        if save in self._saves:
+            self._saves.remove(save)
+            self._end_segment()
+
+    @property
+    def saves(self) -> list[Save]:
+        """The takes to which segments are added."""
+        return [*self._saves]
+
+    def close(self) -> None:
+        """End all takes, and delete the segments: what was saved stays."""
+        self._saves.clear()
+        self._end_segment()
+        while self._segments:
+            self._delete_oldest()
+        with contextlib.suppress(OSError):
+            self._folder.rmdir()
+
+
+def _new_folder(folder: Path, *, has_free_name: bool) -> Path:
+    """Create a folder for a take, with a number if necessary and allowed. Raises OSError, QueryError."""
+    folder.parent.mkdir(exist_ok=True)
+    candidate, number = folder, 1
+    while True:
+        if not candidate.with_name(f"{candidate.name}{SUFFIX}").exists():
+            with contextlib.suppress(FileExistsError):
+                candidate.mkdir()
+                return candidate
+        if not has_free_name:
+            raise QueryError(f"there is a take {folder.name!r} of this source already; choose another name")
+        number += 1
+        candidate = folder.with_name(numbered(folder.name, number))

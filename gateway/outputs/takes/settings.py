@@ -1,0 +1,70 @@
+"""The section ``takes`` of the configuration."""
+
+from pathlib import Path
+from typing import Annotated, Final
+
+from pydantic import Field
+
+from gateway.config.section import Effective, expects
+from gateway.config.settings import OutputSettings, state_directory
+from gateway.config.values import AbsoluteDirectory, Components, Switch
+from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, ChannelPrefix
+from gateway.rtc3d.components import WIRE_ORDER
+
+MAX_KEEP_S: Final = 3600.0
+
+FolderBytes = Annotated[
+    int,
+    Field(strict=True, ge=1024 * 1024, le=1 << 60),
+    expects("a whole number of bytes from 1048576 (1 MiB)"),
+]
+Days = Annotated[
+    float,
+    Field(strict=True, gt=0, le=36_500, allow_inf_nan=False),
+    expects("a number of days above 0, or null for no limit"),
+]
+KeepSeconds = Annotated[
+    float,
+    Field(strict=True, ge=0, le=MAX_KEEP_S, allow_inf_nan=False),
+    expects(f"0 for off, or a number of seconds up to {MAX_KEEP_S:g}"),
+]
+
+
+class TakesSettings(OutputSettings):
+    """The settings of the output that records takes."""
+
+    enabled: Switch = False
+    """Whether takes can be recorded, started and stopped by peers (see `remote_control` of the sources)."""
+
+    directory: AbsoluteDirectory | None = None
+    """The folder. null means takes in the state directory of the service, or of the user without systemd."""
+
+    prefix: ChannelPrefix = DEFAULT_LCM_PREFIX
+    """The beginning of all channels in the files, as on LCM."""
+
+    components: Components = WIRE_ORDER
+    """The components to record: [all], or a list. Status, clock and parameters are always recorded."""
+
+    tool_poses: Switch = False
+    """Whether to record the pose of each tool on its own channel, too."""
+
+    max_bytes: FolderBytes = 100 * 1024 * 1024 * 1024
+    """The maximum size of the folder, over all sources. The oldest takes are deleted first."""
+
+    max_age_days: Days | None = None
+    """Older takes are deleted. null means no limit."""
+
+    keep_last_s: KeepSeconds = 0.0
+    """How many of the last seconds to keep always, so that they can be saved as a take. 0 means off."""
+
+    @property
+    def effective(self) -> dict[str, Effective]:
+        """See Section."""
+        if self.directory is not None:
+            return {}
+        return {"directory": Effective(str(self.effective_directory), ("STATE_DIRECTORY", "XDG_STATE_HOME"))}
+
+    @property
+    def effective_directory(self) -> Path:
+        """``directory``, or the default folder if it is None."""
+        return state_directory() / "takes" if self.directory is None else Path(self.directory)

@@ -1,0 +1,88 @@
+"""An output that records takes, with a source whose messages the test publishes."""
+
+import asyncio
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import rtc3d
+
+from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name
+from gateway.messages.host_time import now_utime
+from gateway.messages.topics import Topic
+from gateway.outputs.takes.output import TakesOutput
+from gateway.outputs.takes.settings import TakesSettings
+from gateway.rtc3d.components import COMPONENTS_BY_KEY
+from gateway.takes.event_log import Event
+from gateway.takes.reader import TakeReader
+from gateway.takes.recording import MAX_QUEUED_BYTES
+from tests.waiting import wait_until_async
+
+
+class RecordingLab:
+    """The source "lab" on an output whose folder is ``directory``."""
+
+    def __init__(self, directory: Path, max_queued_bytes: int = MAX_QUEUED_BYTES, **settings: Any) -> None:
+        self.directory = directory
+        self.output = TakesOutput(settings_in(directory, **settings), max_queued_bytes)
+        self.takes = self.output.takes
+        self.publishers = {
+            component.key: self.output.publisher(Topic("lab", (component.key,), lcm_type_name(kind)))
+            for component, kind in MESSAGE_TYPES.items()
+        }
+        self.output.announce("lab")
+        self._sequence = 0
+
+    def publish(self, key: str = "3d", size: int = 0) -> bytes:
+        """Publish the next message of a component, with ``size`` markers or events; return it."""
+        message: Any = MESSAGE_TYPES[COMPONENTS_BY_KEY[key]]()
+        message.utime = message.capture_utime = now_utime()
+        message.sequence = self._sequence
+        self._sequence += 1
+        if key == "3d":
+            message.num_markers = size
+            message.markers = [rtc3d.marker_t() for _ in range(size)]
+        encoded: bytes = message.encode()
+        self.publishers[key].publish(encoded)
+        return encoded
+
+    def path(self, name: str) -> Path:
+        return self.directory / "lab" / name
+
+
+def settings_in(directory: Path, **settings: Any) -> TakesSettings:
+    return TakesSettings(enabled=True, directory=str(directory), **settings)
+
+
+def events(path: Path) -> list[Event]:
+    """Return the events of a take; there must be no damage."""
+    reader = TakeReader(path)
+    found = [*reader.events()]
+    assert not any(log.num_damaged for log in reader.logs)
+    return found
+
+
+def frames(path: Path) -> list[bytes]:
+    """Return the messages of frames in a take, in order."""
+    return [event.message for event in events(path) if not event.channel.endswith(("_TAKE", "_PARAMETERS"))]
+
+
+@asynccontextmanager
+async def recording_lab(directory: Path, **settings: Any) -> AsyncIterator[RecordingLab]:
+    """Run an output whose folder is ``directory``, and call ``maintain`` as the gateway does."""
+    lab = RecordingLab(directory, **settings)
+    lab.output.start()
+
+    async def maintain() -> None:
+        while True:
+            lab.output.maintain()
+            await asyncio.sleep(0.02)
+
+    task = asyncio.create_task(maintain())
+    try:
+        await wait_until_async(lambda: lab.output.health().connected)
+        yield lab
+    finally:
+        task.cancel()
+        await asyncio.to_thread(lab.output.close)
