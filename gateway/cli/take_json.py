@@ -26,6 +26,7 @@ def statistics_json(statistics: TakeStatistics) -> dict[str, Any]:
                 {"file": str(damage.file), "offset": damage.offset, "bytes": damage.num_bytes}
                 for damage in statistics.damage
             ],
+            "empty_files": [str(file) for file in statistics.empty_files],
         },
         "unknown": statistics.unknown,
     }

@@ -12,6 +12,7 @@ from rich.text import Text
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.safe_text import safe_text
 from gateway.takes.component_statistics import ComponentStatistics, MessageStatistics
+from gateway.takes.reader import is_gateways_channel
 from gateway.takes.source_statistics import SourceStatistics
 from gateway.takes.statistics import TakeStatistics
 
@@ -156,10 +157,13 @@ def _problems(statistics: TakeStatistics) -> Iterator[str]:
         yield f"Damage: {statistics.damaged_bytes} bytes at {places} could not be read"
         for damage in statistics.damage[:_MAX_SHOWN]:
             yield safe_text(f"  {damage.file.name}: {damage.num_bytes} bytes from {damage.offset} on")
+        for text in statistics.empty_files.values():
+            yield f"  {text}"
     if statistics.unknown:
         yield f"{_count(sum(statistics.unknown.values()), 'message')} of other programs or other versions:"
         for channel, number in sorted(statistics.unknown.items(), key=lambda item: -item[1])[:_MAX_SHOWN]:
-            yield safe_text(f"  {channel}: {number}")
+            version = " (another version of the gateway?)" if is_gateways_channel(channel) else ""
+            yield safe_text(f"  {channel}: {number}{version}")
 
 
 def _source_problems(source: SourceStatistics) -> Iterator[str]:

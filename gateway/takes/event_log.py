@@ -4,6 +4,7 @@ An event is a header (big-endian: sync word, number, time, sizes), the channel, 
 reads the same format, but ends at the first damaged byte.
 """
 
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,10 +12,12 @@ from typing import BinaryIO, Final, NamedTuple
 
 from gateway.config.files import check_is_file
 from gateway.errors import TakeError
+from gateway.safe_text import safe_text
 
 SYNC: Final = bytes.fromhex("eda1da01")
 _HEADER: Final = struct.Struct(">4sqqii")
 """Sync word, event number, time in µs since the Unix epoch, size of the channel, size of the message."""
+_HEADER_BYTES: Final = _HEADER.size
 
 MAX_CHANNEL_BYTES: Final = 255
 MAX_MESSAGE_BYTES: Final = 256 * 1024 * 1024
@@ -23,7 +26,10 @@ MAX_MESSAGE_BYTES: Final = 256 * 1024 * 1024
 MAX_LISTED_DAMAGE: Final = 100
 """How many places of damage are listed; all are counted."""
 
-_READ_BYTES: Final = 4 * 1024 * 1024
+_MAX_NAMES: Final = 1000
+"""So many names of channels are decoded once only."""
+
+_READ_BYTES: Final = 1024 * 1024
 _MAX_FOREIGN_BYTES: Final = 64 * 1024 * 1024
 """A file without an event in its first 64 MiB is no event log."""
 
@@ -70,35 +76,39 @@ class EventLogReader:
         """Yield the events from a place in the file on. Raises TakeError if it is no event log."""
         self.damage, self.num_damaged, self.damaged_bytes = [], 0, 0
         try:
-            check_is_file(self.path)
-            with self.path.open("rb") as file:
+            with open_file(self.path) as file:
                 file.seek(start_offset)
                 yield from self._events(_Window(file, start_offset))
-        except OSError as error:
-            raise TakeError(f"{self.path} cannot be read: {error.strerror or error}") from error
+        except (OSError, ValueError) as error:  # ValueError: of a path with NUL
+            reason = getattr(error, "strerror", None) or error
+            raise TakeError(f"{safe_text(str(self.path))} cannot be read: {reason}") from error
 
     def _events(self, window: "_Window") -> Iterator[Event]:
-        num_events = 0
+        has_events = False
         damage_start: int | None = None
         while window.has(1):
+            if damage_start is None:
+                for intact in window.intact_events():
+                    has_events = True
+                    yield intact
             event = _event(window)
             if event is None:
                 if damage_start is None:
                     damage_start = window.offset
                 window.skip_to_sync()
-                if not num_events and window.offset - damage_start > _MAX_FOREIGN_BYTES:
+                if not has_events and window.offset - damage_start > _MAX_FOREIGN_BYTES:
                     break
                 continue
             if damage_start is not None:
                 self._add_damage(damage_start, event.offset)
                 damage_start = None
-            num_events += 1
+            has_events = True
             yield event
         if damage_start is not None:
             self._add_damage(damage_start, window.offset)
-        if not num_events:
+        if not has_events:
             what = f"has {window.offset} bytes without an LCM event" if window.offset else "is empty"
-            raise TakeError(f"{self.path} {what}; choose a recording (.lcmlog)")
+            raise TakeError(f"{safe_text(str(self.path))} {what}; choose a recording (.lcmlog)")
 
     def _add_damage(self, start: int, stop: int) -> None:
         if len(self.damage) < MAX_LISTED_DAMAGE:
@@ -107,23 +117,73 @@ class EventLogReader:
         self.damaged_bytes += stop - start
 
 
+def open_file(path: Path) -> BinaryIO:
+    """Open a regular file to read it. Raises OSError, also if it is something else, and ValueError."""
+    check_is_file(path)
+    # With O_NONBLOCK, this does not wait for a writer if a pipe has replaced the file since the check.
+    return os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb", buffering=0)
+
+
 class _Window:
     """A part of a file in memory, which moves forward. ``offset`` is the present place in the file."""
 
     def __init__(self, file: BinaryIO, offset: int) -> None:
         self._file = file
+        self._names: dict[bytes, str] = {}
         self._data = b""
         self._start = 0  # of the present place in _data
         self.offset = offset
 
     def has(self, num_bytes: int) -> bool:
         """Whether the file has this many more bytes; they are in memory then."""
-        missing = self._start + num_bytes - len(self._data)
-        if missing > 0:
+        while (missing := self._start + num_bytes - len(self._data)) > 0:
             more = self._file.read(max(missing, _READ_BYTES))
+            if not more:
+                break
             self._data = self._data[self._start :] + more
             self._start = 0
         return len(self._data) - self._start >= num_bytes
+
+    def intact_events(self) -> Iterator[Event]:
+        """Yield the next events, as far as each is in memory and another one follows directly.
+
+        This is the fast way through a log without damage; ``_event`` has all the rules.
+        """
+        data, start = self._data, self._start
+        to_offset = self.offset - start
+        last_header = len(data) - _HEADER.size
+        unpack, new_event, names = _HEADER.unpack_from, tuple.__new__, self._names
+        if start > last_header:
+            return
+        sync, number, utime, channel_bytes, message_bytes = unpack(data, start)
+        while (
+            sync == SYNC
+            and 0 < channel_bytes <= MAX_CHANNEL_BYTES
+            and 0 <= message_bytes <= MAX_MESSAGE_BYTES
+        ):
+            message_start = start + _HEADER_BYTES + channel_bytes
+            stop = message_start + message_bytes
+            if stop > last_header:
+                break
+            channel = data[start + _HEADER_BYTES : message_start]
+            sync, next_number, next_utime, next_channel_bytes, next_message_bytes = unpack(data, stop)
+            name = names.get(channel)
+            if sync != SYNC or (name is None and (name := self._name(channel)) is None):
+                break
+            yield new_event(Event, (number, utime, name, data[message_start:stop], to_offset + start))
+            start = stop
+            number, utime = next_number, next_utime
+            channel_bytes, message_bytes = next_channel_bytes, next_message_bytes
+        self.move(start - self._start)
+
+    def _name(self, channel: bytes) -> str | None:
+        try:
+            name = channel.decode()
+        except UnicodeDecodeError:
+            return None
+        if len(self._names) < _MAX_NAMES:
+            self._names[channel] = name
+        return name
 
     def header(self, ahead: int = 0) -> tuple[bytes, int, int, int, int] | None:
         """Return the fields of a plausible header ``ahead`` bytes from here; None if there is none."""

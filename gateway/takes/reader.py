@@ -1,23 +1,39 @@
 """Reading a take: which source and which kind of message each event of its files belongs to."""
 
 import itertools
+import stat
 from collections import Counter
 from collections.abc import Iterator
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import rtc3d
 
 from gateway.errors import ProtocolError, TakeError
-from gateway.messages.decode import decode, message_type
+from gateway.messages.decode import message_type
 from gateway.messages.encode import MESSAGE_TYPES
+from gateway.safe_text import safe_text
 from gateway.takes.event_log import Event, EventLogReader
+from gateway.takes.source_names import NAMED_WITHIN_EVENTS, SourceNames
 
 SUFFIX: Final = ".lcmlog"
 """The extension of an event log."""
 
-_NAMED_WITHIN_EVENTS: Final = 20_000
-"""Within so many events, each source has been named: by its description, or by its status once a second."""
+_BATCH_BYTES: Final = 4 * 1024 * 1024
+_BATCH_MESSAGES: Final = 20_000
+"""A batch ends with so many bytes, or so many messages."""
+
+_EVENT_BYTES: Final = 40
+"""About so many bytes of a file belong to an event beside its message."""
+
+_VERSION_OFFSET: Final = 36
+"""Where a ``parameters_t`` has the version, followed by the XML."""
+
+_MAX_ROUTES: Final = 10_000
+
+_MAX_SHOWN: Final = 5
+"""How many channels an error lists."""
 
 _KEYS: Final[dict[type[Any], str]] = {
     **{message_type: component.key for component, message_type in MESSAGE_TYPES.items()},
@@ -26,7 +42,6 @@ _KEYS: Final[dict[type[Any], str]] = {
     rtc3d.parameters_t: "parameters",
     rtc3d.take_t: "take",
 }
-_POSE: Final = "_6D_"
 
 
 class TakeMessage(NamedTuple):
@@ -42,6 +57,16 @@ class TakeMessage(NamedTuple):
     message: bytes
 
 
+@dataclass(slots=True)
+class MessageBatch:
+    """Messages of one source and key in their order, with the times of their events in µs since 1970."""
+
+    source: str
+    key: str
+    utimes: list[int] = field(default_factory=list)
+    messages: list[bytes] = field(default_factory=list)
+
+
 class TakeReader:
     """Reads a take: an event log, or a folder of them (a saved take) as one.
 
@@ -54,74 +79,166 @@ class TakeReader:
         """The files. After a complete pass, they know their damage."""
         self.unknown: Counter[str] = Counter()
         """How many messages have a type that this version does not know, by channel, in the newest pass."""
-        self._sources = self._named_sources()
+        self.empty_files: dict[Path, str] = {}
+        """Files of a folder without any event, and why, in the newest pass."""
+        self.read_bytes = 0
+        """How far the newest pass of ``batches`` has come."""
+        self._names = SourceNames(itertools.islice(self.events(), NAMED_WITHIN_EVENTS))
         self._routes: dict[tuple[str, bytes], tuple[str, str] | None] = {}  # by channel and fingerprint
         self.start_utime: int = next(self.events()).utime
         """The time of the first event."""
 
-    def events(self) -> Iterator[Event]:
-        """Yield all events of all files. Raises TakeError."""
-        return itertools.chain.from_iterable(log.events() for log in self.logs)
-
-    def messages(self) -> Iterator[TakeMessage]:
-        """Yield the messages of a gateway, in their order. Raises TakeError."""
-        self.unknown.clear()
-        routes = self._routes
-        for event in self.events():
-            identity = (event.channel, event.message[:8])
-            if identity not in routes:
-                routes[identity] = self._route(event)
-            route = routes[identity]
-            if route is None:
-                self.unknown[event.channel] += 1
-            else:
-                yield TakeMessage(event.utime, *route, event.message)
+    @property
+    def num_bytes(self) -> int:
+        """The size of all files; 0 for a file that is gone."""
+        return sum(_size(log.path) for log in self.logs)
 
     @property
     def source_names(self) -> list[str]:
         """The names of the sources in what was read so far."""
         return list(dict.fromkeys(route[0] for route in self._routes.values() if route is not None))
 
-    def _named_sources(self) -> dict[str, str]:
-        """Return the names of the sources by the beginning of their channels."""
-        names: dict[str, str] = {}
-        for event in itertools.islice(self.events(), _NAMED_WITHIN_EVENTS):
-            kind = _type_of(event.message)
-            if kind is rtc3d.take_t or kind is rtc3d.status_t:
-                try:
-                    message = decode(event.message)
-                except ProtocolError:
-                    continue
-                channels = event.channel.rpartition("_")[0]
-                names.setdefault(channels, message.source)
-        return names
+    def events(self) -> Iterator[Event]:
+        """Yield all events of all files. Raises TakeError."""
+        self.empty_files = {}
+        for log in self.logs:
+            try:
+                yield from log.events()
+            except TakeError as error:
+                # After a loss of power, one file of a folder may be empty.
+                self.empty_files[log.path] = str(error)
+                if len(self.empty_files) == len(self.logs):
+                    raise
 
-    def _route(self, event: Event) -> tuple[str, str] | None:
-        """Return the source and the key of an event's channel; None if its type is unknown."""
-        kind = _type_of(event.message)
+    def messages(self) -> Iterator[TakeMessage]:
+        """Yield the messages of a gateway, in their order. Raises TakeError, also if there are none."""
+        self.unknown.clear()
+        routes, new_message = self._routes, tuple.__new__
+        for event in self.events():
+            _, utime, channel, message, _ = event
+            identity = (channel, message[:8])
+            if identity not in routes:
+                self._add_route(identity)
+            route = routes[identity]
+            if route is None:
+                self.unknown[channel] += 1
+            else:
+                yield new_message(TakeMessage, (utime, *route, message))
+        self._check_is_take()
+
+    def batches(self) -> Iterator[list[MessageBatch]]:
+        """Yield the messages of a gateway in batches of some MB, each with one entry per source and key.
+
+        This is the fast way to read everything. A batch ends before parameters that differ from those
+        before. Raises TakeError, also if there are no such messages.
+        """
+        self.unknown.clear()
+        self.read_bytes = 0
+        batches: dict[tuple[str, bytes], MessageBatch | None] = {}
+        newest: dict[str, bytes] = {}
+        num_bytes = num_messages = 0
+        for _, utime, channel, message, _ in self.events():
+            identity = (channel, message[:8])
+            if identity in batches:
+                batch = batches[identity]
+            else:
+                batch = batches[identity] = self._new_batch(identity)
+            num_messages += 1
+            num_bytes += len(message)
+            if batch is None:
+                self.unknown[channel] += 1
+                continue
+            is_news = batch.key == "parameters" and newest.get(batch.source) != message[_VERSION_OFFSET:]
+            if is_news or num_bytes >= _BATCH_BYTES or num_messages >= _BATCH_MESSAGES:
+                if is_news:
+                    newest[batch.source] = message[_VERSION_OFFSET:]
+                self.read_bytes += num_bytes + num_messages * _EVENT_BYTES
+                yield [filled for filled in batches.values() if filled is not None and filled.messages]
+                num_bytes = num_messages = 0
+                batch = MessageBatch(batch.source, batch.key)
+                batches = {identity: batch}
+            batch.utimes.append(utime)
+            batch.messages.append(message)
+        yield [filled for filled in batches.values() if filled is not None and filled.messages]
+        self._check_is_take()
+
+    def _check_is_take(self) -> None:
+        """Raise TakeError if no message of a gateway was found."""
+        if self._names.has_sources:
+            return
+        channels = [safe_text(channel) for channel in sorted(self.unknown)]
+        shown = ", ".join(channels[:_MAX_SHOWN]) + (", …" if len(channels) > _MAX_SHOWN else "")
+        version = (
+            "; they may be of another version of the gateway"
+            if any(map(is_gateways_channel, self.unknown))
+            else ""
+        )
+        raise TakeError(
+            f"{safe_text(str(self.path))} has no message of this gateway, but "
+            f"{sum(self.unknown.values())} messages of other types, on channel {shown}{version}"
+        )
+
+    def _new_batch(self, identity: tuple[str, bytes]) -> MessageBatch | None:
+        if identity not in self._routes:
+            self._add_route(identity)
+        route = self._routes[identity]
+        return None if route is None else MessageBatch(*route)
+
+    def _add_route(self, identity: tuple[str, bytes]) -> None:
+        """Find the source and the key of a channel; None if the type of its messages is unknown."""
+        channel, fingerprint = identity
+        if len(self._routes) >= _MAX_ROUTES:
+            self._routes.clear()  # a log of damage, or of a program with millions of channels
+        kind = _type_of(fingerprint)
         if kind is rtc3d.tool_pose_t:
-            channels, separator, label = event.channel.rpartition(_POSE)
-            return (self._source(channels), f"6d/{label}") if separator else None
-        if kind is None or kind not in _KEYS:
-            return None
-        return self._source(event.channel.rpartition("_")[0]), _KEYS[kind]
-
-    def _source(self, channels: str) -> str:
-        """Return the name of the source with these channels; without a description, it is made from them."""
-        return self._sources.get(channels) or channels.partition("_")[2].lower() or channels.lower() or "take"
+            self._routes[identity] = self._names.source_and_tool(channel)
+        elif kind in _KEYS:
+            self._routes[identity] = self._names.source(channel.rpartition("_")[0]), _KEYS[kind]
+        else:
+            self._routes[identity] = None
 
 
 def log_paths(path: Path) -> list[Path]:
-    """Return the event logs of a take: the file itself, or those in a folder, by name. Raises TakeError."""
-    if not path.is_dir():
-        return [path]
+    """Return the event logs of a take: the file itself, or those in a folder, by name. Raises TakeError.
+
+    If a folder has no .lcmlog files, it may have those of lcm-logger: NAME.0, NAME.1, … or NAME.00, …, which
+    are sorted by their first events, because lcm-logger may number them backwards.
+    """
     try:
-        logs = sorted(entry for entry in path.iterdir() if entry.suffix == SUFFIX)
-    except OSError as error:
-        raise TakeError(f"{path} cannot be read: {error.strerror}") from error
+        if not stat.S_ISDIR(path.stat().st_mode):
+            return [path]
+        entries = sorted(path.iterdir())
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise TakeError(f"{safe_text(str(path))} cannot be read: {reason}") from error
+    logs = [entry for entry in entries if entry.suffix == SUFFIX]
     if not logs:
-        raise TakeError(f"{path} has no recordings ({SUFFIX}); choose a recording or the folder of one")
+        numbered = [entry for entry in entries if entry.suffix[1:].isdecimal()]
+        logs = sorted(numbered, key=_first_utime)
+    if not logs:
+        raise TakeError(
+            f"{safe_text(str(path))} has no recordings ({SUFFIX}); choose a recording or the folder of one"
+        )
     return logs
+
+
+def _first_utime(log: Path) -> int:
+    try:
+        return next(EventLogReader(log).events()).utime
+    except TakeError:
+        return 0
+
+
+def _size(file: Path) -> int:
+    try:
+        return file.stat().st_size
+    except OSError:
+        return 0
+
+
+def is_gateways_channel(channel: str) -> bool:
+    """Return whether a channel is named as one of a gateway."""
+    return channel.rpartition("_")[2].lower() in _KEYS.values()
 
 
 def _type_of(message: bytes) -> type[Any] | None:

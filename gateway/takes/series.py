@@ -11,6 +11,7 @@ from gateway.errors import TakeError
 from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.component_rows import HEAD, NATIVE_ITEM_DTYPES, Array, Rows
+from gateway.takes.growing_array import GrowingArray
 from gateway.takes.labels import Description, common, describe, event_labels
 from gateway.takes.restarts import find_restarts
 
@@ -278,31 +279,28 @@ class SeriesBuilder:
 
     def __init__(self, component: ComponentType) -> None:
         self._component = component
-        self._heads: list[Array] = []
-        self._items: dict[int, list[Array]] = {}
+        self._columns = {name: GrowingArray(HEAD[name].newbyteorder("=")) for name in _COLUMNS}
+        self._items: dict[int, GrowingArray] = {}
 
     def add(self, rows: Rows) -> None:
         """Append the content of messages."""
         heads, items = rows.heads, rows.items
         if self._component is ComponentType.EVENT:
             heads, items = _one_row_per_event(rows)
-        self._heads.append(heads)
+        for name, column in self._columns.items():
+            column.extend(heads[name])
         for num_items, values in items.items():
-            self._items.setdefault(num_items, []).append(values)
+            if num_items not in self._items:
+                dtype = NATIVE_ITEM_DTYPES[self._component]
+                self._items[num_items] = GrowingArray(dtype, (num_items,))
+            self._items[num_items].extend(values)
 
     def build(self, parameters: Sequence[ParametersEntry], start_utime: int) -> Series | None:
         """Return what was collected, and forget it; None if it is nothing."""
-        num_rows = sum(map(len, self._heads))
-        if not num_rows:
+        columns = {name: column.take() for name, column in self._columns.items()}
+        recorded = {num_items: items.take() for num_items, items in self._items.items()}
+        if not len(columns["utime"]):
             return None
-        columns = {name: np.empty(num_rows, HEAD[name].newbyteorder("=")) for name in _COLUMNS}
-        start = 0
-        for heads in self._heads:
-            for name, column in columns.items():
-                column[start : start + len(heads)] = heads[name]
-            start += len(heads)
-        self._heads.clear()
-        recorded = {num_items: _joined(chunks) for num_items, chunks in self._items.items()}
         return Series(self._component, columns, recorded, parameters, start_utime)
 
 
@@ -317,20 +315,6 @@ def _one_row_per_event(rows: Rows) -> tuple[Array, dict[int, Array]]:
         places = starts[counts == num_items][:, None] + np.arange(num_items)
         items[places.ravel(), 0] = values.ravel()
     return heads, {1: items}
-
-
-def _joined(chunks: list[Array]) -> Array:
-    """Return the chunks as one array; each chunk is released when it was copied."""
-    if len(chunks) == 1:
-        return chunks.pop()
-    joined = np.empty((sum(map(len, chunks)), *chunks[0].shape[1:]), chunks[0].dtype)
-    chunks.reverse()
-    start = 0
-    while chunks:
-        chunk = chunks.pop()
-        joined[start : start + len(chunk)] = chunk
-        start += len(chunk)
-    return joined
 
 
 def _entries_of_rows(utime: Array, version: Array, parameters: Sequence[ParametersEntry]) -> Array:

@@ -7,6 +7,7 @@ import numpy as np
 from gateway.errors import ParametersError, ProtocolError
 from gateway.messages.decode import decode
 from gateway.messages.encode import FINGERPRINT_BYTES
+from gateway.messages.parameters_text import xml_bytes
 from gateway.messages.stamp import PREFIX
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters, sections_of
@@ -153,7 +154,7 @@ class SourceStatistics:
         self._drops = newest
 
     def _set_parameters(self, message: Any) -> None:
-        version, xml = message.parameters_version, message.xml.encode(errors="surrogatepass")
+        version, xml = message.parameters_version, xml_bytes(message.xml)
         is_first = self._newest is None
         before = Parameters()
         if self._newest is not None:

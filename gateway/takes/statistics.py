@@ -9,13 +9,7 @@ from gateway.takes.event_log import MAX_LISTED_DAMAGE
 from gateway.takes.reader import TakeReader
 from gateway.takes.source_statistics import SourceStatistics
 
-_BATCH_BYTES: Final = 8 * 1024 * 1024
-"""So many bytes of messages are analysed at once."""
-
-_MAX_BATCH_MESSAGES: Final = 50_000
 _MAX_SOURCES: Final = 100
-_XML_OFFSET: Final = 36
-"""Where a ``parameters_t`` has the version and the XML."""
 
 
 class FileDamage(NamedTuple):
@@ -46,6 +40,8 @@ class TakeStatistics:
     damaged_bytes: int = 0
     damage: list[FileDamage] = field(default_factory=list)
     """The first places of damage, at most MAX_LISTED_DAMAGE."""
+    empty_files: dict[Path, str] = field(default_factory=dict)
+    """Files of a folder without any event, and why."""
 
     @property
     def seconds(self) -> float:
@@ -74,35 +70,16 @@ def take_statistics(path: Path, progress: Callable[[int, int], object] | None = 
     """
     reader = TakeReader(path)
     files = [log.path for log in reader.logs]
-    num_bytes = sum(file.stat().st_size for file in files)
-    statistics = TakeStatistics(path, files, num_bytes, reader.start_utime, reader.start_utime)
-    batch: dict[tuple[str, str], list[bytes]] = {}
-    parameters: dict[str, bytes] = {}
-    batch_bytes = read_bytes = batch_messages = 0
-
-    def flush() -> None:
-        for (name, key), messages in batch.items():
+    statistics = TakeStatistics(path, files, reader.num_bytes, reader.start_utime, reader.start_utime)
+    for batches in reader.batches():
+        for batch in batches:
+            statistics.num_messages += len(batch.messages)
+            statistics.end_utime = max(statistics.end_utime, *batch.utimes)
+            name = batch.source
             if name in statistics.sources or len(statistics.sources) < _MAX_SOURCES:
-                statistics.sources.setdefault(name, SourceStatistics(name)).add(key, messages)
-        batch.clear()
-
-    for message in reader.messages():
-        if message.key == "parameters" and parameters.get(message.source) != message.message[_XML_OFFSET:]:
-            parameters[message.source] = message.message[_XML_OFFSET:]
-            flush()  # what came before may have other labels under the same version
-        batch.setdefault((message.source, message.key), []).append(message.message)
-        batch_bytes += len(message.message)
-        batch_messages += 1
-        statistics.end_utime = max(statistics.end_utime, message.utime)
-        if batch_bytes >= _BATCH_BYTES or batch_messages >= _MAX_BATCH_MESSAGES:
-            flush()
-            statistics.num_messages += batch_messages
-            read_bytes += batch_bytes
-            batch_bytes = batch_messages = 0
-            if progress is not None:
-                progress(read_bytes, num_bytes)
-    flush()
-    statistics.num_messages += batch_messages
+                statistics.sources.setdefault(name, SourceStatistics(name)).add(batch.key, batch.messages)
+        if progress is not None:
+            progress(reader.read_bytes, statistics.num_bytes)
     for source in statistics.sources.values():
         source.finish()
     _add_damage(statistics, reader)
@@ -116,4 +93,6 @@ def _add_damage(statistics: TakeStatistics, reader: TakeReader) -> None:
         statistics.num_damaged += log.num_damaged
         statistics.damaged_bytes += log.damaged_bytes
         statistics.damage += [FileDamage(log.path, *damage) for damage in log.damage]
+    statistics.num_damaged += len(reader.empty_files)
+    statistics.empty_files = dict(reader.empty_files)
     del statistics.damage[MAX_LISTED_DAMAGE:]

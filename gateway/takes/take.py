@@ -1,5 +1,6 @@
 """Reading a take into numpy arrays, for analysis and for conversion to other formats."""
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -9,16 +10,14 @@ import rtc3d
 
 from gateway.errors import ParametersError, ProtocolError, TakeError
 from gateway.messages.decode import decode
+from gateway.messages.parameters_text import xml_bytes
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_changes import differ_in_statistics_only
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.takes.component_rows import decode_rows
-from gateway.takes.reader import TakeReader
+from gateway.takes.reader import MessageBatch, TakeReader
 from gateway.takes.series import ParametersEntry, Series, SeriesBuilder
-
-_BATCH_BYTES: Final = 8 * 1024 * 1024
-"""So many bytes of messages are decoded at once."""
 
 
 @dataclass
@@ -101,14 +100,14 @@ def open_take(
     """
     wanted = _components(components)
     reader = TakeReader(Path(path))
-    first_utime = reader.start_utime if from_s is None else reader.start_utime + round(from_s * 1e6)
+    first_utime = None if from_s is None else reader.start_utime + round(from_s * 1e6)
     end_utime = None if to_s is None else reader.start_utime + round(to_s * 1e6)
     loader = _Loader(sources, wanted)
-    for message in reader.messages():
-        is_in_range = first_utime <= message.utime and (end_utime is None or message.utime < end_utime)
-        loader.add(message.source, message.key, message.message, is_in_range=is_in_range)
+    for batches in reader.batches():
+        for batch in batches:
+            loader.add(batch, first_utime, end_utime)
     take = Take(Path(path), reader.start_utime, loader.finish(reader.start_utime))
-    take.num_damaged = sum(log.num_damaged for log in reader.logs)
+    take.num_damaged = sum(log.num_damaged for log in reader.logs) + len(reader.empty_files)
     take.damaged_bytes = sum(log.damaged_bytes for log in reader.logs)
     take.unknown = dict(reader.unknown)
     missing = set(sources or ()) - take.sources.keys()
@@ -135,44 +134,42 @@ class _Loader:
         self._sources: dict[str, TakeSource] = {}
         self._xml: dict[str, bytes] = {}  # the newest parameters, by source
         self._builders: dict[tuple[str, str], SeriesBuilder] = {}
-        self._batch: dict[tuple[str, str], list[bytes]] = {}
-        self._batch_bytes = 0
 
-    def add(self, name: str, key: str, message: bytes, *, is_in_range: bool) -> None:
-        """Take one message. Parameters are taken from the whole take."""
-        if self._wanted is not None and name not in self._wanted:
+    def add(self, batch: MessageBatch, first_utime: int | None, end_utime: int | None) -> None:
+        """Take messages in a range of time; parameters are taken from the whole take."""
+        if self._wanted is not None and batch.source not in self._wanted:
             return
-        source = self._sources.get(name)
+        source = self._sources.get(batch.source)
         if source is None:
-            source = self._sources[name] = TakeSource(name)
-        if key in COMPONENTS_BY_KEY:
-            if is_in_range and key in self._components:
-                self._batch.setdefault((name, key), []).append(message)
-                self._batch_bytes += len(message)
-                if self._batch_bytes >= _BATCH_BYTES:
-                    self._decode_batch()
-        elif key == "parameters" or (key in ("take", "status") and not source.server):
-            self._describe(source, key, message)
+            source = self._sources[batch.source] = TakeSource(batch.source)
+        if batch.key in self._components:
+            messages = batch.messages
+            if first_utime is not None or end_utime is not None:
+                first = -math.inf if first_utime is None else first_utime
+                end = math.inf if end_utime is None else end_utime
+                times = zip(batch.utimes, messages, strict=True)
+                messages = [message for utime, message in times if first <= utime < end]
+            self._add_frames(source, batch.key, messages)
+        elif batch.key in ("take", "status", "parameters"):
+            for message in batch.messages:
+                if batch.key == "parameters" or not source.server:
+                    self._describe(source, batch.key, message)
 
     def finish(self, start_utime: int) -> dict[str, TakeSource]:
         """Return the sources with their arrays."""
-        self._decode_batch()
         for (name, key), builder in self._builders.items():
             source = self._sources[name]
             setattr(source, _FIELDS[key], builder.build(source.parameters, start_utime))
         return self._sources
 
-    def _decode_batch(self) -> None:
-        for (name, key), messages in self._batch.items():
-            component = COMPONENTS_BY_KEY[key]
-            rows = decode_rows(component, messages)
-            if rows.malformed:
-                _count(self._sources[name].malformed, key, rows.malformed)
-            if (name, key) not in self._builders:
-                self._builders[name, key] = SeriesBuilder(component)
-            self._builders[name, key].add(rows)
-        self._batch.clear()
-        self._batch_bytes = 0
+    def _add_frames(self, source: TakeSource, key: str, messages: list[bytes]) -> None:
+        rows = decode_rows(COMPONENTS_BY_KEY[key], messages)
+        if rows.malformed:
+            _count(source.malformed, key, rows.malformed)
+        builder = self._builders.get((source.name, key))
+        if builder is None:
+            builder = self._builders[source.name, key] = SeriesBuilder(COMPONENTS_BY_KEY[key])
+        builder.add(rows)
 
     def _describe(self, source: TakeSource, key: str, message: bytes) -> None:
         try:
@@ -187,7 +184,7 @@ class _Loader:
 
     def _add_parameters(self, source: TakeSource, decoded: rtc3d.parameters_t) -> None:
         """Add the parameters if they differ from those before; they are repeated every few seconds."""
-        xml = decoded.xml.encode(errors="surrogatepass")
+        xml = xml_bytes(decoded.xml)
         version = decoded.parameters_version
         newest = source.parameters[-1] if source.parameters else None
         if newest and newest.version == version and differ_in_statistics_only(self._xml[source.name], xml):

@@ -1,0 +1,179 @@
+"""Files that are no takes, or not only takes: a clear error, or a report of what was left out."""
+
+import os
+import random
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.errors import TakeError
+from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
+from gateway.rtc3d.parameters_xml import encode_parameters
+from gateway.takes import open_take
+from gateway.takes.reader import TakeReader
+from gateway.takes.statistics import take_statistics
+from tests.takes import log_bytes, markers, parameters, write_take
+
+READERS: list[Callable[[Path], Any]] = [
+    open_take,
+    take_statistics,
+    lambda path: list(TakeReader(path).messages()),
+]
+
+
+def png(path: Path) -> None:
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + random.Random(1).randbytes(100_000))
+
+
+def text(path: Path) -> None:
+    path.write_text("time,x,y\n" * 10_000)
+
+
+def c3d(path: Path) -> None:
+    path.write_bytes(b"\x02\x50" + bytes(510) + random.Random(2).randbytes(51_200))
+
+
+def sync_words(path: Path) -> None:
+    path.write_bytes(bytes.fromhex("eda1da01") * 100_000)
+
+
+def huge_hole(path: Path) -> None:
+    with path.open("wb") as file:
+        file.truncate(100 * 1024**3)
+
+
+def huge_claims(path: Path) -> None:
+    # Each header claims a message of 200 MB that is not there.
+    claim = bytes.fromhex("eda1da01") + bytes(16) + (4).to_bytes(4, "big") + (200_000_000).to_bytes(4, "big")
+    path.write_bytes((claim + b"NAME" + bytes(2000)) * 500)
+
+
+def empty(path: Path) -> None:
+    path.touch()
+
+
+def folder(path: Path) -> None:
+    path.mkdir()
+
+
+def folder_of_others(path: Path) -> None:
+    path.mkdir()
+    (path / "notes.txt").touch()
+    (path / "a.lcmlog").touch()
+
+
+def pipe(path: Path) -> None:
+    os.mkfifo(path)
+
+
+def device(path: Path) -> None:
+    path.symlink_to("/dev/zero")
+
+
+def symlink_loop(path: Path) -> None:
+    path.symlink_to(path)
+
+
+def nothing(path: Path) -> None:
+    pass
+
+
+def other_log(path: Path) -> None:
+    write_take(path, [(f"CAMERA_{number % 9}", bytes(50)) for number in range(100)])
+
+
+def other_version(path: Path) -> None:
+    write_take(path, [("MOCAP_LAB_3D", bytes(56))])
+
+
+MAKERS = [
+    (png, "without an LCM event; choose a recording"),
+    (text, "without an LCM event"),
+    (c3d, "without an LCM event"),
+    (sync_words, "without an LCM event"),
+    (huge_hole, "without an LCM event"),
+    (huge_claims, "without an LCM event"),
+    (empty, "is empty"),
+    (folder, "has no recordings"),
+    (folder_of_others, "is empty"),
+    (pipe, "it is a pipe"),
+    (device, "it is a device"),
+    (symlink_loop, "Too many levels of symbolic links"),
+    (nothing, "No such file"),
+    (
+        other_log,
+        "100 messages of other types, on channel CAMERA_0, CAMERA_1, CAMERA_2, CAMERA_3, CAMERA_4, …$",
+    ),
+    (other_version, "on channel MOCAP_LAB_3D; they may be of another version of the gateway"),
+]
+
+
+@pytest.mark.timeout(20)
+@pytest.mark.parametrize("read", READERS, ids=["open_take", "take_statistics", "messages"])
+@pytest.mark.parametrize(("make", "message"), MAKERS, ids=[make.__name__ for make, _ in MAKERS])
+def test_what_is_no_take_is_a_clear_error(
+    tmp_path: Path, make: Callable[[Path], None], message: str, read: Callable[[Path], Any]
+) -> None:
+    path = tmp_path / "take"
+    make(path)
+    with pytest.raises(TakeError, match=message) as raised:
+        read(path)
+    assert str(path) in str(raised.value)
+
+
+@pytest.mark.parametrize("name", ["a\0b", "a" * 300, "file/below"])
+def test_odd_paths(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").touch()
+    with pytest.raises(TakeError, match="cannot be read"):
+        open_take(tmp_path / name)
+
+
+def test_a_folder_is_read_without_its_empty_files(tmp_path: Path) -> None:
+    write_take(tmp_path / "a-001.lcmlog", [markers(1, 0)])
+    (tmp_path / "a-002.lcmlog").touch()
+    write_take(tmp_path / "a-003.lcmlog", [markers(1, 1)])
+    take = open_take(tmp_path)
+    assert take.sources["lab"].markers
+    assert take.sources["lab"].markers.sequence.tolist() == [0, 1]
+    assert take.num_damaged == 1
+    statistics = take_statistics(tmp_path)
+    assert list(statistics.empty_files) == [tmp_path / "a-002.lcmlog"]
+    assert not statistics.is_complete
+
+
+def test_rotated_files_of_lcm_logger_are_read_in_the_order_of_their_times(tmp_path: Path) -> None:
+    for number in range(3):  # with --rotate, the newest file is .0
+        write_take(tmp_path / f"log.{2 - number}", [markers(1, number)])
+    source = open_take(tmp_path).sources["lab"]
+    assert source.markers
+    assert source.markers.sequence.tolist() == [0, 1, 2]
+
+
+def test_a_log_that_grows_while_it_is_read_gives_what_was_complete(tmp_path: Path) -> None:
+    path = write_take(tmp_path / "take.lcmlog", [markers(1, number) for number in range(3)])
+    more = log_bytes([markers(1, 3)])
+    messages = TakeReader(path).messages()
+    read = [next(messages)]
+    with path.open("ab") as file:
+        file.write(more[:-1])
+    read += messages
+    assert [int.from_bytes(message.message[24:32], "big") for message in read] == [0, 1, 2]
+
+
+def test_a_log_that_shrinks_while_it_is_read_ends(tmp_path: Path) -> None:
+    path = write_take(tmp_path / "take.lcmlog", [markers(100, number) for number in range(3000)])
+    messages = TakeReader(path).messages()
+    next(messages)
+    os.truncate(path, 2_000_000)
+    assert 0 < sum(1 for _ in messages) < 3000
+
+
+def test_labels_in_latin_1_keep_their_letters(tmp_path: Path) -> None:
+    content = encode_parameters(Parameters(markers=Parameters3D(markers=(Marker("1", "Foot"),))))
+    xml = "<?xml version='1.0' encoding='ISO-8859-1'?>" + content.decode().replace("Foot", "Fuß")
+    messages = [parameters(xml.encode()), markers(1, 0)]
+    found = open_take(write_take(tmp_path / "take.lcmlog", messages)).sources["lab"].markers
+    assert found
+    assert found.labels == ("Fuß",)
