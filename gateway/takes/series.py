@@ -93,6 +93,11 @@ class Series:
         """Return times in µs since 1970 as seconds since the beginning of the take, float64."""
         return (utime - self.start_utime) / 1e6
 
+    def parameters_of(self, row: int) -> Parameters:
+        """Return the server's parameters that describe a row; without any section if the take has none."""
+        entry = int(self._entries[row])
+        return self._parameters[entry].parameters if entry >= 0 else Parameters()
+
     @cached_property
     def labels(self) -> tuple[str, ...]:
         """The names of the columns of ``items``, each different; () for events.

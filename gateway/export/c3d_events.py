@@ -1,0 +1,57 @@
+"""The events of a measurement in a C3D file: the group EVENT."""
+
+from typing import Final
+
+import numpy as np
+
+from gateway.export.c3d_format import MAX_LIST, Parameter
+from gateway.export.event_texts import event_text
+from gateway.export.job import ExportJob
+from gateway.export.labels import printable
+from gateway.export.measurements import Measurement
+from gateway.takes.component_rows import Array
+from gateway.takes.series import Series
+
+_MINUTE_S: Final = 60.0
+_MARGIN_S: Final = 1.0
+"""An event so shortly before the first frame or after the last one belongs to the measurement."""
+_MAX_EVENT_AGE_US: Final = 10_000_000
+"""An event's own time stamp is used if it is as near as this to that of its frame."""
+
+
+def event_times_us(events: Series) -> Array:
+    """Return the server's time of each event: its own, or that of its frame if it is far from that."""
+    own = events.items["timestamp"].astype(np.int64)
+    is_near = abs(own - events.timestamp_us) <= _MAX_EVENT_AGE_US
+    return np.where(is_near, own, events.timestamp_us)
+
+
+def event_group(job: ExportJob, measurement: Measurement, first_row: int, num_rows: int) -> list[Parameter]:
+    """Return the group EVENT with the events of these rows; [] if there are none."""
+    events = measurement.source.events
+    if events is None:
+        return []
+    rate_hz = measurement.grid.rate_hz
+    seconds = measurement.seconds_of(event_times_us(events), events.capture_utime) - first_row / rate_hz
+    (chosen,) = np.nonzero((seconds > -_MARGIN_S) & (seconds < num_rows / rate_hz + _MARGIN_S))
+    chosen = chosen[np.argsort(seconds[chosen], kind="stable")]
+    if len(chosen) > MAX_LIST:
+        job.note(
+            f"{len(chosen) - MAX_LIST} of {len(chosen)} events were left out: a C3D file has at most 255"
+        )
+        chosen = chosen[:MAX_LIST]
+    if not len(chosen):
+        return []
+    count = len(chosen)
+    texts = [event_text(events.parameters_of(row), events.items[row]) for row in chosen.tolist()]
+    minutes, rest = np.divmod(np.maximum(seconds[chosen], 0.0), _MINUTE_S)
+    return [
+        Parameter("USED", np.array(count, np.int16)),
+        Parameter("CONTEXTS", ["General"] * count),
+        Parameter("LABELS", [printable(text.label) for text in texts]),
+        Parameter("DESCRIPTIONS", [printable(text.description) for text in texts]),
+        Parameter("SUBJECTS", [""] * count),
+        Parameter("TIMES", np.stack([minutes, rest]).astype(np.float32)),
+        Parameter("ICON_IDS", np.zeros(count, np.int16)),
+        Parameter("GENERIC_FLAGS", np.zeros(count, np.int16)),
+    ]

@@ -1,0 +1,144 @@
+"""Force plates in C3D files: which analog channels a plate has, and how readers compute its loads from them.
+
+The Force component has the loads that the server has computed (§7.5). C3D has none: readers compute them from
+analog channels by the plate's type (C3D user guide, FORCE_PLATFORM:TYPE). If that gives the recorded loads,
+the plate refers to the server's own channels. Otherwise six channels are added, from which readers get them.
+"""
+
+import re
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from gateway.rtc3d.parameters import ParametersAnalog, Plate, Point
+from gateway.takes.component_rows import Array
+
+FORCES_AND_MOMENTS: Final = 2
+"""The type of plates whose six channels are Fx, Fy, Fz, Mx, My, Mz at the transducer's origin."""
+EIGHT_FORCES: Final = 3
+"""The type of plates (Kistler) with eight channels: Fx12, Fx34, Fy14, Fy23, Fz1, Fz2, Fz3, Fz4."""
+CALIBRATED: Final = 4
+"""As FORCES_AND_MOMENTS, after a multiplication by FORCE_PLATFORM:CAL_MATRIX."""
+
+ADDED_LABELS: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
+
+_MILLIMETRES: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "µm": 0.001, "in": 25.4}
+_MOMENT_UNIT: Final = re.compile(r"\s*k?n\W?(mm|cm|m)\s*", re.IGNORECASE)
+_TOLERANCE: Final = 1e-3
+"""How much computed loads may differ from recorded ones, as a part of the largest."""
+
+
+class PlateGeometry(NamedTuple):
+    """Where a plate is, in the unit of the points.
+
+    ``corners`` has the shape (4, 3) and ``origin`` (3,). ``rotation``, shape (3, 3), turns the plate's axes
+    into those of the laboratory.
+    """
+
+    corners: Array
+    origin: Array
+    rotation: Array
+
+
+def geometry_of(plate: Plate, unit: str) -> PlateGeometry | None:
+    """Return a plate's geometry; None if its four corners are not known or not those of a rectangle."""
+    if len(plate.corners) != 4:
+        return None
+    corners = np.array([_position(corner, unit) for corner in plate.corners])
+    origin = np.zeros(3) if plate.origin is None else np.nan_to_num(_position(plate.origin, unit))
+    x_axis, y_side = corners[0] - corners[1], corners[0] - corners[3]
+    z_axis = np.cross(x_axis, y_side)
+    y_axis = np.cross(z_axis, x_axis)
+    axes = np.stack([x_axis, y_axis, z_axis], axis=1)
+    lengths = np.linalg.norm(axes, axis=0)
+    if not np.isfinite(axes).all() or not lengths.all():
+        return None
+    return PlateGeometry(corners, origin, axes / lengths)
+
+
+def own_channels(plate: Plate, analog: ParametersAnalog | None) -> tuple[int, ...]:
+    """Return the indices of a plate's analog channels; () if they are not known."""
+    by_id = {channel.id: index for index, channel in enumerate(analog.channels if analog else ())}
+    found = [by_id[channel_id] for channel_id in plate.analog_channel_ids if channel_id in by_id]
+    return tuple(found) if len(found) == len(plate.analog_channel_ids) else ()
+
+
+def possible_types(plate: Plate, num_channels: int) -> tuple[int, ...]:
+    """Return the types that a plate with so many channels can have, the most likely one first."""
+    if num_channels == 8:
+        return (EIGHT_FORCES,)
+    if num_channels != 6:
+        return ()
+    return (CALIBRATED, FORCES_AND_MOMENTS) if calibration_of(plate).any() else (FORCES_AND_MOMENTS,)
+
+
+def calibration_of(plate: Plate) -> Array:
+    """Return a plate's calibration matrix, shape (6, 6); zeros if it has none of this size."""
+    rows = plate.calibration_matrix
+    if len(rows) != 6 or any(len(row) != 6 for row in rows):
+        return np.zeros((6, 6))
+    matrix = np.array(rows)
+    return matrix if np.isfinite(matrix).all() else np.zeros((6, 6))
+
+
+def loads_from_channels(plate_type: int, values: Array, calibration: Array, geometry: PlateGeometry) -> Array:
+    """Return forces and moments in the laboratory's axes, shape (samples, 6), as readers compute them.
+
+    ``values`` has the shape (samples, channels). Moments are about the centre of the plate's surface.
+    """
+    origin = _reader_origin(geometry.origin)
+    if plate_type == EIGHT_FORCES:
+        x12, x34, y14, y23, z1, z2, z3, z4 = values.T
+        a, b, depth = origin
+        force = np.stack([x12 + x34, y14 + y23, z1 + z2 + z3 + z4], axis=1)
+        moment = np.stack(
+            [b * (z1 + z2 - z3 - z4), a * (z2 + z3 - z1 - z4), b * (x34 - x12) + a * (y14 - y23)], axis=1
+        )
+        moment += np.cross(force, [0.0, 0.0, depth])
+    else:
+        if plate_type == CALIBRATED:
+            values = values @ calibration.T
+        force = values[:, :3]
+        moment = values[:, 3:] + np.cross(force, origin)
+    return np.concatenate([force @ geometry.rotation.T, moment @ geometry.rotation.T], axis=1)
+
+
+def channels_from_loads(loads: Array, geometry: PlateGeometry) -> Array:
+    """Return the six channels of a FORCES_AND_MOMENTS plate from which readers compute ``loads``.
+
+    ``loads`` has the shape (samples, 6): forces and moments in the laboratory's axes, the moments about the
+    centre of the plate's surface.
+    """
+    force = loads[:, :3] @ geometry.rotation
+    moment = loads[:, 3:] @ geometry.rotation - np.cross(force, _reader_origin(geometry.origin))
+    return np.concatenate([force, moment], axis=1)
+
+
+def is_equal(computed: Array, recorded: Array) -> bool:
+    """Whether computed loads are those that were recorded, both of shape (samples, 6)."""
+    computed, recorded = computed.reshape(-1, 2, 3), recorded.reshape(-1, 2, 3)  # forces, moments
+    largest = np.maximum(abs(recorded), abs(computed)).max(axis=(0, 2), initial=0.0)
+    difference = abs(computed - recorded).max(axis=(0, 2), initial=0.0)
+    return bool((difference <= _TOLERANCE * np.maximum(largest, 1e-6)).all())
+
+
+def moment_factor(moment_unit: str, position_unit: str) -> float:
+    """Return what turns moments in their own unit into those with the unit of positions: 1000 for Nm and
+    mm."""
+    match = _MOMENT_UNIT.fullmatch(moment_unit)
+    return _length_factor(match[1], position_unit) if match else 1.0
+
+
+def _position(point: Point, unit: str) -> Array:
+    return np.array([point.x, point.y, point.z]) * _length_factor(point.unit, unit)
+
+
+def _length_factor(unit: str, wanted: str) -> float:
+    """Return the factor from one unit of length to another; 1 if one of them is not known."""
+    from_mm, to_mm = (_MILLIMETRES.get(name.strip().lower()) for name in (unit, wanted))
+    return from_mm / to_mm if from_mm and to_mm else 1.0
+
+
+def _reader_origin(origin: Array) -> Array:
+    """Return the origin as readers take it: below the surface, so with a negative z (user guide, ORIGIN)."""
+    return -origin if origin[2] > 0 else origin

@@ -1,0 +1,27 @@
+"""The formats to which takes are exported, by extension."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Final
+
+from gateway.errors import TakeError
+from gateway.export.c3d import export_c3d
+from gateway.export.job import ExportJob
+
+FORMATS: Final[dict[str, Callable[[ExportJob], None]]] = {
+    ".c3d": export_c3d,
+}
+"""What writes the files of a job, by the extension of its ``out``."""
+
+
+def export_take(job: ExportJob) -> list[Path]:
+    """Write the files of a job, and return their names. Raises TakeError; then none of them exists."""
+    write = FORMATS.get(job.out.suffix.lower())
+    if write is None:
+        known = ", ".join(FORMATS)
+        raise TakeError(f"{job.out} has no known extension; choose one of {known}")
+    if job.from_s is not None and job.to_s is not None and job.from_s >= job.to_s:
+        raise TakeError(f"--from {job.from_s:g} is not before --to {job.to_s:g}")
+    with job.files:
+        write(job)
+    return job.files.paths

@@ -1,0 +1,77 @@
+"""An export: which part of which take becomes which file, and what is reported about it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from gateway.errors import TakeError
+from gateway.takes.new_file import NewFiles
+from gateway.takes.take import Take, open_take
+
+
+def _no_progress(*_: object) -> None:
+    """Show nothing."""
+
+
+@dataclass
+class ExportJob:
+    """What to export, and where it goes.
+
+    ``source`` is one source's name, None all; ``from_s`` and ``to_s`` are in seconds from the first event of
+    the take. ``progress`` is called with what is being done, how much of it is done, and how much there is
+    (0: that is not known). ``notes`` are sentences about what was changed or left out.
+    """
+
+    take: Path
+    out: Path
+    source: str | None = None
+    from_s: float | None = None
+    to_s: float | None = None
+    progress: Callable[[str, int, int], None] = _no_progress
+    notes: list[str] = field(default_factory=list)
+    files: NewFiles = field(default_factory=NewFiles)
+
+    def note(self, text: str) -> None:
+        """Report a sentence about what was changed or left out; the same one is reported once."""
+        if text not in self.notes:
+            self.notes.append(text)
+
+    def open_take(self) -> Take:
+        """Return the chosen part of the take, and report what could not be read. Raises TakeError."""
+        self.progress(f"reading {self.take.name}", 0, 0)
+        take = open_take(
+            self.take,
+            sources=None if self.source is None else [self.source],
+            from_s=self.from_s,
+            to_s=self.to_s,
+        )
+        self.note_damage(take.num_damaged, take.damaged_bytes, take.unknown)
+        for source in take.sources.values():
+            for key, count in source.malformed.items():
+                self.note(f"{source.name}: {count} malformed messages of {key} were left out")
+        return take
+
+    def note_damage(self, num_damaged: int, damaged_bytes: int, unknown: dict[str, int]) -> None:
+        """Report damage of the take, and messages of unknown types by channel."""
+        if num_damaged:
+            places = "place" if num_damaged == 1 else "places"
+            self.note(f"the take is damaged at {num_damaged} {places}: {damaged_bytes} bytes cannot be read")
+        if unknown:
+            self.note(
+                f"{sum(unknown.values())} messages of other programs on {', '.join(unknown)} were left out"
+            )
+
+    def file_name(self, *parts: str) -> Path:
+        """Return the name of one of several files: the name of ``out`` with these parts at its end."""
+        stem = "-".join([self.out.stem, *(part.replace("/", "_") for part in parts if part)])
+        return self.out.with_name(stem + self.out.suffix)
+
+
+def nothing_to_export(job: ExportJob, what: str) -> TakeError:
+    """Return the error for a take without data that the format can hold."""
+    part = "" if job.from_s is None and job.to_s is None else " between --from and --to"
+    source = "" if job.source is None else f" of {job.source}"
+    return TakeError(
+        f"{job.take} has no {what}{source}{part}, and {job.out.suffix} holds nothing else; "
+        "`rtc3d-gateway take info` lists what the take has"
+    )
