@@ -45,7 +45,8 @@ def _write(job: ExportJob, content: C3dContent, path: Path) -> None:
         frames = np.concatenate([points, channels.reshape(stop - start, -1)], axis=1)
         file.write(frames.astype("<f4").tobytes())
         job.progress(f"writing {path.name}", stop, content.num_frames)
-    file.write(bytes(-file.tell() % BLOCK_BYTES))
+    if content.num_frames <= MAX_WORD:  # ezc3d reads longer files to their end
+        file.write(bytes(-file.tell() % BLOCK_BYTES))
     missing = content.measurement.frames.num_missing(
         content.first_row, content.first_row + content.num_frames
     )

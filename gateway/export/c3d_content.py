@@ -97,10 +97,8 @@ def _sampled(
         if parts and fits:
             found.setdefault((count, run.labels), []).extend(parts)
         elif parts:
-            job.note(
-                f"{key} was left out: C3D needs {'the rate of the analog channels' if samples else 'a rate'} "
-                f"that is a multiple of the {measurement.grid.rate_hz:g} Hz of the frames; export to .csv has it"
-            )
+            wanted = "that of the analog channels" if samples else "a multiple of that of the frames"
+            job.note(f"{key} was left out: in C3D, its rate must be {wanted}; export to .csv has it")
     if not found:
         return None, samples
     chosen = max(found, key=lambda identity: sum(len(part.rows) for part in found[identity]))

@@ -1,8 +1,8 @@
 """The C3D format: a header, parameters in groups, and frames of 32-bit floats, all little-endian.
 
-The format is that of the C3D user guide (c3d.org), with what ezc3d and the package ``c3d`` add to it: more
-than 255 labels continue in LABELS2, LABELS3, …, and files of more than 65535 frames have a POINT:FRAMES that
-is a float, POINT:LONG_FRAMES, and TRIAL:ACTUAL_END_FIELD.
+The format is that of the C3D user guide (c3d.org), with what other programs write beyond its limits: more
+than 255 labels continue in LABELS2, LABELS3, …; the number of more than 65535 frames is in
+TRIAL:ACTUAL_END_FIELD.
 
 The file is written here and not by ezc3d, because ezc3d keeps the whole recording in memory (4 MB for each
 second of 55 markers and 69 analog channels), does not report a full disk, and cuts files at 65535 frames.
@@ -90,7 +90,6 @@ def number_lists(name: str, numbers: Numbers) -> list[Parameter]:
 
 def standard_groups(shape: Shape, point_units: Texts) -> Groups:
     """Return POINT, ANALOG and TRIAL with what the shape says; labels and the like are still missing."""
-    is_long = shape.num_frames > MAX_WORD
     analog_rate_hz = shape.rate_hz * shape.samples_per_frame if shape.num_channels else 0.0
     groups: Groups = {
         "POINT": [
@@ -98,7 +97,7 @@ def standard_groups(shape: Shape, point_units: Texts) -> Groups:
             Parameter("SCALE", _float(-shape.scale)),
             Parameter("RATE", _float(shape.rate_hz)),
             Parameter("DATA_START", _integer(0)),
-            Parameter("FRAMES", (_float if is_long else _integer)(shape.num_frames)),
+            Parameter("FRAMES", _integer(min(shape.num_frames, MAX_WORD))),
             Parameter("UNITS", point_units),
         ],
         "ANALOG": [
@@ -116,7 +115,7 @@ def standard_groups(shape: Shape, point_units: Texts) -> Groups:
             Parameter("CAMERA_RATE", _float(shape.rate_hz)),
         ],
     }
-    if is_long:
+    if shape.num_frames > MAX_WORD:
         groups["POINT"].append(Parameter("LONG_FRAMES", _float(shape.num_frames)))
     return groups
 

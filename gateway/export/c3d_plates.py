@@ -1,6 +1,6 @@
 """The force plates of a measurement in a C3D file: FORCE_PLATFORM, and the channels that it needs."""
 
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -138,24 +138,22 @@ def _common_samples(analog: Placed, forces: Placed) -> tuple[Array, Array] | Non
 
 def plate_group(plans: list[PlatePlan]) -> list[Parameter]:
     """Return the group FORCE_PLATFORM."""
-    count = len(plans)
-    channels = np.zeros((max((len(plan.channels) for plan in plans), default=6), count), np.int16)
-    for column, plan in enumerate(plans):
-        channels[: len(plan.channels), column] = np.array(plan.channels) + 1
+    num_rows = max((len(plan.channels) for plan in plans), default=0)
+    channels = [np.array(plan.channels + (-1,) * (num_rows - len(plan.channels))) + 1 for plan in plans]
     units = {plan.plate.channels[0].unit for plan in plans if plan.plate.channels} - {"", "N"}
     matrices = [calibration_of(plan.plate) if plan.type == CALIBRATED else np.zeros((6, 6)) for plan in plans]
     return [
-        Parameter("USED", np.array(count, np.int16)),
+        Parameter("USED", np.array(len(plans), np.int16)),
         Parameter("TYPE", np.array([plan.type for plan in plans], np.int16)),
         Parameter("ZERO", np.zeros(2, np.int16)),
-        Parameter("CORNERS", _stack([plan.geometry.corners.T for plan in plans], (3, 4))),
-        Parameter("ORIGIN", _stack([plan.geometry.origin for plan in plans], (3,))),
-        Parameter("CHANNEL", channels),
-        Parameter("CAL_MATRIX", _stack(matrices, (6, 6))),
+        Parameter("CORNERS", _stack([plan.geometry.corners.T for plan in plans])),
+        Parameter("ORIGIN", _stack([plan.geometry.origin for plan in plans])),
+        Parameter("CHANNEL", _stack(channels, np.int16)),
+        Parameter("CAL_MATRIX", _stack(matrices)),
         *([Parameter("UNITS", [units.pop()])] if len(units) == 1 else []),
     ]
 
 
-def _stack(arrays: list[Array], shape: tuple[int, ...]) -> Array:
-    """Return arrays of this shape along a new last dimension, which may have the size 0."""
-    return np.stack(arrays, axis=-1).astype(np.float32) if arrays else np.zeros((*shape, 0), np.float32)
+def _stack(arrays: list[Array], dtype: type[np.number[Any]] = np.float32) -> Array:
+    """Return arrays along a new last dimension; an empty list if there are none."""
+    return np.stack(arrays, axis=-1).astype(dtype) if arrays else np.zeros(0, dtype)

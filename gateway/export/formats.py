@@ -6,10 +6,14 @@ from typing import Final
 
 from gateway.errors import TakeError
 from gateway.export.c3d import export_c3d
+from gateway.export.csv_files import export_csv
 from gateway.export.job import ExportJob
+from gateway.export.trc import export_trc
 
 FORMATS: Final[dict[str, Callable[[ExportJob], None]]] = {
     ".c3d": export_c3d,
+    ".trc": export_trc,
+    ".csv": export_csv,
 }
 """What writes the files of a job, by the extension of its ``out``."""
 

@@ -1,6 +1,6 @@
 """An export: which part of which take becomes which file, and what is reported about it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -36,12 +36,16 @@ class ExportJob:
         if text not in self.notes:
             self.notes.append(text)
 
-    def open_take(self) -> Take:
-        """Return the chosen part of the take, and report what could not be read. Raises TakeError."""
+    def open_take(self, components: Collection[str] | None = None) -> Take:
+        """Return the chosen part of the take, and report what could not be read. Raises TakeError.
+
+        ``components`` are the keys of those to load; None means all.
+        """
         self.progress(f"reading {self.take.name}", 0, 0)
         take = open_take(
             self.take,
             sources=None if self.source is None else [self.source],
+            components=components,
             from_s=self.from_s,
             to_s=self.to_s,
         )

@@ -1,0 +1,98 @@
+"""Force plates: the loads that ezc3d computes from the exported channels are those that were recorded."""
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gateway.export.force_plates import (
+    CALIBRATED,
+    EIGHT_FORCES,
+    FORCES_AND_MOMENTS,
+    channels_from_loads,
+    geometry_of,
+    is_equal,
+    loads_from_channels,
+    moment_factor,
+    own_channels,
+    possible_types,
+)
+from gateway.rtc3d.parameters import AnalogChannel, ParametersAnalog, Plate, Point
+
+CORNERS = (Point(508, 464, 0), Point(508, 0, 10), Point(0, 0, 10), Point(0, 464, 0))
+PLATE = Plate("1", corners=CORNERS, origin=Point(1.5, -0.8, -34))
+
+
+def test_channels_give_the_loads_from_which_they_were_computed() -> None:
+    geometry = geometry_of(PLATE, "mm")
+    assert geometry
+    loads = np.random.default_rng(1).normal(size=(50, 6)) * 500
+    channels = channels_from_loads(loads, geometry)
+    assert np.allclose(loads_from_channels(FORCES_AND_MOMENTS, channels, np.zeros((6, 6)), geometry), loads)
+
+
+@pytest.mark.parametrize(
+    "corners",
+    [
+        (),
+        CORNERS[:3],
+        (Point(), Point(), Point(), Point()),
+        (Point(0, 0, 0), Point(1, 0, 0), Point(2, 0, 0), Point(3, 0, 0)),
+        (Point(1, 1, 1),) * 4,
+    ],
+)
+def test_a_plate_needs_four_corners_that_span_a_surface(corners: tuple[Point, ...]) -> None:
+    assert geometry_of(replace(PLATE, corners=corners), "mm") is None
+
+
+def test_positions_have_the_unit_of_the_points() -> None:
+    geometry = geometry_of(replace(PLATE, origin=Point(0.1, 0.2, -0.3, "m")), "mm")
+    assert geometry
+    assert geometry.origin.tolist() == pytest.approx([100, 200, -300])
+    in_metres = geometry_of(replace(PLATE, origin=None), "m")
+    assert in_metres
+    assert in_metres.corners[0].tolist() == pytest.approx([0.508, 0.464, 0])
+    assert in_metres.origin.tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("moment_unit", "position_unit", "factor"),
+    [
+        ("Nm", "mm", 1000),
+        ("Nmm", "mm", 1),
+        ("N.m", "mm", 1000),
+        ("N·mm", "m", 0.001),
+        ("N*m", "m", 1),
+        ("", "mm", 1),
+        ("lbf", "mm", 1),
+        ("Nm", "furlong", 1),
+    ],
+)
+def test_moments_have_the_unit_of_the_points(moment_unit: str, position_unit: str, factor: float) -> None:
+    assert moment_factor(moment_unit, position_unit) == pytest.approx(factor)
+
+
+def test_own_channels_are_found_by_their_ids() -> None:
+    analog = ParametersAnalog(tuple(AnalogChannel(name) for name in ("7", "a", "9")))
+    assert own_channels(replace(PLATE, analog_channel_ids=("9", "7")), analog) == (2, 0)
+    assert own_channels(replace(PLATE, analog_channel_ids=("9", "8")), analog) == ()
+    assert own_channels(replace(PLATE, analog_channel_ids=("9",)), None) == ()
+
+
+def test_the_type_follows_from_the_channels_and_the_calibration() -> None:
+    calibrated = replace(PLATE, calibration_matrix=tuple(map(tuple, np.eye(6).tolist())))
+    assert possible_types(PLATE, 6) == (FORCES_AND_MOMENTS,)
+    assert possible_types(calibrated, 6) == (CALIBRATED, FORCES_AND_MOMENTS)
+    assert possible_types(PLATE, 8) == (EIGHT_FORCES,)
+    assert possible_types(PLATE, 4) == ()
+    for odd in (((1.0,) * 5,) * 6, ((math.nan,) * 6,) * 6):
+        assert possible_types(replace(PLATE, calibration_matrix=odd), 6) == (FORCES_AND_MOMENTS,)
+
+
+def test_loads_are_compared_by_the_largest_of_their_kind() -> None:
+    loads = np.array([[100.0, 0, 700, 20_000, -50_000, 0]])
+    assert is_equal(loads, loads + np.array([0.5, 0, 0, 40, 0, 0]))
+    assert not is_equal(loads, loads + np.array([1, 0, 0, 0, 0, 0]))
+    assert not is_equal(loads, loads + np.array([0, 0, 0, 0, 0, 60]))
+    assert is_equal(np.zeros((0, 6)), np.zeros((0, 6)))
