@@ -10,24 +10,27 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 from gateway.cli.options import SourceOption
+from gateway.config.section import join_or
 from gateway.export.formats import FORMATS, export_take
 from gateway.export.job import ExportJob
 from gateway.safe_text import safe_text
 
-_KNOWN = ", ".join(FORMATS)
-
 
 def export(
     file: Annotated[Path, typer.Argument(help="The take: a recording (.lcmlog), or the folder of one.")],
-    out: Annotated[Path, typer.Argument(help=f"The new file; its extension is the format: {_KNOWN}.")],
+    out: Annotated[
+        Path, typer.Argument(help=f"The new file; its extension is the format: {join_or(FORMATS)}.")
+    ],
     source: SourceOption = None,
     from_s: Annotated[
         float | None,
-        typer.Option("--from", min=0, help="Begin so many seconds after the beginning of the take."),
+        typer.Option("--from", min=0, help="Where to begin, in s from the take's first message."),
     ] = None,
     to_s: Annotated[
         float | None,
-        typer.Option("--to", min=0, help="End so many seconds after the beginning of the take."),
+        typer.Option(
+            "--to", min=0, help="Where to end, in s from the first message; the default is its end."
+        ),
     ] = None,
 ) -> None:
     """Convert a take to a file of another program, such as C3D; never overwrite a file."""
