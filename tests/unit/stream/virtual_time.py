@@ -7,6 +7,7 @@ from typing import Any
 
 EPOCH_UTIME = 1_700_000_000_000_000
 
+STEP_S = 0.01
 _MAX_STEPS = 10_000
 
 
@@ -65,5 +66,5 @@ async def until(condition: Callable[[], Any]) -> None:
     for _ in range(_MAX_STEPS):
         if condition():
             return
-        await asyncio.sleep(0.01)
-    raise AssertionError(f"still not true after {_MAX_STEPS / 100:g} s of virtual time")
+        await asyncio.sleep(STEP_S)
+    raise AssertionError(f"still not true after {_MAX_STEPS * STEP_S:g} s of virtual time")
