@@ -19,7 +19,7 @@ from gateway.service.log_format import LogFormat, LogLevel, set_up_log
 from gateway.service.log_limit import LogLimit
 from gateway.service.process_end import end_at_once
 
-_SWITCH_INTERVAL_S: Final = 0.0005
+SWITCH_INTERVAL_S: Final = 0.0005
 """How long a thread that runs Python keeps the event loop waiting for its lock. Every message to an output
 releases that lock once, so that the default of 5 ms would add up to more than the time between two frames."""
 
@@ -35,7 +35,7 @@ def run(
         signal.signal(number, end_at_once)
     limit = LogLimit()
     set_up_log(log_level, log_format, limit)
-    sys.setswitchinterval(_SWITCH_INTERVAL_S)
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
     # The objects of all modules stay until the end. Without this, each full garbage collection looks through
     # them and stops the event loop for some 20 ms; many tiny packets cause one every second.
     gc.freeze()

@@ -2,7 +2,9 @@
 
 import asyncio
 import contextlib
+import gc
 import signal
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -21,6 +23,7 @@ from gateway.cli.options import (
     ToolsOption,
     checked_host,
 )
+from gateway.cli.run import SWITCH_INTERVAL_S
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
 from gateway.rtc3d_server.scene import Scene
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
@@ -125,6 +128,9 @@ def simulate(
         scene = C3dScene(c3d)
     else:
         scene = extended.scene.build()
+    # A take is read by a thread, while frames are sent.
+    sys.setswitchinterval(SWITCH_INTERVAL_S)
+    gc.freeze()
     uvloop.run(_run_simulator(Simulator(scene, host=host, port=port, once=once), extended, seconds))
 
 

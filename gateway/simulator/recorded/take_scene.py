@@ -21,20 +21,20 @@ from gateway.simulator.recorded.take_pass import TakePass
 from gateway.takes.reader import TakeReader
 from gateway.worker_thread import WorkerThread
 
-_AHEAD_US: Final = 8_000_000
+_AHEAD_US: Final = 3_000_000
 _MAX_AHEAD_BYTES: Final = 64 * 1024 * 1024
-"""So much of a take is read ahead, whichever is less."""
+"""So much of a take is read ahead, whichever is less. With more objects, garbage collection takes longer."""
 
-_BATCH_BYTES: Final = 4 * 1024 * 1024
-_BATCH_MOMENTS: Final = 2000
-"""So much is read at once, whichever is less."""
+_BATCH_BYTES: Final = 1024 * 1024
+_BATCH_MOMENTS: Final = 200
+"""So much is read at once, whichever is less: it takes some milliseconds, and frames are sent meanwhile."""
 
 _KEPT_US: Final = 1_000_000
 """Moments of the past that a new client may need: the newest frame, and those of a stream that goes on."""
 
 _ADVANCE_US: Final = 100_000
 _WAITING_US: Final = 10_000
-"""How often the scene is advanced, and how often while it waits for the disk."""
+"""How often the scene is advanced, and how often while little of it is in memory."""
 
 _PREVIEW_MOMENTS: Final = 3000
 """The numbers and rates of components without parameters are those of so many moments at the beginning."""
@@ -151,7 +151,7 @@ class TakeScene:
         for frames in self._frames:
             frames.forget(elapsed_us - 2 * LATE_US)
         self._read_on(elapsed_us)
-        is_waiting = self._reading is not None and self._last_us < elapsed_us + _ADVANCE_US
+        is_waiting = self._reading is not None and self._last_us < elapsed_us + _AHEAD_US // 2
         return elapsed_us + (_WAITING_US if is_waiting else _ADVANCE_US)
 
     def stop(self) -> None:

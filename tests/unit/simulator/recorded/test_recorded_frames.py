@@ -1,0 +1,274 @@
+"""The rules of §5.3.4 and §5.3.5 for recorded frames."""
+
+import struct
+from collections.abc import Iterable, Mapping, Sequence
+
+import pytest
+
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
+from gateway.rtc3d.packets import Packet, PacketType
+from gateway.rtc3d.parameters import AnalogChannel, Marker, Parameters, Parameters3D, ParametersAnalog
+from gateway.rtc3d.parameters_xml import encode_parameters
+from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks
+from gateway.simulator.recorded.moments import Moment
+from gateway.simulator.recorded.parameters import RecordedParameters
+from gateway.simulator.recorded.recorded_frames import RecordedFrames
+from tests.unit.rtc3d_server.wire import WireComponent, components_in, packets_in
+
+NONE = RecordedParameters(b"")
+ANNOUNCED = RecordedParameters(
+    encode_parameters(
+        Parameters(
+            markers=Parameters3D(100.0, markers=(Marker("1", "m"),)),
+            analog=ParametersAnalog((AnalogChannel("1", "a", frequency_hz=1000.0),)),
+        )
+    )
+)
+MEASURED = {ComponentType.MARKERS: 100.0, ComponentType.TOOLS: 100.0, ComponentType.ANALOG: 1000.0}
+SECOND_US = 1_000_000
+
+
+def moment(due_us: int, numbers: Mapping[str, int], parameters: RecordedParameters = NONE) -> Moment:
+    """Return a moment with components without items, told apart by their frame numbers."""
+    contents = {
+        COMPONENTS_BY_KEY[key]: struct.pack(">iqi", number, 7_000_000 + due_us, 0)
+        if key != "event"
+        else struct.pack(">iqi iqiii", number, 7_000_000 + due_us, 1, number, due_us, -1, -1, -1)
+        for key, number in numbers.items()
+    }
+    return Moment(due_us, 7_000_000 + due_us, parameters, contents)
+
+
+def lab(
+    seconds: float = 1.0, parameters: RecordedParameters = NONE, *, pause: tuple[float, float] = (0, 0)
+) -> list[Moment]:
+    """Return markers and tools at 100 Hz, analog at 1000 Hz; markers and tools pause from … to … (s)."""
+    moments = []
+    for number in range(round(seconds * 1000)):
+        numbers = {"analog": number + 1}
+        if number % 10 == 0 and not pause[0] <= number / 1000 < pause[1]:
+            numbers |= {"3d": number // 10 + 1, "6d": number // 10 + 1}
+        if number % 100 == 30:
+            numbers["event"] = number // 100 + 1
+        moments.append(moment(number * 1000, numbers, parameters))
+    return moments
+
+
+class Client:
+    """A client's session on recorded frames; the test sets the time."""
+
+    def __init__(self, moments: Iterable[Moment], *, is_end: bool = True, event_bytes: int = 24) -> None:
+        self.moments = list(moments)
+        self.event_bytes = event_bytes
+        self.elapsed_us = -SECOND_US
+        self.sources: list[RecordedFrames] = []
+        self._is_end = is_end
+        self.session = ClientSession(SessionCallbacks(self._frames, lambda _: b"", lambda: self.elapsed_us))
+
+    def _frames(self, components: Sequence[ComponentType]) -> RecordedFrames:
+        frames = RecordedFrames(components, self.event_bytes, MEASURED)
+        frames.add(self.moments, is_end=self._is_end)
+        self.sources.append(frames)
+        return frames
+
+    def send(self, text: str) -> None:
+        self.session.answer(Packet(PacketType.COMMAND, text.encode()))
+
+    def frames_until(self, seconds: float, byte_order: str = "big") -> list[list[WireComponent]]:
+        found = []
+        while self.elapsed_us < round(seconds * SECOND_US):
+            self.elapsed_us = min(self.elapsed_us + 500_000, round(seconds * SECOND_US))
+            packets = packets_in(b"".join(each.packet for each in self.session.due_frames(self.elapsed_us)))
+            found += [
+                components_in(body, byte_order, event_bytes=self.event_bytes)  # type: ignore[arg-type]
+                for _, body in packets
+            ]
+        return found
+
+
+def numbers(frames: list[list[WireComponent]]) -> list[dict[str, int]]:
+    """Return the frame number of each component in each frame."""
+    return [{ComponentType(each.type).key: each.frame_number for each in frame} for frame in frames]
+
+
+def only(key: str, frames: list[list[WireComponent]]) -> list[int]:
+    return [found[key] for found in numbers(frames) if key in found]
+
+
+# Rates (§5.3.5) -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("parameters", [NONE, ANNOUNCED])
+def test_a_stream_has_the_rate_of_the_slowest_component(parameters: RecordedParameters) -> None:
+    client = Client(lab(1, parameters))
+    client.send("StreamFrames 3D Analog")
+    assert numbers(client.frames_until(1)) == [{"3d": k + 1, "analog": 10 * k + 1} for k in range(100)]
+
+
+@pytest.mark.parametrize(("components", "key"), [("3D 6D", "6d"), ("Analog", "analog"), ("6D", "6d")])
+def test_components_of_one_rate_are_sent_completely(components: str, key: str) -> None:
+    client = Client(lab(1))
+    client.send(f"StreamFrames {components}")
+    frames = client.frames_until(1)
+    assert only(key, frames) == list(range(1, 1001 if key == "analog" else 101))
+    assert all(len(frame) == len(components.split()) for frame in frames)
+
+
+def test_contents_are_sent_as_recorded() -> None:
+    client = Client(lab(0.05))
+    client.send("StreamFrames All")
+    assert client.frames_until(1)[3] == [
+        WireComponent(1, 4, 7_030_000, []),
+        WireComponent(4, 4, 7_030_000, []),
+        WireComponent(2, 31, 7_030_000, []),
+        WireComponent(5, 1, 7_030_000, [(1, 30_000, -1, -1, -1)]),
+    ]
+
+
+def test_a_component_that_is_missing_in_some_frames_costs_the_others_nothing() -> None:
+    moments = [moment(k * 10_000, {"3d": k} if k % 3 else {"3d": k, "6d": k}, ANNOUNCED) for k in range(90)]
+    client = Client(moments)
+    client.send("StreamFrames 3D 6D")
+    frames = client.frames_until(2)
+    assert only("3d", frames) == list(range(90))
+    assert only("6d", frames) == list(range(0, 90, 3))
+
+
+def test_while_the_slowest_component_pauses_the_next_one_sets_the_rate() -> None:
+    client = Client(lab(1, pause=(0.3, 0.7)))
+    client.send("StreamFrames 3D 6D Analog")
+    frames = client.frames_until(2)
+    assert only("3d", frames) == [*range(1, 31), *range(71, 101)]
+    gap = [each for each in only("analog", frames) if 300 < each <= 700]
+    assert gap == list(range(316, 677))
+
+
+def test_components_may_begin_later() -> None:
+    client = Client(lab(1, pause=(0, 0.5)))
+    client.send("StreamFrames All")
+    frames = client.frames_until(1)
+    assert only("3d", frames) == list(range(51, 101))
+    assert only("analog", frames)[:400] == list(range(1, 401))
+
+
+@pytest.mark.parametrize("requested", ["AllFrames", "FrequencyDivisor:1", "Frequency:100", "Frequency:2000"])
+def test_no_request_exceeds_the_recorded_rate(requested: str) -> None:
+    client = Client(lab(1))
+    client.send(f"StreamFrames {requested} 3D")
+    assert only("3d", client.frames_until(1)) == list(range(1, 101))
+
+
+def test_a_divisor_and_a_frequency_choose_among_recorded_frames() -> None:
+    for requested, expected in (
+        ("FrequencyDivisor:4", [1, 5, 9, 13, 17]),
+        ("Frequency:50", [1, 3, 5, 7, 9]),
+        ("Frequency:60", [1, 3, 5, 6, 8]),
+    ):
+        client = Client(lab(1))
+        client.send(f"StreamFrames {requested} 3D")
+        assert only("3d", client.frames_until(1))[:5] == expected
+
+
+def test_a_frequency_counts_from_the_rate_that_was_recorded_not_the_announced_one() -> None:
+    client = Client([moment(k * 20_000, {"3d": k}, ANNOUNCED) for k in range(50)])
+    client.send("StreamFrames Frequency:25 3D")
+    assert only("3d", client.frames_until(1)) == list(range(0, 50, 2))
+
+
+def test_frames_become_due_as_they_become_known() -> None:
+    moments = lab(2)
+    client = Client(moments[:500], is_end=False)
+    client.send("StreamFrames 3D Events")
+    frames = client.frames_until(1)
+    [due_us] = {client.session.due_us}
+    assert due_us is None
+    client.sources[0].add(moments[500:], is_end=True)
+    assert client.session.due_us == 500_000
+    assert only("3d", frames + client.frames_until(2)) == list(range(1, 201))
+
+
+def test_frames_that_nobody_takes_for_three_seconds_are_dropped_but_not_their_events() -> None:
+    client = Client(lab(10))
+    client.send("StreamFrames 3D Events")
+    client.elapsed_us = 9_500_000
+    frames = client.frames_until(10)
+    assert only("3d", frames)[0] == 702
+    assert client.session.frames_dropped == 701
+    assert [event[0] for event in frames[0][1].items] == list(range(1, 71))
+
+
+def test_forgotten_frames_count_as_dropped() -> None:
+    client = Client(lab(60))
+    client.send("StreamFrames Analog")
+    client.sources[0].forget(50 * SECOND_US)
+    client.elapsed_us = 50 * SECOND_US + 500_000
+    assert only("analog", client.frames_until(51))[0] == 50_001
+    assert client.session.frames_dropped == 50_000
+
+
+# Events -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate", ["AllFrames", "Frequency:7", "FrequencyDivisor:33"])
+@pytest.mark.parametrize("components", ["All", "3D Events", "Events", "Analog Event"])
+def test_every_event_is_sent_once_with_the_next_frame(rate: str, components: str) -> None:
+    client = Client(lab(10))
+    client.send(f"StreamFrames {rate} {components}")
+    sent = [
+        event[0]
+        for frame in client.frames_until(10)
+        for component in frame
+        if component.type == ComponentType.EVENT
+        for event in component.items
+    ]
+    assert sent == list(range(1, len(sent) + 1))
+    assert len(sent) >= 95
+
+
+def test_events_after_the_last_frame_are_sent_too() -> None:
+    client = Client([*lab(0.1), moment(105_000, {"event": 9})])
+    client.send("StreamFrames 3D Events")
+    assert numbers(client.frames_until(1))[-1] == {"event": 9}
+
+
+def test_a_take_of_events_only_has_a_frame_for_each() -> None:
+    client = Client([moment(k * 500_000, {"event": k}) for k in range(5)])
+    client.send("StreamFrames")
+    assert numbers(client.frames_until(3)) == [{"event": k} for k in range(5)]
+
+
+@pytest.mark.parametrize("byte_order", ["big", "little"])
+def test_events_can_have_16_bytes(byte_order: str) -> None:
+    client = Client(lab(0.1), event_bytes=16)
+    client.send(f"SetByteOrder {byte_order}Endian")
+    client.send("StreamFrames Events")
+    assert client.frames_until(1, byte_order) == [[WireComponent(5, 1, 7_030_000, [(1, -1, -1, -1)])]]
+
+
+# SendCurrentFrame (§5.3.4) ------------------------------------------------------------------
+
+
+def test_the_current_frame_is_the_newest_one_and_then_the_next() -> None:
+    client = Client(lab(1))
+    client.elapsed_us = 123_456
+    client.send("SendCurrentFrame 3D")
+    assert only("3d", client.frames_until(0.1235)) == [13]
+    client.send("SendCurrentFrame 3D")
+    assert client.session.due_us == 130_000
+    assert only("3d", client.frames_until(0.13)) == [14]
+
+
+def test_the_current_frame_of_what_the_take_lacks_is_empty() -> None:
+    client = Client(lab(1))
+    client.send("SendCurrentFrame Force")
+    assert client.frames_until(0.5) == [[]]
+
+
+def test_polling_gets_each_event_once() -> None:
+    client = Client(lab(1))
+    events = []
+    for tenth in range(1, 20):
+        client.send("SendCurrentFrame Events")
+        for frame in client.frames_until(tenth / 20):
+            events += [event[0] for component in frame for event in component.items]
+    assert events == list(range(1, 11))

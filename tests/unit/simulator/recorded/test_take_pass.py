@@ -1,0 +1,132 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from gateway.rtc3d.components import ComponentType
+from gateway.simulator.recorded.moments import Moment
+from gateway.simulator.recorded.parameters import RecordedParameters
+from gateway.simulator.recorded.take_pass import TakePass
+from gateway.takes.reader import TakeReader
+from tests.takes import START_UTIME, Message, description, frame, markers, parameters, write_take
+
+FIRST = b"<RT_Parameters><General><Name>first</Name></General></RT_Parameters>"
+SECOND = b"<RT_Parameters><General><Name>second</Name></General></RT_Parameters>"
+DEFAULT = RecordedParameters(b"<RT_Parameters/>")
+
+
+def read(
+    path: Path, messages: list[Message], *, first_utime: int | None = None, end_utime: int | None = None
+) -> tuple[list[Moment], TakePass]:
+    found = TakePass(TakeReader(write_take(path, messages)), "lab", first_utime, end_utime, DEFAULT)
+    return list(found.moments()), found
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "take.lcmlog"
+
+
+def test_moments_have_the_content_of_the_messages_from_byte_40_on(path: Path) -> None:
+    messages = [description(), *(markers(3, number) for number in range(5))]
+    moments, _ = read(path, messages)
+    assert [moment.contents[ComponentType.MARKERS] for moment in moments] == [
+        message[40:] for _, message in messages[1:]
+    ]
+    assert [moment.due_us for moment in moments] == [0, 10_000, 20_000, 30_000, 40_000]
+
+
+def test_only_the_chosen_source_is_read(path: Path) -> None:
+    moments, _ = read(
+        path, [description(), description("other"), markers(3, 0), markers(3, 1, source="other")]
+    )
+    assert len(moments) == 1
+
+
+def test_a_range_begins_anywhere_and_its_end_is_not_included(path: Path) -> None:
+    moments, _ = read(
+        path,
+        [markers(3, number) for number in range(100)],
+        first_utime=START_UTIME + 200_000,
+        end_utime=START_UTIME + 500_000,
+    )
+    assert [moment.timestamp_us for moment in moments] == list(range(200_000, 500_000, 10_000))
+    assert moments[0].due_us == 0
+
+
+def test_each_frame_has_the_parameters_that_were_valid(path: Path) -> None:
+    messages = [
+        markers(3, 0, version=0),
+        parameters(FIRST, 1),
+        markers(3, 1, version=1),
+        parameters(SECOND, 2),
+        markers(3, 2, version=1),  # arrived before the change
+        markers(3, 3, version=2),
+        parameters(SECOND, 2),  # repeated every few seconds
+        markers(3, 4, version=3),  # whose parameters are missing
+    ]
+    moments, found = read(path, messages)
+    assert [moment.parameters.xml for moment in moments] == [DEFAULT.xml, FIRST, FIRST, SECOND, SECOND]
+    assert found.first_parameters is not None
+    assert found.first_parameters.xml == FIRST
+
+
+def test_parameters_that_became_void_are_those_of_the_take_no_more(path: Path) -> None:
+    moments, _ = read(
+        path, [parameters(FIRST, 1), markers(3, 0, version=1), parameters(b"", 2), markers(3, 1, version=2)]
+    )
+    assert [moment.parameters.xml for moment in moments] == [FIRST, DEFAULT.xml]
+
+
+@pytest.mark.parametrize("encoding", ["ISO-8859-1", "latin1", "UTF-8"])
+def test_xml_keeps_the_encoding_that_it_declares(path: Path, encoding: str) -> None:
+    xml = f'<?xml version="1.0" encoding="{encoding}"?><RT_Parameters><Größe/></RT_Parameters>'
+    messages = [parameters(xml.encode(), 1), markers(3, 0, version=1)]
+    [moment], _ = read(path, messages)
+    assert moment.parameters.xml == xml.encode(encoding)
+
+
+def test_malformed_messages_are_left_out_and_counted(path: Path) -> None:
+    channel, message = markers(3, 1)
+    parameters_channel, parameters_message = parameters(FIRST)
+    moments, found = read(
+        path,
+        [
+            markers(3, 0),
+            (channel, message[:-1]),
+            (channel, message + b"\0"),
+            (channel, message[:52] + b"\xff\xff\xff\xff" + message[56:]),
+            (channel, message[:20]),
+            (parameters_channel, parameters_message[:-5]),
+            markers(3, 2),
+        ],
+    )
+    assert [moment.timestamp_us for moment in moments] == [0, 20_000]
+    assert found.num_malformed == 5
+
+
+def test_a_capture_time_that_cannot_be_true_is_not_used(path: Path) -> None:
+    broken = [
+        (channel, message[:16] + bytes(8) + message[24:])
+        for channel, message in (markers(3, number, timestamp_us=0) for number in range(5))
+    ]
+    moments, _ = read(path, broken)
+    assert [moment.due_us for moment in moments] == [0, 10_000, 20_000, 30_000, 40_000]
+
+
+def test_a_thousand_layouts_are_read_as_they_are(path: Path) -> None:
+    messages = [markers(number % 1000, number) for number in range(2000)]
+    moments, found = read(path, messages)
+    assert [moment.contents[ComponentType.MARKERS] for moment in moments] == [
+        each[1][40:] for each in messages
+    ]
+    assert found.num_malformed == 0
+
+
+def test_the_bits_of_each_nan_are_kept(path: Path) -> None:
+    payload = np.uint32(0x7FA00001).view(np.float32)
+    messages = [frame(ComponentType.ANALOG, [payload, np.nan, -np.nan], number) for number in range(3)]
+    moments, _ = read(path, messages)
+    assert [moment.contents[ComponentType.ANALOG] for moment in moments] == [
+        each[1][40:] for each in messages
+    ]
