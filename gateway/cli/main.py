@@ -25,6 +25,7 @@ from gateway.cli.doctor import doctor
 from gateway.cli.echo import echo
 from gateway.cli.export import export
 from gateway.cli.params import params
+from gateway.cli.record import record
 from gateway.cli.replay import replay
 from gateway.cli.run import run
 from gateway.cli.simulate import simulate
@@ -42,7 +43,7 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-for command in (run, check, doctor, simulate, demo, echo, params, replay, export):
+for command in (run, check, doctor, simulate, demo, echo, params, record, replay, export):
     app.command()(command)
 app.add_typer(config.app, name="config")
 app.add_typer(take.app, name="take")

@@ -21,6 +21,7 @@ COMMANDS: Final = (
     "demo",
     "echo",
     "params",
+    "record",
     "replay",
     "config",
     "config show",

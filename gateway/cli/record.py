@@ -1,0 +1,146 @@
+"""``rtc3d-gateway record``: write what gateways publish to an LCM event log."""
+
+import os
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Final
+
+import typer
+
+from gateway.cli.options import (
+    ComponentsOption,
+    ConnectOption,
+    PrefixOption,
+    SourcesOption,
+    UrlOption,
+    ZenohConfigOption,
+)
+from gateway.cli.record_progress import RecordProgress
+from gateway.cli.record_summary import print_summary
+from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url
+from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
+from gateway.outputs.zenoh.subscriber import open_zenoh
+from gateway.recorder.file_sink import FileSink
+from gateway.recorder.lcm_side import START_S, LcmSide
+from gateway.recorder.sides import RecordingSide
+from gateway.recorder.take_recording import TakeRecording
+from gateway.recorder.target import Target
+from gateway.recorder.zenoh_side import ZenohSide
+
+_TICK_S: Final = 0.1
+_CLOSE_S: Final = 0.5
+"""How long to wait for Zenoh or LCM to close: a peer that does not read delays it."""
+
+
+def record(
+    file: Annotated[
+        Path,
+        typer.Argument(
+            metavar="FILE",
+            help="The new file (.lcmlog), or a folder for SOURCE-DATE-TIME.lcmlog. Nothing is overwritten.",
+        ),
+    ],
+    source: SourcesOption = None,
+    component: ComponentsOption = None,
+    seconds: Annotated[
+        float | None,
+        typer.Option(
+            min=0, help="Stop after this many seconds of messages; the default is to record until Ctrl-C."
+        ),
+    ] = None,
+    lcm: Annotated[bool, typer.Option("--lcm", help="Record from LCM; the default is from Zenoh.")] = False,
+    connect: ConnectOption = None,
+    zenoh_config: ZenohConfigOption = None,
+    url: UrlOption = None,
+    prefix: PrefixOption = None,
+) -> None:
+    """Record what gateways publish, until Ctrl-C. The exit status is 0 only if no message is missing.
+
+    A second Ctrl-C ends at once, without what waits for the disk.
+    """
+    if lcm and (connect is not None or zenoh_config is not None):
+        raise typer.BadParameter("--connect and --zenoh-config are for recording from Zenoh")
+    if url is not None and not lcm:
+        raise typer.BadParameter("--url is for recording from LCM; add --lcm")
+    stop = _stop_signals()
+    target = Target(file)
+    recording = TakeRecording(
+        lambda sources: FileSink(target.open(sources)), component, START_S if lcm else 0.0
+    )
+    sources = list(dict.fromkeys(source or ()))
+    try:
+        side: RecordingSide
+        if lcm:
+            lcm_url = effective_lcm_url(url)
+            side = LcmSide(lcm_url, prefix or DEFAULT_LCM_PREFIX, sources, component, recording)
+        else:
+            session = open_zenoh(connect, zenoh_config)
+            side = ZenohSide(session, prefix or DEFAULT_ZENOH_PREFIX, sources, component, recording)
+        progress = RecordProgress(recording, side, sources)
+        try:
+            _run(recording, side, progress, stop, seconds)
+            _end(recording, progress)
+        finally:
+            progress.close()
+            _close(side.close)
+        is_complete = print_summary(recording, sys.stdout)
+    finally:
+        target.discard_empty()
+    if not is_complete:
+        raise typer.Exit(1)
+
+
+def _stop_signals() -> threading.Event:
+    """Return an event that the first signal sets. The second one ends the process at once."""
+    stop = threading.Event()
+
+    def handle(number: int, _frame: FrameType | None) -> None:
+        if stop.is_set():
+            if sys.stderr.isatty():
+                os.write(2, b"\x1b[?25h\n")  # the progress line has hidden the cursor
+            os._exit(128 + number)
+        stop.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # nohup, and shells for `&`
+            signal.signal(number, handle)
+    return stop
+
+
+def _run(
+    recording: TakeRecording,
+    side: RecordingSide,
+    progress: RecordProgress,
+    stop: threading.Event,
+    seconds: float | None,
+) -> None:
+    """Record until ``stop``, or for ``seconds`` after the first message, or without any."""
+    start_s = time.monotonic()
+    first_s: float | None = None
+    while not stop.wait(_TICK_S):
+        side.tick()
+        recording.tick()
+        progress.tick()
+        first_s = recording.first_heard_s if first_s is None else first_s
+        if seconds is not None and time.monotonic() - (first_s or start_s) >= seconds:
+            return
+
+
+def _end(recording: TakeRecording, progress: RecordProgress) -> None:
+    """Write everything that has arrived. A disk that is full loses it; for a slow one, wait."""
+    recording.stop()
+    if recording.sink is not None:
+        recording.sink.give_up()
+    while not recording.close(_TICK_S):
+        progress.tick()
+
+
+def _close(close: Callable[[], None]) -> None:
+    thread = threading.Thread(target=close, name="record-close", daemon=True)
+    thread.start()
+    thread.join(_CLOSE_S)

@@ -1,0 +1,1 @@
+"""Recording what gateways publish, as one of their subscribers."""

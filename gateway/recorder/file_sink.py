@@ -1,0 +1,106 @@
+"""The file of a recording: written again until the disk accepts it."""
+
+import threading
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Final
+
+from gateway.takes.recording import LogFile
+
+Messages = Sequence[tuple[bytes, bytes]]
+"""Messages, each with its channel."""
+
+RETRY_S: Final = 0.25
+_CHUNK_BYTES: Final = 256 * 1024
+"""How much is written at once: the disk accepts all of it, or nothing."""
+
+
+class FileSink:
+    """Writes messages to ``log``. What the disk does not accept waits, and the queue behind it fills.
+
+    ``write`` and ``sync`` are called in the thread that writes, the others in any thread.
+    """
+
+    def __init__(self, log: LogFile) -> None:
+        self.problem = ""
+        """What is wrong with the disk now; "" if it accepts messages."""
+        self.lost: Counter[bytes] = Counter()
+        """How many messages the disk has not accepted in the end, by channel."""
+        self.num_errors = 0
+        """How often the disk stopped accepting messages."""
+        self.is_unsafe = False
+        """Whether the disk reported that something written before may be lost."""
+        self._log = log
+        self._gives_up = threading.Event()
+
+    @property
+    def path(self) -> Path:
+        """The path of the file."""
+        return self._log.path
+
+    @property
+    def is_in_place(self) -> bool:
+        """Whether the file still has its path. Do not call it after ``close``."""
+        return self._log.is_in_place()
+
+    @property
+    def num_bytes(self) -> int:
+        """The size of the file."""
+        return self._log.num_bytes
+
+    def give_up(self) -> None:
+        """Try once more and then lose what the disk does not accept, because the recording ends."""
+        self._gives_up.set()
+
+    def write(self, messages: Messages) -> None:
+        """Write messages; wait while the disk does not accept them."""
+        for chunk in _chunks(messages):
+            self._write(chunk)
+
+    def _write(self, messages: Messages) -> None:
+        while True:
+            gives_up = self._gives_up.is_set()
+            try:
+                self._log.append(messages)
+            except OSError as error:
+                self._failed(error)
+                if gives_up:
+                    self.lost.update(channel for channel, _ in messages)
+                    return
+                self._gives_up.wait(RETRY_S)
+            else:
+                self.problem = ""
+                return
+
+    def _failed(self, error: OSError) -> None:
+        if not self.problem:
+            self.num_errors += 1
+        self.problem = f"{self.path} cannot be written: {error.strerror or error}"
+
+    def sync(self) -> None:
+        """Store on the disk what was written."""
+        try:
+            self._log.sync()
+        except OSError as error:
+            self.is_unsafe = True
+            self._failed(error)
+
+    def close(self) -> None:
+        """Close the file, after the thread that writes has ended."""
+        try:
+            self._log.close()
+        except OSError as error:
+            self.is_unsafe = True
+            self._failed(error)
+
+
+def _chunks(messages: Messages) -> Iterator[Messages]:
+    start = num_bytes = 0
+    for index, (_, message) in enumerate(messages):
+        if num_bytes + len(message) > _CHUNK_BYTES and index > start:
+            yield messages[start:index]
+            start, num_bytes = index, 0
+        num_bytes += len(message)
+    if start < len(messages):
+        yield messages[start:]

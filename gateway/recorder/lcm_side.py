@@ -1,0 +1,178 @@
+"""Receiving from gateways on LCM for a recording."""
+
+import logging
+import re
+import time
+import uuid
+from collections.abc import Collection
+from typing import Final
+
+import rtc3d
+
+from gateway.errors import OutputError, ProtocolError
+from gateway.messages.decode import decode
+from gateway.messages.topics import lcm_channel
+from gateway.outputs.lcm.connection import open_lcm, receiving_url
+from gateway.outputs.lcm.settings import lcm_queries_url
+from gateway.outputs.lcm.subscriber import LcmSubscriber, no_gateway
+from gateway.recorder.series import FINGERPRINTS, POSE, RecordedSource, Series
+from gateway.recorder.take_recording import MAX_SERIES, TakeRecording
+
+START_S: Final = 1.2
+"""Each source is heard within this time, because it sends a status once a second."""
+
+_AGAIN_S: Final = 0.3
+_POSE_MARK: Final = "_6D_"
+
+_KEYS_BY_FINGERPRINT: Final = {fingerprint: key for key, fingerprint in FINGERPRINTS.items()}
+
+logger = logging.getLogger(__name__)
+
+
+class LcmSide:
+    """Subscribes on an LCM URL, and asks on the URL of requests that belongs to it. Raises OutputError.
+
+    Messages are received in one thread, answers in another.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        prefix: str,
+        sources: Collection[str],
+        components: Collection[str] | None,
+        recording: TakeRecording,
+    ) -> None:
+        self._url = url
+        self._prefix = prefix
+        self._names = {lcm_channel(prefix, name): name for name in sources}
+        self._recording = recording
+        self._series: dict[str, Series | None] = {}  # by channel; None: not recorded
+        self._asked_s: dict[str, float] = {}  # when a source was asked, by its channels
+        self._requester = f"rtc3d-gateway record {uuid.uuid4()}"
+        self._by_request_id: dict[int, RecordedSource] = {}
+        self._subscribers = [
+            LcmSubscriber(
+                open_lcm(receiving_url(url)), _pattern(prefix, [*self._names], components), self._receive
+            )
+        ]
+        try:
+            self._queries = open_lcm(lcm_queries_url(url))
+        except OutputError:
+            self._subscribers[0].close()
+            raise
+        replies = f"{re.escape(prefix)}_.+_PARAMETERS_REPLY"
+        self._subscribers.append(LcmSubscriber(self._queries, replies, self._receive_reply))
+
+    # In the threads that receive.
+
+    def _receive(self, channel: str, message: bytes) -> None:
+        series = self._series.get(channel) or self._find_series(channel, message)
+        if series is None:
+            return
+        if series.key == "parameters" and series.accepts(message):
+            self._recording.receive_parameters(series, message, is_made=False)
+            return
+        self._recording.receive(series, message)
+        if series.key == "status" and not series.source.has_known_name:
+            self._name(series.source, message)
+
+    def _find_series(self, channel: str, message: bytes) -> Series | None:
+        """Return the series of a channel that was not recorded before; None, counted, if it cannot be."""
+        if channel in self._series:
+            self._recording.ignore(beyond_limit=True)
+            return None
+        if channel.endswith(("_REQUEST", "_REPLY", "_RECONNECTED")):
+            return None
+        key = _KEYS_BY_FINGERPRINT.get(message[:8])
+        if key == POSE:
+            channels, _, label = channel.rpartition(_POSE_MARK)
+            key = f"{POSE}{label}"
+        else:
+            channels = channel.removesuffix(f"_{key.upper()}") if key else channel
+        if not key or channels in {"", channel}:
+            self._recording.ignore(beyond_limit=False)
+            return None
+        source = self._source(channels)
+        series = None if source is None else self._recording.series(source, key, channel)
+        if len(self._series) < 2 * MAX_SERIES:
+            self._series[channel] = series
+        if series is None:
+            self._recording.ignore(beyond_limit=True)
+        return series
+
+    def _source(self, channels: str) -> RecordedSource | None:
+        name = self._names.get(channels)
+        guess = channels.removeprefix(f"{self._prefix}_").lower()
+        source = self._recording.source(name or guess, channels, is_known=False)
+        if source is not None and name is not None:
+            source.has_known_name = True
+        return source
+
+    def _name(self, source: RecordedSource, status: bytes) -> None:
+        """Take the name of a source from its status: its channels have capital letters only."""
+        try:
+            name = decode(status).source
+        except ProtocolError:
+            return
+        if lcm_channel(self._prefix, name) == source.channels:
+            source.name, source.has_known_name = name, True
+
+    def _receive_reply(self, _channel: str, data: bytes) -> None:
+        try:
+            reply = decode(data)
+        except ProtocolError:
+            return
+        if not isinstance(reply, rtc3d.parameters_reply_t) or reply.requester != self._requester:
+            return
+        source = self._by_request_id.get(reply.request_id)
+        if source is None or reply.error_code in {"busy", "rate"}:
+            return
+        parameters = None
+        if not reply.error:
+            parameters = self._recording.parameters_message(
+                source, reply.xml.encode(), None, reply.parameters_version, min(max(0.0, reply.age_s), 1e9)
+            )
+        self._recording.answered(source, parameters)
+
+    # In the thread of the command.
+
+    def tick(self) -> None:
+        """Ask for the parameters of sources that wait for their description."""
+        now_s = time.monotonic()
+        for channels, source in [*self._recording.sources.items()]:
+            if source.has_answer or not source.is_waiting:
+                continue
+            if now_s - self._asked_s.get(channels, float("-inf")) > _AGAIN_S:
+                self._asked_s[channels] = now_s
+                self._ask(source)
+
+    def _ask(self, source: RecordedSource) -> None:
+        request = rtc3d.parameters_request_t()
+        request.requester = self._requester
+        request.request_id = len(self._by_request_id)
+        self._by_request_id[request.request_id] = source
+        try:
+            self._queries.publish(f"{source.channels}_PARAMETERS_REQUEST", request.encode())
+        except OSError as error:
+            logger.debug("asking for the parameters of %s: %s", source.name, error)
+
+    def silence(self) -> str:
+        """See RecordingSide."""
+        return no_gateway(" ".join(self._names) or self._prefix, self._url)
+
+    def close(self) -> None:
+        """See RecordingSide."""
+        for subscriber in self._subscribers:
+            subscriber.close()
+
+
+def _pattern(prefix: str, channels: Collection[str], components: Collection[str] | None) -> str:
+    """Return the regular expression of the channels to subscribe to."""
+    sources = "|".join(map(re.escape, channels)) or f"{re.escape(prefix)}_.+"
+    if components is None:
+        return f"({sources})_.+"
+    names = "|".join(
+        "6D(_.+)?" if name == "6d" else name.upper() for name in {*components, "status", "parameters"}
+    )
+    return f"({sources})_({names})"

@@ -1,0 +1,178 @@
+"""Receiving from gateways on Zenoh for a recording."""
+
+import json
+import math
+import re
+import time
+from collections.abc import Collection
+from typing import Any, Final
+from urllib.parse import unquote
+
+import zenoh
+
+from gateway.messages.topics import lcm_channel, zenoh_key
+from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX
+from gateway.outputs.zenoh.subscriber import no_gateway, served_sources
+from gateway.recorder.series import POSE, RecordedSource, Series
+from gateway.recorder.take_recording import MAX_SERIES, MAX_XML_BYTES, TakeRecording
+from gateway.rtc3d.components import COMPONENTS_BY_KEY
+
+_QUERY_S: Final = 1.0
+_AGAIN_S: Final = 0.3
+"""When a query is repeated that got no answer, as may happen while Zenoh connects."""
+
+_SOURCE_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,24}")
+_NO_KEYS: Final = {"c3d", "recording", "take"}
+"""Keys of a source that are no messages: nothing of them is recorded."""
+
+_PLAIN_KEYS: Final = {*COMPONENTS_BY_KEY, "status", "clock", "parameters"}
+_INT32: Final = range(-(1 << 31), 1 << 31)
+
+
+class ZenohSide:
+    """Subscribes on an open session, which ``close`` closes.
+
+    Each subscription calls ``_receive`` in a thread of its own.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        prefix: str,
+        sources: Collection[str],
+        components: Collection[str] | None,
+        recording: TakeRecording,
+    ) -> None:
+        self._session = session
+        self._prefix = prefix
+        self._sources = sources
+        self._recording = recording
+        self._series: dict[str, Series | None] = {}  # by key; None: not recorded
+        self._asked_s: dict[str, float] = {}  # when the description of a source was queried, by its name
+        for name in self._served():
+            self._source(name)
+        wanted = ["**"] if components is None else [*components, "status", "parameters"]
+        paths = dict.fromkeys("6d/**" if path == "6d" else path for path in wanted)
+        for source in sources or ("*",):
+            for path in paths:
+                session.declare_subscriber(f"{zenoh_key(prefix, source)}/{path}", self._receive)
+
+    def _served(self) -> list[str]:
+        found = served_sources(self._session, self._prefix)
+        return [name for name in found if not self._sources or name in self._sources]
+
+    def _source(self, name: str) -> RecordedSource | None:
+        if not _SOURCE_NAME.fullmatch(name):
+            return None
+        return self._recording.source(name, lcm_channel(DEFAULT_LCM_PREFIX, name), is_known=True)
+
+    # In Zenoh's threads.
+
+    def _receive(self, sample: zenoh.Sample) -> None:
+        key = str(sample.key_expr)
+        series = self._series.get(key) or self._find_series(key)
+        if series is None:
+            return
+        if series.key == "parameters":
+            self._receive_parameters(series, sample)
+        else:
+            self._recording.receive(series, sample.payload.to_bytes())
+
+    def _find_series(self, key: str) -> Series | None:
+        """Return the series of a key that was not recorded before; None, counted, if it cannot be."""
+        if key in self._series:
+            self._recording.ignore(beyond_limit=True)
+            return None
+        name, _, path = key.removeprefix(f"{self._prefix}/").partition("/")
+        if path in _NO_KEYS:
+            return None
+        label = unquote(path.removeprefix(POSE)) if path.startswith(POSE) else None
+        if not _SOURCE_NAME.fullmatch(name) or (label is None and path not in _PLAIN_KEYS):
+            self._recording.ignore(beyond_limit=False)
+            return None
+        source = self._source(name)
+        names = (path,) if label is None else ("6d", label)
+        channel = "" if source is None else lcm_channel(source.channels, *names)
+        series = None if source is None else self._recording.series(source, path, channel)
+        if len(self._series) < 2 * MAX_SERIES:
+            self._series[key] = series
+        if series is None:
+            self._recording.ignore(beyond_limit=True)
+        return series
+
+    def _receive_parameters(self, series: Series, sample: zenoh.Sample) -> None:
+        if len(sample.payload) > MAX_XML_BYTES:
+            self._recording.ignore(beyond_limit=False)
+            return
+        self._recording.receive_parameters(
+            series, self._parameters_message(series.source, sample), is_made=True
+        )
+
+    def _parameters_message(self, source: RecordedSource, sample: zenoh.Sample) -> bytes:
+        facts = _facts(sample)
+        return self._recording.parameters_message(
+            source,
+            sample.payload.to_bytes(),
+            _int32(facts.get("session")),
+            _int32(facts.get("parameters_version")) or 0,
+            _age_s(facts.get("age_s")),
+        )
+
+    def _answered_parameters(self, source: RecordedSource, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            if len(reply.ok.payload) <= MAX_XML_BYTES:
+                self._recording.answered(source, self._parameters_message(source, reply.ok))
+        elif reply.err is not None and str(reply.err.encoding).partition(";")[2] not in {"", "busy", "rate"}:
+            self._recording.answered(source, None)
+
+    def _answered_status(self, source: RecordedSource, reply: zenoh.Reply) -> None:
+        if reply.ok is not None:
+            self._recording.answered_status(source, reply.ok.payload.to_bytes())
+
+    # In the thread of the command.
+
+    def tick(self) -> None:
+        """Query the parameters and the status of sources that wait for their description."""
+        now_s = time.monotonic()
+        for source in [*self._recording.sources.values()]:
+            if source.is_waiting and now_s - self._asked_s.get(source.name, -math.inf) > _AGAIN_S:
+                self._asked_s[source.name] = now_s
+                self._ask(source)
+
+    def _ask(self, source: RecordedSource) -> None:
+        key = zenoh_key(self._prefix, source.name)
+        if not source.has_answer:
+            self._session.get(
+                f"{key}/parameters",
+                lambda reply: self._answered_parameters(source, reply),
+                timeout=_QUERY_S,
+            )
+        if source.status is None:
+            self._session.get(
+                f"{key}/status", lambda reply: self._answered_status(source, reply), timeout=_QUERY_S
+            )
+
+    def silence(self) -> str:
+        """See RecordingSide."""
+        return no_gateway(self._prefix, self._sources, served_sources(self._session, self._prefix))
+
+    def close(self) -> None:
+        """See RecordingSide."""
+        self._session.close()
+
+
+def _facts(sample: zenoh.Sample) -> dict[str, Any]:
+    """Return the attachment of a sample; {} if it is no JSON object."""
+    try:
+        facts = json.loads(b"{}" if sample.attachment is None else sample.attachment.to_bytes())
+    except (ValueError, RecursionError):
+        return {}
+    return facts if isinstance(facts, dict) else {}
+
+
+def _int32(value: Any) -> int | None:
+    return value if isinstance(value, int) and value in _INT32 else None
+
+
+def _age_s(value: Any) -> float:
+    return float(value) if isinstance(value, int | float) and 0 <= value < 1e9 else 0.0
