@@ -32,8 +32,8 @@ class ActiveFault:
         """How often it happened: packets, replies or reads that it changed; for other faults, beginnings."""
         self.variant = 0
         """A random number, different each time the fault begins."""
-        self.began_us = 0
-        """The measurement's time when the fault last began."""
+        self.timestamp_us: int | None = None
+        """The time stamp of the first frame since the fault last began, if the fault remembers it."""
         self._undo: Callable[[], None] | None = None
         self._end_timer: asyncio.TimerHandle | None = None
 
@@ -56,7 +56,7 @@ class ActiveFault:
         """Begin the fault."""
         self.ended.clear()
         self.variant = int(self._timing_rng.integers(2**31))
-        self.began_us = self.server.elapsed_us() or 0
+        self.timestamp_us = None
         self._undo = self.fault.begin(self)
 
     def end_after(self, seconds: float, end: Callable[["ActiveFault"], None]) -> None:

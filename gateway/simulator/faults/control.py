@@ -114,10 +114,6 @@ class Faults:
 
     # For faults (FaultyServer) --------------------------------------------------------------
 
-    def elapsed_us(self) -> int | None:
-        """See FaultyServer."""
-        return self._server.elapsed_us()
-
     def stop_measurement(self) -> None:
         """See FaultyServer."""
         self._server.stop_measurement()

@@ -31,10 +31,6 @@ class FaultyServer(Protocol):
         """The clients' connections."""
         ...
 
-    def elapsed_us(self) -> int | None:
-        """Return the measurement's time in µs; None while none is running."""
-        ...
-
     def stop_measurement(self) -> None:
         """Stop the measurement, if one is running."""
         ...

@@ -107,8 +107,11 @@ class FrozenTimestamps(FrameFault):
 
     def change_frame(self, body: bytes, byte_order: ByteOrder, active: ActiveFault) -> bytes:
         """See FrameFault."""
+        if active.timestamp_us is None:
+            components = split_frame(body, byte_order).components
+            active.timestamp_us = components[0].timestamp_us if components else None
         return _change_components(
-            body, byte_order, lambda component: _rebuild(component, timestamp_us=active.began_us)
+            body, byte_order, lambda component: _rebuild(component, timestamp_us=active.timestamp_us)
         )
 
 

@@ -62,11 +62,13 @@ def test_occlusion_hides_the_same_markers_until_it_begins_again() -> None:
     assert first != third
 
 
-def test_frozen_time_stamps_are_the_time_when_the_fault_began() -> None:
+def test_frozen_time_stamps_are_those_of_the_first_frame_since_the_fault_began() -> None:
     frozen = active(FrozenTimestamps())
-    frozen.began_us = 1234
-    data = changed(FrozenTimestamps(), frame(markers(number=1), markers(number=2)), frozen)
-    assert data == frame(markers(number=1, timestamp_us=1234), markers(number=2, timestamp_us=1234))
+    changed(FrozenTimestamps(), frame(markers(number=1, timestamp_us=1234)), frozen)
+    data = changed(FrozenTimestamps(), frame(markers(number=2, timestamp_us=5)), frozen)
+    assert data == frame(markers(number=2, timestamp_us=1234))
+    frozen.begin()
+    assert changed(FrozenTimestamps(), data := frame(markers(timestamp_us=77)), frozen) == data
 
 
 @pytest.mark.parametrize(("jump_ms", "timestamp_us"), [(-5, 4000), (0.5, 9500), (1e12, 10**15 + 9000)])
