@@ -35,6 +35,7 @@ def export_csv(job: ExportJob) -> None:
     if not job.files.paths:
         raise nothing_to_export(job, "frames")
     writer.note_changes()
+    job.note_malformed(take)
 
 
 class _Writer:
@@ -52,7 +53,7 @@ class _Writer:
         if layout not in self._files:
             self._files[layout] = self._create(name, key, columns)
         rows = _event_rows(run) if key == ComponentType.EVENT.key else _value_rows(run)
-        self._files[layout].write("".join(rows).encode())
+        self._files[layout].writelines(row.encode() for row in rows)
 
     def note_changes(self) -> None:
         """Report components that have several files."""
@@ -93,21 +94,19 @@ def _batches(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
         batch.setdefault((name, key), []).append(message)
         batch_bytes += len(message)
         if batch_bytes >= _BATCH_BYTES:
-            yield from _decoded(job, take, batch)
+            yield from _decoded(take, batch)
             batch.clear()
             batch_bytes = 0
             job.progress(f"reading {job.take.name}", min(done, total), total)
-    yield from _decoded(job, take, batch)
+    yield from _decoded(take, batch)
 
 
-def _decoded(
-    job: ExportJob, take: Take, batch: dict[tuple[str, str], list[bytes]]
-) -> Iterator[tuple[str, str, Series]]:
+def _decoded(take: Take, batch: dict[tuple[str, str], list[bytes]]) -> Iterator[tuple[str, str, Series]]:
     for (name, key), messages in batch.items():
         component = COMPONENTS_BY_KEY[key]
         rows = decode_rows(component, messages)
-        if rows.malformed:
-            job.note(f"{name}: malformed messages of {key} were left out")
+        malformed = take.sources[name].malformed
+        malformed[key] = malformed.get(key, 0) + rows.malformed
         builder = SeriesBuilder(component)
         builder.add(rows)
         series = builder.build(take.sources[name].parameters, take.start_utime)

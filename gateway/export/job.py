@@ -3,10 +3,13 @@
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Final
 
 from gateway.errors import TakeError
 from gateway.takes.new_file import NewFiles
 from gateway.takes.take import Take, open_take
+
+_MAX_NAMED: Final = 10
 
 
 def _no_progress(*_: object) -> None:
@@ -49,21 +52,25 @@ class ExportJob:
             from_s=self.from_s,
             to_s=self.to_s,
         )
-        self.note_damage(take.num_damaged, take.damaged_bytes, take.unknown)
-        for source in take.sources.values():
-            for key, count in source.malformed.items():
-                self.note(f"{source.name}: {count} malformed messages of {key} were left out")
+        if take.num_damaged:
+            places = "1 place" if take.num_damaged == 1 else f"{take.num_damaged} places"
+            self.note(f"the take is damaged at {places}: {take.damaged_bytes} bytes cannot be read")
+        if take.unknown:
+            channels = ", ".join([*take.unknown][:_MAX_NAMED]) + (
+                ", …" if len(take.unknown) > _MAX_NAMED else ""
+            )
+            count = sum(take.unknown.values())
+            self.note(f"messages of other programs were left out: {count}, on the channels {channels}")
+        if components is None:
+            self.note_malformed(take)
         return take
 
-    def note_damage(self, num_damaged: int, damaged_bytes: int, unknown: dict[str, int]) -> None:
-        """Report damage of the take, and messages of unknown types by channel."""
-        if num_damaged:
-            places = "place" if num_damaged == 1 else "places"
-            self.note(f"the take is damaged at {num_damaged} {places}: {damaged_bytes} bytes cannot be read")
-        if unknown:
-            self.note(
-                f"{sum(unknown.values())} messages of other programs on {', '.join(unknown)} were left out"
-            )
+    def note_malformed(self, take: Take) -> None:
+        """Report messages that could not be read."""
+        for source in take.sources.values():
+            for key, count in source.malformed.items():
+                if count:
+                    self.note(f"malformed messages of {key} of {source.name} were left out: {count}")
 
     def file_name(self, *parts: str) -> Path:
         """Return the name of one of several files: the name of ``out`` with these parts at its end."""
