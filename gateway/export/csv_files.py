@@ -2,6 +2,7 @@
 
 import csv
 import io
+import math
 from collections.abc import Iterator
 from typing import IO, Final
 
@@ -18,8 +19,6 @@ _HEAD: Final = ("time_s", "capture_utime", "utime", "sequence", "session", "fram
 _EVENT_FIELDS: Final = ("id", "label", "event_timestamp_us", "param1", "param2", "param3", "description")
 _QUATERNION: Final = ("q0", "qx", "qy", "qz")
 _MOMENTS: Final = ("mx", "my", "mz")
-_BATCH_BYTES: Final = 8 * 1024 * 1024
-_EVENT_HEADER_BYTES: Final = 50  # about, with the channel
 _MAX_FILES: Final = 200
 
 _Layout = tuple[str, str, tuple[str, ...]]  # source, key and columns of a file
@@ -29,7 +28,7 @@ def export_csv(job: ExportJob) -> None:
     """Write a file for each component of each source; if its labels change, one for each set of labels."""
     take = job.open_take(components=())
     writer = _Writer(job, take)
-    for name, key, series in _batches(job, take):
+    for name, key, series in _parts(job, take):
         for run in series.runs():
             writer.write(name, key, run)
     if not job.files.paths:
@@ -78,40 +77,29 @@ class _Writer:
         return sum(layout[:2] == (name, key) for layout in self._files)
 
 
-def _batches(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
-    """Yield parts of the components with up to 8 MB, in the order of the take."""
+def _parts(job: ExportJob, take: Take) -> Iterator[tuple[str, str, Series]]:
+    """Yield parts of the components of some MB, with the names of their sources, in the order of the take."""
     reader = TakeReader(job.take)
-    total = sum(log.path.stat().st_size for log in reader.logs)
-    first = take.start_utime + round((job.from_s or 0.0) * 1e6) if job.from_s is not None else None
-    last = None if job.to_s is None else take.start_utime + round(job.to_s * 1e6)
-    batch: dict[tuple[str, str], list[bytes]] = {}
-    batch_bytes = done = 0
-    for utime, name, key, message in reader.messages():
-        done += len(message) + _EVENT_HEADER_BYTES
-        is_wanted = key in COMPONENTS_BY_KEY and (job.source is None or name == job.source)
-        if not is_wanted or (first is not None and utime < first) or (last is not None and utime >= last):
-            continue
-        batch.setdefault((name, key), []).append(message)
-        batch_bytes += len(message)
-        if batch_bytes >= _BATCH_BYTES:
-            yield from _decoded(take, batch)
-            batch.clear()
-            batch_bytes = 0
-            job.progress(f"reading {job.take.name}", min(done, total), total)
-    yield from _decoded(take, batch)
-
-
-def _decoded(take: Take, batch: dict[tuple[str, str], list[bytes]]) -> Iterator[tuple[str, str, Series]]:
-    for (name, key), messages in batch.items():
-        component = COMPONENTS_BY_KEY[key]
-        rows = decode_rows(component, messages)
-        malformed = take.sources[name].malformed
-        malformed[key] = malformed.get(key, 0) + rows.malformed
-        builder = SeriesBuilder(component)
-        builder.add(rows)
-        series = builder.build(take.sources[name].parameters, take.start_utime)
-        if series is not None:
-            yield name, key, series
+    first = -math.inf if job.from_s is None else take.start_utime + round(job.from_s * 1e6)
+    end = math.inf if job.to_s is None else take.start_utime + round(job.to_s * 1e6)
+    for batches in reader.batches():
+        for batch in batches:
+            source = take.sources.get(batch.source)
+            if source is None or batch.key not in COMPONENTS_BY_KEY:
+                continue
+            component = COMPONENTS_BY_KEY[batch.key]
+            events = zip(batch.utimes, batch.messages, strict=True)
+            messages = [message for utime, message in events if first <= utime < end]
+            if not messages:
+                continue
+            rows = decode_rows(component, messages)
+            source.malformed[batch.key] = source.malformed.get(batch.key, 0) + rows.malformed
+            builder = SeriesBuilder(component)
+            builder.add(rows)
+            series = builder.build(source.parameters, take.start_utime)
+            if series is not None:
+                yield source.name, batch.key, series
+        job.progress(f"reading {job.take.name}", reader.read_bytes, reader.num_bytes)
 
 
 def _columns(key: str, run: Series) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
+from gateway.config.section import join_or
 from gateway.errors import TakeError
 from gateway.export.c3d import export_c3d
 from gateway.export.csv_files import export_csv
@@ -22,8 +23,7 @@ def export_take(job: ExportJob) -> list[Path]:
     """Write the files of a job, and return their names. Raises TakeError; then none of them exists."""
     write = FORMATS.get(job.out.suffix.lower())
     if write is None:
-        known = ", ".join(FORMATS)
-        raise TakeError(f"{job.out} has no known extension; choose one of {known}")
+        raise TakeError(f"{job.out} has no known extension; choose {join_or(FORMATS)}")
     if job.from_s is not None and job.to_s is not None and job.from_s >= job.to_s:
         raise TakeError(f"--from {job.from_s:g} is not before --to {job.to_s:g}")
     with job.files:

@@ -44,13 +44,14 @@ class ExportJob:
 
         ``components`` are the keys of those to load; None means all.
         """
-        self.progress(f"reading {self.take.name}", 0, 0)
+        text = f"reading {self.take.name}"
         take = open_take(
             self.take,
             sources=None if self.source is None else [self.source],
             components=components,
             from_s=self.from_s,
             to_s=self.to_s,
+            progress=lambda done, total: self.progress(text, done, total),
         )
         if take.num_damaged:
             places = "1 place" if take.num_damaged == 1 else f"{take.num_damaged} places"

@@ -1,7 +1,7 @@
 """Reading a take into numpy arrays, for analysis and for conversion to other formats."""
 
 import math
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Final
@@ -80,6 +80,7 @@ def open_take(
     components: Collection[str] | None = None,
     from_s: float | None = None,
     to_s: float | None = None,
+    progress: Callable[[int, int], object] | None = None,
 ) -> Take:
     """Read a take (an event log, or the folder of a saved take) into numpy arrays.
 
@@ -94,9 +95,10 @@ def open_take(
         plt.plot(markers.seconds, head)
 
     ``sources`` (names) and ``components`` (of 3d, 6d, analog, force, event) limit what is loaded, ``from_s``
-    and ``to_s`` the time of the events, in seconds from the first event of the take. The arrays take as much
-    memory as their part of the file. Damage of the file is skipped and counted. Raises TakeError if there is
-    no take, or if a source or component is not in it.
+    and ``to_s`` the time of the events, in seconds from the first event of the take. ``progress`` gets the
+    bytes that were read, and those in all. The arrays take as much memory as their part of the file. Damage
+    of the file is skipped and counted. Raises TakeError if there is no take, or if a source or component is
+    not in it.
     """
     wanted = _components(components)
     reader = TakeReader(Path(path))
@@ -106,6 +108,8 @@ def open_take(
     for batches in reader.batches():
         for batch in batches:
             loader.add(batch, first_utime, end_utime)
+        if progress is not None:
+            progress(reader.read_bytes, reader.num_bytes)
     take = Take(Path(path), reader.start_utime, loader.finish(reader.start_utime))
     take.num_damaged = sum(log.num_damaged for log in reader.logs) + len(reader.empty_files)
     take.damaged_bytes = sum(log.damaged_bytes for log in reader.logs)

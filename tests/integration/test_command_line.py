@@ -23,6 +23,7 @@ COMMANDS: Final = (
     "params",
     "record",
     "replay",
+    "export",
     "config",
     "config show",
 )

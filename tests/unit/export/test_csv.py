@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from gateway.errors import TakeError
-from gateway.export import csv_files
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import (
     EventDefinition,
@@ -22,6 +21,7 @@ from gateway.rtc3d.parameters import (
     Plate,
 )
 from gateway.simulator.synthetic import SyntheticScene
+from gateway.takes import reader
 from tests.recorded_scenes import scene_messages
 from tests.takes import START_UTIME, Message, description, frame, markers, parameters
 from tests.unit.export.exported import export_messages
@@ -196,7 +196,7 @@ def test_a_take_without_components_is_an_error(tmp_path: Path) -> None:
 def test_parts_of_a_long_take_follow_each_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     messages = [parameters(SCENE.parameters), *scene_messages(SCENE, 30)]
     export_messages(tmp_path, messages, "whole.csv")
-    monkeypatch.setattr(csv_files, "_BATCH_BYTES", 1000)
+    monkeypatch.setattr(reader, "_BATCH_BYTES", 1000)
     export_messages(tmp_path, messages, "parts.csv")
     for key in ("3d", "6d", "analog", "force"):
         assert (tmp_path / f"parts-{key}.csv").read_bytes() == (tmp_path / f"whole-{key}.csv").read_bytes()
