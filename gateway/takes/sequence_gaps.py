@@ -59,8 +59,8 @@ class SequenceGaps:
         """Take the numbers and times (µs) of the next messages, each with shape (messages,)."""
         if not len(sequence):
             return
-        before = sequence[0] - 1 if self._newest is None else self._newest[0]
-        if sequence[0] - before == 1 and (np.diff(sequence) == 1).all():
+        first = int(sequence[0])  # numpy's integers overflow
+        if (self._newest is None or first - self._newest[0] == 1) and (np.diff(sequence) == 1).all():
             self._newest = int(sequence[-1]), int(utime[-1])
             return
         for number, time in zip(sequence.tolist(), utime.tolist(), strict=True):
