@@ -171,7 +171,7 @@ lock:
 
 # Coverage-guided fuzzing, FUZZ_SECONDS for each target; not part of the check.
 FUZZ_SECONDS ?= 60
-FUZZ_TARGETS ?= packets frames connection commands parameters configuration messages
+FUZZ_TARGETS ?= packets frames connection commands parameters configuration messages take
 
 fuzz: .venv/installed
 	$(BIN)/pip install --quiet atheris

@@ -17,7 +17,8 @@ from pathlib import Path
 import atheris
 
 with atheris.instrument_imports(include=["gateway"]):
-    from gateway.errors import CommandError, ConfigError, FrameError, ParametersError, ProtocolError
+    from gateway.cli.take_json import statistics_json
+    from gateway.errors import CommandError, ConfigError, FrameError, ParametersError, ProtocolError, TakeError
     from gateway.messages.decode import decode, to_json
     from gateway.messages.encode import encode_message
     from gateway.messages.stamp import Stamp
@@ -28,6 +29,9 @@ with atheris.instrument_imports(include=["gateway"]):
     from gateway.rtc3d.packets import PacketReader
     from gateway.rtc3d.parameters_xml import encode_parameters, parse_parameters
     from gateway.rtc3d.protocol_state import ProtocolState
+    from gateway.takes import open_take
+    from gateway.takes.event_log import encode_event
+    from gateway.takes.statistics import take_statistics
     from tests.configurations import load
 
 from tests.vectors import COMPONENTS, FRAME_WITH_UNKNOWN, FULL_FRAME, PACKETS
@@ -114,9 +118,23 @@ def messages(data: bytes) -> None:
         summarise(decode(data))
 
 
+def take(data: bytes) -> None:
+    """A file is a take whose arrays and statistics can be computed, or is refused."""
+    with tempfile.NamedTemporaryFile(suffix=".lcmlog") as file:
+        file.write(data)
+        file.flush()
+        try:
+            for source in open_take(Path(file.name)).sources.values():
+                for series in source.series.values():
+                    assert sum(map(len, series.runs())) == len(series)
+            statistics_json(take_statistics(Path(file.name)))
+        except TakeError as error:
+            assert file.name in str(error) or "runs()" in str(error)
+
+
 TARGETS: dict[str, Callable[[bytes], None]] = {
     target.__name__: target
-    for target in (packets, frames, connection, commands, parameters, configuration, messages)
+    for target in (packets, frames, connection, commands, parameters, configuration, messages, take)
 }
 
 
@@ -129,6 +147,11 @@ def seeds() -> Iterator[bytes]:
     yield from FULL_FRAME.values()
     yield from FRAME_WITH_UNKNOWN.values()
     yield from (str(command).encode() for command in (Version(), SendParameters(("3d",)), StreamFrames()))
+    log = b""
+    for number, part in enumerate(split_frame(FULL_FRAME["big"], "big").components):
+        channel = f"MOCAP_LAB_{part.type.key.upper()}".encode()
+        log += encode_event(number, number, channel, encode_message(part, STAMP, number))
+        yield log
     for folder, pattern in (("tests/data/spec_xml", "*.xml"), ("config", "*.yaml")):
         for path in (ROOT / folder).glob(pattern):
             yield path.read_bytes()
