@@ -5,7 +5,7 @@ from typing import Final
 import numpy as np
 
 from gateway.export.c3d_format import MAX_LIST, Parameter
-from gateway.export.event_texts import event_text
+from gateway.export.event_texts import MAX_EVENT_AGE_US, event_text
 from gateway.export.job import ExportJob
 from gateway.export.labels import printable
 from gateway.export.measurements import Measurement
@@ -15,14 +15,12 @@ from gateway.takes.series import Series
 _MINUTE_S: Final = 60.0
 _MARGIN_S: Final = 1.0
 """An event so shortly before the first frame or after the last one belongs to the measurement."""
-_MAX_EVENT_AGE_US: Final = 1_000_000
-"""An event's own time stamp is used if it is as near as this to that of its frame."""
 
 
 def event_times_us(events: Series) -> Array:
     """Return the server's time of each event: its own, or that of its frame if it is far from that."""
     own = events.items["timestamp"]
-    is_near = abs(own.astype(np.float64) - events.timestamp_us) <= _MAX_EVENT_AGE_US
+    is_near = abs(own.astype(np.float64) - events.timestamp_us) <= MAX_EVENT_AGE_US
     return np.where(is_near, own, events.timestamp_us)
 
 

@@ -9,6 +9,9 @@ from gateway.takes.labels import event_number
 UNUSED: Final = -1
 """An event's parameter that is not used (0xFFFFFFFF)."""
 
+MAX_EVENT_AGE_US: Final = 1_000_000
+"""An event's own time stamp is used if it is as near as this to that of its frame."""
+
 
 class EventText(NamedTuple):
     """What an event is called, and its parameters, such as "Button id number: 3; ON/OFF state: ON"."""

@@ -11,10 +11,25 @@ from gateway.export.csv_files import export_csv
 from gateway.export.job import ExportJob
 from gateway.export.trc import export_trc
 
+_INSTALL: Final = "pip install 'rtc3d-gateway[foxglove]'"
+
+
+def _export_mcap(job: ExportJob) -> None:
+    """See export_mcap. Raises TakeError if foxglove-sdk is not installed."""
+    try:
+        from gateway.export.mcap import export_mcap  # noqa: PLC0415 - it needs an optional extra
+    except ImportError as error:
+        raise TakeError(
+            f"{job.out} cannot be written without foxglove-sdk; install it: {_INSTALL}"
+        ) from error
+    export_mcap(job)
+
+
 FORMATS: Final[dict[str, Callable[[ExportJob], None]]] = {
     ".c3d": export_c3d,
     ".trc": export_trc,
     ".csv": export_csv,
+    ".mcap": _export_mcap,
 }
 """What writes the files of a job, by the extension of its ``out``."""
 

@@ -1,0 +1,133 @@
+"""Protobuf messages with one number per label: plots find each by its name.
+
+They are a fifth of the size of JSON, and need a tenth of the time.
+"""
+
+import unicodedata
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from google.protobuf.descriptor_pb2 import (
+    DescriptorProto,
+    FieldDescriptorProto,
+    FileDescriptorProto,
+    FileDescriptorSet,
+)
+
+from gateway.export.foxglove_topics import Topic
+from gateway.export.labels import fitting_labels
+from gateway.takes.component_rows import Array
+
+_MAX_NAME_BYTES: Final = 100
+_RESERVED_NUMBERS: Final = range(19000, 20000)
+"""Numbers that protobuf does not allow for fields."""
+
+_FIXED_32_BITS: Final = 5
+"""The wire type of float."""
+
+
+class FloatTopics:
+    """The topics of one source whose messages have a number for each label.
+
+    Programs decode all messages of a topic in the same way. So there is another topic for other labels, such
+    as /lab/analog_2.
+    """
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self._package = f"rtc3d.{field_names([source], 'source')[0]}"
+        self._records: dict[tuple[str, tuple[str, ...]], FloatRecord] = {}
+
+    def record(self, name: str, fields: tuple[str, ...]) -> "FloatRecord":
+        """Return the messages with these fields, which ``field_names`` has made.
+
+        ``name`` is the topic without the source, such as "analog".
+        """
+        found = self._records.get((name, fields))
+        if found is None:
+            number = 1 + sum(key[0] == name for key in self._records)
+            suffix = f"_{number}" if number > 1 else ""
+            # Programs look up the fields by the name of the schema, so each is different.
+            schema_name = f"{self._package}.{name.capitalize()}{suffix}"
+            found = FloatRecord(f"/{self.source}/{name}{suffix}", schema_name, fields)
+            self._records[name, fields] = found
+        return found
+
+
+class FloatRecord:
+    """The messages of a topic that have a field of type float for each name."""
+
+    def __init__(self, topic_name: str, schema_name: str, names: Sequence[str]) -> None:
+        numbers = _field_numbers(len(names))
+        schema = _schema(schema_name, names, numbers)
+        self.topic = Topic(topic_name, "protobuf", schema_name, "protobuf", schema)
+        data = bytearray()
+        places = []
+        for number in numbers:
+            data += _varint(number << 3 | _FIXED_32_BITS)
+            places.append(len(data))
+            data += bytes(4)
+        self._template = np.frombuffer(bytes(data), np.uint8)
+        self._places = np.array(places, np.intp)[:, np.newaxis] + np.arange(4)
+
+    def encode(self, values: Array) -> bytes:
+        """Return the message with these values, one per field, in the order of the names."""
+        data = self._template.copy()
+        data[self._places] = values.astype("<f4").view(np.uint8).reshape(-1, 4)
+        return data.tobytes()
+
+
+def field_names(labels: Sequence[str], noun: str) -> tuple[str, ...]:
+    """Return labels as names of protobuf fields: ASCII letters, digits and _, each different.
+
+    A label without any of these is called by its position: ``noun`` is "channel" for channel_3.
+    """
+    return fitting_labels(labels, _identifier, _MAX_NAME_BYTES, noun)
+
+
+def _identifier(text: str) -> str:
+    decomposed = unicodedata.normalize("NFKD", text.strip())  # Ü becomes U and a mark
+    ascii_text = "".join(character for character in decomposed if not unicodedata.combining(character))
+    name = "".join(
+        character if character.isascii() and character.isalnum() else "_" for character in ascii_text
+    )
+    if not name.strip("_"):
+        return ""
+    return f"_{name}" if name[0].isdigit() else name
+
+
+def _field_numbers(count: int) -> list[int]:
+    numbers = range(1, count + len(_RESERVED_NUMBERS) + 1)
+    return [number for number in numbers if number not in _RESERVED_NUMBERS][:count]
+
+
+def _schema(schema_name: str, names: Sequence[str], numbers: Sequence[int]) -> bytes:
+    """Return the description of the message type as MCAP has it: a FileDescriptorSet."""
+    package, _, message_name = schema_name.rpartition(".")
+    fields = [
+        # In proto2, names may differ in underscores and case only.
+        FieldDescriptorProto(
+            name=name,
+            number=number,
+            label=FieldDescriptorProto.LABEL_OPTIONAL,
+            type=FieldDescriptorProto.TYPE_FLOAT,
+            json_name=name,
+        )
+        for name, number in zip(names, numbers, strict=True)
+    ]
+    message = DescriptorProto(name=message_name, field=fields)
+    file = FileDescriptorProto(
+        name=f"{schema_name}.proto", package=package, syntax="proto2", message_type=[message]
+    )
+    data: bytes = FileDescriptorSet(file=[file]).SerializeToString()
+    return data
+
+
+def _varint(number: int) -> bytes:
+    data = bytearray()
+    while number > 0x7F:
+        data.append(number & 0x7F | 0x80)
+        number >>= 7
+    data.append(number)
+    return bytes(data)

@@ -1,0 +1,220 @@
+"""The messages of one source as Foxglove's, one at a time: for a file, or live.
+
+docs/reference/takes.md has the table of topics. Positions are in metres, in the frame of the source.
+"""
+
+import json
+from typing import Any, Final
+
+import numpy as np
+from foxglove.messages import (
+    FrameTransform,
+    FrameTransforms,
+    Log,
+    LogLevel,
+    PackedElementField,
+    PackedElementFieldNumericType,
+    PointCloud,
+    Pose,
+    Quaternion,
+    Vector3,
+)
+
+from gateway.export.event_texts import MAX_EVENT_AGE_US, event_text
+from gateway.export.float_topics import FloatRecord, FloatTopics, field_names
+from gateway.export.foxglove_forces import ForceScene
+from gateway.export.foxglove_topics import FoxgloveMessage, json_topic, timestamp, topic_of
+from gateway.messages.tool_pose import metres_per_unit
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType, Items
+from gateway.rtc3d.parameters import Parameters
+from gateway.takes.labels import describe, event_labels
+
+_POINT: Final = np.dtype(
+    [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("reliability", "<f4"), ("marker", "<u4")]
+)
+_POINT_FIELDS: Final = [
+    PackedElementField(
+        name=name,
+        offset=4 * index,
+        type=(
+            PackedElementFieldNumericType.Uint32
+            if name == "marker"
+            else PackedElementFieldNumericType.Float32
+        ),
+    )
+    for index, name in enumerate(_POINT.names or ())
+]
+_NO_POSE: Final = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
+"""Points without a pose are not valid in rerun."""
+
+_LOADS: Final = ("fx", "fy", "fz", "mx", "my", "mz")
+_MAX_LAYOUTS: Final = 100
+"""How many different numbers of items of one component are remembered."""
+
+_MILLIMETRE: Final = 1e-3
+
+
+class FoxgloveSource:
+    """Converts messages of one source, as long as its parameters are the same.
+
+    When they change, create another one with the same ``topics``. ``version`` is that of the parameters.
+    ``problem`` is a sentence about what the parameters lack; "" if nothing.
+    """
+
+    def __init__(self, topics: FloatTopics, parameters: Parameters, version: int) -> None:
+        self.source = source = topics.source
+        self.problem = ""
+        self._topics = topics
+        self._parameters = parameters
+        self._version = version
+        unit = "mm" if parameters.markers is None else parameters.markers.unit
+        metres = metres_per_unit(unit)
+        if metres is None:
+            self.problem = f"the unit of length {unit!r} is unknown; positions are shown as if it were mm"
+        self._metres = metres or _MILLIMETRE
+        self._forces = ForceScene(source, parameters)
+        self._labels: dict[tuple[ComponentType, int], tuple[str, ...]] = {}
+        self._records: dict[tuple[ComponentType, int], FloatRecord] = {}
+        self._markers = topic_of(f"/{source}/markers", PointCloud)
+        self._tools = topic_of(f"/{source}/tools", FrameTransforms)
+        self._events = topic_of(f"/{source}/events", Log)
+        self._description = json_topic(f"/{source}/parameters", "rtc3d.Parameters", {"type": "object"})
+
+    def describe(self, utime: int) -> list[FoxgloveMessage]:
+        """Return what is the same for all messages: labels, units and rates, and the outlines of plates."""
+        content = {"version": self._version, **_description(self._parameters)}
+        text = json.dumps(content, ensure_ascii=False, allow_nan=False)
+        return [FoxgloveMessage(self._description, utime, text.encode()), self._forces.plates(utime)]
+
+    def convert(
+        self, component: ComponentType, items: Items, capture_utime: int, timestamp_us: int
+    ) -> list[FoxgloveMessage]:
+        """Return the messages of one component.
+
+        ``items`` has the shape (items,) and the dtype of ITEM_DTYPES, big-endian. ``capture_utime`` is in µs
+        since 1970, from 0 to MAX_UTIME, and ``timestamp_us`` the server's time stamp.
+        """
+        match component:
+            case ComponentType.MARKERS:
+                return [FoxgloveMessage(self._markers, capture_utime, self._cloud(items, capture_utime))]
+            case ComponentType.TOOLS:
+                # Without a transform, rerun would reject the messages before and after this one, too.
+                data = self._transforms(items, capture_utime)
+                return [FoxgloveMessage(self._tools, capture_utime, data)] if data else []
+            case ComponentType.ANALOG:
+                return self._numbers(component, items, capture_utime)
+            case ComponentType.FORCE:
+                return [
+                    *self._numbers(component, items.view(">f4"), capture_utime),
+                    self._forces.arrows(items, capture_utime),
+                ]
+            case ComponentType.EVENT:
+                return [self._log(item, capture_utime, timestamp_us) for item in items]
+
+    def _cloud(self, items: Items, utime: int) -> bytes:
+        """Return the visible markers; each has its position in the parameters, from 0."""
+        values = items.view(">f4").reshape(-1, 4).astype(np.float32)
+        visible = np.flatnonzero(np.isfinite(values[:, :3]).all(axis=1))
+        points = np.empty((len(visible), 5), "<f4")
+        points[:, :4] = values[visible]
+        points[:, :3] *= self._metres
+        points.view("<u4")[:, 4] = visible
+        return PointCloud(
+            timestamp=timestamp(utime),
+            frame_id=self.source,
+            pose=_NO_POSE,
+            point_stride=_POINT.itemsize,
+            fields=_POINT_FIELDS,
+            data=points.tobytes(),
+        ).encode()
+
+    def _transforms(self, items: Items, utime: int) -> bytes:
+        """Return the poses of the visible tools; b"" if there are none."""
+        values = items.view(">f4").reshape(-1, 8).astype(np.float64)
+        # Any NaN means missing (field note 7), and a quaternion of zeros is no rotation.
+        is_visible = np.logical_and(np.isfinite(values).all(axis=1), values[:, :4].any(axis=1)).tolist()
+        if not any(is_visible):
+            return b""
+        labels = self._labels_of(ComponentType.TOOLS, len(values))
+        values[:, 4:7] *= self._metres
+        time = timestamp(utime)
+        return FrameTransforms(
+            transforms=[
+                FrameTransform(
+                    timestamp=time,
+                    parent_frame_id=self.source,
+                    child_frame_id=f"{self.source}/{labels[index]}",
+                    translation=Vector3(x=x, y=y, z=z),
+                    rotation=Quaternion(x=qx, y=qy, z=qz, w=q0),
+                )
+                for index, (q0, qx, qy, qz, x, y, z, _) in enumerate(values.tolist())
+                if is_visible[index]
+            ]
+        ).encode()
+
+    def _numbers(self, component: ComponentType, values: Items, utime: int) -> list[FoxgloveMessage]:
+        """Return the values of a component by their labels; [] if there are none."""
+        if not len(values):
+            return []
+        found = self._records.get((component, len(values)))
+        if found is None:
+            found = self._record(component, len(values))
+            if len(self._records) >= _MAX_LAYOUTS:
+                self._records.clear()
+            self._records[component, len(values)] = found
+        return [FoxgloveMessage(found.topic, utime, found.encode(values))]
+
+    def _record(self, component: ComponentType, num_values: int) -> FloatRecord:
+        if component is ComponentType.ANALOG:
+            names = field_names(self._labels_of(component, num_values), "channel")
+            return self._topics.record("analog", names)
+        plates = field_names(self._labels_of(component, num_values // len(_LOADS)), "plate")
+        labels = [f"{plate}_{load}" for plate in plates for load in _LOADS]
+        return self._topics.record("loads", field_names(labels, "load"))
+
+    def _log(self, item: Any, capture_utime: int, timestamp_us: int) -> FoxgloveMessage:
+        """Return an event, at its own time stamp if that is plausible."""
+        delay_us = timestamp_us - int(item["timestamp"])
+        utime = capture_utime - delay_us if abs(delay_us) <= MAX_EVENT_AGE_US else capture_utime
+        utime = max(utime, 0)
+        text = event_text(self._parameters, item)
+        message = f"{text.label} ({text.description})" if text.description else text.label
+        log = Log(timestamp=timestamp(utime), level=LogLevel.Info, message=message, name=self.source)
+        return FoxgloveMessage(self._events, utime, log.encode())
+
+    def _labels_of(self, component: ComponentType, num_items: int) -> tuple[str, ...]:
+        found = self._labels.get((component, num_items))
+        if found is None:
+            found = describe(component, self._parameters, num_items).labels
+            if len(self._labels) >= _MAX_LAYOUTS:
+                self._labels.clear()
+            self._labels[component, num_items] = found
+        return found
+
+
+def _description(parameters: Parameters) -> dict[str, Any]:
+    """Return the labels, units and rates of the components, and the labels of events, for JSON."""
+    content: dict[str, Any] = {}
+    for component, num_items in _announced(parameters).items():
+        found = describe(component, parameters, num_items)
+        content[component.key] = {
+            "labels": found.labels,
+            "units": found.units,
+            "moment_unit": found.moment_unit,
+            "rate_hz": found.rate_hz,
+        }
+        if component is ComponentType.ANALOG:
+            content[component.key]["fields"] = field_names(found.labels, "channel")
+    content["event"] = {"labels": {str(number): label for number, label in event_labels(parameters).items()}}
+    return content
+
+
+def _announced(parameters: Parameters) -> dict[ComponentType, int]:
+    """Return how many items the parameters describe, by component."""
+    counts = {
+        ComponentType.MARKERS: parameters.markers and len(parameters.markers.markers),
+        ComponentType.TOOLS: parameters.tools and len(parameters.tools.tools),
+        ComponentType.ANALOG: parameters.analog and len(parameters.analog.channels),
+        ComponentType.FORCE: parameters.force and len(parameters.force.plates),
+    }
+    return {component: counts[component] or 0 for component in WIRE_ORDER if counts.get(component)}

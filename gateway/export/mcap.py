@@ -1,0 +1,151 @@
+"""Export to MCAP with Foxglove's types, for Foxglove, Lichtblick and rerun.
+
+The file is written while the take is read, so its size does not matter.
+"""
+
+import bisect
+import struct
+from collections import Counter
+from typing import Final
+
+import numpy as np
+
+from gateway.errors import ProtocolError
+from gateway.export.float_topics import FloatTopics
+from gateway.export.foxglove_messages import FoxgloveSource
+from gateway.export.foxglove_topics import MAX_UTIME
+from gateway.export.job import ExportJob, nothing_to_export
+from gateway.export.mcap_file import McapFile
+from gateway.messages.decode import decode
+from gateway.messages.encode import ITEMS_OFFSET
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES
+from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters_changes import differ_in_statistics_only
+from gateway.takes.reader import TakeReader
+from gateway.takes.take import Take, TakeSource
+
+_HEAD: Final = struct.Struct(">8xqq8x4xi4xqi")
+"""Of a component's message: utime, capture_utime, version of the parameters, time stamp, number of items."""
+
+_EVENT_HEADER_BYTES: Final = 50  # about, with the channel
+_PROGRESS_BYTES: Final = 1024 * 1024
+_NO_PARAMETERS: Final = -1
+
+
+def export_mcap(job: ExportJob) -> None:
+    """Write the sources of a take to one file, each with topics of its own."""
+    take = job.open_take(components=())
+    sources = {name: _SourceExport(source) for name, source in take.sources.items()}
+    with McapFile(job.files.create(job.out)) as file:
+        _write_messages(job, take, sources, file)
+        for source in sources.values():
+            file.write_metadata(source.name, source.metadata)
+    if not file.num_messages:
+        raise nothing_to_export(job, "frames")
+    for source in sources.values():
+        for problem in source.problems:
+            job.note(f"{source.name}: {problem}")
+
+
+def _write_messages(job: ExportJob, take: Take, sources: dict[str, "_SourceExport"], file: McapFile) -> None:
+    """Write the messages of the chosen time, and all parameters."""
+    reader = TakeReader(job.take)
+    total = sum(log.path.stat().st_size for log in reader.logs)
+    first = None if job.from_s is None else take.start_utime + round(job.from_s * 1e6)
+    last = None if job.to_s is None else take.start_utime + round(job.to_s * 1e6)
+    done = shown = 0
+    for utime, name, key, message in reader.messages():
+        done += len(message) + _EVENT_HEADER_BYTES
+        if done - shown >= _PROGRESS_BYTES:
+            shown = done
+            job.progress(f"writing {job.out.name}", min(done, total), total)
+        source = sources.get(name)
+        if source is None:
+            continue
+        if key == "parameters":
+            source.attach_parameters(message, file)
+        elif (
+            key in COMPONENTS_BY_KEY and (first is None or utime >= first) and (last is None or utime < last)
+        ):
+            source.write(key, message, file)
+
+
+class _SourceExport:
+    """One source of a take on its way to a file."""
+
+    def __init__(self, source: TakeSource) -> None:
+        self.name = source.name
+        self._source = source
+        self._entries = source.parameters
+        self._by_version: dict[int, list[int]] = {}  # indices of parameters, in the order of their times
+        for index in sorted(range(len(self._entries)), key=lambda index: self._entries[index].utime):
+            self._by_version.setdefault(self._entries[index].version, []).append(index)
+        self._topics = FloatTopics(source.name)
+        self._converters: dict[int, FoxgloveSource] = {}  # by the index of the parameters
+        self._xml = b""  # of the newest attachment
+        self._num_attached = 0
+        self._left_out: Counter[str] = Counter()
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """What the take says about the source."""
+        return {"server": self._source.server, "gateway_version": self._source.gateway_version}
+
+    @property
+    def problems(self) -> list[str]:
+        """Sentences about what was left out, or what the parameters lack."""
+        left_out = [f"{count} {what} were left out" for what, count in self._left_out.items()]
+        lacking = [converter.problem for converter in self._converters.values() if converter.problem]
+        return list(dict.fromkeys(left_out + lacking))
+
+    def write(self, key: str, message: bytes, file: McapFile) -> None:
+        """Write the message of a component."""
+        component = COMPONENTS_BY_KEY[key]
+        dtype = ITEM_DTYPES[component]
+        if len(message) < ITEMS_OFFSET:
+            self._left_out[f"malformed messages of {key}"] += 1
+            return
+        utime, capture_utime, version, timestamp_us, num_items = _HEAD.unpack_from(message)
+        if len(message) != ITEMS_OFFSET + num_items * dtype.itemsize:
+            self._left_out[f"malformed messages of {key}"] += 1
+            return
+        if not 0 <= capture_utime <= MAX_UTIME:
+            self._left_out[f"messages of {key} from before 1970 or after 2106"] += 1
+            return
+        converter = self._converter(version, utime, capture_utime, file)
+        items = np.frombuffer(message, dtype, num_items, ITEMS_OFFSET)
+        for converted in converter.convert(component, items, capture_utime, timestamp_us):
+            file.write(converted)
+
+    def attach_parameters(self, message: bytes, file: McapFile) -> None:
+        """Attach the server's XML if it is new."""
+        try:
+            decoded = decode(message)
+        except ProtocolError:
+            return  # open_take has counted it
+        xml: bytes = decoded.xml.encode(errors="surrogatepass")
+        if self._num_attached and differ_in_statistics_only(self._xml, xml):
+            return
+        self._xml = xml
+        self._num_attached += 1
+        utime = min(max(decoded.utime, 0), MAX_UTIME)
+        file.attach(utime, f"{self.name}-parameters-{self._num_attached}.xml", "application/xml", xml)
+
+    def _converter(self, version: int, utime: int, capture_utime: int, file: McapFile) -> FoxgloveSource:
+        """Return the converter for a message; describe the source before its first message."""
+        index = self._entry(version, utime)
+        found = self._converters.get(index)
+        if found is None:
+            parameters = Parameters() if index == _NO_PARAMETERS else self._entries[index].parameters
+            found = self._converters[index] = FoxgloveSource(self._topics, parameters, version)
+            for message in found.describe(capture_utime):
+                file.write(message)
+        return found
+
+    def _entry(self, version: int, utime: int) -> int:
+        """Return which parameters describe a message: those that ``Series.parameters_of`` would return."""
+        indices = self._by_version.get(version, ())
+        if len(indices) <= 1:
+            return indices[0] if indices else _NO_PARAMETERS
+        older = bisect.bisect_right(indices, utime, key=lambda index: self._entries[index].utime)
+        return indices[max(older - 1, 0)]
