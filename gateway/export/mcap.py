@@ -11,14 +11,14 @@ from typing import Final
 import numpy as np
 
 from gateway.errors import ProtocolError
-from gateway.export.float_topics import FloatTopics
+from gateway.export.float_topics import MAX_FIELDS, FloatTopics
 from gateway.export.foxglove_messages import FoxgloveSource
 from gateway.export.foxglove_topics import MAX_UTIME
 from gateway.export.job import ExportJob, nothing_to_export
 from gateway.export.mcap_file import McapFile
 from gateway.messages.decode import decode
 from gateway.messages.encode import ITEMS_OFFSET
-from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_changes import differ_in_statistics_only
 from gateway.takes.reader import TakeReader
@@ -30,11 +30,14 @@ _HEAD: Final = struct.Struct(">8xqq8x4xi4xqi")
 _EVENT_HEADER_BYTES: Final = 50  # about, with the channel
 _PROGRESS_BYTES: Final = 1024 * 1024
 _NO_PARAMETERS: Final = -1
+_NUMBERS: Final = (ComponentType.ANALOG, ComponentType.FORCE)
+"""The components whose messages have a field for each number."""
 
 
 def export_mcap(job: ExportJob) -> None:
     """Write the sources of a take to one file, each with topics of its own."""
     take = job.open_take(components=())
+    job.note_malformed(take)
     sources = {name: _SourceExport(source) for name, source in take.sources.items()}
     with McapFile(job.files.create(job.out)) as file:
         _write_messages(job, take, sources, file)
@@ -44,7 +47,7 @@ def export_mcap(job: ExportJob) -> None:
         raise nothing_to_export(job, "frames")
     for source in sources.values():
         for problem in source.problems:
-            job.note(f"{source.name}: {problem}")
+            job.note(problem)
 
 
 def _write_messages(job: ExportJob, take: Take, sources: dict[str, "_SourceExport"], file: McapFile) -> None:
@@ -94,8 +97,12 @@ class _SourceExport:
     @property
     def problems(self) -> list[str]:
         """Sentences about what was left out, or what the parameters lack."""
-        left_out = [f"{count} {what} were left out" for what, count in self._left_out.items()]
-        lacking = [converter.problem for converter in self._converters.values() if converter.problem]
+        left_out = [f"{what} of {self.name} were left out: {count}" for what, count in self._left_out.items()]
+        lacking = [
+            f"{self.name}: {converter.problem}"
+            for converter in self._converters.values()
+            if converter.problem
+        ]
         return list(dict.fromkeys(left_out + lacking))
 
     def write(self, key: str, message: bytes, file: McapFile) -> None:
@@ -110,7 +117,10 @@ class _SourceExport:
             self._left_out[f"malformed messages of {key}"] += 1
             return
         if not 0 <= capture_utime <= MAX_UTIME:
-            self._left_out[f"messages of {key} from before 1970 or after 2106"] += 1
+            self._left_out[f"messages from before 1970 or after 2106 in {key}"] += 1
+            return
+        if component in _NUMBERS and (len(message) - ITEMS_OFFSET) // 4 > MAX_FIELDS:
+            self._left_out[f"messages with more than {MAX_FIELDS} numbers in {key}"] += 1
             return
         converter = self._converter(version, utime, capture_utime, file)
         items = np.frombuffer(message, dtype, num_items, ITEMS_OFFSET)

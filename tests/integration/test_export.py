@@ -15,7 +15,7 @@ from tests.takes import frame, parameters, write_take
 from tests.unit.export.exported import read_ezc3d
 
 SCENE = SyntheticScene(markers=20, tools=0, analog=8, plates=1, rate_hz=100, analog_rate_hz=1000)
-EXTENSIONS = (".c3d", ".trc", ".csv")
+EXTENSIONS = (".c3d", ".trc", ".csv", ".mcap")
 
 
 @pytest.fixture(scope="module")
@@ -57,7 +57,7 @@ def test_an_unknown_extension_is_an_error_that_lists_the_known_ones(take: Path, 
     for name in ("walk.xyz", "walk"):
         done = export(take, tmp_path / name)
         assert (done.returncode, done.stdout) == (1, "")
-        assert done.stderr.endswith(f"{name} has no known extension; choose .c3d, .trc or .csv\n")
+        assert done.stderr.endswith(f"{name} has no known extension; choose .c3d, .trc, .csv or .mcap\n")
     assert names(tmp_path) == []
 
 

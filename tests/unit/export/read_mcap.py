@@ -1,0 +1,79 @@
+"""Reading exported MCAP files by the package ``mcap``, independently of foxglove-sdk."""
+
+import json
+from collections import defaultdict
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from mcap.reader import make_reader
+from mcap.records import Attachment
+from mcap_protobuf.decoder import DecoderFactory
+
+
+class Logged(NamedTuple):
+    """A message and its time in ns since 1970."""
+
+    time_ns: int
+    content: Any
+
+
+class McapContent(NamedTuple):
+    """What a file has. ``schemas`` has the names of the schemas, by topic."""
+
+    topics: dict[str, list[Logged]]
+    schemas: dict[str, str]
+    attachments: list[Attachment]
+    metadata: dict[str, dict[str, str]]
+
+
+def read_mcap(path: Path) -> McapContent:
+    """Return the content of a file; each topic must have one schema only, and pass all checksums."""
+    topics: defaultdict[str, list[Logged]] = defaultdict(list)
+    schemas: dict[str, str] = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        names = [channel.topic for channel in summary.channels.values()]
+        assert len(set(names)) == len(names)
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            assert schema is not None
+            schemas[channel.topic] = schema.name
+            if channel.message_encoding == "json":
+                topics[channel.topic].append(Logged(message.log_time, json.loads(message.data)))
+        for _, channel, message, content in reader.iter_decoded_messages(
+            topics=[name for name in names if not name.endswith("/parameters")], log_time_order=False
+        ):
+            topics[channel.topic].append(Logged(message.log_time, content))
+        assert sum(map(len, topics.values())) == summary.statistics.message_count
+        metadata = {record.name: record.metadata for record in reader.iter_metadata()}
+        return McapContent(dict(topics), schemas, list(reader.iter_attachments()), metadata)
+
+
+def points_of(cloud: Any) -> npt.NDArray[Any]:
+    """Return the points of a PointCloud as its own fields describe them."""
+    formats = {7: "<f4", 5: "<u4"}  # FLOAT32, UINT32
+    dtype = np.dtype(
+        {
+            "names": [field.name for field in cloud.fields],
+            "formats": [formats[field.type] for field in cloud.fields],
+            "offsets": [field.offset for field in cloud.fields],
+            "itemsize": cloud.point_stride,
+        }
+    )
+    return np.frombuffer(cloud.data, dtype)
+
+
+def floats_of(record: Any) -> dict[str, float]:
+    """Return the fields of a message that has numbers only."""
+    return {field.name: getattr(record, field.name) for field in record.DESCRIPTOR.fields}
+
+
+def rotated(quaternion: Any, vector: tuple[float, float, float]) -> npt.NDArray[Any]:
+    """Return a vector after the rotation by a quaternion."""
+    axis, v = np.array([quaternion.x, quaternion.y, quaternion.z]), np.array(vector)
+    t = 2 * np.cross(axis, v)
+    return np.asarray(v + quaternion.w * t + np.cross(axis, t))
