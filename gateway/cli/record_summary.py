@@ -15,6 +15,7 @@ from gateway.recorder.take_recording import MAX_SERIES, MAX_SOURCES, TakeRecordi
 from gateway.safe_text import safe_text
 
 _ORDER: Final = ("3d", "6d", f"{POSE}*", "analog", "force", "event", "status", "clock", "parameters")
+_MAX_NOTES: Final = 10
 _COLUMNS: Final = ("messages", "size", "rate", "gaps", "lost", "not written")
 
 
@@ -74,7 +75,10 @@ def print_summary(recording: TakeRecording, out: TextIO) -> bool:
             )
     console.print(table)
     problems = [*_problems(recording)]
-    for note in (*_notes(recording), *problems):
+    notes = [*_notes(recording)]
+    if len(notes) > _MAX_NOTES:
+        notes[_MAX_NOTES:] = [f"… and {len(notes) - _MAX_NOTES} notes on other sources"]
+    for note in (*notes, *problems):
         console.print(Text(safe_text(note)), soft_wrap=True)
     end = "INCOMPLETE" if problems else "complete: no gaps"
     console.print(Text(f"{sink.path}: {size_text(sink.num_bytes)}, {end}"), soft_wrap=True)
@@ -133,6 +137,13 @@ def _disk_problems(sink: FileSink) -> Iterator[str]:
 
 def _notes(recording: TakeRecording) -> Iterator[str]:
     """Yield what is worth knowing, although nothing is missing because of it."""
+    if recording.num_foreign:
+        yield (
+            f"{recording.num_foreign} messages on these keys or channels were not recorded: they are none of "
+            "this version's types; does another program, or another version of the gateway, publish there?"
+        )
+    if recording.sink is not None and recording.sink.num_errors and not recording.sink.problem:
+        yield f"the disk did not accept what was written for a while ({_times(recording.sink.num_errors)})"
     for source in recording.sources_now:
         checks = [series.check for series in source.series.values()]
         restarts = max((check.num_restarts for check in checks), default=0)
@@ -149,13 +160,6 @@ def _notes(recording: TakeRecording) -> Iterator[str]:
                 f"{source.name}: its parameters were not published, so the recording has no labels; "
                 "see `rtc3d-gateway params`"
             )
-    if recording.num_foreign:
-        yield (
-            f"{recording.num_foreign} messages on these keys or channels were not recorded: they are none of "
-            "this version's types; does another program, or another version of the gateway, publish there?"
-        )
-    if recording.sink is not None and recording.sink.num_errors and not recording.sink.problem:
-        yield f"the disk did not accept what was written for a while ({_times(recording.sink.num_errors)})"
 
 
 def _times(count: int) -> str:

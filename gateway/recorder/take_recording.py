@@ -27,6 +27,7 @@ MAX_SERIES: Final = 4096
 
 MAX_XML_BYTES: Final = 16 * 1024 * 1024
 
+_MIN_UTIME: Final = -(1 << 63)
 _VERSION: Final = slice(PREFIX_END - 4, None)
 """The part of a ``parameters_t`` by which it is known: its version and its XML."""
 
@@ -186,7 +187,7 @@ class TakeRecording:
             utime = source.last_utime or now_utime()
             parameters = ServerParameters(xml, source.session if session is None else session, version)
             sequence, source.num_parameters = source.num_parameters, source.num_parameters + 1
-        arrived_utime = utime - round(1e6 * age_s)
+        arrived_utime = max(utime - round(1e6 * age_s), _MIN_UTIME)
         return encode_parameters(parameters, utime=utime, arrived_utime=arrived_utime, sequence=sequence)
 
     def answered(self, source: RecordedSource, parameters: bytes | None) -> None:

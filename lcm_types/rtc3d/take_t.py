@@ -19,7 +19,7 @@ class take_t(object):
     def __init__(self):
         self.utime = 0
         """
-        When this message was written: µs since the Unix epoch, on the recording computer's clock.
+        When the file begins for this source: µs since the Unix epoch, on the clock of its messages.
         LCM Type: int64_t
         """
 

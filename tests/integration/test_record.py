@@ -112,7 +112,7 @@ class Lab(NamedTuple):
 
 
 @contextmanager
-def lab(tmp_path: Path, side: str, *scene: str) -> Iterator[Lab]:
+def lab(tmp_path: Path, side: str, *scene: str, **source: Any) -> Iterator[Lab]:
     endpoint, url = free_endpoint(), lcm_url()
     published: defaultdict[str, list[bytes]] = defaultdict(list)
 
@@ -125,7 +125,7 @@ def lab(tmp_path: Path, side: str, *scene: str) -> Iterator[Lab]:
     with ExitStack() as stack:
         port, _ = stack.enter_context(simulator("--tools", "2", *SCENE, *scene))
         configuration = {
-            "sources": [{"name": "Lab-1", "host": "127.0.0.1", "port": port}],
+            "sources": [{"name": "Lab-1", "host": "127.0.0.1", "port": port, **source}],
             "zenoh": {
                 "enabled": side == "zenoh",
                 "tool_poses": True,
@@ -219,7 +219,7 @@ def test_parameters_are_recorded_when_they_change_and_before_the_frames_they_des
     path = tmp_path / "walk.lcmlog"
     # The parameters on LCM are repeated every 5 s.
     with (
-        lab(tmp_path, side, "--fault", "rename,every_s=4,for_s=2") as gateway,
+        lab(tmp_path, side, "--fault", "rename,every_s=3,for_s=1.5", parameters_interval_s=0.3) as gateway,
         recording(tmp_path, str(path), *gateway.options) as record,
     ):
         wait_until(lambda: size(path) and path.read_bytes().count(b"MOCAP_LAB_1_PARAMETERS") > 3, 60)
