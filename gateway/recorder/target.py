@@ -2,12 +2,12 @@
 
 import contextlib
 import os
-import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
 from gateway.errors import TakeError
+from gateway.outputs.takes.names import default_name, numbered
 from gateway.takes.reader import SUFFIX
 from gateway.takes.recording import LogFile
 
@@ -40,7 +40,7 @@ class Target:
         """Return the new file, named after the sources if it is in a folder. Raises TakeError."""
         if self._log is None:
             assert self._folder is not None  # noqa: S101 - there is one of both
-            self._log = _create_free(self._folder, default_name(sources))
+            self._log = _create_free(self._folder, default_name(_names(sources)))
         return self._log
 
     def discard_empty(self) -> None:
@@ -58,19 +58,15 @@ def _is_dir(path: Path) -> bool:
         return False  # a name that is too long: creating it says so
 
 
-def default_name(sources: Sequence[str]) -> str:
-    """Return the name of a recording that begins now: its sources, the date and the time (local time).
-
-    Up to three sources are named, joined by "+"; of more, only their number.
-    """
-    names = "+".join(sources) if len(sources) <= _MAX_NAMED else f"{len(sources)}-sources"
-    return f"{names}-{time.strftime('%Y%m%d-%H%M%S')}"
+def _names(sources: Sequence[str]) -> str:
+    """Return up to three sources, joined by "+"; of more, only their number."""
+    return "+".join(sources) if len(sources) <= _MAX_NAMED else f"{len(sources)}-sources"
 
 
 def _create_free(folder: Path, name: str) -> LogFile:
     number = 1
     while True:
-        path = folder / f"{name if number == 1 else f'{name}-{number}'}{SUFFIX}"
+        path = folder / f"{numbered(name, number)}{SUFFIX}"
         if not os.path.lexists(path):
             return _create(path)
         number += 1
