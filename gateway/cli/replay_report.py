@@ -84,7 +84,7 @@ class Progress:
         if player.is_paused:
             parts.append("paused")
         else:
-            parts.append(f"{max(0.0, (position_us - before_us) / 1e6 / passed_s):.3g}×")
+            parts.append(f"{max(0.0, (position_us - before_us) / 1e6 / passed_s):,.2f}×")
             parts.append(f"{(num_messages - before_messages) / passed_s:,.0f} messages/s")
             if player.lateness.num_messages:
                 parts.append(f"late by {1e3 * player.lateness.quantile_s(0.99):.1f} ms (p99)")

@@ -92,7 +92,8 @@ class Player:
     def seek(self, delta_us: int) -> None:
         """Continue at another place, so far from the present one."""
         with self._changed:
-            self._seek_us = max(self._selection.start_us, self.position_us + delta_us)
+            present_us = self.position_us if self._seek_us is None else self._seek_us
+            self._seek_us = max(self._selection.start_us, present_us + delta_us)
             self._notify()
 
     def stop(self) -> None:
@@ -128,9 +129,10 @@ class Player:
             if self._is_stopping:
                 return None
             seek_us, self._seek_us = self._seek_us, None
+            if not is_complete and seek_us is not None:
+                self.position_us = seek_us
             self._notify()
         if not is_complete:
-            self.position_us = seek_us or 0
             return seek_us
         self.num_passes += 1
         if not self.num_messages:

@@ -1,0 +1,314 @@
+"""``rtc3d-gateway replay`` with real Zenoh and LCM: what subscribers get, and what the command says."""
+
+import asyncio
+import contextlib
+import json
+import signal
+from asyncio.subprocess import DEVNULL, PIPE
+from collections import defaultdict
+from collections.abc import AsyncIterator, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import lcm
+import pytest
+import zenoh
+
+from gateway.messages.decode import decode
+from gateway.messages.topics import lcm_channel
+from gateway.outputs.lcm.subscriber import LcmSubscriber
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
+from gateway.rtc3d.parameters_xml import encode_parameters
+from gateway.takes.event_log import encode_event
+from tests.gateway_process import PROGRAM
+from tests.integration.test_command_line import Ended, end_of, run
+from tests.lcm_tools import lcm_logger, lcm_tool
+from tests.networks import free_endpoint, lcm_url, open_zenoh
+from tests.takes import START_UTIME, Message, description, frame, log_bytes, markers, parameters, write_take
+from tests.waiting import wait_until_async
+
+pytestmark = pytest.mark.netns
+
+XML = encode_parameters(Parameters(markers=Parameters3D(100.0, "mm", (Marker("1", "head"),))))
+OTHER_XML = XML.replace(b"head", b"hand")
+RECORDED = {component.key: component for component in ComponentType}
+
+
+def some_messages(source: str = "lab", frames: int = 200) -> list[Message]:
+    """Return all five components of a second or two, with a change of the parameters in the middle."""
+    messages = [description(source), parameters(XML, source=source)]
+    for number in range(frames):
+        utime = START_UTIME + 5000 * number
+        options: dict[str, Any] = {"utime": utime, "source": source, "version": 1 + (number >= frames // 2)}
+        if number == frames // 2:
+            messages.append(parameters(OTHER_XML, 2, utime=utime, source=source))
+        messages += [
+            markers(1, number, **options),
+            frame(ComponentType.TOOLS, [(1, 0, 0, 0, 1, 2, number, 0.1)], number, **options),
+            frame(ComponentType.ANALOG, [number] * 8, number, **options),
+            frame(ComponentType.FORCE, [(number,) * 6], number, **options),
+        ]
+        if not number % 50:
+            event = frame(ComponentType.EVENT, [(1, number, -1, -1, -1)], number // 50, **options)
+            messages.append(event)
+    return messages
+
+
+def by_channel(messages: Iterable[tuple[str, bytes]], prefix: str = "REPLAY") -> dict[str, list[bytes]]:
+    found: defaultdict[str, list[bytes]] = defaultdict(list)
+    for channel, message in messages:
+        renamed = channel.replace("MOCAP", prefix, 1)
+        if renamed.startswith(prefix) and not channel.endswith("_TAKE"):
+            found[renamed].append(message)
+    return dict(found)
+
+
+class Received:
+    """What subscribers of a replay have received, in order: by Zenoh key, and by LCM channel."""
+
+    def __init__(self) -> None:
+        self.samples: defaultdict[str, list[tuple[bytes, str]]] = defaultdict(list)
+        self.messages: list[tuple[str, bytes]] = []
+
+    def receive_sample(self, sample: zenoh.Sample) -> None:
+        attachment = "" if sample.attachment is None else sample.attachment.to_string()
+        self.samples[str(sample.key_expr)].append((sample.payload.to_bytes(), attachment))
+
+    def payloads(self, key: str) -> list[bytes]:
+        return [payload for payload, _ in self.samples[key]]
+
+
+class Subscribers:
+    """A Zenoh session and an LCM subscriber. ``options`` let ``replay`` publish to them."""
+
+    def __init__(self, session: zenoh.Session, endpoint: str, url: str) -> None:
+        self.session = session
+        self.endpoint = endpoint
+        self.url = url
+        self.options = ("--connect", endpoint, "--url", url)
+        self.received = Received()
+
+
+@pytest.fixture
+def subscribers() -> Iterator[Subscribers]:
+    endpoint, url = free_endpoint(), lcm_url()
+    session = open_zenoh("peer", listen=endpoint)
+    found = Subscribers(session, endpoint, url)
+    with contextlib.ExitStack() as stack:
+        stack.callback(session.close)
+        session.declare_subscriber("**", found.received.receive_sample)
+        receive = lambda channel, message: found.received.messages.append((channel, message))  # noqa: E731
+        stack.callback(LcmSubscriber(lcm.LCM(f"{url}&recv_buf_size=2000000"), ".*", receive).close)
+        yield found
+
+
+async def replay(path: Path, *options: str) -> Ended:
+    return await run("replay", str(path), *options)
+
+
+@contextlib.asynccontextmanager
+async def running(path: Path, *options: str) -> AsyncIterator[asyncio.subprocess.Process]:
+    process = await asyncio.create_subprocess_exec(
+        *(*PROGRAM, "replay", str(path), *options), stdin=DEVNULL, stdout=PIPE, stderr=PIPE
+    )
+    try:
+        yield process
+    finally:
+        if process.returncode is None:
+            process.send_signal(signal.SIGINT)
+        assert (await end_of(process)).status in {0, 1}
+
+
+async def test_subscribers_get_every_byte_in_order_under_a_prefix_of_its_own(
+    tmp_path: Path, subscribers: Subscribers
+) -> None:
+    messages = some_messages()
+    path = write_take(tmp_path / "take.lcmlog", messages)
+    ended = await replay(path, *subscribers.options, "--rate", "2")
+    assert ended.status == 0, ended.stderr
+    received = subscribers.received
+    expected = by_channel(messages)
+    assert by_channel(received.messages) == expected
+    assert {key.split("/")[0] for key in received.samples} == {"replay"}
+    for key in RECORDED:
+        assert received.payloads(f"replay/lab/{key}") == expected[lcm_channel("REPLAY", "lab", key)]
+    parameters_seen = list(dict.fromkeys(received.samples["replay/lab/parameters"]))
+    assert [(xml, json.loads(attachment)["parameters_version"]) for xml, attachment in parameters_seen] == [
+        (XML, 1),
+        (OTHER_XML, 2),
+    ]
+    assert "│ 3d         │      200 │" in ended.stdout
+    assert "806 messages in" in ended.stdout
+
+
+async def test_as_fast_as_possible_a_zenoh_subscriber_gets_everything(
+    tmp_path: Path, subscribers: Subscribers
+) -> None:
+    messages = some_messages(frames=2000)
+    path = write_take(tmp_path / "take.lcmlog", messages)
+    ended = await replay(path, "--zenoh", "--connect", subscribers.endpoint, "--rate", "max")
+    assert ended.status == 0, ended.stderr
+    expected = by_channel(messages)
+    for key in RECORDED:
+        received = subscribers.received.payloads(f"replay/lab/{key}")
+        assert received == expected[lcm_channel("REPLAY", "lab", key)]
+
+
+async def test_the_parameters_of_a_replay_can_be_queried(tmp_path: Path, subscribers: Subscribers) -> None:
+    path = write_take(tmp_path / "take.lcmlog", some_messages())
+    async with running(path, *subscribers.options, "--loop", "--from", "0.6"):
+        await wait_until_async(lambda: subscribers.received.samples["replay/lab/3d"])
+        [reply] = subscribers.session.get("replay/lab/parameters")
+        assert reply.ok is not None
+        assert reply.ok.payload.to_bytes() == OTHER_XML
+        [reply] = subscribers.session.get("replay/lab/parameters/3d?format=json")
+        assert reply.ok is not None
+        assert json.loads(reply.ok.payload.to_bytes())["markers"][0]["label"] == "hand"
+        [reply] = subscribers.session.get("replay/lab/3d")
+        assert reply.ok is not None
+        assert len(decode(reply.ok.payload.to_bytes()).markers) == 1
+        keys = {str(reply.ok.key_expr) for reply in subscribers.session.get("replay/*/**") if reply.ok}
+        assert {"replay/lab/parameters", "replay/lab/3d", "replay/lab/schema/markers_t"} <= keys
+        for key in ("recording?set=start", "c3d", "status", "parameters/6d"):
+            [reply] = subscribers.session.get(f"replay/lab/{key}")
+            assert reply.err is not None
+        tokens = [str(reply.ok.key_expr) for reply in subscribers.session.liveliness().get("**") if reply.ok]
+        assert sorted(tokens) == ["replay/lab/alive", "replay/lab/server"]
+        on_lcm = ("--lcm", "--url", subscribers.url, "--prefix", "REPLAY")
+        on_zenoh = ("--connect", subscribers.endpoint, "--prefix", "replay")
+        for options in (on_lcm, on_zenoh):
+            ended = await run("params", "--json", "--source", "lab", *options)
+            assert json.loads(ended.stdout)["lab"]["parameters"]["3d"]["markers"][0]["label"] == "hand"
+
+
+async def test_a_replay_does_not_mix_with_what_somebody_else_publishes(
+    tmp_path: Path, subscribers: Subscribers
+) -> None:
+    path = write_take(tmp_path / "take.lcmlog", some_messages())
+    async with running(path, *subscribers.options, "--loop"):
+        await wait_until_async(lambda: subscribers.received.samples["replay/lab/3d"])
+        for options in (("--zenoh", "--connect", subscribers.endpoint), ("--lcm", "--url", subscribers.url)):
+            ended = await replay(path, *options)
+            assert ended.status == 1
+            assert "somebody else publishes" in ended.stderr
+            assert "choose another --prefix" in ended.stderr
+        ended = await replay(path, *subscribers.options, "--prefix", "site/two", "--to", "0.1")
+        assert ended.status == 0, ended.stderr
+    assert len(by_channel(subscribers.received.messages, "SITE_TWO")["SITE_TWO_LAB_3D"]) == 21
+    assert len(subscribers.received.payloads("site/two/lab/3d")) == 21
+
+
+async def test_an_output_that_does_not_open_is_left_out_unless_it_was_asked_for(
+    tmp_path: Path, subscribers: Subscribers
+) -> None:
+    path = write_take(tmp_path / "take.lcmlog", some_messages(frames=20))
+    nowhere = ("--connect", free_endpoint())
+    ended = await replay(path, *nowhere, "--url", subscribers.url)
+    assert ended.status == 0
+    assert "not replayed there: zenoh" in ended.stderr
+    assert by_channel(subscribers.received.messages) == by_channel(some_messages(frames=20))
+    ended = await replay(path, *nowhere, "--zenoh")
+    assert ended.status == 1
+    assert "zenoh" in ended.stderr
+    assert ended.stdout == ""
+
+
+async def test_lcm_logplayer_plays_a_take_that_our_subscribers_understand(
+    tmp_path: Path, subscribers: Subscribers
+) -> None:
+    messages = some_messages()
+    path = write_take(tmp_path / "take.lcmlog", messages)
+    player = await asyncio.create_subprocess_exec(
+        *(lcm_tool("lcm-logplayer"), f"--lcm-url={subscribers.url}", "--speed=2", str(path)),
+        stdout=DEVNULL,
+        stderr=DEVNULL,
+    )
+    assert await player.wait() == 0
+    received, expected = subscribers.received, by_channel(messages, "MOCAP")
+    await wait_until_async(lambda: by_channel(received.messages, "MOCAP") == expected)
+    tools = [decode(message).tools[0] for message in expected["MOCAP_LAB_6D"]]
+    assert [tool.z for tool in tools] == list(range(200))
+
+
+async def test_a_log_of_lcm_logger_is_replayed(tmp_path: Path, subscribers: Subscribers) -> None:
+    recorded_url = lcm_url()
+    log = tmp_path / "logger.0"
+    messages = some_messages(frames=50)[1:]  # lcm-logger writes no description
+    sender = lcm.LCM(recorded_url)
+    with lcm_logger(log, recorded_url):
+
+        def is_recording() -> bool:
+            sender.publish("PROBE", b"probe")
+            return log.exists() and log.stat().st_size > 0
+
+        await wait_until_async(is_recording)
+        for channel, message in messages:
+            sender.publish(channel, message)
+            await asyncio.sleep(0.001)
+        await wait_until_async(lambda: messages[-1][1] in log.read_bytes())
+    ended = await replay(log, *subscribers.options)
+    assert ended.status == 0, ended.stderr
+    assert by_channel(subscribers.received.messages) == by_channel(messages)
+    assert subscribers.received.payloads("replay/lab/3d") == by_channel(messages)["REPLAY_LAB_3D"]
+    assert "of other programs or versions were left out, on PROBE" in ended.stderr
+
+
+async def test_what_is_left_out_of_a_bad_take_is_reported(tmp_path: Path, subscribers: Subscribers) -> None:
+    messages = some_messages(frames=20)[2:]
+    log = log_bytes(messages[:30]) + b"garbage" + log_bytes(messages[30:])
+    path = tmp_path / "bad.lcmlog"
+    path.write_bytes(log + encode_event(0, START_UTIME, b"OTHER", b"x") + log[:99])
+    ended = await replay(path, *subscribers.options, "--rate", "max")
+    assert ended.status == 0, ended.stderr
+    for text in ("left out, on OTHER", "in 2 places were left out", "no parameters of lab at the beginning"):
+        assert text in ended.stderr
+    for name, content, text in (
+        ("empty", b"", "is empty"),
+        ("foreign", b"text" * 1000, "without an LCM event"),
+    ):
+        (tmp_path / name).write_bytes(content)
+        ended = await replay(tmp_path / name)
+        assert ended.status == 1
+        assert text in ended.stderr
+    ended = await replay(tmp_path / "missing")
+    assert ended.status == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (("--rate", "0"), "expected a number from 0.01 to 1000, or max"),
+        (("--rate", "nan"), "expected a number from 0.01 to 1000, or max"),
+        (("--from", "5", "--to", "5"), "--to must be greater than --from"),
+        (("--zenoh", "--lcm"), "give either --zenoh or --lcm"),
+        (("--zenoh", "--url", "memq://"), "--url is for LCM"),
+        (("--prefix", "a/long/name/of/a/prefix"), "at most 16 characters"),
+        (("--source", "no name"), "name"),
+        (("--component", "c3d"), "expected"),
+    ],
+)
+async def test_options_are_checked(tmp_path: Path, options: tuple[str, ...], text: str) -> None:
+    ended = await replay(write_take(tmp_path / "take.lcmlog", some_messages()), *options)
+    assert ended.status == 2
+    assert text in " ".join(ended.stderr.replace("│", " ").split())
+
+
+async def test_nothing_that_matches_is_an_error(tmp_path: Path, subscribers: Subscribers) -> None:
+    path = write_take(tmp_path / "take.lcmlog", some_messages())
+    ended = await replay(path, "--lcm", "--url", subscribers.url, "--source", "stage")
+    assert ended.status == 1
+    assert "check --source, --component, --from and --to" in ended.stderr
+
+
+async def test_a_folder_and_several_sources(tmp_path: Path, subscribers: Subscribers) -> None:
+    folder = tmp_path / "take"
+    folder.mkdir()
+    lab, stage = some_messages(), some_messages("stage-2")
+    merged = [message for pair in zip(lab, stage, strict=True) for message in pair]
+    write_take(folder / "take-001.lcmlog", merged[:600])
+    write_take(folder / "take-002.lcmlog", merged[600:])
+    ended = await replay(folder, *subscribers.options, "--rate", "4")
+    assert ended.status == 0, ended.stderr
+    assert by_channel(subscribers.received.messages) == by_channel(merged)
+    assert len(subscribers.received.payloads("replay/stage-2/3d")) == 200

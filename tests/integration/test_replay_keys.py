@@ -1,0 +1,136 @@
+"""The keys of ``rtc3d-gateway replay`` on a terminal, whose settings are restored in every way it ends."""
+
+import contextlib
+import os
+import pty
+import select
+import signal
+import subprocess
+import termios
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, Final
+
+import pytest
+
+from tests.gateway_process import PROGRAM
+from tests.networks import lcm_url
+from tests.takes import START_UTIME, description, markers, parameters, write_take
+
+pytestmark = pytest.mark.netns
+
+XML: Final = b"<Parameters></Parameters>"
+_TIMEOUT_S: Final = 20.0
+
+
+class Terminal:
+    """A terminal with a replay in front. ``text`` is what it has shown since the last ``wait_for``."""
+
+    def __init__(self, master: int, process: "subprocess.Popen[bytes]") -> None:
+        self._master = master
+        self.process = process
+        self.text = ""
+
+    def press(self, keys: str) -> None:
+        os.write(self._master, keys.encode())
+
+    def read(self) -> None:
+        if select.select([self._master], [], [], 0.1)[0]:
+            with contextlib.suppress(OSError):  # EIO: the process has ended
+                self.text += os.read(self._master, 65536).decode()
+
+    def wait_for(self, condition: Callable[[str], Any]) -> None:
+        """Wait until ``condition`` holds for what is shown next."""
+        deadline_s = time.monotonic() + _TIMEOUT_S
+        self.text = ""
+        while not condition(self.text):
+            assert time.monotonic() < deadline_s, self.text
+            self.read()
+
+    def wait_for_end(self) -> int:
+        deadline_s = time.monotonic() + _TIMEOUT_S
+        while self.process.poll() is None:
+            assert time.monotonic() < deadline_s
+            self.read()
+        self.read()
+        return self.process.returncode
+
+    def shows_keys(self) -> bool:
+        """Whether the terminal waits for Enter and shows what is typed."""
+        flags = termios.tcgetattr(self._master)[3]
+        return bool(flags & termios.ICANON and flags & termios.ECHO)
+
+
+@pytest.fixture
+def terminal(tmp_path: Path) -> Iterator[Terminal]:
+    messages = [description(), parameters(XML)]
+    messages += [markers(1, number, utime=START_UTIME + 10_000 * number) for number in range(12_000)]
+    path = write_take(tmp_path / "take.lcmlog", messages)
+    master, end = pty.openpty()
+    # The terminal controls the program, as when a shell starts it.
+    command = ["setsid", "--ctty", *PROGRAM, "replay", str(path), "--lcm", "--url", lcm_url()]
+    environ = {**os.environ, "TERM": "xterm", "COLUMNS": "150"}
+
+    with subprocess.Popen(command, stdin=end, stdout=end, stderr=end, env=environ) as process:
+        found = Terminal(master, process)
+        try:
+            found.wait_for(lambda text: "messages/s" in text)
+            assert not found.shows_keys()
+            yield found
+        finally:
+            process.kill()
+            os.close(master)
+            os.close(end)
+
+
+def test_space_pauses_and_continues_and_q_quits(terminal: Terminal) -> None:
+    terminal.press(" ")
+    terminal.wait_for(lambda text: "paused" in text)
+    terminal.press(" ")
+    terminal.wait_for(lambda text: "messages/s" in text)
+    terminal.press("xyzq")
+    assert terminal.wait_for_end() == 0
+    assert "component" in terminal.text
+    assert terminal.shows_keys()
+
+
+def test_arrows_go_back_and_forth(terminal: Terminal) -> None:
+    terminal.press("\x1b[C" * 3)
+    terminal.wait_for(lambda text: "0:00:3" in text)
+    terminal.press("\x1b[D")
+    terminal.wait_for(lambda text: "0:00:2" in text)
+    terminal.press("q")
+    assert terminal.wait_for_end() == 0
+
+
+@pytest.mark.parametrize(
+    "number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT], ids=lambda number: number.name
+)
+def test_every_signal_restores_the_terminal(terminal: Terminal, number: signal.Signals) -> None:
+    terminal.process.send_signal(number)
+    assert terminal.wait_for_end() == 0
+    assert "component" in terminal.text
+    assert terminal.shows_keys()
+
+
+def test_an_error_restores_the_terminal(terminal: Terminal, tmp_path: Path) -> None:
+    take = tmp_path / "take.lcmlog"
+    take.unlink()
+    take.mkdir()
+    terminal.press("\x1b[D")  # reads the file again
+    assert terminal.wait_for_end() == 1
+    assert "cannot be read" in terminal.text
+    assert terminal.shows_keys()
+
+
+def test_while_it_is_stopped_the_terminal_has_its_own_settings(terminal: Terminal) -> None:
+    os.kill(terminal.process.pid, signal.SIGTSTP)
+    os.waitid(os.P_PID, terminal.process.pid, os.WSTOPPED)
+    assert terminal.shows_keys()
+    terminal.process.send_signal(signal.SIGCONT)
+    terminal.wait_for(lambda text: "messages/s" in text)
+    assert not terminal.shows_keys()
+    terminal.press("q")
+    assert terminal.wait_for_end() == 0
+    assert terminal.shows_keys()
