@@ -42,6 +42,7 @@ def _source_json(statistics: TakeStatistics, source: SourceStatistics) -> dict[s
         "gateway_versions": source.gateway_versions,
         "sessions": source.sessions,
         "server_restarts": source.server_restarts,
+        "measurements": source.measurements,
         "gateway_restarts": source.gateway_restarts,
         "components": {
             key: _component_json(statistics, source, part) for key, part in source.components.items()

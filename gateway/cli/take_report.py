@@ -61,7 +61,8 @@ def _source_lines(statistics: TakeStatistics, source: SourceStatistics) -> Itera
         yield safe_text(f"Take {source.take_name!r}, recorded by {source.recorder}{host}")
     texts = [_count(source.sessions, "connection")]
     if source.server_restarts:
-        texts.append(f"the server's time started again {_times(source.server_restarts)}")
+        times = _times(source.server_restarts)
+        texts.append(f"{source.measurements} measurements: the server's time started again {times}")
     if source.gateway_restarts:
         texts.append(f"the gateway started again {_times(source.gateway_restarts)}")
     texts += [

@@ -96,7 +96,7 @@ class TakeReader:
     @property
     def source_names(self) -> list[str]:
         """The names of the sources in what was read so far."""
-        return list(dict.fromkeys(route[0] for route in self._routes.values() if route is not None))
+        return self._names.names
 
     def events(self) -> Iterator[Event]:
         """Yield all events of all files. Raises TakeError."""
@@ -164,7 +164,7 @@ class TakeReader:
 
     def _check_is_take(self) -> None:
         """Raise TakeError if no message of a gateway was found."""
-        if self._names.has_sources:
+        if self._names.names:
             return
         channels = [safe_text(channel) for channel in sorted(self.unknown)]
         shown = ", ".join(channels[:_MAX_SHOWN]) + (", …" if len(channels) > _MAX_SHOWN else "")

@@ -33,9 +33,9 @@ class SourceNames:
                 continue
 
     @property
-    def has_sources(self) -> bool:
-        """Whether there is any source."""
-        return bool(self._names)
+    def names(self) -> list[str]:
+        """The names of the sources so far."""
+        return list(self._names.values())
 
     def source(self, channels: str) -> str:
         """Return the name of the source whose channels begin with this, such as MOCAP_LAB."""

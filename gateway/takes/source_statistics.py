@@ -73,6 +73,11 @@ class SourceStatistics:
         return max((component.server_restarts for component in self.components.values()), default=0)
 
     @property
+    def measurements(self) -> int:
+        """How many measurements the server made, as far as its time shows: each begins with a new time."""
+        return self.server_restarts + 1 if self.components else 0
+
+    @property
     def gateway_restarts(self) -> int:
         """How often the sequence numbers started again."""
         return max((component.gaps.restarts for component in self.components.values()), default=0)

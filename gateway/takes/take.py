@@ -52,6 +52,9 @@ class TakeSource:
         return [] if found is None else found.runs()
 
 
+_MAX_LATE_US: Final = 10_000_000
+"""So long after the end of the range that was asked for, no message belongs to it any more."""
+
 _FIELDS: Final = {"3d": "markers", "6d": "tools", "analog": "analog", "force": "forces", "event": "events"}
 """The fields of TakeSource by the keys of components."""
 
@@ -95,19 +98,21 @@ def open_take(
         plt.plot(markers.seconds, head)
 
     ``sources`` (names) and ``components`` (of 3d, 6d, analog, force, event) limit what is loaded, ``from_s``
-    and ``to_s`` the time of the events, in seconds from the first event of the take. ``progress`` gets the
-    bytes that were read, and those in all. The arrays take as much memory as their part of the file. Damage
-    of the file is skipped and counted. Raises TakeError if there is no take, or if a source or component is
-    not in it.
+    and ``to_s`` the time of the events, in seconds from the first event of the take; what comes after
+    ``to_s`` is not read. ``progress`` gets the bytes that were read, and those in all. The arrays take as
+    much memory as their part of the file. Damage is skipped and counted. Raises TakeError if there is
+    no take, or if a source or component is not in it.
     """
     wanted = _components(components)
     reader = TakeReader(Path(path))
-    first_utime = None if from_s is None else reader.start_utime + round(from_s * 1e6)
-    end_utime = None if to_s is None else reader.start_utime + round(to_s * 1e6)
+    first_utime = -math.inf if from_s is None else reader.start_utime + from_s * 1e6
+    end_utime = math.inf if to_s is None else reader.start_utime + to_s * 1e6
     loader = _Loader(sources, wanted)
     for batches in reader.batches():
         for batch in batches:
             loader.add(batch, first_utime, end_utime)
+        if min((min(batch.utimes) for batch in batches), default=-math.inf) > end_utime + _MAX_LATE_US:
+            break
         if progress is not None:
             progress(reader.read_bytes, reader.num_bytes)
     take = Take(Path(path), reader.start_utime, loader.finish(reader.start_utime))
@@ -139,7 +144,7 @@ class _Loader:
         self._xml: dict[str, bytes] = {}  # the newest parameters, by source
         self._builders: dict[tuple[str, str], SeriesBuilder] = {}
 
-    def add(self, batch: MessageBatch, first_utime: int | None, end_utime: int | None) -> None:
+    def add(self, batch: MessageBatch, first_utime: float, end_utime: float) -> None:
         """Take messages in a range of time; parameters are taken from the whole take."""
         if self._wanted is not None and batch.source not in self._wanted:
             return
@@ -148,11 +153,9 @@ class _Loader:
             source = self._sources[batch.source] = TakeSource(batch.source)
         if batch.key in self._components:
             messages = batch.messages
-            if first_utime is not None or end_utime is not None:
-                first = -math.inf if first_utime is None else first_utime
-                end = math.inf if end_utime is None else end_utime
+            if not first_utime <= min(batch.utimes) <= max(batch.utimes) < end_utime:
                 times = zip(batch.utimes, messages, strict=True)
-                messages = [message for utime, message in times if first <= utime < end]
+                messages = [message for utime, message in times if first_utime <= utime < end_utime]
             self._add_frames(source, batch.key, messages)
         elif batch.key in ("take", "status", "parameters"):
             for message in batch.messages:
