@@ -93,6 +93,7 @@ def _messages_json(statistics: TakeStatistics, part: MessageStatistics) -> dict[
         "gap_list": [_gap_json(statistics, gap) for gap in gaps.gaps],
         "late": gaps.late,
         "repeated": gaps.repeated,
+        "implausible": gaps.implausible,
     }
 
 

@@ -107,7 +107,7 @@ def _row(
         sum(part.num_messages for part in parts),
         items,
         rate,
-        f"{(part.last_utime - part.first_utime) / 1e6:.3f}" if part.first_utime else "",
+        f"{(part.last_utime - part.first_utime) / 1e6:.2f}" if part.first_utime else "",
         sum(gap.missing for gap in gaps),
         gap_text,
     )
@@ -174,6 +174,7 @@ def _source_problems(source: SourceStatistics) -> Iterator[str]:
     for key, part in parts.items():
         for number, what in (
             (part.malformed, "could not be read"),
+            (part.gaps.implausible, "with implausible sequence numbers"),
             (part.gaps.late, "arrived late"),
             (part.gaps.repeated, "arrived again"),
         ):
@@ -205,7 +206,7 @@ def _rate(rate_hz: float | None, announced_hz: float | None) -> str:
 
 
 def _at(statistics: TakeStatistics, utime: int) -> str:
-    return f"{statistics.seconds_at(utime):.3f} s"
+    return f"{statistics.seconds_at(utime):.2f} s"
 
 
 def _times(number: int) -> str:

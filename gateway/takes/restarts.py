@@ -12,6 +12,10 @@ MAX_LATE: Final = 1000
 _NO_TIMES_US: Final = np.array([0, -1, -(1 << 63)], np.int64)
 """What servers send if they have no time (field note 25)."""
 
+_MAX_STEP: Final = 10
+_MAX_STEP_US: Final = 1_000_000
+"""Two messages with at most one between them fit each other if they are not further apart than this."""
+
 _WRAP: Final = 1 << 32
 _WRAP_TOLERANCE_US: Final = 10_000_000
 """32-bit time stamps start again at 0; a time stamp that goes back by about this much has wrapped around."""
@@ -31,7 +35,8 @@ class Restarts(NamedTuple):
 def find_restarts(utime: Array, sequence: Array, timestamp_us: Array, frame_number: Array) -> Restarts:
     """Return where rows, in the order of arrival, start again. The arrays are native integers.
 
-    A message that was overtaken by others on the network is no restart.
+    A message that was overtaken by others on the network is no restart, and neither is one message with
+    damaged numbers.
     """
     step = np.diff(sequence)
     is_restart = (step < -MAX_LATE) | ((step <= 0) & (np.diff(utime) > 0))
@@ -39,7 +44,23 @@ def find_restarts(utime: Array, sequence: Array, timestamp_us: Array, frame_numb
     is_server = _time_goes_back(timestamp_us)
     frame_step = np.diff(frame_number.astype(np.int64))
     is_server |= (frame_step < 0) & (frame_step > -(_WRAP // 2))
-    return Restarts(is_restart, is_server & ~is_late)
+    is_intact = ~_is_beside_damage(sequence, timestamp_us, frame_number)
+    return Restarts(is_restart & is_intact, is_server & ~is_late & is_intact)
+
+
+def _is_beside_damage(sequence: Array, timestamp_us: Array, frame_number: Array) -> Array:
+    """Return for each step whether the row before it, or after it, lies between two that fit each other."""
+    beside = np.zeros(max(len(sequence) - 1, 0), bool)
+    step, time_step = sequence[2:] - sequence[:-2], timestamp_us[2:] - timestamp_us[:-2]
+    regular_steps = np.diff(timestamp_us)
+    regular_steps = regular_steps[(regular_steps > 0) & (regular_steps <= _MAX_STEP_US)]
+    if not len(regular_steps):
+        return beside
+    fits = (frame_number[2:] >= frame_number[:-2]) & (step > 0) & (step <= _MAX_STEP)
+    fits &= (time_step >= 1.5 * np.median(regular_steps)) & (time_step <= _MAX_STEP_US)
+    beside[:-1] |= fits
+    beside[1:] |= fits
+    return beside
 
 
 def _time_goes_back(timestamp_us: Array) -> Array:

@@ -98,6 +98,8 @@ class SourceStatistics:
 
     def finish(self) -> None:
         """Count what is left under its labels. Call it at the end."""
+        for part in (*self.components.values(), *self.others.values()):
+            part.gaps.finish()
         for component in self.components.values():
             for version in component.versions:
                 component.set_labels(version, self._parameters.get(version))
@@ -125,10 +127,10 @@ class SourceStatistics:
                 self._describe(key, decode(message))
             except ProtocolError:
                 statistics.malformed += 1
-        heads = np.frombuffer(b"".join([message[8:32] for message in whole]), ">i8").reshape(-1, 3)
         if key in ("take", "parameters"):  # they are repeated in each file, or have no numbers
-            statistics.num_messages += len(heads)
+            statistics.num_messages += len(whole)
         else:
+            heads = np.frombuffer(b"".join([message[8:32] for message in whole]), ">i8").reshape(-1, 3)
             statistics.add_messages(heads[:, 0].astype(np.int64), heads[:, 2].astype(np.int64))
 
     def _describe(self, key: str, message: Any) -> None:

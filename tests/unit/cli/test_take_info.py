@@ -26,7 +26,7 @@ def test_the_report_shows_what_is_there_and_what_is_missing(tmp_path: Path) -> N
     assert result.exit_code == 0
     words = " ".join(result.stdout.split())
     assert "Source lab: 192.0.2.20:3020, gateway 1.0" in words
-    assert "3d 97 2 100 of 100 0.980 2 1, 2 at 0.520 s" in words
+    assert "3d 97 2 100 of 100 0.98 2 1, 2 at 0.52 s" in words
     assert "head[red] 100.0 %" in words
     assert "lab.lcmlog: 125 bytes from" in words
 

@@ -86,6 +86,22 @@ def test_messages_that_arrive_late_or_twice_are_not_missing(tmp_path: Path) -> N
     assert (gaps.missing, gaps.num_gaps, gaps.late, gaps.repeated, gaps.restarts) == (1, 1, 2, 1, 0)
 
 
+def test_damaged_numbers_are_neither_gaps_nor_restarts(tmp_path: Path) -> None:
+    numbers = (0, 1, 2**62, 2, -5, 3, -(2**63), 5)
+    messages = [
+        markers(1, number, utime=START_UTIME + place, timestamp_us=place, frame_number=place)
+        for place, number in enumerate(numbers)
+    ]
+    gaps = markers_of(tmp_path, messages).gaps
+    assert (gaps.missing, gaps.num_gaps, gaps.implausible, gaps.restarts) == (1, 1, 3, 0)
+
+
+def test_a_gap_or_a_restart_of_any_size_counts_also_at_the_end(tmp_path: Path) -> None:
+    messages = [markers(1, 0), markers(1, 5_000_000), markers(1, 5_000_001), markers(1, 0, utime=2**60)]
+    gaps = markers_of(tmp_path, messages).gaps
+    assert (gaps.missing, gaps.num_gaps, gaps.implausible, gaps.restarts) == (4_999_999, 1, 0, 1)
+
+
 def test_restarts_of_server_and_gateway(tmp_path: Path) -> None:
     messages = [
         markers(1, 0),

@@ -217,3 +217,12 @@ def test_what_comes_after_the_range_is_not_read(tmp_path: Path) -> None:
     assert len(take.sources["lab"].markers) == 100
     assert take.num_damaged == 0
     assert open_take(path, from_s=449).num_damaged == 1
+
+
+def test_one_message_with_damaged_numbers_does_not_end_a_run(tmp_path: Path) -> None:
+    numbers = [markers(1, number) for number in range(3)]
+    odd_time = markers(1, 3, timestamp_us=2**50, frame_number=-7)
+    odd_number = markers(1, 2**40, timestamp_us=50_000, frame_number=5)
+    messages = [*numbers, odd_time, markers(1, 4), odd_number, markers(1, 6), markers(1, 7)]
+    source = open_take(write_take(tmp_path / "a.lcmlog", messages)).sources["lab"]
+    assert [len(run) for run in source.runs("3d")] == [8]
