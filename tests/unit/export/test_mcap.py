@@ -37,7 +37,14 @@ from gateway.simulator.synthetic import SyntheticScene
 from tests.recorded_scenes import scene_messages
 from tests.takes import START_UTIME, Message, description, frame, markers, parameters
 from tests.unit.export.exported import export_messages
-from tests.unit.export.read_mcap import McapContent, floats_of, points_of, read_mcap, rotated
+from tests.unit.export.read_mcap import (
+    McapContent,
+    assert_equals_take,
+    floats_of,
+    points_of,
+    read_mcap,
+    rotated,
+)
 
 SCENE = SyntheticScene(markers=30, tools=3, analog=40, plates=2, rate_hz=100, analog_rate_hz=1000)
 NO_MARKER = (MISSING, MISSING, MISSING, 999.0)
@@ -72,49 +79,20 @@ def plates(*described: Plate, version: int = 1) -> Message:
     return parameters(Parameters(force=ParametersForce(described)), version)
 
 
-def check_values(content: McapContent, scene: C3dScene | SyntheticScene) -> None:
-    """The file has every value of the scene, and each time is that of the capture."""
-    for component, topic in (
-        (ComponentType.MARKERS, "markers"),
-        (ComponentType.ANALOG, "analog"),
-        (ComponentType.FORCE, "loads"),
-    ):
-        logged = content.topics.get(f"/lab/{topic}", [])
-        assert bool(logged) == (component in scene.rates_hz)
-        if not logged:
-            continue
-        items = np.ascontiguousarray(scene.items(component, np.arange(len(logged))))
-        expected = items.view(">f4").reshape(len(logged), items.shape[1], -1).astype(np.float32)
-        if component is ComponentType.MARKERS:
-            for row, message in zip(expected, logged, strict=True):
-                points = points_of(message.content)
-                found = np.full_like(row, np.nan)
-                found[points["marker"], 0], found[points["marker"], 1] = points["x"], points["y"]
-                found[points["marker"], 2] = points["z"]
-                assert np.allclose(found[:, :3], row[:, :3] / 1000, rtol=1e-6, atol=0, equal_nan=True)
-                assert np.array_equal(points["reliability"], row[points["marker"], 3])
-        else:
-            found = np.array([list(floats_of(message.content).values()) for message in logged])
-            assert np.array_equal(found.astype(np.float32), expected.reshape(len(logged), -1))
-        seconds = (np.array([message.time_ns for message in logged]) / 1e9 - START_UTIME / 1e6).tolist()
-        wanted = np.arange(len(logged)) / scene.rates_hz[component] + 0.001
-        assert seconds == pytest.approx(wanted.tolist(), abs=5e-4)
-
-
 @pytest.mark.takes
 @pytest.mark.parametrize("name", ["qualisys", "optotrak"])
 def test_every_value_of_a_real_recording_is_exported(tmp_path: Path, name: str) -> None:
     scene = C3dScene(Path(os.environ["RTC3D_TAKES"]) / f"{name}.c3d")
     messages = [description(), parameters(scene.parameters), *scene_messages(scene, scene.num_frames or 0)]
     content = export(tmp_path, messages)
-    check_values(content, scene)
+    assert_equals_take(content, tmp_path / "take.lcmlog")
     assert len(content.topics["/lab/markers"]) == scene.num_frames
 
 
 def test_every_value_of_a_computed_scene_is_exported(tmp_path: Path) -> None:
     messages = [description(), parameters(SCENE.parameters), *scene_messages(SCENE, 50)]
     content = export(tmp_path, messages)
-    check_values(content, SCENE)
+    assert_equals_take(content, tmp_path / "take.lcmlog")
     assert content.schemas == {
         "/lab/markers": "foxglove.PointCloud",
         "/lab/tools": "foxglove.FrameTransforms",
