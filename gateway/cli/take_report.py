@@ -206,7 +206,7 @@ def _rate(rate_hz: float | None, announced_hz: float | None) -> str:
 
 
 def _at(statistics: TakeStatistics, utime: int) -> str:
-    return f"{statistics.seconds_at(utime):.2f} s"
+    return f"{round(statistics.seconds_at(utime), 2) + 0.0:.2f} s"  # no minus before 0.00
 
 
 def _times(number: int) -> str:

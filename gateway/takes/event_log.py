@@ -20,7 +20,7 @@ _HEADER: Final = struct.Struct(">4sqqii")
 _HEADER_BYTES: Final = _HEADER.size
 
 MAX_CHANNEL_BYTES: Final = 255
-MAX_MESSAGE_BYTES: Final = 256 * 1024 * 1024
+MAX_MESSAGE_BYTES: Final = 64 * 1024 * 1024
 """An event with a longer channel or message is damage. LCM's own channels have at most 63 bytes."""
 
 MAX_LISTED_DAMAGE: Final = 100
@@ -225,6 +225,20 @@ class _Window:
             self.move(rest)
         else:
             self.move(rest - len(SYNC) + 1)
+            self._skip_hole()
+
+    def _skip_hole(self) -> None:
+        """Go to the next data if the file has a hole here: many GB of zeros that are not on the disk."""
+        descriptor, position = self._file.fileno(), self._file.tell()
+        try:
+            data = os.lseek(descriptor, position, os.SEEK_DATA)
+        except OSError:  # there is none
+            data = os.lseek(descriptor, 0, os.SEEK_END)
+        if data > position:
+            # What is left in memory, three bytes, cannot begin a sync word that goes on with zeros.
+            self._data, self._start, self.offset = b"", 0, data
+        else:
+            os.lseek(descriptor, position, os.SEEK_SET)
 
 
 def _event(window: _Window) -> Event | None:

@@ -2,6 +2,7 @@
 
 import os
 import random
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.takes import open_take
 from gateway.takes.reader import TakeReader
 from gateway.takes.statistics import take_statistics
-from tests.takes import log_bytes, markers, parameters, write_take
+from tests.takes import description, log_bytes, markers, parameters, write_take
 
 READERS: list[Callable[[Path], Any]] = [
     open_take,
@@ -177,3 +178,44 @@ def test_labels_in_latin_1_keep_their_letters(tmp_path: Path) -> None:
     found = open_take(write_take(tmp_path / "take.lcmlog", messages)).sources["lab"].markers
     assert found
     assert found.labels == ("Fuß",)
+
+
+@pytest.mark.timeout(20)
+def test_a_hole_of_any_size_in_a_log_is_skipped(tmp_path: Path) -> None:
+    path = write_take(tmp_path / "take.lcmlog", [markers(1, 0)])
+    size, hole = path.stat().st_size, 100 * 1024**3
+    with path.open("r+b") as file:
+        file.seek(hole)
+        file.write(log_bytes([markers(1, 1)]))
+        file.truncate(2 * hole)
+    statistics = take_statistics(path)
+    assert statistics.sources["lab"].components["3d"].num_messages == 2
+    assert statistics.damaged_bytes == 2 * hole - 2 * size
+
+
+def test_segments_that_were_joined_are_one_take(tmp_path: Path) -> None:
+    start = [description(), parameters(Parameters(markers=Parameters3D(markers=(Marker("1", "a"),))))]
+    first = log_bytes([*start, markers(1, 0), markers(1, 1)])
+    (tmp_path / "take.lcmlog").write_bytes(first + log_bytes([*start, markers(1, 2)]))
+    found = take_statistics(tmp_path / "take.lcmlog")
+    source = found.sources["lab"]
+    assert found.is_complete
+    assert (source.components["3d"].num_messages, source.gateway_restarts) == (3, 0)
+    assert source.num_parameters_changes == 1
+    assert len(open_take(tmp_path / "take.lcmlog").sources["lab"].runs("3d")) == 1
+
+
+def test_reading_needs_less_memory_than_twice_the_file(tmp_path: Path) -> None:
+    path = write_take(tmp_path / "take.lcmlog", [markers(200, 0)])
+    message = markers(200, 0)
+    event = log_bytes([message])
+    path.write_bytes(event * 12_000)
+    tracemalloc.start()
+    try:
+        take = open_take(path)
+        _, peak_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert take.sources["lab"].markers
+    assert take.sources["lab"].markers.items.shape == (12_000, 200)
+    assert peak_bytes < 1.7 * path.stat().st_size
