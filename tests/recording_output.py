@@ -23,8 +23,10 @@ from tests.waiting import wait_until_async
 class RecordingLab:
     """The source "lab" on an output whose folder is ``directory``."""
 
-    def __init__(self, directory: Path, max_queued_bytes: int = MAX_QUEUED_BYTES, **settings: Any) -> None:
-        self.directory = directory
+    def __init__(
+        self, directory: Path | None, max_queued_bytes: int = MAX_QUEUED_BYTES, **settings: Any
+    ) -> None:
+        self.directory = Path() if directory is None else directory
         self.output = TakesOutput(settings_in(directory, **settings), max_queued_bytes)
         self.takes = self.output.takes
         self.publishers = {
@@ -51,8 +53,9 @@ class RecordingLab:
         return self.directory / "lab" / name
 
 
-def settings_in(directory: Path, **settings: Any) -> TakesSettings:
-    return TakesSettings(enabled=True, directory=str(directory), **settings)
+def settings_in(directory: Path | None, **settings: Any) -> TakesSettings:
+    """Return settings with this folder; None means the default one."""
+    return TakesSettings(enabled=True, directory=None if directory is None else str(directory), **settings)
 
 
 def events(path: Path) -> list[Event]:
@@ -69,7 +72,7 @@ def frames(path: Path) -> list[bytes]:
 
 
 @asynccontextmanager
-async def recording_lab(directory: Path, **settings: Any) -> AsyncIterator[RecordingLab]:
+async def recording_lab(directory: Path | None, **settings: Any) -> AsyncIterator[RecordingLab]:
     """Run an output whose folder is ``directory``, and call ``maintain`` as the gateway does."""
     lab = RecordingLab(directory, **settings)
     lab.output.start()

@@ -62,7 +62,7 @@ class FileSink:
         while True:
             gives_up = self._gives_up.is_set()
             try:
-                self._log.append(messages)
+                messages = messages[self._log.append(messages) :]
             except OSError as error:
                 self._failed(error)
                 if gives_up:
@@ -70,8 +70,9 @@ class FileSink:
                     return
                 self._gives_up.wait(RETRY_S)
             else:
-                self.problem = ""
-                return
+                if not messages:
+                    self.problem = ""
+                    return
 
     def _failed(self, error: OSError) -> None:
         if not self.problem:

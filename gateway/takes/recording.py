@@ -1,5 +1,6 @@
 """Writing messages to event logs, by a thread from a bounded queue: a slow disk never delays the stream."""
 
+import logging
 import os
 import threading
 import time
@@ -9,6 +10,7 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, Final, Protocol, TypeVar
 
+from gateway.log import DefectLog
 from gateway.takes.event_log import encode_event
 
 MAX_QUEUED_BYTES: Final = 64 * 1024 * 1024
@@ -18,10 +20,15 @@ WRITE_PERIOD_S: Final = 0.1
 SYNC_PERIOD_S: Final = 0.5
 """How often the thread writes, and how often it has the system store everything on the disk."""
 
+_ENTRY_BYTES: Final = 128
+"""What a message in the queue takes besides its content."""
+
 _UTIME: Final = slice(8, 16)
 """Where a message of the gateway has its ``utime``, after the fingerprint."""
 
 _Result = TypeVar("_Result")
+
+logger = logging.getLogger(__name__)
 
 
 class LogFile:
@@ -36,28 +43,32 @@ class LogFile:
         self.num_bytes = 0
         self._descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
 
-    def append(self, messages: Sequence[tuple[bytes, bytes]]) -> None:
+    def append(self, messages: Sequence[tuple[bytes, bytes]]) -> int:
         """Append messages of the gateway, each with its channel. The time of an event is their ``utime``.
 
-        Raises OSError; then none of them is in the file.
+        Returns how many the disk has taken, at least one. Raises OSError if it takes none.
         """
-        events = b"".join(
-            [
-                encode_event(number, utime_of(message), channel, message)
-                for number, (channel, message) in enumerate(messages, start=self.num_messages)
-            ]
-        )
-        rest = memoryview(events)
+        events = [
+            encode_event(number, utime_of(message), channel, message)
+            for number, (channel, message) in enumerate(messages, start=self.num_messages)
+        ]
+        rest = memoryview(b"".join(events))
+        num_bytes = len(rest)
         try:
             while rest:
                 rest = rest[os.write(self._descriptor, rest) :]
         except OSError:
-            # A part of them may be there; the next event must follow a complete one.
-            os.ftruncate(self._descriptor, self.num_bytes)
-            os.lseek(self._descriptor, self.num_bytes, os.SEEK_SET)
-            raise
-        self.num_messages += len(messages)
-        self.num_bytes += len(events)
+            num_messages, num_bytes = _complete(events, num_bytes - len(rest))
+            # The next event must follow a complete one.
+            os.ftruncate(self._descriptor, self.num_bytes + num_bytes)
+            os.lseek(self._descriptor, self.num_bytes + num_bytes, os.SEEK_SET)
+            if not num_messages:
+                raise
+        else:
+            num_messages = len(messages)
+        self.num_messages += num_messages
+        self.num_bytes += num_bytes
+        return num_messages
 
     def sync(self) -> None:
         """Store on the disk what was appended. Raises OSError."""
@@ -104,6 +115,7 @@ class Recorder:
         self._wake = threading.Event()
         self._is_closed = False
         self._unsynced: dict[Sink, None] = {}
+        self._defects = DefectLog(logger, name)
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
 
@@ -114,7 +126,7 @@ class Recorder:
 
     def record(self, sink: Sink, channel: bytes, message: bytes) -> bool:
         """Queue a message; return False if the queue is full. Call it in one thread only."""
-        num_bytes = len(message)
+        num_bytes = len(message) + _ENTRY_BYTES
         if self._offered_bytes + num_bytes - self._written_bytes > self._max_queued_bytes:
             return False
         self._offered_bytes += num_bytes
@@ -122,7 +134,10 @@ class Recorder:
         return True
 
     def call(self, function: Callable[[], _Result]) -> Future[_Result]:
-        """Call ``function`` in the thread, after everything recorded so far was written."""
+        """Call ``function`` in the thread, after everything recorded so far was written.
+
+        The future can be cancelled before; then nothing is called.
+        """
         done: Future[_Result] = Future()
         self._queue.append(lambda: _make(done, function))
         self._wake.set()
@@ -162,8 +177,11 @@ class Recorder:
 
     def _write(self, batch: dict[Sink, list[tuple[bytes, bytes]]]) -> None:
         for sink, messages in batch.items():
-            sink.write(messages)
-            self._written_bytes += sum(len(message) for _, message in messages)
+            try:
+                sink.write(messages)
+            except Exception as defect:  # noqa: BLE001 - the other sinks continue
+                self._defects.log(defect)
+            self._written_bytes += sum(len(message) + _ENTRY_BYTES for _, message in messages)
             self._unsynced[sink] = None
 
 
@@ -172,7 +190,19 @@ def utime_of(message: bytes) -> int:
     return int.from_bytes(message[_UTIME], "big", signed=True)
 
 
+def _complete(events: Sequence[bytes], num_bytes: int) -> tuple[int, int]:
+    """Return how many events are complete in so many bytes, and their size."""
+    complete_bytes = 0
+    for number, event in enumerate(events):
+        if complete_bytes + len(event) > num_bytes:
+            return number, complete_bytes
+        complete_bytes += len(event)
+    return len(events), complete_bytes
+
+
 def _make(done: Future[Any], function: Callable[[], Any]) -> None:
+    if not done.set_running_or_notify_cancel():
+        return
     try:
         done.set_result(function())
     except BaseException as error:  # noqa: BLE001 - it belongs to the caller

@@ -1,5 +1,8 @@
 """The outputs under test, each with the network around it."""
 
+import asyncio
+import tempfile
+from pathlib import Path
 from typing import Protocol
 
 import lcm
@@ -11,9 +14,12 @@ from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.outputs.memory import MemoryOutput
+from gateway.outputs.takes.output import TakesOutput
+from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber
+from gateway.takes.event_log import EventLogReader
 from tests.lcm_relay import LcmRelay
 from tests.networks import (
     add_multicast_route,
@@ -151,6 +157,42 @@ class LcmRig:
         if self._subscriber is not None:
             self._subscriber.close()
         self.restore()
+
+
+class TakesRig:
+    """A folder that comes and goes, with a running take of each source."""
+
+    remedies = ("is the disk mounted", "does its disk respond")
+
+    def __init__(self) -> None:
+        self.names = LCM_CHANNELS
+        self._parent = tempfile.TemporaryDirectory()
+        self._folder = Path(self._parent.name) / "takes"
+        self._folder.mkdir()
+        settings = TakesSettings(enabled=True, directory=str(self._folder))
+        self.output = TakesOutput(settings, max_queued_bytes=100_000)
+        for topic in self.names:
+            self.output.announce(topic.source)
+
+    @property
+    def received(self) -> list[tuple[str, bytes]]:
+        events = [
+            event for path in self._folder.glob("*/*.lcmlog") for event in EventLogReader(path).events()
+        ]
+        return [(event.channel, event.message) for event in events if not event.channel.endswith("_TAKE")]
+
+    def subscribe(self) -> None:
+        for source in sorted({topic.source for topic in self.names}):
+            asyncio.run(self.output.takes.start(source, "take"))
+
+    def cut(self) -> None:
+        self._folder.rename(self._folder.with_name("gone"))
+
+    def restore(self) -> None:
+        self._folder.with_name("gone").rename(self._folder)
+
+    def close(self) -> None:
+        self._parent.cleanup()
 
 
 class LcmRelayRig:

@@ -8,13 +8,24 @@ import pytest
 from gateway.errors import OutputError
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import Output, Publisher
-from tests.contract.rigs import ANALOG, MARKERS, PROBE, LcmRelayRig, LcmRig, MemoryRig, Rig, ZenohRig
+from tests.contract.rigs import (
+    ANALOG,
+    MARKERS,
+    PROBE,
+    LcmRelayRig,
+    LcmRig,
+    MemoryRig,
+    Rig,
+    TakesRig,
+    ZenohRig,
+)
 from tests.waiting import wait_until
 
 NETWORKED = [
     pytest.param(ZenohRig, id="zenoh"),
     pytest.param(LcmRig, id="lcm-multicast", marks=pytest.mark.netns),
     pytest.param(LcmRelayRig, id="lcm-relay"),
+    pytest.param(TakesRig, id="takes"),
 ]
 without_memory = pytest.mark.parametrize("rig", NETWORKED, indirect=True)
 

@@ -2,6 +2,7 @@
 
 import socket
 from dataclasses import dataclass
+from pathlib import Path
 
 import rtc3d
 
@@ -9,6 +10,7 @@ from gateway import __version__
 from gateway.messages.limits import encode_within_limits
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.parameters_message import published_again
+from gateway.takes.recording import LogFile
 
 
 @dataclass(frozen=True)
@@ -56,3 +58,16 @@ class FileHeader:
         if self.parameters is not None:
             messages.append((self.parameters_channel, published_again(self.parameters, utime)))
         return messages
+
+    def begin_log(self, path: Path, name: str, utime: int) -> LogFile:
+        """Create a file with these messages. Raises OSError; then there is no file."""
+        messages = self.messages(name, utime)
+        log = LogFile(path)
+        try:
+            while messages:
+                messages = messages[log.append(messages) :]
+        except OSError:
+            log.close()
+            path.unlink(missing_ok=True)
+            raise
+        return log

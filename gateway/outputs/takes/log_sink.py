@@ -57,18 +57,18 @@ class LogSink(ABC):
             self._write(chunk)
 
     def _write(self, messages: Messages) -> None:
-        while True:
+        rest = messages
+        while rest:
             try:
-                log = self.log_for(utime_of(messages[0][1]))
-                log.append(messages)
+                log = self.log_for(utime_of(rest[0][1]))
+                rest = rest[log.append(rest) :]
             except OSError as error:
                 self.disk.failed(self.path, error)
                 if self._gives_up.wait(RETRY_S):
-                    self.lose(messages)
+                    self.lose(rest)
                     break
             else:
                 self.disk.succeeded()
-                break
         for channel, message in messages:
             if channel == self.header.parameters_channel:
                 self.header.parameters = message

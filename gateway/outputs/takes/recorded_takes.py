@@ -200,7 +200,7 @@ class RecordedTakes:
         """Return the result of a call in a thread. Raises QueryError in place of errors of the disk."""
         try:
             async with asyncio.timeout(_TIMEOUT_S):
-                return await asyncio.wrap_future(future)
+                return await asyncio.shield(asyncio.wrap_future(future))  # what was asked for happens later
         except TimeoutError:
             text = f"the disk of {path} did not respond within {_TIMEOUT_S:g} s; check it"
             raise QueryError(text, code="disk") from None

@@ -49,8 +49,8 @@ class Save:
 
     def link(self, segment: Path) -> None:
         """Add a segment. Raises OSError."""
+        os.link(segment, self.folder / f"{self.name}-{self._num_files + 1:03}{SUFFIX}")
         self._num_files += 1
-        os.link(segment, self.folder / f"{self.name}-{self._num_files:03}{SUFFIX}")
 
     @property
     def is_full(self) -> bool:
@@ -74,6 +74,7 @@ class RollingSegments(LogSink):
         self._segments: deque[_Segment] = deque()
         self._log: LogFile | None = None
         self._log_began_s = 0.0
+        self._num_segments = 0  # so far: no name is used twice
         self._is_in_place = True
         self._saves: list[Save] = []
 
@@ -113,22 +114,10 @@ class RollingSegments(LogSink):
 
     def _new_log(self, utime: int) -> LogFile:
         self._folder.mkdir(parents=True, exist_ok=True)
-        name = default_name(self.header.description.source)
-        number = 1
-        while True:
-            path = self._folder / f"{numbered(name, number)}{SUFFIX}"
-            try:
-                log = LogFile(path)
-            except FileExistsError:
-                number += 1
-                continue
-            try:
-                log.append(self.header.messages(path.stem, utime))
-            except OSError:
-                log.close()
-                path.unlink()
-                raise
-            return log
+        name = f"{default_name(self.header.description.source)}-{self._num_segments:06}"
+        log = self.header.begin_log(self._folder / f"{name}{SUFFIX}", name, utime)
+        self._num_segments += 1
+        return log
 
     def sync(self) -> None:
         """See LogSink."""
@@ -183,7 +172,8 @@ class RollingSegments(LogSink):
         try:
             for segment in self._segments:
                 if segment.end_s >= since_s:
-                    save.link(segment.path)
+                    with contextlib.suppress(FileNotFoundError):  # somebody has removed it
+                        save.link(segment.path)
             if self._log is not None:
                 save.link(self._log.path)
         except OSError:

@@ -64,22 +64,12 @@ class TakeFile(LogSink):
                 raise QueryError(f"there is a take {name!r} of this source already; choose another name")
             number += 1
             self.name = numbered(name, number)
-        self._log = self._new_log(self.utime)
+        self._log = self.header.begin_log(self.path, self.name, self.utime)
 
     def cancel(self) -> None:
         """Do not create the file, because nobody waits for it any more. Any thread may call it."""
         self._is_cancelled = True
         self.give_up()
-
-    def _new_log(self, utime: int) -> LogFile:
-        log = LogFile(self.path)
-        try:
-            log.append(self.header.messages(self.name, utime))
-        except OSError:
-            log.close()
-            self.path.unlink()
-            raise
-        return log
 
     def log_for(self, utime: int) -> LogFile:
         """See LogSink. If the file was removed, another one takes its place."""
@@ -87,7 +77,7 @@ class TakeFile(LogSink):
         assert log is not None  # noqa: S101 - see write
         if not self._is_in_place and not log.is_in_place():
             self._folder.mkdir(exist_ok=True)
-            self._log, removed = self._new_log(utime), log
+            self._log, removed = self.header.begin_log(self.path, self.name, utime), log
             removed.close()
             logger.warning(
                 "takes: %s was removed while it was recorded; the take continues in a new file", self.path

@@ -1,0 +1,253 @@
+"""Takes on a disk that is full, slow, gone, or not what it should be."""
+
+import asyncio
+import contextlib
+import logging
+import os
+import resource
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from gateway.errors import OutputError, QueryError
+from gateway.losses import Losses
+from gateway.outputs.takes import recorded_takes
+from tests.losses import amounts
+from tests.recording_output import RecordingLab, frames, recording_lab
+from tests.waiting import wait_until_async
+
+MIB = 1024 * 1024
+
+
+@contextlib.contextmanager
+def files_of_at_most(num_bytes: int) -> Iterator[None]:
+    """Let the kernel refuse longer files, as on a full disk."""
+    _, hard = limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (num_bytes, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+
+
+async def test_what_waits_for_a_full_disk_is_written_when_there_is_room(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with recording_lab(tmp_path) as lab:
+        await lab.takes.start("lab", "walk")
+        with files_of_at_most(300_000):
+            published = [lab.publish(size=1000) for _ in range(100)]
+            await wait_until_async(lambda: not lab.output.health().connected)
+            assert "walk.lcmlog cannot be written: File too large" in lab.output.health().problem
+            with pytest.raises(QueryError, match="cannot be written") as refused:
+                await lab.takes.save("lab", 1)
+            assert refused.value.code == "disk"
+        await wait_until_async(lambda: lab.output.health().connected)
+        stopped = await lab.takes.stop("lab")
+    assert frames(lab.path("walk.lcmlog")) == published
+    assert stopped.num_lost == 0
+    assert len([each for each in caplog.messages if "cannot be written" in each]) == 1
+
+
+async def test_what_does_not_fit_into_the_queue_is_refused_and_a_gap_in_the_take(tmp_path: Path) -> None:
+    async with recording_lab(tmp_path, max_queued_bytes=MIB) as lab:
+        await lab.takes.start("lab", "walk")
+        accepted = []
+        with files_of_at_most(300_000):
+            accepted.append(lab.publish(size=20_000))
+            await wait_until_async(lambda: not lab.output.health().connected)
+            causes = set()
+            for _ in range(100):
+                try:
+                    accepted.append(lab.publish(size=20_000))
+                except OutputError as error:
+                    causes.add(error.cause)
+            assert causes == {"disk too slow"}
+        await wait_until_async(lambda: lab.output.health().connected)
+        accepted.append(lab.publish())
+        await lab.takes.stop("lab")
+    assert frames(lab.path("walk.lcmlog")) == accepted
+
+
+async def test_a_take_that_ends_on_a_full_disk_counts_what_is_missing(tmp_path: Path) -> None:
+    async with recording_lab(tmp_path) as lab:
+        losses = Losses(logging.getLogger("gateway"), "lab to takes")
+        lab.output.count_losses("lab", losses)
+        await lab.takes.start("lab", "walk")
+        published = [lab.publish()]
+        with files_of_at_most(100_000):
+            published += [lab.publish(size=1000) for _ in range(100)]
+            await wait_until_async(lambda: not lab.output.health().connected)
+            assert len(frames(lab.path("walk.lcmlog"))) == 7  # of 16 kB; the eighth does not fit
+            stopped = await lab.takes.stop("lab")
+    found = frames(lab.path("walk.lcmlog"))
+    assert found == published[: len(found)]
+    assert stopped.num_lost == len(published) - len(found) > 0
+    assert amounts(losses.report()) == {"not written": (stopped.num_lost, stopped.num_lost)}
+
+
+async def test_a_folder_that_is_missing_is_not_created(tmp_path: Path) -> None:
+    lab = RecordingLab(tmp_path / "takes")
+    lab.output.start()
+    try:
+        await until_problem(lab, "No such file or directory; is the disk mounted?")
+        with pytest.raises(QueryError, match="is the disk mounted") as refused:
+            await lab.takes.start("lab", "walk")
+        assert refused.value.code == "disk"
+        (tmp_path / "takes").mkdir()
+        await until_problem(lab, "")
+        await lab.takes.start("lab", "walk")
+    finally:
+        lab.output.close()
+    assert lab.path("walk.lcmlog").is_file()
+
+
+async def test_a_file_instead_of_the_folder_is_reported(tmp_path: Path) -> None:
+    (tmp_path / "takes").write_text("no folder")
+    lab = RecordingLab(tmp_path / "takes")
+    lab.output.start()
+    await until_problem(lab, "it is not a folder; choose a folder as takes.directory")
+    lab.output.close()
+
+
+async def test_the_folder_of_the_user_is_created(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
+    async with recording_lab(None) as lab:
+        await lab.takes.start("lab", "walk")
+    assert (tmp_path / "state" / "takes" / "lab" / "walk.lcmlog").is_file()
+
+
+async def test_a_take_whose_file_is_removed_continues_in_a_new_one(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with recording_lab(tmp_path) as lab:
+        await lab.takes.start("lab", "walk")
+        lab.publish()
+        await wait_until_async(lambda: len(frames(lab.path("walk.lcmlog"))) == 1)
+        lab.path("walk.lcmlog").unlink()
+
+        def is_back() -> bool:
+            lab.publish()
+            return lab.path("walk.lcmlog").exists()
+
+        await wait_until_async(is_back)
+        newest = lab.publish()
+        await lab.takes.stop("lab")
+    assert frames(lab.path("walk.lcmlog"))[-1] == newest
+    assert any("was removed while it was recorded" in each for each in caplog.messages)
+
+
+async def test_a_disk_that_does_not_respond_is_reported_and_delays_nobody(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(recorded_takes, "_TIMEOUT_S", 0.2)
+    async with recording_lab(tmp_path) as lab:
+        lab.path("").mkdir()
+        os.mkfifo(lab.path("walk.lcmlog.x"))
+        with _stopped_disk(lab):
+            with pytest.raises(QueryError, match="did not respond") as refused:
+                await lab.takes.start("lab", "walk")
+            assert refused.value.code == "disk"
+            assert not lab.publishers["3d"].wanted
+        await lab.takes.start("lab", "run")
+    assert [path.name for path in lab.path("").glob("*.lcmlog")] == ["run.lcmlog"]
+
+
+@contextlib.contextmanager
+def _stopped_disk(lab: RecordingLab) -> Iterator[None]:
+    """Have the thread that writes wait for a pipe that nobody opens, as for a disk that does not respond."""
+    pipe = lab.path("walk.lcmlog.x")
+    recorder = lab.takes._recorder
+    assert recorder is not None
+    recorder.call(lambda: pipe.open("rb").close())
+    yield
+    os.close(os.open(pipe, os.O_WRONLY))
+
+
+async def until_problem(lab: RecordingLab, text: str) -> None:
+    def has_it() -> bool:
+        lab.output.maintain()
+        problem = lab.output.health().problem
+        return text in problem if text else not problem
+
+    await wait_until_async(has_it)
+
+
+# Limits --------------------------------------------------------------------------------------
+
+
+def old_take(folder: Path, name: str, num_bytes: int, age_s: float) -> Path:
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{name}.lcmlog"
+    path.write_bytes(bytes(num_bytes))
+    at_s = time.time() - age_s
+    os.utime(path, (at_s, at_s))
+    return path
+
+
+async def test_the_oldest_takes_are_deleted_first(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    paths = [
+        old_take(tmp_path / source, name, MIB // 2, age_s)
+        for source, name, age_s in (
+            ("lab", "a", 400),
+            ("lab", "b", 300),
+            ("hall", "c", 200),
+            ("lab", "d", 100),
+        )
+    ]
+    (tmp_path / "lab" / "a.c3d").write_bytes(bytes(10))
+    (tmp_path / "lab" / "notes.txt").write_text("not ours")
+    async with recording_lab(tmp_path, max_bytes=MIB + MIB // 4):
+        await wait_until_async(lambda: not paths[1].exists())
+    assert [path.exists() for path in paths] == [False, False, True, True]
+    assert not (tmp_path / "lab" / "a.c3d").exists()
+    assert (tmp_path / "lab" / "notes.txt").exists()
+    assert [each for each in caplog.messages if "deleted" in each] == [
+        f"takes: deleted {tmp_path}/lab/a, the oldest one: the folder has {2 * MIB + 10} bytes, and "
+        f"takes.max_bytes is {MIB + MIB // 4}",
+        f"takes: deleted {tmp_path}/lab/b, the oldest one: the folder has {MIB + MIB // 2} bytes, and "
+        f"takes.max_bytes is {MIB + MIB // 4}",
+    ]
+
+
+async def test_old_takes_are_deleted_by_their_age(tmp_path: Path) -> None:
+    old, new = old_take(tmp_path / "lab", "a", 10, 3 * 86_400), old_take(tmp_path / "lab", "b", 10, 86_400)
+    async with recording_lab(tmp_path, max_age_days=2):
+        await wait_until_async(lambda: not old.exists())
+    assert new.exists()
+
+
+async def test_a_take_ends_if_nothing_else_can_be_deleted(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    old = old_take(tmp_path / "lab", "old", 1000, 1000)
+    async with recording_lab(tmp_path, max_bytes=MIB) as lab:
+        losses = Losses(logging.getLogger("gateway"), "lab to takes")
+        lab.output.count_losses("lab", losses)
+        await lab.takes.start("lab", "walk")
+        published = []
+        while (await lab.takes.list("lab")).running is not None:
+            published.append(lab.publish(size=1000))
+            await asyncio.sleep(0.001)
+        at = time.time() - 60
+        os.utime(lab.path("walk.lcmlog"), (at, at))
+        await asyncio.sleep(0.2)  # it must not be deleted either
+    assert not old.exists()
+    found = frames(lab.path("walk.lcmlog"))
+    assert found == published[: len(found)]
+    assert amounts(losses.report()) == {"folder full": (1, 0)}
+    assert any("walk ends, because the folder" in each for each in caplog.messages)
+
+
+async def test_links_count_once(tmp_path: Path) -> None:
+    async with recording_lab(tmp_path, max_bytes=MIB, keep_last_s=60) as lab:
+        lab.publish(size=15_000)
+        for number in range(5):
+            await lab.takes.save("lab", 60, 0, f"fall {number}")
+            at = time.time() - 60 * number - 60
+            os.utime(next(lab.path(f"fall {number}").iterdir()), (at, at))
+        await asyncio.sleep(0.2)
+        assert len((await lab.takes.list("lab")).takes) == 5
