@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import json
 import os
+import re
 import signal
 import socket
 import sys
@@ -239,6 +240,34 @@ async def test_with_a_disk_that_does_not_respond(site: Site) -> None:
             await site.until_logged("→ streaming", 8)
             await wait_until_async(lambda: any(site.config.parent.glob("spool/*")))
             await site.stop()
+
+
+async def test_with_a_disk_that_does_not_take_recordings(site: Site) -> None:
+    folder = site.config.parent / "takes"
+    folder.mkdir()
+    async with ScriptedServer(flood) as server:
+        site.configure(
+            [server.port] * 2, takes={"enabled": True, "directory": str(folder), "keep_last_s": 60.0}
+        )
+        async with site.running(sabotage=NEVER_ENDS.format("os", "fdatasync")):
+            await site.until_logged("→ streaming", 2)
+            await site.until_logged("MiB wait for it; check what else writes to it")
+            await site.stop()
+            assert re.search("bytes are not written|not finished: output takes", site.log)
+
+
+async def test_while_the_last_seconds_are_kept(site: Site) -> None:
+    folder = site.config.parent / "takes"
+    folder.mkdir()
+    async with ScriptedServer(flood) as server:
+        site.configure(
+            [server.port] * 2, takes={"enabled": True, "directory": str(folder), "keep_last_s": 60.0}
+        )
+        async with site.running():
+            await site.until_logged("→ streaming", 2)
+            await asyncio.sleep(1)
+            await site.stop()
+            assert not [*folder.glob(".rolling/*/*")]
 
 
 async def test_with_an_lcm_peer_that_does_not_answer(site: Site) -> None:

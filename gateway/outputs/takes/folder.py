@@ -7,6 +7,7 @@ import logging
 import os
 import shutil
 import stat
+import threading
 import time
 from collections.abc import Collection
 from pathlib import Path
@@ -81,6 +82,7 @@ class TakesFolder:
         self.directory = directory
         self._is_own = is_own
         self._lock: int | None = None
+        self._opening = threading.Lock()
         self._times: dict[tuple[Path, int, int], tuple[int, float]] = {}  # of takes, by path, size and time
 
     # The folder itself.
@@ -89,7 +91,8 @@ class TakesFolder:
         """Check whether takes can be written here; return what is wrong, or "". May be called again."""
         try:
             check_directory(self.directory, is_own=self._is_own)
-            return self._take_lock()
+            with self._opening:
+                return self._take_lock()
         except OSError as error:
             return disk_problem(self.directory, error)
 
@@ -100,7 +103,8 @@ class TakesFolder:
             with contextlib.suppress(OSError):
                 if os.path.samestat(os.fstat(self._lock), path.stat()):
                     return ""
-            self.close()
+            os.close(self._lock)
+            self._lock = None
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -114,9 +118,10 @@ class TakesFolder:
 
     def close(self) -> None:
         """Let another gateway use the folder."""
-        lock, self._lock = self._lock, None
-        if lock is not None:
-            os.close(lock)
+        with self._opening:
+            lock, self._lock = self._lock, None
+            if lock is not None:
+                os.close(lock)
 
     def recover(self) -> None:
         """Keep the segments that a gateway has left behind, which was killed, as a take. Raises OSError."""

@@ -14,6 +14,7 @@ from gateway.errors import OutputError, QueryError, TakeError
 from gateway.messages.host_time import now_utime
 from gateway.outputs.takes.disk import Disk, disk_problem
 from gateway.outputs.takes.folder import ROLLING, TakesFolder, add_c3d
+from gateway.outputs.takes.folder_watch import FolderWatch
 from gateway.outputs.takes.header import FileHeader, SourceDescription
 from gateway.outputs.takes.names import check_name, default_name
 from gateway.outputs.takes.segments import RollingSegments, Save
@@ -30,16 +31,8 @@ MAX_AFTER_S: Final = 3600.0
 _TIMEOUT_S: Final = 4.0
 """How long a peer waits for the disk."""
 
-_SILENT_S: Final = 5.0
-"""How long a check of the folder may take; after that, the disk does not respond."""
-
-_CLOSE_S: Final = 1.0
+_CLOSE_S: Final = 0.8
 """How long the end of the gateway waits for the disk."""
-
-_DAY_S: Final = 86_400.0
-
-_REST: Final = 50
-"""The folder is not checked for this many times as long as the newest check took."""
 
 _Result = TypeVar("_Result")
 
@@ -58,20 +51,17 @@ class RecordedTakes:
         self.settings = settings
         self.server: Callable[[str], str] = lambda _source: ""
         self.disk = Disk()
-        self._folder = _folder(settings)
+        self._watch = FolderWatch(settings)
         self._max_queued_bytes = max_queued_bytes
         self._recorder: Recorder | None = None
         self._is_closed = False
         self._recordings: dict[str, SourceRecording] = {}
-        self._folder_thread = WorkerThread("takes-folder")
         self._read_thread = WorkerThread("takes-read")
         self._copy_thread = WorkerThread("takes-copy")
-        self._check: Future[tuple[str, int]] | None = None
-        self._next_check_s = 0.0
-        self._folder_problem = self._unchecked_problem()
 
-    def _unchecked_problem(self) -> str:
-        return f"{self._folder.directory} is not checked yet; does its disk respond?"
+    @property
+    def _folder(self) -> TakesFolder:
+        return self._watch.folder
 
     # For peers.
 
@@ -189,7 +179,7 @@ class RecordedTakes:
 
     def _open_recorder(self) -> Recorder:
         recorder, problem = self._started_recorder(), self.problem
-        if problem:
+        if problem and self._watch.is_checked:  # otherwise, creating a file will tell
             raise QueryError(problem, code="disk")
         return recorder
 
@@ -295,9 +285,8 @@ class RecordedTakes:
         if self._recorder is not None or self._is_closed:
             return
         self._recorder = recorder = Recorder("takes", self._max_queued_bytes)
-        folder = self._folder
-        recorder.call(partial(self._recover, folder))
-        self._start_check()
+        recorder.call(partial(self._recover, self._folder))
+        self._check_folder()
         for recording in self._recordings.values():
             self._keep(recording)
 
@@ -316,11 +305,7 @@ class RecordedTakes:
             return "the output takes is closed; start the gateway again"
         if self._recorder is None:
             return "the output takes is not open; start it first"
-        if self._folder_thread.call_age_s > _SILENT_S:
-            return (
-                f"the disk of {self._folder.directory} does not respond; check it, and whether it is mounted"
-            )
-        return self._folder_problem or self.disk.problem
+        return self._watch.problem or self.disk.problem
 
     def refusal(self) -> OutputError | None:
         """Return the error for a message that is published while the output is not open."""
@@ -340,38 +325,15 @@ class RecordedTakes:
         """Check the folder and its limits. Called once a second."""
         for recording in self._recordings.values():
             recording.maintain()
-        check = self._check
-        if check is not None and check.done():
-            self._check = None
-            self._folder_problem, excess_bytes = check.result()
-            if excess_bytes:
-                self._end_because_full(excess_bytes)
-        if self._check is None and time.monotonic() >= self._next_check_s:
-            self._start_check()
+        if self._watch.excess_bytes:
+            self._end_because_full(self._watch.excess_bytes)
+            self._watch.excess_bytes = 0
+        self._check_folder()
 
-    def _start_check(self) -> None:
-        if self._recorder is None or self._is_closed:
-            return
-        folder, settings = self._folder, self.settings
-        protected = {path for each in self._recordings.values() for path in each.running_paths}
-        age_s = None if settings.max_age_days is None else settings.max_age_days * _DAY_S
-
-        def check() -> tuple[str, int]:
-            began_s = time.monotonic()
-            problem, excess = folder.open(), 0
-            if not problem:
-                try:
-                    excess = folder.delete_old(
-                        max_bytes=settings.max_bytes, max_age_s=age_s, protected=protected
-                    )
-                except OSError as error:
-                    problem = disk_problem(folder.directory, error)
-            # With thousands of takes, this would keep a disk busy.
-            ended_s = time.monotonic()
-            self._next_check_s = ended_s + _REST * (ended_s - began_s)
-            return problem, excess
-
-        self._check = self._folder_thread.submit(check)
+    def _check_folder(self) -> None:
+        if self._recorder is not None and not self._is_closed:
+            protected = {path for each in self._recordings.values() for path in each.running_paths}
+            self._watch.check(self.settings, protected)
 
     def _end_because_full(self, excess_bytes: int) -> None:
         recorder = self._recorder
@@ -399,14 +361,13 @@ class RecordedTakes:
         """Apply settings: limits at once, everything else to the next take and to the rolling segments."""
         before, self.settings = self.settings, settings
         if settings.effective_directory != before.effective_directory:
-            old, self._folder = self._folder, _folder(settings)
-            self._check, self._folder_problem = None, self._unchecked_problem()
-            self._read_thread.submit(old.close)
-            self._next_check_s = 0.0
-            self._start_check()
+            old, self._watch = self._watch, FolderWatch(settings)
+            old.close()
+            self._check_folder()
         recorder = self._recorder
         if recorder is None:
             return
+        recorder.call(self._folder.open)
         for recording in self._recordings.values():
             segments = recording.segments
             if segments is not None and settings.keep_last_s and _same_files(settings, before):
@@ -437,7 +398,7 @@ class RecordedTakes:
                     *(self._folder.directory, recorder.queued_bytes),
                 )
                 return
-        self._folder.close()
+        self._watch.close()
 
 
 def _add_c3d(take: Path, c3d_file: Path) -> None:
@@ -447,10 +408,6 @@ def _add_c3d(take: Path, c3d_file: Path) -> None:
         logger.warning("takes: the C3D file of %s is not kept beside it: %s", take, error)
     else:
         logger.info("takes: %s is the C3D file of this take from the server", path)
-
-
-def _folder(settings: TakesSettings) -> TakesFolder:
-    return TakesFolder(settings.effective_directory, is_own=settings.directory is None)
 
 
 def _same_files(settings: TakesSettings, before: TakesSettings) -> bool:

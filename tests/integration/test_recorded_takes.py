@@ -1,0 +1,204 @@
+"""Takes that the gateway records: through reloads, the end of the process, and a kill."""
+
+import asyncio
+import contextlib
+import signal
+import subprocess
+import time
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from gateway.config.settings import MetricsSettings, ReconnectSettings, Settings, SourceSettings
+from gateway.gateway import Gateway
+from gateway.messages.decode import decode
+from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.takes.output import TakesOutput
+from gateway.outputs.takes.recorded_takes import RecordedTakes
+from gateway.outputs.takes.settings import TakesSettings
+from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.simulator.simulator import Simulator
+from gateway.simulator.synthetic import SyntheticScene
+from gateway.takes.reader import TakeReader
+from tests.configurations import make_settings
+from tests.gateway_process import program, simulator
+from tests.networks import free_endpoint, zenoh_keys
+from tests.recording_output import settings_in
+from tests.waiting import wait_until, wait_until_async
+
+pytestmark = pytest.mark.netns
+
+
+class Site:
+    """The settings of a gateway with the source lab."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._endpoint = free_endpoint()
+
+    def settings(self, port: int, takes: TakesSettings, **source: Any) -> Any:
+        reconnect = ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05)
+        return make_settings(
+            sources=(SourceSettings(name="lab", host="127.0.0.1", port=port, reconnect=reconnect, **source),),
+            zenoh=ZenohSettings(config=zenoh_keys("peer", listen=self._endpoint)),
+            lcm=LcmSettings(enabled=False),
+            takes=takes,
+            metrics=MetricsSettings(enabled=False),
+        )
+
+
+@contextlib.asynccontextmanager
+async def running(settings: Settings) -> AsyncIterator[Gateway]:
+    gateway, stop = Gateway(settings), asyncio.Event()
+    task = asyncio.create_task(gateway.run(stop))
+    try:
+        await gateway.opened.wait()
+        yield gateway
+    finally:
+        stop.set()
+        async with asyncio.timeout(10):
+            await task
+
+
+def takes_of(gateway: Gateway) -> RecordedTakes:
+    [output] = [output for output in gateway.outputs if isinstance(output, TakesOutput)]
+    return output.takes
+
+
+def markers(take: Path) -> list[Any]:
+    return [decode(each.message) for each in TakeReader(take).messages() if each.key == "3d"]
+
+
+async def growth(take: Path) -> None:
+    """Wait until more is written."""
+    before = size_of(take)
+    await wait_until_async(lambda: size_of(take) > before)
+
+
+def size_of(take: Path) -> int:
+    return take.stat().st_size if take.exists() else 0
+
+
+def scene() -> SyntheticScene:
+    return SyntheticScene(markers=3, tools=1, analog=1, plates=0, rate_hz=200)
+
+
+async def test_a_running_take_survives_reloads(tmp_path: Path) -> None:
+    site, first, second = Site(tmp_path), tmp_path / "first", tmp_path / "second"
+    first.mkdir()
+    second.mkdir()
+    walk = first / "lab" / "walk.lcmlog"
+    async with (
+        Simulator(scene()) as server,
+        running(site.settings(server.port, settings_in(first))) as gateway,
+    ):
+        takes = takes_of(gateway)
+        await takes.start("lab", "walk")
+        await growth(walk)
+        changed = site.settings(server.port, settings_in(first), byte_order="little")
+        assert await gateway.reload(changed) == ["source lab changed"]
+        await growth(walk)
+        other = site.settings(
+            server.port, settings_in(second, components=["3d"], keep_last_s=10), byte_order="little"
+        )
+        assert await gateway.reload(other) == ["output takes changed"]
+        assert takes_of(gateway) is takes
+        await growth(walk)
+        await takes.stop("lab")
+        await takes.start("lab", "run")
+        await growth(second / "lab" / "run.lcmlog")
+        await takes.save("lab", 10, 0, "fall")
+    sequences = [message.sequence for message in markers(walk)]
+    assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
+    assert len({message.session for message in markers(walk)}) == 2
+    assert {each.key for each in TakeReader(walk).messages()} >= {"3d", "6d"}
+    run = {each.key for each in TakeReader(second / "lab" / "run.lcmlog").messages()}
+    assert "3d" in run
+    assert not run & {"6d", "analog"}
+    assert markers(second / "lab" / "fall")
+
+
+async def test_a_take_ends_when_the_output_is_disabled_or_the_source_is_removed(tmp_path: Path) -> None:
+    site, walk = Site(tmp_path), tmp_path / "lab" / "walk.lcmlog"
+    settings = settings_in(tmp_path)
+    async with Simulator(scene()) as server, running(site.settings(server.port, settings)) as gateway:
+        await takes_of(gateway).start("lab", "walk")
+        await growth(walk)
+        assert await gateway.reload(site.settings(server.port, TakesSettings())) == ["output takes removed"]
+        size = walk.stat().st_size
+        assert await gateway.reload(site.settings(server.port, settings)) == ["output takes added"]
+        await wait_until_async(lambda: takes_of(gateway).problem == "")
+        await takes_of(gateway).start("lab", "run")
+        run = tmp_path / "lab" / "run.lcmlog"
+        await growth(run)
+        first, *_ = TakeReader(run).messages()
+        assert decode(first.message).server == f"127.0.0.1:{server.port}"
+        assert "parameters" in {each.key for each in TakeReader(run).messages()}
+        renamed = settings_with_name(site.settings(server.port, settings), "hall")
+        assert set(await gateway.reload(renamed)) == {"source lab removed", "source hall added"}
+        assert walk.stat().st_size == size
+        assert markers(walk)
+        await asyncio.sleep(0.2)
+        size = run.stat().st_size
+        await takes_of(gateway).start("hall", "walk")
+        await growth(tmp_path / "hall" / "walk.lcmlog")
+        assert run.stat().st_size == size
+
+
+def settings_with_name(settings: Settings, name: str) -> Settings:
+    [source] = settings.sources
+    return settings.model_copy(update={"sources": (source.model_copy(update={"name": name}),)})
+
+
+# A process of its own ------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def gateway_with_takes(folder: Path, port: int) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a gateway that keeps the last 60 s."""
+    configuration = {
+        "sources": [{"name": "lab", "host": "127.0.0.1", "port": port}],
+        "zenoh": {"config": zenoh_keys("peer", listen=free_endpoint())},
+        "lcm": {"enabled": False},
+        "metrics": {"enabled": False},
+        "takes": {"enabled": True, "directory": str(folder / "takes"), "keep_last_s": 60.0},
+    }
+    (folder / "takes").mkdir(exist_ok=True)
+    config = folder / "gateway.yaml"
+    config.write_text(yaml.safe_dump(configuration))
+    with (
+        (folder / "gateway.log").open("ab") as log,
+        program("run", "--config", str(config), stderr=log) as run,
+    ):
+        yield run
+
+
+def test_a_kill_costs_less_than_a_second(tmp_path: Path) -> None:
+    rolling = tmp_path / "takes" / ".rolling" / "lab"
+    with simulator("--rate", "200") as (port, _):
+        with gateway_with_takes(tmp_path, port) as process:
+            wait_until(lambda: [*rolling.glob("*")], 30)
+            [segment] = rolling.glob("*")
+            wait_until(lambda: segment.stat().st_size > 200_000, 30)
+            killed_s = time.time()
+            process.kill()
+            process.wait()
+        before = TakeReader(segment)
+        assert killed_s - max(each.utime for each in before.messages()) / 1e6 < 1
+        sequences = [message.sequence for message in markers(segment)]
+        assert sequences == list(range(sequences[0], sequences[0] + len(sequences)))
+        with gateway_with_takes(tmp_path, port) as process:
+            wait_until(lambda: [*(tmp_path / "takes" / "lab").glob("*/*.lcmlog")], 30)
+            [take] = (tmp_path / "takes" / "lab").iterdir()
+            assert [message.sequence for message in markers(take)] == sequences
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(10) == 0
+    assert (
+        "the last seconds of lab before the gateway was killed are kept as"
+        in (tmp_path / "gateway.log").read_text()
+    )
+    assert not [*rolling.glob("*")]
+    assert not rolling.exists()
