@@ -25,6 +25,8 @@ from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
 from gateway.outputs.memory import MemoryOutput
+from gateway.outputs.takes.output import TakesOutput
+from gateway.outputs.takes.settings import TakesSettings
 from gateway.simulator.simulator import Simulator
 from gateway.stream.session import Session
 from gateway.stream.state import StreamState
@@ -36,9 +38,11 @@ GATEWAY: Final = "frame_per_read"
 BATCH: Final = "frames_in_one_read"
 SEGMENTS: Final = "frame_in_two_reads"
 PLAIN: Final = "plain_python"
+RECORDING: Final = "recording"
 LCM_GEN: Final = "lcm_gen"
 GOAL_US: Final = 5.0
 GOAL_TIMES: Final = 50.0
+GOAL_RECORDING_US: Final = 5.0
 _BATCH_FRAMES: Final = 64
 _SEGMENT_BYTES: Final = 1448
 """The payload of a TCP segment on Ethernet; a frame has 2252 bytes."""
@@ -49,6 +53,7 @@ _LOOPS: Final = {
     BATCH: _BLOCK_FRAMES * 16,
     SEGMENTS: _BLOCK_FRAMES * 16,
     PLAIN: _BLOCK_FRAMES * 16,
+    RECORDING: _BLOCK_FRAMES * 16,
     LCM_GEN: 1000,
 }
 _TEXTS: Final = {
@@ -56,6 +61,7 @@ _TEXTS: Final = {
     BATCH: f"gateway, {_BATCH_FRAMES} frames per read",
     SEGMENTS: "gateway, each frame in two reads, split like TCP segments on Ethernet",
     PLAIN: "gateway not compiled, one frame per read",
+    RECORDING: "gateway, one frame per read, recording a take, including the thread that writes",
     LCM_GEN: "lcm-gen: decode and encode the same five messages",
 }
 
@@ -85,9 +91,15 @@ class _StoringOutput(MemoryOutput):
 
 
 class _FedGateway:
-    """A running gateway, connected to a silent server. ``run`` passes frames to its session directly."""
+    """A running gateway, connected to a silent server. ``run`` passes frames to its session directly.
 
-    def __init__(self) -> None:
+    With ``records``, a take is running, and ``run`` includes the time of the thread that writes it.
+    """
+
+    def __init__(self, *, records: bool = False) -> None:
+        self._folder = tempfile.TemporaryDirectory()
+        settings = TakesSettings(enabled=True, directory=self._folder.name)
+        self._takes = TakesOutput(settings) if records else None
         self._loop = uvloop.new_event_loop()
         self._output = _StoringOutput()
         self._frames = Frames(DENSE.packet(), _BLOCK_FRAMES)
@@ -108,9 +120,8 @@ class _FedGateway:
             streams=(StreamSettings(backlog="latest"),),
         )
         self._stop = asyncio.Event()
-        gateway = Gateway(
-            make_settings(sources=(source,), metrics=MetricsSettings(enabled=False)), [self._output]
-        )
+        outputs = [self._output] if self._takes is None else [self._output, self._takes]
+        gateway = Gateway(make_settings(sources=(source,), metrics=MetricsSettings(enabled=False)), outputs)
         self._running = self._loop.create_task(gateway.run(self._stop))
         [source_gateway] = gateway.sources
         [stream] = source_gateway.streams
@@ -119,6 +130,8 @@ class _FedGateway:
         )
         session = stream.session
         assert session is not None  # noqa: S101 - that was waited for
+        if self._takes is not None:
+            await self._takes.takes.start("lab")
         return session
 
     def run(self, loops: int, per_read: int, *, segments: bool = False) -> float:
@@ -143,6 +156,9 @@ class _FedGateway:
             began_s = time.process_time()
             for read in reads:
                 feed(read)
+            if self._takes is not None:
+                while self._takes.takes.queued_bytes:  # noqa: ASYNC110 - another thread writes
+                    await asyncio.sleep(0.01)
             took_s += time.process_time() - began_s
         return took_s
 
@@ -160,6 +176,7 @@ class _FedGateway:
         self._stop.set()
         self._loop.run_until_complete(self._running)
         self._loop.run_until_complete(self._server.close())
+        self._folder.cleanup()
 
 
 def expected_s(quick: bool) -> float:
@@ -191,7 +208,7 @@ def tables(result: dict[str, Any]) -> list[Table]:
     """Return the tables of the result."""
     values = result["cpu_us_per_frame"]
     rows = []
-    for name, text in _TEXTS.items():
+    for name, text in _measured(values).items():
         ratio = "" if name == LCM_GEN else table_cell(_compared_with_lcm_gen(values, name))
         rows.append([text, f"{statistics.median(values[name]):.2f}", ratio])
     return [Table(TITLE, ["what", "CPU µs per frame", "lcm-gen takes this many times as long"], rows)]
@@ -215,6 +232,26 @@ def goals(result: dict[str, Any]) -> list[Goal]:
             f"{times:.0f} times less with one frame per read, {times_batch:.0f} with {_BATCH_FRAMES}",
             times >= GOAL_TIMES,
         ),
+        *_recording_goals(values),
+    ]
+
+
+def _measured(values: dict[str, list[float]]) -> dict[str, str]:
+    """Return the texts of the variants in a result; an older one has no recording."""
+    return {name: text for name, text in _TEXTS.items() if name in values}
+
+
+def _recording_goals(values: dict[str, list[float]]) -> list[Goal]:
+    if RECORDING not in values:
+        return []
+    added_us = statistics.median(values[RECORDING]) - statistics.median(values[GATEWAY])
+    return [
+        Goal(
+            "cost of recording a five-component frame, on top",
+            f"at most {GOAL_RECORDING_US:g} µs",
+            f"{added_us:.1f} µs",
+            added_us <= GOAL_RECORDING_US,
+        )
     ]
 
 
@@ -227,7 +264,7 @@ def main() -> None:
     import pyperf  # noqa: PLC0415 - as above
 
     name = sys.argv.pop(1)
-    fed = functools.cache(_FedGateway)
+    fed = functools.cache(lambda: _FedGateway(records=name == RECORDING))
     decoded = functools.cache(lambda: [(message, type(decode(message))) for message in fed().messages()])
 
     def feed(loops: int) -> float:

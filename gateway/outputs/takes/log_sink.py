@@ -3,7 +3,7 @@
 import threading
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -15,8 +15,8 @@ from gateway.takes.recording import LogFile, utime_of
 Messages = Sequence[tuple[bytes, bytes]]
 """Messages of the gateway, each with its channel."""
 
-_CHUNK_BYTES: Final = 256 * 1024
-"""How much is written at once: the disk accepts all of it, or nothing."""
+_CHUNK_MESSAGES: Final = 512
+"""How many messages are written at once, so that a segment does not become much too long."""
 
 
 class LogSink(ABC):
@@ -53,8 +53,12 @@ class LogSink(ABC):
 
     def write(self, messages: Messages) -> None:
         """Write messages; wait while the disk does not accept them."""
-        for chunk in _chunks(messages):
+        for start in range(0, len(messages), _CHUNK_MESSAGES):
+            chunk = messages[start : start + _CHUNK_MESSAGES]
             self._write(chunk)
+            newest = dict(chunk).get(self.header.parameters_channel)
+            if newest is not None:
+                self.header.parameters = newest
 
     def _write(self, messages: Messages) -> None:
         rest = messages
@@ -69,23 +73,9 @@ class LogSink(ABC):
                     break
             else:
                 self.disk.succeeded()
-        for channel, message in messages:
-            if channel == self.header.parameters_channel:
-                self.header.parameters = message
 
     def lose(self, messages: Messages) -> None:
         """Count messages that are not written."""
         self.num_lost += len(messages)
         num_frames = max(Counter(channel for channel, _ in messages).values())
         self._losses.lost("not written", self.disk.problem, messages=len(messages), frames=num_frames)
-
-
-def _chunks(messages: Messages) -> Iterator[Messages]:
-    start = num_bytes = 0
-    for index, (_, message) in enumerate(messages):
-        if num_bytes + len(message) > _CHUNK_BYTES and index > start:
-            yield messages[start:index]
-            start, num_bytes = index, 0
-        num_bytes += len(message)
-    if start < len(messages):
-        yield messages[start:]

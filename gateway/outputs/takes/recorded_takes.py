@@ -307,6 +307,11 @@ class RecordedTakes:
             return "the output takes is not open; start it first"
         return self._watch.problem or self.disk.problem
 
+    @property
+    def queued_bytes(self) -> int:
+        """How many bytes wait for the disk."""
+        return 0 if self._recorder is None else self._recorder.queued_bytes
+
     def refusal(self) -> OutputError | None:
         """Return the error for a message that is published while the output is not open."""
         problem = self.problem
