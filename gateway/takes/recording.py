@@ -125,8 +125,8 @@ class Recorder:
         self._is_closed = False
         self._unsynced: dict[Sink, None] = {}
         self._defects = DefectLog(logger, name)
-        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
-        self._thread.start()
+        self._writer = threading.Thread(target=self._run, name=name, daemon=True)
+        self._writer.start()
 
     @property
     def queued_bytes(self) -> int:
@@ -156,8 +156,8 @@ class Recorder:
         """Write what waits, and end the thread. Return False if the disk needs longer than ``timeout_s``."""
         self._is_closed = True
         self._wake.set()
-        self._thread.join(timeout_s)
-        return not self._thread.is_alive()
+        self._writer.join(timeout_s)
+        return not self._writer.is_alive()
 
     def _run(self) -> None:
         synced_s = time.monotonic()
