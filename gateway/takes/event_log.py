@@ -30,6 +30,9 @@ _MAX_NAMES: Final = 1000
 """So many names of channels are decoded once only."""
 
 _READ_BYTES: Final = 1024 * 1024
+_AHEAD_BYTES: Final = 32 * 1024 * 1024
+"""How far the system reads ahead, so that a slow disk does not delay what is replayed."""
+
 _MAX_FOREIGN_BYTES: Final = 64 * 1024 * 1024
 """A file without an event in its first 64 MiB is no event log."""
 
@@ -133,11 +136,14 @@ class _Window:
         self._data = b""
         self._start = 0  # of the present place in _data
         self.offset = offset
+        os.posix_fadvise(file.fileno(), offset, _AHEAD_BYTES, os.POSIX_FADV_WILLNEED)
 
     def has(self, num_bytes: int) -> bool:
         """Whether the file has this many more bytes; they are in memory then."""
         while (missing := self._start + num_bytes - len(self._data)) > 0:
             more = self._file.read(max(missing, _READ_BYTES))
+            ahead = self._file.tell() + _AHEAD_BYTES
+            os.posix_fadvise(self._file.fileno(), ahead, _READ_BYTES, os.POSIX_FADV_WILLNEED)
             if not more:
                 break
             self._data = self._data[self._start :] + more
