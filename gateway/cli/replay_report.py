@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from gateway.replay.player import Player
-from gateway.replay.publication import Publication
+from gateway.replay.publication import MAX_SOURCES, MAX_TOPICS, Publication
 from gateway.replay.timeline import Jump
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.safe_text import safe_text
@@ -149,6 +149,11 @@ def _notes(player: Player, publication: Publication, reader: TakeReader) -> list
         f"{count:,} messages of {safe_text(source)} are damaged and were left out"
         for source, count in publication.num_unreadable.items()
     ]
+    if publication.num_surplus:
+        notes.append(
+            f"{publication.num_surplus:,} messages were left out, because the take has more than "
+            f"{MAX_SOURCES} sources or {MAX_TOPICS} keys"
+        )
     if reader.unknown:
         channels = [safe_text(channel) for channel, _ in reader.unknown.most_common(_MAX_LISTED)]
         more = ", …" if len(reader.unknown) > _MAX_LISTED else ""
@@ -161,4 +166,5 @@ def _notes(player: Player, publication: Publication, reader: TakeReader) -> list
         for log in reader.logs
         if log.damaged_bytes
     ]
+    notes += [f"left out: {safe_text(problem)}" for problem in reader.empty_files.values()]
     return notes

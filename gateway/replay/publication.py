@@ -1,20 +1,31 @@
 """Publishing the messages of a take on outputs, as the gateway that recorded them did."""
 
 import asyncio
+import re
 import time
 from collections import Counter
 from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, NamedTuple
 
-from gateway.errors import OutputError, ProtocolError
+from gateway.errors import OutputError, ParametersError, ProtocolError
 from gateway.messages.decode import decode, message_type
 from gateway.messages.encode import CONTENT_OFFSET, lcm_type_name
-from gateway.messages.topics import Topic
+from gateway.messages.topics import Topic, lcm_channel, unique_name
 from gateway.outputs.contract import Output, ServerParameters
+from gateway.rtc3d.parameters_xml import parse_parameters
 
 _PARAMETERS_S: Final = 1.0
 """How long messages wait at most until the outputs have sent the parameters that describe them."""
+
+
+MAX_TOPICS: Final = 4096
+MAX_SOURCES: Final = 256
+"""Further keys and sources are left out: a gateway has at most 261 keys per source."""
+
+MAX_NAME_LENGTH: Final = 24
+_NOT_IN_NAMES: Final = re.compile("[^A-Za-z0-9_-]+")
+"""Names of sources are like those in a configuration; a log of other programs may have any."""
 
 
 class Refusal(NamedTuple):
@@ -35,8 +46,12 @@ class ReplayedSource:
     newest: dict[str, bytes] = field(default_factory=dict)
 
 
-_Publishers = list[tuple[str, Callable[[bytes], None]]]
-"""The publishers of one key, each with the name of its output."""
+class _Route(NamedTuple):
+    """Where the messages of one key go: the newest is kept, and each output has a publisher."""
+
+    newest: dict[str, bytes]
+    component: str
+    publishers: Sequence[tuple[str, Callable[[bytes], None]]]
 
 
 class Publication:
@@ -58,11 +73,14 @@ class Publication:
         """What the outputs did not accept."""
         self.num_unreadable: Counter[str] = Counter()
         """How many messages without a whole prefix, and parameters, could not be read, by source."""
+        self.num_surplus = 0
+        """How many messages had too many different keys or sources to be published."""
         self.without_parameters: set[str] = set()
         """The sources of which a component came before any parameters."""
         self._outputs = outputs
         self._loop = loop
-        self._publishers: dict[tuple[str, str], _Publishers] = {}
+        self._routes: dict[tuple[str, str], _Route] = {}  # by the recorded source and the key
+        self._recorded_sources: dict[str, ReplayedSource] = {}
 
     # In the thread that publishes.
 
@@ -74,46 +92,58 @@ class Publication:
         if len(message) < CONTENT_OFFSET:
             self.num_unreadable[source] += 1
             return
-        publishers = self._publishers.get((source, key))
-        if publishers is None:
-            publishers = self._open(source, key, message)
-        self.sources[source].newest[key] = message
-        for output, publish in publishers:
+        route = self._routes.get((source, key)) or self._open(source, key, message)
+        if route is None:
+            self.num_surplus += 1
+            return
+        route.newest[key] = message
+        for output, publish in route.publishers:
             try:
                 publish(message)
             except OutputError as error:
-                self.refusals[Refusal(_component(key), output, error.cause)] += 1
-        self.num_messages[_component(key)] += 1
+                self.refusals[Refusal(route.component, output, error.cause)] += 1
+        self.num_messages[route.component] += 1
 
-    def _open(self, source: str, key: str, message: bytes) -> _Publishers:
-        if self._source(source).parameters is None and key not in {"status", "clock"}:
-            self.without_parameters.add(source)
-        topic = Topic(source, tuple(key.split("/", 1)), lcm_type_name(message_type(message)))
-        publishers: _Publishers = [(output.name, output.publisher(topic).publish) for output in self._outputs]
-        self._publishers[source, key] = publishers
-        return publishers
+    def _open(self, recorded_source: str, key: str, message: bytes) -> _Route | None:
+        source = self._source(recorded_source)
+        if source is None or len(self._routes) >= MAX_TOPICS:
+            return None
+        if source.parameters is None and key not in {"status", "clock"}:
+            self.without_parameters.add(source.name)
+        name, _, label = key.partition("/")
+        path = (name, _recorded_label(label, source.parameters)) if label else (name,)
+        topic = Topic(source.name, path, lcm_type_name(message_type(message)))
+        publishers = [(output.name, output.publisher(topic).publish) for output in self._outputs]
+        route = _Route(source.newest, f"{name}/tool" if label else name, publishers)
+        self._routes[recorded_source, key] = route
+        return route
 
-    def _source(self, name: str) -> ReplayedSource:
-        source = self.sources.get(name)
-        if source is None:
-            source = self.sources[name] = ReplayedSource(name)
+    def _source(self, recorded_name: str) -> ReplayedSource | None:
+        """Return a source, which gets a name that is possible in a key; None if there are too many."""
+        source = self._recorded_sources.get(recorded_name)
+        if source is None and len(self.sources) < MAX_SOURCES:
+            name = unique_name(_NOT_IN_NAMES.sub("-", recorded_name) or "-", self.sources, MAX_NAME_LENGTH)
+            source = self.sources[name] = self._recorded_sources[recorded_name] = ReplayedSource(name)
             self._in_loop(self._announce(name))
         return source
 
-    def _publish_parameters(self, name: str, message: bytes) -> None:
+    def _publish_parameters(self, recorded_source: str, message: bytes) -> None:
         try:
             recorded = decode(message)
         except ProtocolError:
-            self.num_unreadable[name] += 1
+            self.num_unreadable[recorded_source] += 1
+            return
+        source = self._source(recorded_source)
+        if source is None:
+            self.num_surplus += 1
             return
         parameters = ServerParameters(
             recorded.xml.encode(), recorded.session, recorded.parameters_version, message=message
         )
-        source = self._source(name)
         before = source.parameters
         source.parameters, source.published_s = parameters, time.monotonic()
         is_new = before is None or before[:3] != parameters[:3]
-        self._in_loop(self._send_parameters(name, parameters, wait=is_new))
+        self._in_loop(self._send_parameters(source.name, parameters, wait=is_new))
         self.num_messages["parameters"] += 1
 
     def _in_loop(self, work: Coroutine[Any, Any, None]) -> None:
@@ -140,5 +170,13 @@ class Publication:
                 output.show_streaming(source, is_streaming)
 
 
-def _component(key: str) -> str:
-    return "6d/tool" if key.startswith("6d/") else key
+def _recorded_label(label: str, parameters: ServerParameters | None) -> str:
+    """Return the label of a tool from the parameters; ``label`` is what the channel has of it."""
+    try:
+        tools = parse_parameters(b"" if parameters is None else parameters.xml).parameters.tools
+    except ParametersError:
+        tools = None
+    for tool in () if tools is None else tools.tools:
+        if lcm_channel("", tool.label) == lcm_channel("", label):
+            return tool.label.strip()
+    return label

@@ -6,15 +6,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import rtc3d
 
 from gateway.errors import OutputError, TakeError
 from gateway.outputs.contract import Output, ServerParameters
 from gateway.replay.play_list import Selection
 from gateway.replay.player import Player
-from gateway.replay.publication import Publication, Refusal
+from gateway.replay.publication import MAX_TOPICS, Publication, Refusal
 from gateway.replay.replay import playing
 from gateway.replay.timeline import Jump
 from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool
 from gateway.takes.event_log import encode_event
 from gateway.takes.reader import TakeReader
 from tests.takes import START_UTIME, Message, description, frame, log_bytes, markers, parameters, write_take
@@ -243,3 +245,36 @@ async def test_a_defect_of_an_output_ends_the_replay_with_its_error(tmp_path: Pa
     output.error = ZeroDivisionError()
     with pytest.raises(ZeroDivisionError):
         await Replayed(output).play(write_take(tmp_path / "take.lcmlog", some_messages()))
+
+
+async def test_poses_are_published_under_the_labels_of_the_tools(tmp_path: Path) -> None:
+    pose = rtc3d.tool_pose_t()
+    pose.utime = START_UTIME
+    content = Parameters(tools=Parameters6D(100.0, (Tool("1", "Left/hand 1"), Tool("2", "probe"))))
+    messages: list[Message] = [parameters(content)]
+    messages += [(f"MOCAP_LAB_6D_{name}", pose.encode()) for name in ("LEFT_HAND_1", "OTHER")]
+    replayed = Replayed()
+    await replayed.play(write_take(tmp_path / "take.lcmlog", messages))
+    [output] = replayed.outputs
+    assert isinstance(output, RecordingOutput)
+    assert [topic.path for topic in output.declared] == [("6d", "Left/hand 1"), ("6d", "OTHER")]
+    assert replayed.publication.num_messages == {"parameters": 1, "6d/tool": 2}
+
+
+async def test_sources_get_names_that_are_possible_in_keys(tmp_path: Path) -> None:
+    messages = [
+        *(description("a/b*"), ("MOCAP_A_B_3D", markers(1)[1])),
+        ("x_" + "y" * 30 + "_3D", markers(1)[1]),
+    ]
+    replayed = Replayed()
+    await replayed.play(write_take(tmp_path / "take.lcmlog", messages))
+    assert replayed.publication.sources.keys() == {"a-b-", "y" * 24}
+
+
+async def test_the_number_of_keys_is_limited(tmp_path: Path) -> None:
+    pose = rtc3d.tool_pose_t().encode()
+    messages = [(f"MOCAP_LAB_6D_TOOL{number}", pose) for number in range(MAX_TOPICS + 10)]
+    replayed = Replayed()
+    await replayed.play(write_take(tmp_path / "take.lcmlog", messages))
+    assert len(replayed.keys) == MAX_TOPICS
+    assert replayed.publication.num_surplus == 10
