@@ -156,8 +156,8 @@ PLAIN_PYTHON: Final = {"PYTHONPATH": str(ROOT)}
 """The environment in which a program imports the gateway's sources instead of build/compiled."""
 
 
-def run_measured(command: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
-    """Run a program on the first core until it ends; raises RuntimeError with its output if it failed."""
+def run_measured(command: Sequence[str], environment: Mapping[str, str] | None = None) -> str:
+    """Run a program on the first core and return its output; raises RuntimeError with it if it failed."""
     with _on_measured_core():
         done = subprocess.run(  # noqa: S603 - the command is our own
             command,
@@ -170,6 +170,7 @@ def run_measured(command: Sequence[str], environment: Mapping[str, str] | None =
         )
     if done.returncode:
         raise RuntimeError(done.stdout)
+    return done.stdout
 
 
 def gateway(file: Path, settings: dict[str, Any]) -> Program:
