@@ -27,10 +27,7 @@ _LATIN_1: Final = re.compile(r"""\s*<\?xml[^>]*encoding\s*=\s*["'](iso-8859-1|la
 
 
 class TakePass:
-    """One reading of a take. ``first_utime`` and ``end_utime`` limit the events that count; None is no limit.
-
-    ``default`` are the parameters of components before the first parameters in the take.
-    """
+    """One reading of a take. ``first_utime`` and ``end_utime`` limit its events; None is no limit."""
 
     def __init__(
         self,
@@ -38,7 +35,7 @@ class TakePass:
         source: str,
         first_utime: int | None,
         end_utime: int | None,
-        default: RecordedParameters | None,
+        default: RecordedParameters,
     ) -> None:
         self._reader = reader
         self._source = source
@@ -47,7 +44,8 @@ class TakePass:
         self._builder = MomentBuilder()
         self._newest: RecordedParameters | None = None
         self._versions: dict[int, RecordedParameters] = {}
-        self._default = default or RecordedParameters(b"")
+        self.default = default
+        """The parameters of components before the first parameters in the take."""
         self.first_parameters: RecordedParameters | None = None
         """The first parameters in the take; None if none have been read."""
         self.num_malformed = 0
@@ -104,7 +102,7 @@ class TakePass:
                 prefix.session,
                 message.message[8:24] + message.message[32:CONTENT_OFFSET],
                 content,
-                self._versions.get(prefix.parameters_version) or self._newest or self._default,
+                self._versions.get(prefix.parameters_version) or self._newest or self.default,
             )
         )
 

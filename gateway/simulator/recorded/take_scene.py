@@ -5,7 +5,7 @@ import weakref
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from itertools import islice, pairwise
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from statistics import median_low
 from typing import Final, NamedTuple
@@ -13,6 +13,7 @@ from typing import Final, NamedTuple
 from gateway.errors import TakeError
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import General, Parameters
+from gateway.safe_text import quoted, safe_text
 from gateway.simulator.recorded import frame_contents
 from gateway.simulator.recorded.moments import Moment
 from gateway.simulator.recorded.parameters import RecordedParameters, derived_parameters
@@ -76,23 +77,31 @@ class TakeScene:
         self._source = _chosen_source(self._reader, source)
         self._first_utime = None if from_s is None else self._reader.start_utime + round(from_s * 1e6)
         self._end_utime = None if to_s is None else self._reader.start_utime + round(to_s * 1e6)
-        self._default: RecordedParameters | None = None
+        self._default = RecordedParameters(b"")
         first_pass = self._new_pass()
-        preview = list(islice(first_pass.moments(), _PREVIEW_MOMENTS))
+        moments = first_pass.moments()
+        preview = list(islice(moments, _PREVIEW_MOMENTS))
         if not preview:
             raise TakeError(
-                f"{path} has no frames of {self._source}"
+                f"{safe_text(str(path))} has no frames of {safe_text(self._source)}"
                 f"{_range_text(from_s, to_s)}; rtc3d-gateway take info shows what is in it"
             )
         self._rates_hz = _rates_hz(preview)
-        self._default = first_pass.first_parameters
-        if self._default is None:
+        if first_pass.first_parameters is not None:
+            self._default = first_pass.first_parameters
+        else:
             self._default = _derived(preview, self._rates_hz)
             _log.warning(
                 "%s has no parameters of %s at its beginning; the simulator serves minimal ones, with the "
                 "numbers of items and the rates of the first frames, and numbers as labels",
-                *(path, self._source),
+                *(safe_text(str(path)), safe_text(self._source)),
             )
+        for moment in preview:
+            if not moment.parameters.xml:
+                moment.parameters = self._default
+        first_pass.default = self._default
+        # The first measurement goes on from here, because it can take long to find the beginning of a range.
+        self._prepared: tuple[TakePass, Iterator[Moment]] | None = (first_pass, chain(preview, moments))
         self._is_reported = False
         self._frames: weakref.WeakSet[RecordedFrames] = weakref.WeakSet()
         self._thread = WorkerThread("take")
@@ -111,7 +120,7 @@ class TakeScene:
         self._ahead: deque[Moment] = deque()
         self._ahead_bytes = 0
         self._past: deque[Moment] = deque()
-        self._parameters = self._default or RecordedParameters(b"")
+        self._parameters = self._default
 
     # Scene ----------------------------------------------------------------------------------
 
@@ -133,6 +142,9 @@ class TakeScene:
         """See Scene."""
         self._reset()
         self._frames.clear()
+        if self._prepared is not None:
+            self._pass, self._moments = self._prepared
+            self._prepared = None
         self._read_on(0)
 
     def advance(self, elapsed_us: int) -> int | None:
@@ -218,7 +230,13 @@ class TakeScene:
             _log.warning(
                 "%s is not complete: %d damaged places (%d bytes), %d messages of an unknown type, and %d "
                 "malformed messages are left out",
-                *(self._reader.path, num_damaged, num_bytes, num_unknown, self._pass.num_malformed),
+                *(
+                    safe_text(str(self._reader.path)),
+                    num_damaged,
+                    num_bytes,
+                    num_unknown,
+                    self._pass.num_malformed,
+                ),
             )
 
 
@@ -245,19 +263,17 @@ def _chosen_source(reader: TakeReader, source: str | None) -> str:
             if message.key in COMPONENTS_BY_KEY
         )
     )
+    path, listed = safe_text(str(reader.path)), safe_text(", ".join(names)) or "none"
     if source is None:
         if len(names) > 1:
-            raise TakeError(
-                f"{reader.path} has several sources: {', '.join(names)}; choose one with --source"
-            )
+            raise TakeError(f"{path} has several sources: {listed}; choose one with --source")
         if not names:
-            raise TakeError(f"{reader.path} has no frames; choose another recording")
+            raise TakeError(f"{path} has no frames; choose another recording")
         return names[0]
     if source not in names:
         is_later = any(message.source == source for message in reader.messages())
         if not is_later:
-            listed = ", ".join(names) or "none"
-            raise TakeError(f"{reader.path} has no source {source!r}; its sources are: {listed}")
+            raise TakeError(f"{path} has no source {quoted(source)}; its sources are: {listed}")
     return source
 
 

@@ -244,6 +244,8 @@ def test_a_file_that_cannot_be_read_any_more_ends_the_take(
     path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     scene = TakeScene(write_take(path, take_of(5)))
+    scene.start()
+    scene.stop()
     path.unlink()
     scene.start()
     advance_until(scene, 0, lambda: scene.length_us is not None)
