@@ -1,5 +1,6 @@
 """A take as an RT server: simulate --take, from the file to another gateway and to other clients."""
 
+import random
 import subprocess
 import sys
 from collections.abc import Callable
@@ -24,11 +25,12 @@ from gateway.simulator.faults.server_faults import ChangeScene, Rename, Restart
 from gateway.simulator.recorded.take_scene import TakeScene
 from gateway.simulator.scene_settings import SceneSettings
 from gateway.simulator.simulator import Simulator
+from gateway.takes.event_log import EventLogReader
 from gateway.takes.reader import TakeReader
 from tests.integration.raw_client import RawClient, connected, consecutive, numbers, until
 from tests.memory_gateway import run_gateway
 from tests.recorded_servers import SCENES, has_ended, record
-from tests.takes import START_UTIME, description, frame, markers, parameters, write_take
+from tests.takes import START_UTIME, Message, description, frame, markers, parameters, write_take
 from tests.unit.rtc3d_server.wire import (
     ANALOG,
     COMMAND,
@@ -201,6 +203,75 @@ async def test_a_gateway_follows_parameters_that_change(tmp_path: Path) -> None:
         assert [message.frame_number for message in messages] == list(range(300))
         assert {message.parameters_version for message in messages[:100]} == {1}
         assert messages[-1].parameters_version == 2
+
+
+# Unusual takes ------------------------------------------------------------------------------
+
+
+def is_component(message: Message) -> bool:
+    return not message[0].endswith(("_TAKE", "_PARAMETERS"))
+
+
+def with_timestamp(message: Message, change: Callable[[int], int]) -> Message:
+    channel, data = message
+    timestamp_us = int.from_bytes(data[44:52], "big", signed=True)
+    return channel, data[:44] + change(timestamp_us).to_bytes(8, "big", signed=True) + data[52:]
+
+
+def with_gaps(messages: list[Message]) -> list[Message]:
+    rng = random.Random(1)
+    return [message for message in messages if not is_component(message) or rng.random() > 0.2]
+
+
+def frozen(messages: list[Message]) -> list[Message]:
+    return [
+        with_timestamp(message, lambda _: -1) if is_component(message) else message for message in messages
+    ]
+
+
+def restarted(messages: list[Message]) -> list[Message]:
+    return [
+        with_timestamp(message, lambda us: us - 7_250_000 if us > 7_250_000 else us)
+        if is_component(message)
+        else message
+        for message in messages
+    ]
+
+
+def without_parameters(messages: list[Message]) -> list[Message]:
+    return list(filter(is_component, messages))
+
+
+def analog_ends_early(messages: list[Message]) -> list[Message]:
+    middle = len(messages) // 2
+    return [message for k, message in enumerate(messages) if k < middle or "ANALOG" not in message[0]]
+
+
+def damaged(messages: list[Message]) -> list[Message]:
+    return [
+        (channel, data[:-1]) if k % 50 == 25 else (channel, data)
+        for k, (channel, data) in enumerate(messages)
+    ]
+
+
+@pytest.mark.parametrize(
+    "change", [with_gaps, frozen, restarted, without_parameters, analog_ends_early, damaged]
+)
+async def test_everything_that_is_in_an_unusual_take_is_recorded_again(
+    take: Path, change: Callable[[list[Message]], list[Message]], tmp_path: Path
+) -> None:
+    events = [(event.channel, event.message) for event in EventLogReader(take).events()]
+    path = write_take(tmp_path / "unusual.lcmlog", change(events))
+    expected = {
+        key: [content for content in each if len(content) % 4 == 0] for key, each in contents(path).items()
+    }
+
+    again = contents(await record(TakeScene(path), tmp_path / "again.lcmlog", has_ended))
+
+    assert {key: len(each) for key, each in again.items()} == {
+        key: len(each) for key, each in expected.items()
+    }
+    assert again == expected
 
 
 # Faults -------------------------------------------------------------------------------------

@@ -94,11 +94,11 @@ class TakePass:
             self.num_malformed += 1
             return []
         prefix = prefix_of(message.message)
-        is_plausible = abs(message.utime - prefix.capture_utime) < _MAX_LATE_CAPTURE_US
+        is_plausible = abs(prefix.utime - prefix.capture_utime) < _MAX_LATE_CAPTURE_US
         return self._builder.add(
             Recorded(
                 component,
-                prefix.capture_utime if is_plausible else message.utime,
+                prefix.capture_utime if is_plausible else prefix.utime,
                 prefix.session,
                 message.message[8:24] + message.message[32:CONTENT_OFFSET],
                 content,

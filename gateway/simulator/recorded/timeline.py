@@ -13,6 +13,9 @@ _MAX_STEP_US: Final = 1_000_000
 _PROOF_US: Final = 1_000_000
 """After time stamps were not plausible, they must advance like the time of capture for so long."""
 
+_MAX_PAUSE_US: Final = 86_400_000_000
+"""A longer pause is none: the computer's clock was set, or a time is damaged."""
+
 _DRIFT: Final = 1e-3
 """Two clocks may differ by this much of the elapsed time; a crystal is off by 1e-4 at most."""
 
@@ -31,11 +34,17 @@ class Timeline:
         self._server_offset_us: int | None = None  # the time in the take minus the time stamp
         self._capture_offset_us = 0  # the time in the take minus the time of capture
         self._capture_utime = 0  # of the newest message
+        self._newest_us = 0
         self._trusted_from_utime: int | None = None  # when time stamps can be trusted again; None for now
         self._last: dict[ComponentType, tuple[int, int, int]] = {}
 
     def time_us(self, component: ComponentType, session: int, timestamp_us: int, capture_utime: int) -> int:
         """Return when a message is due. ``session`` is the number of its connection to the server."""
+        time_us = self._place(component, session, timestamp_us, capture_utime)
+        self._newest_us = max(self._newest_us, time_us)
+        return time_us
+
+    def _place(self, component: ComponentType, session: int, timestamp_us: int, capture_utime: int) -> int:
         if self._server_offset_us is None:
             self._server_offset_us = -timestamp_us
             self._capture_offset_us = -capture_utime
@@ -56,6 +65,9 @@ class Timeline:
             self._capture_offset_us += server_us - captured_us
             self._capture_utime = capture_utime
             return server_us
+        if not -_TOLERANCE_US <= captured_us - self._newest_us <= _MAX_PAUSE_US:
+            self._capture_offset_us += self._newest_us - captured_us
+            captured_us = self._newest_us
         self._server_offset_us = captured_us - timestamp_us
         self._trusted_from_utime = capture_utime + _PROOF_US
         self._capture_utime = capture_utime

@@ -80,3 +80,29 @@ def test_the_clock_may_be_set_back_when_two_components_follow() -> None:
         placed.append(timeline.time_us(MARKERS, 1, k * PERIOD_US, captured))
         assert timeline.time_us(ANALOG, 2, k * PERIOD_US, captured + 100) == placed[-1]
     assert placed == regular(300)
+
+
+@pytest.mark.parametrize("step", [-(10**15), -3_600_000_000, 10**15])
+@pytest.mark.parametrize("restart", [-1_000_000, 3_000_000])
+def test_the_clock_may_be_set_while_the_server_restarts(restart: int, step: int) -> None:
+    before = [(time, time) for time in regular(200)]
+    after = [(restart + time, 2_000_000 + step + time) for time in regular(200)]
+    placed = times(before + after)
+    assert placed[:200] == regular(200)
+    assert placed[200:] == regular(200, placed[200])
+    assert placed[200] - placed[199] <= PERIOD_US
+
+
+def test_the_clock_may_be_set_back_while_time_stamps_are_frozen() -> None:
+    messages = [(0, time - (3_600_000_000 if k >= 100 else 0)) for k, time in enumerate(regular(300))]
+    placed = times(messages)
+    assert placed == [*regular(100), *regular(200, 99 * PERIOD_US)]
+
+
+def test_a_damaged_time_delays_nothing() -> None:
+    messages = [(time, time) for time in regular(300)]
+    messages[100] = (-(2**62), 2**62)
+    placed = times(messages)
+    assert placed[:100] == regular(100)
+    assert placed[150:] == regular(150, placed[150])
+    assert abs(placed[150] - 150 * PERIOD_US) <= 2 * PERIOD_US
