@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from itertools import chain, islice, pairwise
+from operator import itemgetter
 from pathlib import Path
 from statistics import median_low
 from typing import Final, NamedTuple
@@ -44,6 +45,7 @@ _SOURCES_WITHIN: Final = 20_000
 """All sources of a take have a message among so many at its beginning."""
 
 _DEFAULT_PERIOD_US: Final = 10_000
+_SAME_RATE: Final = 1.2
 
 _log = logging.getLogger(__name__)
 
@@ -278,16 +280,26 @@ def _chosen_source(reader: TakeReader, source: str | None) -> str:
 
 
 def _rates_hz(moments: Sequence[Moment]) -> dict[ComponentType, float]:
-    """Return the rate of each measured component in these moments that has at least three of them."""
+    """Return the rate of each measured component in these moments that has at least three of them.
+
+    Rates within the factor _SAME_RATE are equal: without time stamps, they have the jitter of the network.
+    """
     times_us: dict[ComponentType, list[int]] = {}
     for moment in moments:
         for component in moment.contents:
             times_us.setdefault(component, []).append(moment.due_us)
-    return {
+    measured_hz = {
         component: 1e6 / median_low([later - earlier for earlier, later in pairwise(times)])
         for component, times in times_us.items()
         if component is not ComponentType.EVENT and len(times) > 2
     }
+    rates_hz: dict[ComponentType, float] = {}
+    slower_hz = 0.0
+    for component, rate_hz in sorted(measured_hz.items(), key=itemgetter(1)):
+        if rate_hz > slower_hz * _SAME_RATE:
+            slower_hz = rate_hz
+        rates_hz[component] = slower_hz
+    return rates_hz
 
 
 def _period_us(rates_hz: Mapping[ComponentType, float]) -> int:

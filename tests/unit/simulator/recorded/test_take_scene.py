@@ -1,5 +1,6 @@
 """TakeScene in virtual time: what is read ahead, how passes follow each other, and what cannot be played."""
 
+import random
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -173,6 +174,20 @@ def test_without_parameters_they_are_derived_from_the_frames(
     assert [event.id for event in found.events.events] == ["77"]
     assert "has no parameters of lab" in caplog.text
     assert parse_parameters(scene.parameters_xml(("3d",), GENERAL)).parameters.markers == found.markers
+
+
+def test_derived_rates_that_differ_by_jitter_are_one_rate(path: Path) -> None:
+    rng = random.Random(1)
+    messages = []
+    for number in range(300):
+        for component, items in ((ComponentType.MARKERS, [(1, 2, 3, 0)]), (ComponentType.ANALOG, [1.0])):
+            utime = START_UTIME + 10_000 * number + rng.randint(0, 9000)
+            messages.append(frame(component, items, number, timestamp_us=0, utime=utime))
+    messages.sort(key=lambda message: message[1][8:16])
+    described = TakeScene(write_take(path, messages)).parameters
+    assert described.markers is not None
+    assert described.analog is not None
+    assert described.markers.frequency_hz == described.analog.channels[0].frequency_hz
 
 
 def test_parameters_that_cannot_be_read_are_sent_as_they_are(path: Path) -> None:
