@@ -143,6 +143,25 @@ def test_while_the_slowest_component_pauses_the_next_one_sets_the_rate() -> None
     assert gap == list(range(316, 677))
 
 
+@pytest.mark.parametrize("batch", [1, 7, 200])
+def test_the_frames_do_not_depend_on_how_much_is_read_at_once(batch: int) -> None:
+    moments = lab(1, pause=(0.3, 0.7))
+    whole = Client(moments)
+    whole.send("StreamFrames All")
+    pieces = Client([], is_end=False)
+    pieces.send("StreamFrames All")
+    for start in range(0, len(moments), batch):
+        pieces.sources[0].add(moments[start : start + batch], is_end=start + batch >= len(moments))
+    assert pieces.frames_until(2) == whole.frames_until(2)
+
+
+def test_a_pass_does_not_end_in_the_first_frame_of_the_next_one() -> None:
+    client = Client(lab(0.1))
+    client.send("StreamFrames 3D Analog")
+    client.sources[0].add([moment(100_000, {"3d": 1})], is_end=True)
+    assert numbers(client.frames_until(1))[-1] == {"3d": 1}
+
+
 def test_components_may_begin_later() -> None:
     client = Client(lab(1, pause=(0, 0.5)))
     client.send("StreamFrames All")
