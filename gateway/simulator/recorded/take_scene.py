@@ -2,7 +2,7 @@
 
 import logging
 import weakref
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from itertools import chain, islice, pairwise
@@ -43,6 +43,8 @@ _PREVIEW_MOMENTS: Final = 3000
 
 _SOURCES_WITHIN: Final = 20_000
 """All sources of a take have a message among so many at its beginning."""
+
+_LEAST_SHARE: Final = 0.005
 
 _DEFAULT_PERIOD_US: Final = 10_000
 _SAME_RATE: Final = 1.2
@@ -257,14 +259,16 @@ def _read_batch(moments: Iterator[Moment]) -> _Batch:
 
 
 def _chosen_source(reader: TakeReader, source: str | None) -> str:
-    """Return the source to play. Raises TakeError if the take has several, or others only."""
-    names = list(
-        dict.fromkeys(
-            message.source
-            for message in islice(reader.messages(), _SOURCES_WITHIN)
-            if message.key in COMPONENTS_BY_KEY
-        )
+    """Return the source to play. Raises TakeError if the take has several, or others only.
+
+    Sources with few messages, compared with the others, are none: a damaged channel looks like a source.
+    """
+    counts = Counter(
+        message.source
+        for message in islice(reader.messages(), _SOURCES_WITHIN)
+        if message.key in COMPONENTS_BY_KEY
     )
+    names = [name for name, count in counts.items() if count >= _LEAST_SHARE * max(counts.values())]
     path, listed = safe_text(str(reader.path)), safe_text(", ".join(names)) or "none"
     if source is None:
         if len(names) > 1:
@@ -272,10 +276,8 @@ def _chosen_source(reader: TakeReader, source: str | None) -> str:
         if not names:
             raise TakeError(f"{path} has no frames; choose another recording")
         return names[0]
-    if source not in names:
-        is_later = any(message.source == source for message in reader.messages())
-        if not is_later:
-            raise TakeError(f"{path} has no source {quoted(source)}; its sources are: {listed}")
+    if source not in counts and all(message.source != source for message in reader.messages()):
+        raise TakeError(f"{path} has no source {quoted(source)}; its sources are: {listed}")
     return source
 
 

@@ -211,6 +211,12 @@ def test_a_take_of_several_sources_needs_a_choice(path: Path) -> None:
         TakeScene(path, "hall")
 
 
+def test_a_damaged_channel_is_no_source(path: Path) -> None:
+    _, message = markers(1, 100)
+    scene = TakeScene(write_take(path, [*take_of(500), ("MOCAP_L@B_3D", message), ("XOCAP_LAB_3D", message)]))
+    assert scene.parameters.markers is not None
+
+
 @pytest.mark.parametrize(
     ("content", "problem"),
     [
