@@ -33,7 +33,9 @@ def test_every_command_prints_the_output_on_the_page(folder: Path, terminals: di
             else:
                 status = terminal.end()
                 # On a busy machine, some messages may be lost; that is not the matter of this page.
-                assert status == 0 or command.startswith("rtc3d-gateway record"), f"{block.place}:\n{terminal.text}"
+                assert status == 0 or command.startswith("rtc3d-gateway record"), (
+                    f"{block.place}:\n{terminal.text}"
+                )
                 assert terminal.shows(output), f"{block.place} printed:\n{terminal.text}"
     assert num_commands > 6
     assert read_ezc3d(folder / "walk.c3d")["data"]["points"].shape[1] == 24
