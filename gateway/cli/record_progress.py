@@ -102,7 +102,7 @@ class RecordProgress:
             self._print_loss(f"{num_refused - self._num_refused} {text}; {num_refused} so far")
         self._num_lost, self._num_refused = num_lost, num_refused
         for source in self._recording.sources_now:
-            if any(series.check.has_two_publishers for series in source.series.values()):
+            if any(series.check.has_two_publishers for series in source.series):
                 self._report(
                     f"two gateways publish the source {source.name}: give one of them another name, "
                     "or record through one only; both are recorded"

@@ -87,7 +87,7 @@ def print_summary(recording: TakeRecording, out: TextIO) -> bool:
 
 def _rows(source: RecordedSource) -> Iterator[tuple[str, list[Series]]]:
     rows: defaultdict[str, list[Series]] = defaultdict(list)
-    for series in source.series.values():
+    for series in source.series:
         if series.is_recorded and series.num_messages:
             rows[series.row].append(series)
     for row in sorted(rows, key=_ORDER.index):
@@ -103,6 +103,11 @@ def _problems(recording: TakeRecording) -> Iterator[str]:
         yield from _disk_problems(recording.sink)
     if recording.is_moved:
         yield "the file was moved or deleted while it was recorded"
+    if recording.defect is not None:
+        yield (
+            f"{recording.num_defects} messages were not recorded because of a defect in rtc3d-gateway: "
+            f"{type(recording.defect).__name__}: {recording.defect}; report this"
+        )
     if recording.num_beyond:
         yield (
             f"{recording.num_beyond} messages were not recorded: there are more than {MAX_SOURCES} sources "
@@ -116,7 +121,7 @@ def _losses(recording: TakeRecording) -> Iterator[str]:
     if num_lost:
         yield f"{num_lost} messages were lost between the gateway and this computer, or in the gateway"
     for source in recording.sources_now:
-        if any(series.check.has_two_publishers for series in source.series.values()):
+        if any(series.check.has_two_publishers for series in source.series):
             yield (
                 f"two gateways publish the source {source.name}, so losses cannot be counted exactly; "
                 "give one of them another name"
@@ -145,7 +150,7 @@ def _notes(recording: TakeRecording) -> Iterator[str]:
     if recording.sink is not None and recording.sink.num_errors and not recording.sink.problem:
         yield f"the disk did not accept what was written for a while ({_times(recording.sink.num_errors)})"
     for source in recording.sources_now:
-        checks = [series.check for series in source.series.values()]
+        checks = [series.check for series in source.series]
         restarts = max((check.num_restarts for check in checks), default=0)
         if restarts:
             yield f"{source.name}: its gateway was started again ({_times(restarts)})"

@@ -1,6 +1,7 @@
 """Receiving from gateways on LCM for a recording."""
 
 import logging
+import math
 import re
 import time
 import uuid
@@ -67,6 +68,12 @@ class LcmSide:
     # In the threads that receive.
 
     def _receive(self, channel: str, message: bytes) -> None:
+        try:
+            self._record(channel, message)
+        except Exception as defect:  # noqa: BLE001 - the other messages are recorded
+            self._recording.failed(defect)
+
+    def _record(self, channel: str, message: bytes) -> None:
         series = self._series.get(channel) or self._find_series(channel, message)
         if series is None:
             return
@@ -140,11 +147,11 @@ class LcmSide:
     def tick(self) -> None:
         """Ask for the parameters of sources that wait for their description."""
         now_s = time.monotonic()
-        for channels, source in [*self._recording.sources.items()]:
+        for source in self._recording.sources_now:
             if source.has_answer or not source.is_waiting:
                 continue
-            if now_s - self._asked_s.get(channels, float("-inf")) > _AGAIN_S:
-                self._asked_s[channels] = now_s
+            if now_s - self._asked_s.get(source.channels, -math.inf) > _AGAIN_S:
+                self._asked_s[source.channels] = now_s
                 self._ask(source)
 
     def _ask(self, source: RecordedSource) -> None:

@@ -61,10 +61,14 @@ class Series:
         return message[:8] == self._fingerprint and len(message) >= PREFIX_END
 
     def count(self, message: bytes) -> None:
-        """Count a message that has arrived."""
+        """Count a message that has arrived, and those that are missing before it."""
+        self.add(message)
+        self.check.add(message)
+
+    def add(self, message: bytes) -> None:
+        """Count a message whose number does not matter."""
         self.num_messages += 1
         self.num_bytes += len(message)
-        self.check.add(message)
 
 
 class RecordedSource:
@@ -75,8 +79,7 @@ class RecordedSource:
         self.channels = channels
         self.has_known_name = False
         """Whether a gateway or the user has said the name; otherwise, it is made from the channels."""
-        self.series: dict[str, Series] = {}
-        """By key."""
+        self.series_by_key: dict[str, Series] = {}
         self.heard_s: float | None = None
         """When the newest message arrived, on the monotonic clock; None before the first."""
         self.status: bytes | None = None
@@ -96,6 +99,11 @@ class RecordedSource:
         self._found_s = time.monotonic()
 
     @property
+    def series(self) -> list[Series]:
+        """The series so far; other threads may add some at any time."""
+        return [*self.series_by_key.values()]
+
+    @property
     def is_waiting(self) -> bool:
         """Whether something that the description needs is still to come."""
         is_complete = self.heard_s is not None and self.status is not None and self.has_answer
@@ -108,24 +116,24 @@ class RecordedSource:
     @property
     def first_utime(self) -> int | None:
         """The time of its first message, in µs since the Unix epoch; None before."""
-        times = [each.check.first_utime for each in self.series.values() if each.check.first_utime]
+        times = [each.check.first_utime for each in self.series if each.check.first_utime]
         return min(times, default=None)
 
     @property
     def last_utime(self) -> int | None:
         """The time of its newest message, in µs since the Unix epoch; None before the first."""
-        times = [each.check.last_utime for each in self.series.values() if each.check.last_utime]
+        times = [each.check.last_utime for each in self.series if each.check.last_utime]
         return max(times, default=None)
 
     @property
     def session(self) -> int:
         """The newest session."""
-        return max((each.check.session for each in self.series.values()), default=0)
+        return max((each.check.session for each in self.series), default=0)
 
     @property
     def num_data(self) -> int:
         """How many messages of frames have arrived to be recorded."""
-        return sum(each.num_messages for each in self.series.values() if each.has_data and each.is_recorded)
+        return sum(each.num_messages for each in self.series if each.has_data and each.is_recorded)
 
     def decoded_status(self) -> Any | None:
         """Return the newest status as ``status_t``; None if there is none that can be read."""

@@ -56,6 +56,9 @@ class TakeRecording:
         """How many messages were not recorded, because they are none of a gateway."""
         self.num_beyond = 0
         """How many messages were not recorded, because there are too many sources or keys."""
+        self.defect: Exception | None = None
+        """The first defect of this program; ``num_defects`` messages were not recorded because of such."""
+        self.num_defects = 0
         self.first_heard_s: float | None = None
         """When the first message arrived, on the monotonic clock; None before."""
         self.is_moved = False
@@ -86,7 +89,7 @@ class TakeRecording:
     def all_series(self) -> list[Series]:
         """The series of all sources so far."""
         with self._lock:
-            return [series for source in self.sources.values() for series in source.series.values()]
+            return [series for source in self.sources.values() for series in source.series]
 
     @property
     def num_messages(self) -> int:
@@ -117,18 +120,17 @@ class TakeRecording:
     def series(self, source: RecordedSource, key: str, channel: str) -> Series | None:
         """Return the series of a key, new or not, on this channel or a similar one; None if too many."""
         with self._lock:
-            series = source.series.get(key)
-            if series is None and self._num_series < MAX_SERIES:
-                taken = {each.channel.decode() for each in source.series.values()}
-                series = Series(
-                    source,
-                    key,
-                    unique_name(channel, taken, MAX_CHANNEL_LENGTH),
-                    is_recorded=self._is_wanted(key),
-                )
-                source.series[key] = series
-                self._num_series += 1
-            return series
+            return self._find_series(source, key, channel)
+
+    def _find_series(self, source: RecordedSource, key: str, channel: str) -> Series | None:
+        series = source.series_by_key.get(key)
+        if series is None and self._num_series < MAX_SERIES:
+            taken = {each.channel.decode() for each in source.series}
+            free = unique_name(channel, taken, MAX_CHANNEL_LENGTH)
+            series = Series(source, key, free, is_recorded=self._is_wanted(key))
+            source.series_by_key[key] = series
+            self._num_series += 1
+        return series
 
     def _is_wanted(self, key: str) -> bool:
         if self._components is None or key == "parameters":
@@ -159,6 +161,12 @@ class TakeRecording:
             self.num_foreign += not beyond_limit
             self.num_beyond += beyond_limit
 
+    def failed(self, defect: Exception) -> None:
+        """Note a defect in this program: a message is not recorded, but the others are."""
+        with self._lock:
+            self.defect = self.defect or defect
+            self.num_defects += 1
+
     def receive_parameters(self, series: Series, message: bytes, *, is_made: bool) -> None:
         """Record a ``parameters_t``, published or ``is_made`` here, unless it repeats the newest one."""
         with self._lock:
@@ -169,9 +177,8 @@ class TakeRecording:
             if self._is_closed or (former is not None and former[_VERSION] == message[_VERSION]):
                 return
             source.parameters = message
-            series.num_messages += 1
-            series.num_bytes += len(message)
             if former is not None or source.is_described:
+                series.add(message)
                 self._put(series, message)
             else:
                 source.first_parameters, source.has_made_first = message, is_made
@@ -259,11 +266,13 @@ class TakeRecording:
         message.recorder = f"rtc3d-gateway record {__version__}"
         message.host = socket.gethostname()
         description = [(f"{source.channels}_TAKE".encode(), encode_within_limits(message))]
-        if source.first_parameters is not None:
-            parameters = source.first_parameters
+        parameters = source.first_parameters
+        series = self._find_series(source, "parameters", f"{source.channels}_PARAMETERS")
+        if parameters is not None and series is not None:
             if source.has_made_first:
                 parameters = published_again(parameters, message.utime)
-            description.append((f"{source.channels}_PARAMETERS".encode(), parameters))
+            series.add(parameters)
+            description.append((series.channel, parameters))
         self._recorder.call(functools.partial(self.sink.write, description))
         source.is_described = True
 

@@ -69,6 +69,12 @@ class ZenohSide:
     # In Zenoh's threads.
 
     def _receive(self, sample: zenoh.Sample) -> None:
+        try:
+            self._record(sample)
+        except Exception as defect:  # noqa: BLE001 - the other messages are recorded
+            self._recording.failed(defect)
+
+    def _record(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
         series = self._series.get(key) or self._find_series(key)
         if series is None:
@@ -134,7 +140,7 @@ class ZenohSide:
     def tick(self) -> None:
         """Query the parameters and the status of sources that wait for their description."""
         now_s = time.monotonic()
-        for source in [*self._recording.sources.values()]:
+        for source in self._recording.sources_now:
             if source.is_waiting and now_s - self._asked_s.get(source.name, -math.inf) > _AGAIN_S:
                 self._asked_s[source.name] = now_s
                 self._ask(source)

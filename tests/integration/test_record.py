@@ -1,6 +1,7 @@
 """``rtc3d-gateway record`` as a program of its own, beside gateways and publishers on real Zenoh and LCM."""
 
 import os
+import pty
 import re
 import resource
 import signal
@@ -412,6 +413,22 @@ def test_hostile_publishers_are_bounded(tmp_path: Path, publisher: Publisher) ->
     assert re.search(r"messages on these keys or channels were not recorded", ended.stdout)
     assert "\x1b" not in ended.stdout + ended.stderr
     assert len(ended.stdout.splitlines()) < 100
+
+
+def test_a_terminal_shows_the_progress_on_one_line(tmp_path: Path, publisher: Publisher) -> None:
+    reading, terminal = pty.openpty()
+    arguments = ("record", str(tmp_path / "walk"), "--connect", publisher.endpoint)
+    with subprocess.Popen([*PROGRAM, *arguments], stdout=subprocess.DEVNULL, stderr=terminal) as process:
+        publisher.wait_for_subscriber()
+        publisher.publish("lab", *range(10), *range(12, 20))
+        shown = ""
+        while not re.search(r"\r.*0:0\d  2 kB  .* messages/s  .*/s  2 lost  0 kB to be written", shown):
+            shown += os.read(reading, 65536).decode()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 1
+    os.close(terminal)
+    os.close(reading)
+    assert "2 messages were lost on the way; 2 so far\r\n" in shown
 
 
 # Files and ends --------------------------------------------------------------------------------

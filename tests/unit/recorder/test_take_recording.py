@@ -190,7 +190,7 @@ def test_only_the_chosen_components_are_recorded(tmp_path: Path) -> None:
     recorded.receive("lab", "3d", markers(1))
     recorded.receive("lab", "6d/Tool 1", FINGERPRINTS["6d/"] + PREFIX.pack(UTIME, UTIME, 0, 1, 1) + bytes(45))
     assert recorded.channels() == ["MOCAP_LAB_TAKE", "MOCAP_LAB_PARAMETERS", "MOCAP_LAB_6D/TOOL 1"]
-    assert recorded.recording.num_messages == 1
+    assert recorded.recording.num_messages == 2  # the pose and the parameters
 
 
 @pytest.mark.parametrize("message", [b"", b"x", bytes(100), markers(1)[:39], status("lab")])
