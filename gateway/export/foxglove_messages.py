@@ -23,7 +23,7 @@ from foxglove.messages import (
 from gateway.export.event_texts import MAX_EVENT_AGE_US, event_text
 from gateway.export.float_topics import FloatRecord, FloatTopics, field_names
 from gateway.export.foxglove_forces import ForceScene
-from gateway.export.foxglove_topics import FoxgloveMessage, json_topic, timestamp, topic_of
+from gateway.export.foxglove_topics import MAX_UTIME, FoxgloveMessage, json_topic, timestamp, topic_of
 from gateway.messages.tool_pose import metres_per_unit
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType, Items
 from gateway.rtc3d.parameters import Parameters
@@ -176,7 +176,7 @@ class FoxgloveSource:
         """Return an event, at its own time stamp if that is plausible."""
         delay_us = timestamp_us - int(item["timestamp"])
         utime = capture_utime - delay_us if abs(delay_us) <= MAX_EVENT_AGE_US else capture_utime
-        utime = max(utime, 0)
+        utime = min(max(utime, 0), MAX_UTIME)
         text = event_text(self._parameters, item)
         message = f"{text.label} ({text.description})" if text.description else text.label
         log = Log(timestamp=timestamp(utime), level=LogLevel.Info, message=message, name=self.source)

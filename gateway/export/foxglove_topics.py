@@ -1,6 +1,7 @@
 """Topics and messages as Foxglove's programs take them, in a file or live."""
 
 import json
+from functools import cache
 from typing import Any, Final, NamedTuple, Protocol
 
 from foxglove import Schema
@@ -11,7 +12,7 @@ MAX_UTIME: Final = ((1 << 32) - 1) * 1_000_000
 
 
 class Topic(NamedTuple):
-    """A topic and what its messages are; two topics of one name may have different schemas."""
+    """A topic and the type of its messages."""
 
     name: str
     encoding: str
@@ -36,6 +37,7 @@ class MessageClass(Protocol):
         """Return the schema of its messages."""
 
 
+@cache
 def topic_of(name: str, message_class: MessageClass) -> Topic:
     """Return a topic with messages of one of Foxglove's own types."""
     schema = message_class.get_schema()

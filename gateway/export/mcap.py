@@ -29,6 +29,7 @@ _HEAD: Final = struct.Struct(">8xqq8x4xi4xqi")
 
 _EVENT_HEADER_BYTES: Final = 50  # about, with the channel
 _PROGRESS_BYTES: Final = 1024 * 1024
+_MAX_CONVERTERS: Final = 100
 _NO_PARAMETERS: Final = -1
 _NUMBERS: Final = (ComponentType.ANALOG, ComponentType.FORCE)
 """The components whose messages have a field for each number."""
@@ -88,6 +89,7 @@ class _SourceExport:
         self._xml = b""  # of the newest attachment
         self._num_attached = 0
         self._left_out: Counter[str] = Counter()
+        self._lacking: dict[str, None] = {}  # sentences
 
     @property
     def metadata(self) -> dict[str, str]:
@@ -98,12 +100,7 @@ class _SourceExport:
     def problems(self) -> list[str]:
         """Sentences about what was left out, or what the parameters lack."""
         left_out = [f"{what} of {self.name} were left out: {count}" for what, count in self._left_out.items()]
-        lacking = [
-            f"{self.name}: {converter.problem}"
-            for converter in self._converters.values()
-            if converter.problem
-        ]
-        return list(dict.fromkeys(left_out + lacking))
+        return left_out + [f"{self.name}: {problem}" for problem in self._lacking]
 
     def write(self, key: str, message: bytes, file: McapFile) -> None:
         """Write the message of a component."""
@@ -147,7 +144,11 @@ class _SourceExport:
         found = self._converters.get(index)
         if found is None:
             parameters = Parameters() if index == _NO_PARAMETERS else self._entries[index].parameters
+            if len(self._converters) == _MAX_CONVERTERS:
+                self._converters.clear()
             found = self._converters[index] = FoxgloveSource(self._topics, parameters, version)
+            if found.problem:
+                self._lacking[found.problem] = None
             for message in found.describe(capture_utime):
                 file.write(message)
         return found

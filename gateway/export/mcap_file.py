@@ -1,5 +1,8 @@
 """An MCAP file that is being written, with foxglove-sdk."""
 
+import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import TracebackType
 from typing import IO, Final, Self
 
@@ -12,11 +15,14 @@ from gateway.export.foxglove_topics import FoxgloveMessage, Topic
 _MAX_CHANNELS: Final = 1000
 """More can only come from labels that change all the time."""
 
+# foxglove-sdk logs errors of the file, which McapFile raises. Without a handler, they would go to stderr.
+logging.getLogger("foxglove").addHandler(logging.NullHandler())
+
 
 class McapFile:
-    """An MCAP file in chunks compressed by zstd. ``close`` writes its index.
+    """An MCAP file in chunks compressed by zstd. The end of the block writes its index.
 
-    ``file`` stays open. Its errors are raised by the next call, and by ``close``.
+    The file itself stays open. Its errors are raised by the next call, and at the end of the block.
     """
 
     def __init__(self, file: IO[bytes]) -> None:
@@ -35,12 +41,10 @@ class McapFile:
     ) -> None:
         try:
             self._writer.close()
-        except Exception:  # foxglove-sdk's own, in place of the file's
-            if error is None:
-                self._file.raise_error()
+        except Exception:
+            if error is None and not self._file.has_failed:
                 raise
-        if error is None:
-            self._file.raise_error()
+        self._file.raise_error()  # in place of foxglove-sdk's own
 
     def write(self, message: FoxgloveMessage) -> None:
         """Append a message."""
@@ -82,6 +86,11 @@ class _WatchedFile:
         self._file = file
         self._error: BaseException | None = None
 
+    @property
+    def has_failed(self) -> bool:
+        """Whether there was an error."""
+        return self._error is not None
+
     def raise_error(self) -> None:
         """Raise the first error of the file, if there was one."""
         if self._error is not None:
@@ -89,24 +98,23 @@ class _WatchedFile:
 
     def write(self, data: bytes | bytearray) -> int:
         """See IO.write."""
-        try:
+        with self._watched():
             return self._file.write(data)
-        except BaseException as error:
-            self._error = self._error or error
-            raise
 
     def seek(self, offset: int, whence: int = 0) -> int:
         """See IO.seek."""
-        try:
+        with self._watched():
             return self._file.seek(offset, whence)
-        except BaseException as error:
-            self._error = self._error or error
-            raise
 
     def flush(self) -> None:
         """See IO.flush."""
-        try:
+        with self._watched():
             self._file.flush()
+
+    @contextmanager
+    def _watched(self) -> Iterator[None]:
+        try:
+            yield
         except BaseException as error:
             self._error = self._error or error
             raise

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from gateway.errors import TakeError
+from gateway.export.foxglove_topics import FoxgloveMessage, Topic
+from gateway.export.mcap_file import McapFile
 from gateway.messages.topics import lcm_channel
 from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.rtc3d.parameters import (
@@ -399,3 +401,25 @@ def test_without_foxglove_sdk_the_error_says_how_to_install_it(
     with pytest.raises(TakeError, match=r"pip install 'rtc3d-gateway\[foxglove\]'"):
         export_messages(tmp_path, [markers(1)], "walk.mcap")
     assert [path.name for path in tmp_path.iterdir()] == ["take.lcmlog"]
+
+
+def test_a_full_disk_is_its_own_error_whatever_is_written() -> None:
+    topic = Topic("/lab/test", "json", "test", "jsonschema", b"{}")
+    message = FoxgloveMessage(topic, START_UTIME, os.urandom(2_000_000))
+
+    def attach(file: McapFile) -> None:
+        file.attach(START_UTIME, "large", "application/xml", bytes(2_000_000))
+
+    def write(file: McapFile) -> None:
+        file.write(message)
+
+    def describe_only(file: McapFile) -> None:
+        file.write_metadata("lab", {"server": "192.0.2.20:3020"})
+
+    for use in (attach, write, describe_only, lambda _file: None):
+        with (
+            Path("/dev/full").open("wb", buffering=0) as full,
+            pytest.raises(OSError, match="No space left on device"),
+            McapFile(full) as file,
+        ):
+            use(file)
