@@ -4,7 +4,7 @@ import asyncio
 import logging
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
-from typing import Final
+from typing import Any, Final
 
 from gateway.c3d_files.spool import Spool
 from gateway.config.settings import Settings, SourceSettings, SpoolSettings
@@ -231,7 +231,13 @@ class Gateway:
     def _add_source(self, settings: SourceSettings, before: Source | None = None) -> None:
         fan_out = before.fan_out if before else FanOut(settings.name, self._outputs)
         self._sources[settings.name] = Source(
-            settings, fan_out, self._spool, self._publish_parameters, self._announce_file, before
+            settings,
+            fan_out,
+            self._spool,
+            self._publish_parameters,
+            self._announce_file,
+            self._follow_recording,
+            before,
         )
 
     async def _publish_parameters(self, source: str, parameters: ServerParameters) -> None:
@@ -247,6 +253,16 @@ class Gateway:
     def _announce_file(self, source: str, file: ServerFile) -> None:
         for output in self._outputs:
             guarded(output, partial(output.announce_file, source, file), None)
+
+    async def _follow_recording(self, source: str, start: bool, name: str) -> dict[str, Any]:
+        """Let the outputs follow a recording; return what they add to the reply to the peer."""
+        reply: dict[str, Any] = {}
+        for output in self._outputs:
+            try:
+                reply |= await output.follow_recording(source, start=start, name=name)
+            except Exception as defect:  # noqa: BLE001 - the recording starts nevertheless
+                log_defect(output, defect)
+        return reply
 
 
 async def _run_to_defect(source: Source) -> BaseException:

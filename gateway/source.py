@@ -3,7 +3,9 @@
 import asyncio
 import logging
 import math
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
+from functools import partial
+from typing import Any
 
 from gateway.c3d_files.receiving import SourceFiles
 from gateway.c3d_files.spool import Spool, StoredFile
@@ -19,6 +21,7 @@ from gateway.publish.status_messages import clock_message, status_message
 from gateway.queries.known_parameters import ServerAnswer
 from gateway.queries.parameter_refresh import ParameterRefresh
 from gateway.queries.payloads import FilePayload
+from gateway.queries.recordings import RecordingAccess
 from gateway.queries.server_requests import StreamAccess
 from gateway.queries.source_queries import SourceQueries
 from gateway.rtc3d.parameters import Parameters
@@ -48,6 +51,7 @@ class Source:
         spool: Spool,
         publish_parameters: Callable[[str, ServerParameters], Awaitable[None]],
         announce_file: Callable[[str, ServerFile], None],
+        follow_recording: Callable[[str, bool, str], Awaitable[Mapping[str, Any]]],
         before: "Source | None" = None,
     ) -> None:
         self.settings = settings
@@ -72,6 +76,7 @@ class Source:
             if settings.streams == "auto"
             else ConfiguredStreams(settings.streams, self._new_stream)
         )
+        self._follow_recording = follow_recording
         self.queries = self._new_queries(before)
         self._publish_parameters = publish_parameters
         self._announce_file = announce_file
@@ -94,7 +99,7 @@ class Source:
             newest_message=self.fan_out.newest,
             status_message=lambda: self._newest_status,
             last_c3d=self._last_c3d,
-            record=self._record,
+            recording=RecordingAccess(self._record, partial(self._follow_recording, self.settings.name)),
             announce_parameters=self._announce_parameters,
             before=None if before is None else before.queries,
         )
@@ -226,6 +231,8 @@ class Source:
     def _on_state(self, status: StreamStatus, former: StreamState) -> None:
         is_streaming = any(status.state is StreamState.STREAMING for status in self.statuses)
         self.fan_out.show_streaming(is_streaming)
+        has_no_data = any(status.state is StreamState.NO_MEASUREMENT for status in self.statuses)
+        self.fan_out.show_measurement(True if is_streaming else False if has_no_data else None)
         if status.state is StreamState.WAITING:
             self.fan_out.forget_layouts()
         if former is StreamState.NO_MEASUREMENT and status.state is StreamState.STREAMING:

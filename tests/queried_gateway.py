@@ -17,6 +17,7 @@ from gateway.config.settings import (
 )
 from gateway.gateway import Gateway
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import SendParameters, parse_command
 from gateway.rtc3d.components import ComponentType
@@ -126,6 +127,7 @@ async def run_gateway(
     spool: Path | None = None,
     tool_poses: bool = False,
     max_rate_hz: dict[ComponentType, float] | None = None,
+    takes: TakesSettings | None = None,
     **source: Any,
 ) -> AsyncIterator[Gateway]:
     """Run a gateway with the source "lab", whose server listens on ``port`` of this host.
@@ -159,6 +161,7 @@ async def run_gateway(
         lcm=LcmSettings(
             enabled=lcm_url is not None, url=lcm_url, queries_url=queries_url, tool_poses=tool_poses
         ),
+        takes=takes or TakesSettings(),
         spool=SpoolSettings(directory=None if spool is None else str(spool)),
         metrics=MetricsSettings(enabled=False),
     )

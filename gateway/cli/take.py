@@ -9,12 +9,17 @@ import typer
 from rich.console import Console
 
 from gateway.cli.file_progress import file_progress
+from gateway.cli.take_control import add_commands
 from gateway.cli.take_json import statistics_json
 from gateway.cli.take_report import write_report
 from gateway.safe_text import safe_json
 from gateway.takes.statistics import take_statistics
 
-app = typer.Typer(no_args_is_help=True, help="Inspect recordings (takes).")
+app = typer.Typer(
+    no_args_is_help=True, help="Inspect recordings (takes), and control those of running gateways."
+)
+
+add_commands(app)
 
 
 @app.command()

@@ -277,6 +277,21 @@ class Output(ABC):
     def announce_file(self, source: str, file: ServerFile) -> None:
         """Announce a C3D file that the server sent."""
 
+    # Recordings and measurements of the server.
+
+    def show_measurement(self, source: str, is_running: bool | None) -> None:
+        """Take note that a measurement runs on the server of ``source``, or that none does.
+
+        None means that this is unknown, because no connection has frames or No Data.
+        """
+
+    async def follow_recording(self, source: str, *, start: bool, name: str) -> Mapping[str, Any]:
+        """Follow a recording that a peer starts or stops on the server of ``source``.
+
+        Called before it starts and after it has stopped. Returns what to add to the reply to the peer.
+        """
+        return {}
+
     # Queries of peers.
 
     def serve_queries(self, service: QueryService) -> None:

@@ -108,6 +108,7 @@ class FanOut:
         self._plan: _Plan | None = None  # of the previous frame
         self._item_counts = ItemCounts(source)
         self._is_streaming = False
+        self._is_measuring: bool | None = None
         self.set_outputs(outputs)
 
     def set_outputs(self, outputs: Sequence[Output]) -> None:
@@ -131,6 +132,8 @@ class FanOut:
         self._last_routes[output.name] = route
         if self._is_streaming:
             output.show_streaming(self._source, True)
+        if self._is_measuring is not None:
+            output.show_measurement(self._source, self._is_measuring)
         return route
 
     def close(self) -> None:
@@ -240,6 +243,13 @@ class FanOut:
         self._is_streaming = is_streaming
         for route in self._routes:
             guarded(route.output, partial(route.output.show_streaming, self._source, is_streaming), None)
+
+    def show_measurement(self, is_running: bool | None) -> None:
+        """Show on every output whether a measurement runs on the server; None if that is unknown."""
+        if is_running is not self._is_measuring:
+            self._is_measuring = is_running
+            for route in self._routes:
+                guarded(route.output, partial(route.output.show_measurement, self._source, is_running), None)
 
     def check_losses(self) -> None:
         """Log the end of each period in which messages were lost. Called once a second."""

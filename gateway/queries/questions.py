@@ -7,6 +7,7 @@ import rtc3d
 
 from gateway.errors import QueryError
 from gateway.outputs.contract import KeyPath
+from gateway.outputs.takes.names import check_name
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ComponentType
 from gateway.rtc3d.parameters import SECTIONS
 from gateway.safe_text import quoted
@@ -16,13 +17,16 @@ SCHEMA_TYPES: Final = tuple(name for name in vars(rtc3d) if name.endswith("_t"))
 
 RECORDING: Final[KeyPath] = ("recording",)
 
+ANY: Final = ("NAME",)
+"""Stands for the values of an option that is a name."""
+
 _OPTIONS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
     "parameters": {"format": ("xml", "json"), "fresh": ("true", "false"), "stale": ("ok",)},
     "component": {"format": ("lcm", "json")},
     "status": {"format": ("lcm", "json")},
     "c3d": {},
     "schema": {},
-    "recording": {"set": ("start", "stop")},
+    "recording": {"set": ("start", "stop"), "name": ANY},
 }
 """The options of each kind of question, with the values that each accepts."""
 
@@ -30,8 +34,8 @@ _OPTIONS: Final[dict[str, dict[str, tuple[str, ...]]]] = {
 class Question(NamedTuple):
     """A query for one key of one source. ``kind`` decides which of the other fields are used.
 
-    ``name`` is the section ("" for all), the component's key, or the type. ``set`` is start, stop, or "" if
-    the query does not have it.
+    ``name`` is the section ("" for all), the component's key, the type, or the name of a recording. ``set``
+    is start, stop, or "" if the query does not have it.
     """
 
     kind: Literal["parameters", "component", "status", "c3d", "schema", "recording"]
@@ -71,6 +75,11 @@ def parse_question(
     """
     kind, name = _kind_and_name(path, components)
     _check_options(options, [kind])
+    if "name" in options:
+        if options.get("set") != "start":
+            raise QueryError("name is an option of set=start only")
+        name = options["name"]
+        check_name(name)
     return Question(
         kind,  # type: ignore[arg-type]  # _OPTIONS and Question.kind have the same kinds
         name,
@@ -110,7 +119,7 @@ def _check_options(options: Mapping[str, str], kinds: Iterable[str]) -> None:
             raise QueryError(
                 f"unknown option {quoted(name)} of {', '.join(kinds)}; accepted: {known or 'none'}"
             )
-        if value not in accepted[name]:
+        if accepted[name] != dict.fromkeys(ANY) and value not in accepted[name]:
             raise QueryError(f"{name}={quoted(value)} is not accepted; accepted: {', '.join(accepted[name])}")
 
 

@@ -50,8 +50,9 @@ class SourceQueryService:
         return [path for path in known_keys(self._sources()[source].components) if path != RECORDING]
 
     def commands(self) -> list[str]:
-        """See QueryService."""
-        return ["/".join(RECORDING), *self._commands()]
+        """See QueryService. Those of outputs that are off are included: their answer says so."""
+        of_kinds = (command for kind in OUTPUTS.values() for command in kind.commands)
+        return [*dict.fromkeys(("/".join(RECORDING), *self._commands(), *of_kinds))]
 
     def accepted_keys(self, source: str) -> str:
         """See QueryService."""

@@ -19,6 +19,7 @@ from gateway.queries.known_parameters import Announce
 from gateway.queries.parameter_cache import ParameterCache
 from gateway.queries.payloads import JsonPayload, NewestJson
 from gateway.queries.questions import Question
+from gateway.queries.recordings import RecordingAccess, Recordings
 from gateway.queries.server_requests import ServerRequests, StreamAccess
 from gateway.rtc3d.commands import SendCurrentFrame
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, Component, ComponentType
@@ -35,10 +36,9 @@ class SourceQueries:
     """Answers questions about one source; ``parameters`` has those of its server.
 
     ``newest_message`` returns the newest message of a component as the output of a name numbers it.
-    ``last_c3d`` raises QueryError if there is no file. ``record`` starts (True) or stops a recording, and
-    returns False if there is no connection. ``announce_parameters`` takes the server's parameters when they
-    change. ``before`` are the queries of the source that this one replaces after a reload; its parameters
-    continue.
+    ``last_c3d`` raises QueryError if there is no file. ``announce_parameters`` takes the server's parameters
+    when they change. ``before`` are the queries of the source that this one replaces after a reload; its
+    parameters continue.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class SourceQueries:
         newest_message: Callable[[ComponentType, str], bytes | None],
         status_message: Callable[[], bytes],
         last_c3d: Callable[[], Coroutine[Any, Any, Answer]],
-        record: Callable[[bool], bool],
+        recording: RecordingAccess,
         announce_parameters: Announce,
         before: "SourceQueries | None" = None,
     ) -> None:
@@ -57,8 +57,11 @@ class SourceQueries:
         self._newest_message = newest_message
         self._status_message = status_message
         self._last_c3d = last_c3d
-        self._record = record
         self._requests = ServerRequests(settings, streams)
+        self._recordings: Recordings = Recordings(
+            *(settings.name, self._requests, recording),
+            None if before is None else before._recordings,  # noqa: SLF001 - the same class
+        )
         self._newest_json = NewestJson()
         self._controls = TokenBucket(CONTROLS_PER_S)
         self.parameters: ParameterCache = ParameterCache(
@@ -118,7 +121,7 @@ class SourceQueries:
             case "c3d":
                 return await self._requests.share("c3d", self._last_c3d)
             case "recording":
-                return self._recording(question)
+                return await self._recording(question)
 
     async def _parameters(self, question: Question) -> Answer:
         sections = (question.name,) if question.name else ()
@@ -196,9 +199,8 @@ class SourceQueries:
                 return found
         raise QueryError(f"the current frame has no {component.key}", code="nothing-yet")
 
-    def _recording(self, question: Question) -> Answer:
+    async def _recording(self, question: Question) -> Answer:
         if not question.set:
-            raise QueryError("recording takes one option; accepted: set=start, set=stop")
-        if not self._record(question.set == "start"):
-            raise self._requests.no_connection_error()
-        return Answer(json_bytes({"source": self._settings.name, "sent": question.set}), JSON)
+            raise QueryError("recording needs an option; accepted: set=start;name=NAME, set=stop")
+        content = await self._recordings.control(start=question.set == "start", name=question.name)
+        return Answer(json_bytes(content), JSON)

@@ -127,6 +127,48 @@ def open_file(path: Path) -> BinaryIO:
     return os.fdopen(os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC), "rb", buffering=0)
 
 
+class EventBoundary:
+    """Finds the end of the last complete event in a log that arrives in pieces.
+
+    After damage, everything counts as complete.
+    """
+
+    def __init__(self) -> None:
+        self._num_bytes = 0
+        self._complete_bytes = 0
+        self._header = bytearray()  # the beginning of one
+        self._left = 0  # of the present event, after its header
+        self._is_damaged = False
+
+    @property
+    def complete_bytes(self) -> int:
+        """How many bytes the complete events have together."""
+        return self._num_bytes if self._is_damaged else self._complete_bytes
+
+    def feed(self, data: bytes) -> None:
+        """Take the next bytes of the log."""
+        place = 0
+        while place < len(data) and not self._is_damaged:
+            if len(self._header) < _HEADER.size:
+                more = data[place : place + _HEADER.size - len(self._header)]
+                self._header += more
+                place += len(more)
+                if len(self._header) < _HEADER.size:
+                    break
+                fields = _plausible_header(self._header)
+                if fields is None:
+                    self._is_damaged = True
+                    break
+                self._left = fields[3] + fields[4]
+            taken = min(self._left, len(data) - place)
+            self._left -= taken
+            place += taken
+            if not self._left:
+                self._complete_bytes = self._num_bytes + place
+                self._header.clear()
+        self._num_bytes += len(data)
+
+
 class _Window:
     """A part of a file in memory, which moves forward. ``offset`` is the present place in the file."""
 
@@ -195,14 +237,7 @@ class _Window:
         """Return the fields of a plausible header ``ahead`` bytes from here; None if there is none."""
         if not self.has(ahead + _HEADER.size):
             return None
-        fields: tuple[bytes, int, int, int, int] = _HEADER.unpack_from(self._data, self._start + ahead)
-        sync, _, _, channel_bytes, message_bytes = fields
-        is_plausible = (
-            sync == SYNC
-            and 0 < channel_bytes <= MAX_CHANNEL_BYTES
-            and 0 <= message_bytes <= MAX_MESSAGE_BYTES
-        )
-        return fields if is_plausible else None
+        return _plausible_header(self._data, self._start + ahead)
 
     def bytes(self, ahead: int, num_bytes: int) -> bytes:
         """Return bytes that ``has`` has found."""
@@ -245,6 +280,16 @@ class _Window:
             self._data, self._start, self.offset = b"", 0, data
         else:
             os.lseek(descriptor, position, os.SEEK_SET)
+
+
+def _plausible_header(data: bytes | bytearray, offset: int = 0) -> tuple[bytes, int, int, int, int] | None:
+    """Return the fields of the header at ``offset``; None if they cannot be those of one."""
+    fields: tuple[bytes, int, int, int, int] = _HEADER.unpack_from(data, offset)
+    sync, _, _, channel_bytes, message_bytes = fields
+    is_plausible = (
+        sync == SYNC and 0 < channel_bytes <= MAX_CHANNEL_BYTES and 0 <= message_bytes <= MAX_MESSAGE_BYTES
+    )
+    return fields if is_plausible else None
 
 
 def _event(window: _Window) -> Event | None:

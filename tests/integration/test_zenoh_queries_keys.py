@@ -212,9 +212,19 @@ async def test_recording_is_started_and_stopped_with_the_packet_of_wavefront() -
         assert server.received == [start, stop]
 
 
+async def test_a_recording_with_a_name_is_started_and_stopped_with_commands() -> None:
+    async with gateway_with_server(remote_control=True) as (server, _, _, peer):
+        reply = await query(peer, "mocap/lab/recording?set=start;name=walk 1")
+        assert reply.json == {"source": "lab", "sent": "start", "name": "walk 1", "is_named": True}
+        reply = await query(peer, "mocap/lab/recording?set=stop")
+        assert reply.json == {"source": "lab", "sent": "stop"}
+        assert server.commands[-2:] == ["Recording Start,file=walk 1.c3d", "Recording Stop"]
+        assert server.received == []
+
+
 async def test_recording_control_needs_a_valid_option_and_a_single_source() -> None:
     async with gateway_with_server(remote_control=True) as (server, _, _, peer):
-        assert "accepted: set=start, set=stop" in (await query(peer, "mocap/lab/recording")).error
+        assert "accepted: set=start;name=NAME, set=stop" in (await query(peer, "mocap/lab/recording")).error
         assert "accepted: start, stop" in (await query(peer, "mocap/lab/recording?set=pause")).error
         reply = await query(peer, "mocap/*/recording?set=start")
         assert (

@@ -52,6 +52,7 @@ class Lab:
         self.output = output or ToyOutput()
         self.parameters: list[tuple[str, ServerParameters]] = []
         self.files: list[tuple[str, ServerFile]] = []
+        self.followed: list[tuple[str, bool, str]] = []
         self.source = Source(
             # An interval of 0 cannot be configured. Here, a refresh always reaches the server.
             SourceSettings(name="lab", host=HOST, **settings).model_copy(update={"fresh_interval_s": 0.0}),
@@ -59,11 +60,16 @@ class Lab:
             spool,
             self._publish_parameters,
             lambda *each: self.files.append(each),
+            self._follow_recording,
             before,
         )
 
     async def _publish_parameters(self, source: str, parameters: ServerParameters) -> None:
         self.parameters.append((source, parameters))
+
+    async def _follow_recording(self, source: str, start: bool, name: str) -> dict[str, Any]:
+        self.followed.append((source, start, name))
+        return {}
 
     def messages(self, component: str) -> list[Any]:
         return [decode(message) for topic, message in self.output.messages if topic.path == (component,)]

@@ -193,7 +193,7 @@ class TakesFolder:
         log = path.with_name(f"{name}{SUFFIX}")
         paths = [log] if log.is_file() else log_paths_or_none(path)
         if not paths:
-            raise QueryError(f"source {source!r} has no take {name!r}; ask for take to see which there are")
+            raise QueryError(f"source {source!r} has no take {name!r}; take list shows which there are")
         sizes = [each.stat().st_size for each in paths]
         pieces, rest = [], MAX_PIECE_BYTES
         start = offset

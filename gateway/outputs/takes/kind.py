@@ -13,5 +13,6 @@ TAKES: Final = OutputKind(
     create=TakesOutput,
     checks=CHECKS,
     run_checks=check_takes,
+    commands=("take",),
     leaves_host=lambda _settings: False,
 )

@@ -12,6 +12,7 @@ from gateway.errors import QueryError
 from gateway.outputs.contract import Answer
 from gateway.queries.known_parameters import ServerAnswer
 from gateway.queries.questions import Question
+from gateway.queries.recordings import RecordingAccess
 from gateway.queries.server_requests import StreamAccess
 from gateway.queries.source_queries import SourceQueries
 from gateway.rtc3d.commands import Command
@@ -87,6 +88,7 @@ class FakeSource:
         """The XML of all announced parameters, None if they are void, with their version."""
         self.num_file_reads = 0
         self.recorded: list[bool] = []
+        self.followed: list[tuple[bool, str]] = []
         # The configuration does not accept 0. It sends every fresh query to the server.
         source_settings = SourceSettings(name="lab", host="192.0.2.1").model_copy(
             update={"fresh_interval_s": 0.0} | settings
@@ -100,7 +102,7 @@ class FakeSource:
             lambda component, _output: self.newest_messages.get(component),
             rtc3d.status_t().encode,
             self._last_c3d,
-            self._record,
+            RecordingAccess(self._record, self._follow_recording),
             self._announce,
         )
         self.status.connected("the server")
@@ -132,6 +134,10 @@ class FakeSource:
     def _record(self, start: bool) -> bool:
         self.recorded.append(start)
         return self.server.is_connected
+
+    async def _follow_recording(self, start: bool, name: str) -> dict[str, Any]:
+        self.followed.append((start, name))
+        return {"take": name} if start else {}
 
     def disconnect(self) -> None:
         """Lose the connection of the first stream."""

@@ -30,6 +30,7 @@ MARKERS_ONLY = frozenset({ComponentType.MARKERS})
         ("schema/markers_t", {}, Question("schema", "markers_t")),
         ("schema/rtc3d.marker_t", {}, Question("schema", "marker_t")),
         ("recording", {"set": "start"}, Question("recording", set="start")),
+        ("recording", {"set": "start", "name": "walk 1"}, Question("recording", "walk 1", set="start")),
         ("recording", {}, Question("recording")),
     ],
 )
@@ -44,6 +45,24 @@ def test_an_unknown_key_is_refused(key: str) -> None:
     with pytest.raises(QueryError, match="accepted: ") as refused:
         parse_question(tuple(key.split("/")), {}, ALL)
     assert refused.value.code == "bad-request"
+
+
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        ({"set": "stop", "name": "walk"}, "name is an option of set=start only"),
+        ({"name": "walk"}, "name is an option of set=start only"),
+        ({"set": "start", "name": ""}, "cannot be the name of a take"),
+        ({"set": "start", "name": "../x"}, "cannot be the name of a take"),
+        ({"set": "start", "name": "x,run=1"}, "cannot be the name of a take"),
+        ({"set": "start", "name": "x\0"}, "cannot be the name of a take"),
+        ({"set": "start", "name": "x" * 1_000_000}, "cannot be the name of a take"),
+    ],
+)
+def test_the_name_of_a_recording_is_checked(options: dict[str, str], text: str) -> None:
+    with pytest.raises(QueryError, match=text) as refused:
+        parse_question(("recording",), options, ALL)
+    assert len(str(refused.value)) < 400
 
 
 def test_every_known_key_is_parsed_and_listed_as_accepted() -> None:

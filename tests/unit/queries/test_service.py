@@ -73,6 +73,8 @@ async def test_the_command_of_an_output_that_is_off_is_an_error_that_says_what_t
     with pytest.raises(QueryError, match=r"to use play, set toy\.enabled: true in the gateway") as caught:
         await service_of(FakeSource()).answer("lab", ("play",), {"set": "start"})
     assert caught.value.code == "disabled"
+    assert service_of(FakeSource()).commands()[:2] == ["recording", "record/trim"]
+    assert "play" in service_of(FakeSource()).commands()
 
 
 async def test_a_wildcard_selects_neither_recording_nor_commands_of_outputs() -> None:

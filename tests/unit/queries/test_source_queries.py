@@ -71,24 +71,6 @@ async def test_a_file_is_read_once_for_simultaneous_queries() -> None:
     assert source.num_file_reads == 1
 
 
-async def test_recording_is_started_and_stopped() -> None:
-    source = FakeSource(remote_control=True)
-    answer = await source.answer("recording", set="start")
-    assert answer.payload == b'{"source":"lab","sent":"start"}'
-    await source.answer("recording", set="stop")
-    assert source.recorded == [True, False]
-    with pytest.raises(QueryError, match="accepted: set=start, set=stop"):
-        await source.answer("recording")
-
-
-async def test_recording_without_a_connection_is_an_error() -> None:
-    source = FakeSource(remote_control=True)
-    source.server.is_connected = False
-    with pytest.raises(QueryError, match="has no connection yet") as caught:
-        await source.answer("recording", set="start")
-    assert caught.value.code == "no-connection"
-
-
 def markers_message(session: int) -> bytes:
     [component] = split_frame(FRAME, "big").components
     return encode_message(component, Stamp(1, 1, session, 1), 5)

@@ -1,0 +1,112 @@
+"""The output of ``take list``, and texts about takes."""
+
+from collections.abc import Mapping
+from datetime import datetime
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from gateway.safe_text import safe_text
+
+
+class ListedTake:
+    """A take as a gateway describes it. A gateway of another version may describe it in another way."""
+
+    def __init__(self, fields: Mapping[str, Any]) -> None:
+        self.name = str(fields.get("name", ""))
+        self.num_bytes = _number(fields, "bytes")
+        self.begin_utime = _number(fields, "begin_utime")
+        self.seconds = _number(fields, "seconds")
+        self.num_lost = round(_number(fields, "lost"))
+        self.is_running = fields.get("is_running") is True
+
+    @property
+    def size_text(self) -> str:
+        """The size, such as "3.4 MB"."""
+        return size_text(self.num_bytes)
+
+    @property
+    def duration_text(self) -> str:
+        """The duration, such as "12.3 s", "4 min 12.3 s" or "1 h 2 min 3.4 s"."""
+        minutes, seconds = divmod(round(self.seconds, 1), 60)
+        hours, minutes = divmod(int(minutes), 60)
+        text = f"{seconds:.1f} s"
+        if hours or minutes:
+            text = f"{minutes} min {text}"
+        return f"{hours} h {text}" if hours else text
+
+    @property
+    def begin_text(self) -> str:
+        """The beginning, in local time."""
+        try:
+            begin = datetime.fromtimestamp(self.begin_utime / 1e6).astimezone()
+        except (OverflowError, OSError, ValueError):
+            return "?"
+        return begin.strftime("%Y-%m-%d %H:%M:%S") if self.begin_utime else "?"
+
+    @property
+    def lost_text(self) -> str:
+        """What the disk did not accept; "" if nothing."""
+        return f", {self.num_lost} messages lost" if self.num_lost else ""
+
+
+def size_text(num_bytes: float) -> str:
+    """Return a size, such as "3.4 MB"."""
+    for unit, factor in (("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
+        if num_bytes >= factor:
+            return f"{num_bytes / factor:.1f} {unit}"
+    return f"{num_bytes:.0f} bytes"
+
+
+def write_list(replies: Mapping[str, Mapping[str, Any]], console: Console) -> None:
+    """Write a table of the takes of all sources, and a line for each source about what is not in it."""
+    table = Table()
+    table.add_column("source", no_wrap=True)
+    table.add_column("name")
+    table.add_column("begin", no_wrap=True)
+    for heading in ("duration", "size"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    table.add_column("")
+    for source, content in replies.items():
+        for take in listed_takes(content):
+            state = "running" if take.is_running else ""
+            lost = take.lost_text.removeprefix(", ")
+            table.add_row(
+                *map(_cell, (source, take.name, take.begin_text, take.duration_text, take.size_text)),
+                _cell(", ".join(filter(None, (state, lost)))),
+            )
+    if table.row_count:
+        console.print(table)
+    for source, content in replies.items():
+        for line in _notes(source, content):
+            console.print(_cell(line))
+
+
+def listed_takes(content: Mapping[str, Any]) -> list[ListedTake]:
+    """Return the takes in a gateway's reply."""
+    takes = content.get("takes")
+    if not isinstance(takes, list):
+        return []
+    return [ListedTake(take) for take in takes if isinstance(take, dict)]
+
+
+def _notes(source: str, content: Mapping[str, Any]) -> list[str]:
+    num_listed, num_takes = len(listed_takes(content)), round(_number(content, "num_takes"))
+    kept_s = _number(content, "kept_s")
+    notes = [] if num_takes else [f"{source}: no takes"]
+    if num_takes > num_listed:
+        notes.append(f"{source}: the newest {num_listed} of {num_takes} takes")
+    if kept_s >= 1:
+        notes.append(f"{source}: the last {kept_s:.0f} s are kept, to be saved with: take save")
+    return notes
+
+
+def _number(fields: Mapping[str, Any], name: str) -> float:
+    value = fields.get(name)
+    return value if isinstance(value, int | float) and abs(value) < 1e300 else 0
+
+
+def _cell(text: str) -> Text:
+    return Text(safe_text(text))
