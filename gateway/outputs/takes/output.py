@@ -2,15 +2,24 @@
 
 import asyncio
 from collections.abc import Callable, Mapping
+from typing import Any
 
 from gateway.losses import Losses
 from gateway.messages.topics import Topic
-from gateway.outputs.contract import Command, Output, QueryService, ServerFile, ServerParameters
+from gateway.outputs.contract import (
+    Command,
+    Output,
+    Publisher,
+    QueryService,
+    ServerFile,
+    ServerParameters,
+)
 from gateway.outputs.status import OutputHealth
 from gateway.outputs.takes.control import TakeCommand
-from gateway.outputs.takes.publisher import TakesPublisher
+from gateway.outputs.takes.follow import EventPublisher, TakeFollower
 from gateway.outputs.takes.recorded_takes import RecordedTakes
 from gateway.outputs.takes.settings import TakesSettings
+from gateway.rtc3d.components import ComponentType
 from gateway.takes.recording import MAX_QUEUED_BYTES
 
 
@@ -25,14 +34,24 @@ class TakesOutput(Output):
         self.takes = RecordedTakes(settings, max_queued_bytes)
         """What is recorded, and what peers can do with it."""
         self._command = TakeCommand(self.takes)
+        self._followers: dict[str, TakeFollower] = {}  # by source
 
     def start(self) -> None:
         """Start to check the folder and to write."""
         self.takes.open()
 
-    def publisher(self, topic: Topic) -> TakesPublisher:
+    def publisher(self, topic: Topic) -> Publisher:
         """Return a new publisher of ``topic``, under a channel as on LCM."""
-        return self.takes.recording(topic.source).publisher(topic, self.takes.refusal, self.takes.queue_full)
+        recording = self.takes.recording(topic.source)
+        publisher = recording.publisher(topic, self.takes.refusal, self.takes.queue_full)
+        if topic.path == (ComponentType.EVENT.key,):
+            return EventPublisher(publisher, self._follower(topic.source))
+        return publisher
+
+    def _follower(self, source: str) -> TakeFollower:
+        if source not in self._followers:
+            self._followers[source] = TakeFollower(source, self.takes)
+        return self._followers[source]
 
     def watch_wanted(self, source: str, on_change: Callable[[], None]) -> bool:
         """Messages are wanted while a take is running or the last seconds are kept."""
@@ -45,8 +64,10 @@ class TakesOutput(Output):
         return OutputHealth(not problem, problem)
 
     def maintain(self) -> None:
-        """Check the folder and its limits."""
+        """Check the folder and its limits, and whether measurements have ended."""
         self.takes.maintain()
+        for follower in self._followers.values():
+            follower.maintain()
 
     def is_configured_like(self, other: Output) -> bool:
         """Any settings can be taken over."""
@@ -72,6 +93,15 @@ class TakesOutput(Output):
     def withdraw(self, source: str) -> None:
         """End what is recorded of ``source``."""
         self.takes.withdraw(source)
+        self._followers.pop(source, None)
+
+    def show_measurement(self, source: str, is_running: bool | None) -> None:
+        """Start a take with a measurement, if the settings say so."""
+        self._follower(source).show_measurement(is_running)
+
+    async def follow_recording(self, source: str, *, start: bool, name: str) -> Mapping[str, Any]:
+        """Start and stop a take with a recording, if the settings say so."""
+        return await self._follower(source).follow_recording(start=start, name=name)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
         """Record the parameters now and at the beginning of each file."""

@@ -4,11 +4,11 @@ import asyncio
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Any, Final, TypeVar
 
 from gateway.errors import OutputError, QueryError, TakeError
 from gateway.messages.host_time import now_utime
@@ -70,6 +70,13 @@ class RecordedTakes:
 
         "" means a name of source and time. A source has one running take.
         """
+        return await self.begin(source, name, has_free_name=not name)
+
+    def begin(self, source: str, name: str, *, has_free_name: bool) -> Coroutine[Any, Any, StoredTake]:
+        """Start a take at once, like ``start``; the coroutine, which must be awaited, waits for the disk.
+
+        With ``has_free_name``, a number is added to the name if there is such a take already.
+        """
         recording, recorder = self._announced(source), self._open_recorder()
         if name:
             check_name(name)
@@ -81,7 +88,7 @@ class RecordedTakes:
             self._folder.directory / source,
             name or default_name(source),
             now_utime(),
-            has_free_name=not name,
+            has_free_name=has_free_name,
             header=self._header(recording),
             disk=self.disk,
             losses=recording.losses,
@@ -89,6 +96,11 @@ class RecordedTakes:
         recording.take = take
         created = recorder.call(take.create)  # first, because what is recorded from now on follows it
         recording.add(recorder, take, self.settings.components)
+        return self._begun(recorder, recording, take, created)
+
+    async def _begun(
+        self, recorder: Recorder, recording: SourceRecording, take: TakeFile, created: Future[None]
+    ) -> StoredTake:
         try:
             await self._done(created, take.path)
         except QueryError:
@@ -99,13 +111,25 @@ class RecordedTakes:
         logger.info("takes: recording %s", take.path)
         return StoredTake(take.name, 0, take.utime, 0.0, is_running=True)
 
+    def running(self, source: str) -> TakeFile | None:
+        """Return the running take of a source."""
+        recording = self._recordings.get(source)
+        return None if recording is None else recording.take
+
     async def stop(self, source: str) -> StoredTake:
         """End the running take, and return it when everything is on the disk."""
+        return await self.end(source)
+
+    def end(self, source: str) -> Coroutine[Any, Any, StoredTake]:
+        """End the running take at once, like ``stop``; the coroutine, which must be awaited, waits."""
         recording, recorder = self._announced(source), self._started_recorder()
         take = recording.take
         if take is None:
             raise QueryError(f"no take of source {source!r} is running", code="nothing-yet")
-        await self._done(self._end_take(recorder, recording, take), take.path)
+        return self._ended(take, self._end_take(recorder, recording, take))
+
+    async def _ended(self, take: TakeFile, ended: Future[None]) -> StoredTake:
+        await self._done(ended, take.path)
         stored = await self._read(partial(self._folder.take_at, take.stem), take.path)
         return stored._replace(num_lost=take.num_lost)
 

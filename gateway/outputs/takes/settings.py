@@ -1,11 +1,11 @@
 """The section ``takes`` of the configuration."""
 
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated, Final, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from gateway.config.section import Effective, expects
+from gateway.config.section import Effective, expects, validation_error
 from gateway.config.settings import OutputSettings, state_directory
 from gateway.config.values import AbsoluteDirectory, Components, Switch
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, ChannelPrefix
@@ -27,6 +27,15 @@ KeepSeconds = Annotated[
     float,
     Field(strict=True, ge=0, le=MAX_KEEP_S, allow_inf_nan=False),
     expects(f"0 for off, or a number of seconds up to {MAX_KEEP_S:g}"),
+]
+
+
+Follow = Annotated[
+    Literal["none", "recording", "measurement", "events"],
+    expects("none, recording, measurement or events"),
+]
+EventId = Annotated[
+    int, Field(strict=True, ge=0, le=0xFFFF_FFFF), expects("a whole number from 0 to 4294967295, or null")
 ]
 
 
@@ -56,6 +65,23 @@ class TakesSettings(OutputSettings):
 
     keep_last_s: KeepSeconds = 0.0
     """How many of the last seconds to keep always, so that they can be saved as a take. 0 means off."""
+
+    follow: Follow = "none"
+    """What starts and stops takes besides peers: recordings or measurements of the server, or its events."""
+
+    start_event_id: EventId | None = None
+    """With `follow: events`: the id of the event that starts a take."""
+
+    stop_event_id: EventId | None = None
+    """With `follow: events`: the id of the event that stops the take. It can be the same id."""
+
+    @model_validator(mode="after")
+    def _check_event_ids(self) -> Self:
+        if self.follow == "events":
+            for key in ("start_event_id", "stop_event_id"):
+                if getattr(self, key) is None:
+                    raise validation_error("found nothing; expected a number with follow: events", key)
+        return self
 
     @property
     def effective(self) -> dict[str, Effective]:

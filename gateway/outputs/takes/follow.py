@@ -1,0 +1,198 @@
+"""Takes that follow what the server does: its recordings, its measurements, or events that it sends."""
+
+import asyncio
+import logging
+import struct
+import time
+from collections.abc import Callable, Coroutine
+from typing import Any, Final, Protocol
+
+from gateway.errors import QueryError
+from gateway.log import HOLD_S, FailureLog
+from gateway.outputs.contract import Publisher
+from gateway.outputs.takes.settings import TakesSettings
+from gateway.outputs.takes.stored import StoredTake
+from gateway.outputs.takes.take_file import TakeFile
+
+END_S: Final = 2.0
+"""For how long the server must send No Data until a take of a measurement ends."""
+
+LOST_S: Final = 60.0
+"""A measurement has ended if nothing is known of it for so long, because the connection is lost."""
+
+_NUM_EVENTS: Final = struct.Struct(">i")
+_NUM_EVENTS_OFFSET: Final = 52
+_EVENT_ID: Final = struct.Struct(">I20x")  # an event has 24 bytes, its id first
+_EVENTS_OFFSET: Final = 56
+
+logger = logging.getLogger(__name__)
+
+
+class FollowedTakes(Protocol):
+    """What following takes needs of them; see RecordedTakes."""
+
+    settings: TakesSettings
+
+    def begin(self, source: str, name: str, *, has_free_name: bool) -> Coroutine[Any, Any, StoredTake]:
+        """Start a take at once; the coroutine waits for the disk. Raises QueryError."""
+
+    def end(self, source: str) -> Coroutine[Any, Any, StoredTake]:
+        """End the running take at once; the coroutine waits for the disk. Raises QueryError."""
+
+    def running(self, source: str) -> TakeFile | None:
+        """Return the running take."""
+
+
+class TakeFollower:
+    """Starts and stops takes of one source as ``takes.settings.follow`` says.
+
+    It stops only a take that it started. If another take is running, that one goes on, and none is started.
+    """
+
+    def __init__(
+        self, source: str, takes: FollowedTakes, monotonic: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._source = source
+        self._takes = takes
+        self._monotonic = monotonic
+        self._take: TakeFile | None = None  # that was started here
+        self._is_measuring: bool | None = None
+        self._since_s = monotonic()
+        self._is_handled = False  # the present measurement has, or had, a take
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._failures = FailureLog(logger, source, HOLD_S)
+
+    @property
+    def _follow(self) -> str:
+        return self._takes.settings.follow
+
+    @property
+    def needs_events(self) -> bool:
+        """Whether events start and stop takes."""
+        return self._follow == "events"
+
+    async def follow_recording(self, *, start: bool, name: str) -> dict[str, Any]:
+        """Start or stop a take with a recording on the server; return what to add to the peer's reply."""
+        if self._follow != "recording":
+            return {}
+        try:
+            if start:
+                return {"take": (await self._begin(name)).name}
+            if self._is_running:
+                return {"take": (await self._takes.end(self._source)).name}
+        except QueryError as error:
+            logger.warning("%s: no take follows the recording: %s", self._source, error)
+            return {"take_problem": str(error)}
+        return {}
+
+    def show_measurement(self, is_running: bool | None) -> None:
+        """Start a take if a measurement begins, before its first frame is published."""
+        self._is_measuring = is_running
+        self._since_s = self._monotonic()
+        self.maintain()
+
+    def maintain(self) -> None:
+        """Start the take of the measurement, or stop it if the measurement has ended. Called once a second.
+
+        A measurement ends when the server says so, which is No Data, for END_S. A stall or a lost connection
+        does not end it, or it would be split into several takes; but what does not come back for LOST_S has
+        ended.
+        """
+        if self._follow != "measurement":
+            return
+        if self._is_measuring:
+            if not self._is_handled:
+                self._begin_soon()
+        elif self._monotonic() - self._since_s >= (LOST_S if self._is_measuring is None else END_S):
+            self._is_handled = False
+            self._end_soon()
+
+    def receive_event(self, event_id: int) -> None:
+        """Start or stop a take at an event of the server. The same event can do both."""
+        settings = self._takes.settings
+        if self._is_running:
+            if event_id == settings.stop_event_id:
+                self._end_soon()
+        elif event_id == settings.start_event_id:
+            self._begin_soon()
+
+    @property
+    def _is_running(self) -> bool:
+        """Whether the take that was started here is still running."""
+        return self._take is not None and self._takes.running(self._source) is self._take
+
+    def _begin(self, name: str = "") -> Coroutine[Any, Any, StoredTake]:
+        """Start a take at once; the coroutine waits for the disk. Raises QueryError."""
+        take = self._takes.begin(self._source, name, has_free_name=True)
+        self._take = self._takes.running(self._source)
+        return take
+
+    def _begin_soon(self) -> None:
+        if self._is_running:
+            return
+        running = self._takes.running(self._source)
+        if running is not None:
+            self._is_handled = True
+            logger.info(
+                "%s: take %r is running already, so no other one is started", self._source, running.name
+            )
+            return
+        try:
+            take = self._begin()
+        except QueryError as error:
+            self._failures.failed(f"no take is started: {error}")
+            return
+        self._is_handled = True
+        self._run(take)
+
+    def _end_soon(self) -> None:
+        if self._is_running:
+            try:
+                self._run(self._takes.end(self._source))
+            except QueryError as error:
+                self._failures.failed(f"the take is not stopped: {error}")
+
+    def _run(self, call: Coroutine[Any, Any, StoredTake]) -> None:
+        task = asyncio.get_running_loop().create_task(self._log_failure(call))
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _log_failure(self, call: Coroutine[Any, Any, StoredTake]) -> None:
+        try:
+            await call
+        except QueryError as error:
+            self._is_handled = False
+            self._failures.failed(f"a take is not started or stopped: {error}")
+        else:
+            self._failures.recovered("takes are started and stopped again")
+
+
+class EventPublisher:
+    """Shows events to the follower before ``publisher`` publishes them, so that they are in the take."""
+
+    def __init__(self, publisher: Publisher, follower: TakeFollower) -> None:
+        self._publisher = publisher
+        self._follower = follower
+
+    @property
+    def wanted(self) -> bool:
+        """Whether events are recorded, or start and stop takes."""
+        return self._publisher.wanted or self._follower.needs_events
+
+    def publish(self, message: bytes) -> None:
+        """See Publisher."""
+        if self._follower.needs_events:
+            for event_id in event_ids(message):
+                self._follower.receive_event(event_id)
+        self._publisher.publish(message)
+
+    def close(self) -> None:
+        """See Publisher."""
+        self._publisher.close()
+
+
+def event_ids(message: bytes) -> list[int]:
+    """Return the ids of the events in an ``events_t``, each as an unsigned number."""
+    (number,) = _NUM_EVENTS.unpack_from(message, _NUM_EVENTS_OFFSET)
+    end = _EVENTS_OFFSET + number * _EVENT_ID.size
+    return [event_id for (event_id,) in _EVENT_ID.iter_unpack(message[_EVENTS_OFFSET:end])]

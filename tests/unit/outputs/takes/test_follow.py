@@ -1,0 +1,225 @@
+"""Takes that follow measurements, recordings and events of the server, in virtual time."""
+
+import asyncio
+import logging
+from collections.abc import AsyncIterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import rtc3d
+
+from gateway.outputs.takes import follow
+from gateway.outputs.takes.follow import END_S, LOST_S, event_ids
+from gateway.takes.reader import TakeReader
+from tests.recording_output import RecordingLab, recording_lab
+from tests.unit.messages.samples import component_message
+from tests.vectors import LONG_EVENTS
+from tests.waiting import wait_until_async
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+    """The clock of the followers."""
+    clock = SimpleNamespace(now_s=100.0)
+    monkeypatch.setattr(follow, "time", SimpleNamespace(monotonic=lambda: clock.now_s))
+    return clock
+
+
+class Followed:
+    """A source whose takes follow its server; its clock is the test's."""
+
+    def __init__(self, lab: RecordingLab, clock: SimpleNamespace) -> None:
+        self.lab = lab
+        self.clock = clock
+        self.follower = lab.output._follower("lab")
+        self.follower._monotonic = lambda: clock.now_s
+        self.follower._since_s = clock.now_s
+
+    def show(self, is_running: bool | None, after_s: float = 0.0) -> None:
+        self.clock.now_s += after_s
+        self.lab.output.show_measurement("lab", is_running)
+
+    def wait(self, seconds: float) -> None:
+        self.clock.now_s += seconds
+        self.follower.maintain()
+
+    @property
+    def running(self) -> str:
+        take = self.lab.takes.running("lab")
+        return "" if take is None else take.name
+
+    async def names(self) -> list[str]:
+        """Return the names of the takes when the disk has them all, the oldest first."""
+        await wait_until_async(lambda: not self.follower._tasks)
+        return sorted(take.name for take in (await self.lab.takes.list("lab")).takes)
+
+
+def frames_of(lab: RecordingLab, name: str) -> list[bytes]:
+    messages = TakeReader(lab.path(f"{name}.lcmlog")).messages()
+    return [message.message for message in messages if message.key in {"3d", "event"}]
+
+
+@pytest.fixture
+async def measured(tmp_path: Path, clock: SimpleNamespace) -> AsyncIterator[Followed]:
+    async with recording_lab(tmp_path, follow="measurement") as lab:
+        yield Followed(lab, clock)
+
+
+async def test_each_measurement_has_a_take_from_its_first_frame_on(measured: Followed) -> None:
+    names = []
+    for _ in range(2):
+        measured.show(True)
+        names.append(measured.running)
+        published = [measured.lab.publish() for _ in range(5)]
+        measured.show(False)
+        measured.wait(END_S - 0.1)
+        assert measured.running == names[-1]
+        measured.wait(0.2)
+        assert measured.running == ""
+        [name] = set(await measured.names()) - set(names[:-1])
+        assert frames_of(measured.lab, name) == published
+        names[-1] = name
+    assert len(set(names)) == 2
+
+
+@pytest.mark.parametrize(("gap", "gap_s"), [(None, LOST_S - 1), (False, END_S - 0.1)])
+async def test_a_stall_a_reconnection_or_a_short_no_data_does_not_split_a_take(
+    measured: Followed, gap: bool | None, gap_s: float
+) -> None:
+    measured.show(True)
+    for _ in range(5):
+        measured.show(gap)
+        measured.wait(gap_s)
+        measured.show(True)
+    measured.wait(1000.0)
+    assert measured.running
+    assert len(await measured.names()) == 1
+
+
+async def test_a_measurement_that_does_not_come_back_ends(measured: Followed) -> None:
+    measured.show(True)
+    measured.show(None)
+    measured.wait(LOST_S + 0.1)
+    assert measured.running == ""
+
+
+async def test_a_stopped_take_is_not_started_again_before_the_next_measurement(measured: Followed) -> None:
+    measured.show(True)
+    await measured.lab.takes.stop("lab")
+    measured.wait(1.0)
+    measured.show(None)
+    measured.show(True)
+    assert measured.running == ""
+    measured.show(False)
+    measured.wait(END_S + 0.1)
+    measured.show(True)
+    assert measured.running
+
+
+async def test_the_take_of_a_peer_goes_on(measured: Followed, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
+    await measured.lab.takes.start("lab", "of a peer")
+    measured.show(True)
+    assert "take 'of a peer' is running already, so no other one is started" in caplog.text
+    measured.show(False)
+    measured.wait(END_S + 0.1)
+    assert measured.running == "of a peer"
+
+
+async def test_a_take_that_cannot_start_is_tried_again_and_logged_once(
+    measured: Followed, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = measured.lab.directory / "lab"
+    folder.write_text("in the way")
+    measured.show(True)
+    await wait_until_async(lambda: not measured.follower._tasks)
+    for _ in range(3):
+        measured.wait(1.0)
+        await wait_until_async(lambda: not measured.follower._tasks)
+    [warning] = [record for record in caplog.records if "a take is not started" in record.message]
+    assert warning.levelno == logging.WARNING
+    folder.unlink()
+    measured.lab.takes.disk.succeeded()
+    measured.wait(1.0)
+    assert len(await measured.names()) == 1
+
+
+# Recordings ----------------------------------------------------------------------------------
+
+
+async def test_a_take_follows_a_recording_under_the_same_name(tmp_path: Path) -> None:
+    async with recording_lab(tmp_path, follow="recording") as lab:
+        output = lab.output
+        assert await output.follow_recording("lab", start=True, name="walk") == {"take": "walk"}
+        published = lab.publish()
+        assert await output.follow_recording("lab", start=False, name="") == {"take": "walk"}
+        assert frames_of(lab, "walk") == [published]
+        assert await output.follow_recording("lab", start=False, name="") == {}
+        assert await output.follow_recording("lab", start=True, name="walk") == {"take": "walk-2"}
+        reply = await output.follow_recording("lab", start=True, name="run")
+        assert "'walk-2' of source 'lab' is running already" in reply["take_problem"]
+        await lab.takes.stop("lab")
+        await lab.takes.start("lab", "of a peer")
+        assert await output.follow_recording("lab", start=False, name="") == {}
+        running = lab.takes.running("lab")
+        assert running is not None
+        assert running.name == "of a peer"
+
+
+@pytest.mark.parametrize("setting", ["none", "measurement"])
+async def test_without_the_setting_no_take_follows_a_recording(tmp_path: Path, setting: str) -> None:
+    async with recording_lab(tmp_path, follow=setting) as lab:
+        assert await lab.output.follow_recording("lab", start=True, name="walk") == {}
+        assert lab.takes.running("lab") is None
+
+
+# Events --------------------------------------------------------------------------------------
+
+
+def event_message(*ids: int) -> bytes:
+    message = rtc3d.events_t()
+    message.num_events = len(ids)
+    for event_id in ids:
+        event = rtc3d.event_t()
+        event.id = event_id
+        message.events.append(event)
+    encoded: bytes = message.encode()
+    return encoded
+
+
+async def test_events_start_and_stop_takes(tmp_path: Path, clock: SimpleNamespace) -> None:
+    settings: dict[str, Any] = {"follow": "events", "start_event_id": 5, "stop_event_id": 0xFFFF_FFFE}
+    async with recording_lab(tmp_path, **settings) as lab:
+        followed = Followed(lab, clock)
+        publisher = lab.publishers["event"]
+        assert publisher.wanted
+        publisher.publish(event_message(7))
+        publisher.publish(event_message(-2))
+        assert followed.running == ""
+        start, both = event_message(7, 5), event_message(5, 9)
+        publisher.publish(start)
+        publisher.publish(both)
+        assert followed.running
+        publisher.publish(event_message(-2))
+        assert followed.running == ""
+        [name] = await followed.names()
+        assert frames_of(lab, name) == [start, both]
+
+
+async def test_one_event_can_start_and_stop_in_turns(tmp_path: Path, clock: SimpleNamespace) -> None:
+    settings: dict[str, Any] = {"follow": "events", "start_event_id": 5, "stop_event_id": 5}
+    async with recording_lab(tmp_path, **settings) as lab:
+        followed = Followed(lab, clock)
+        for is_running in (True, False, True, False):
+            lab.publishers["event"].publish(event_message(5))
+            assert bool(followed.running) is is_running
+            await asyncio.sleep(0)
+        assert len(await followed.names()) == 2
+
+
+def test_the_ids_of_events_are_read_from_a_message() -> None:
+    assert event_ids(component_message(LONG_EVENTS)) == [0x123456, 2]
+    assert event_ids(event_message()) == []
+    assert event_ids(event_message(-1)) == [0xFFFF_FFFF]
