@@ -64,11 +64,11 @@ def write_list(replies: Mapping[str, Mapping[str, Any]], console: Console) -> No
     """Write a table of the takes of all sources, and a line for each source about what is not in it."""
     table = Table()
     table.add_column("source", no_wrap=True)
-    table.add_column("name")
+    table.add_column("name", overflow="fold")
     table.add_column("begin", no_wrap=True)
     for heading in ("duration", "size"):
         table.add_column(heading, justify="right", no_wrap=True)
-    table.add_column("")
+    table.add_column("state")
     for source, content in replies.items():
         for take in listed_takes(content):
             state = "running" if take.is_running else ""

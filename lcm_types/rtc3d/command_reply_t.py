@@ -35,7 +35,7 @@ class command_reply_t(object):
 
         self.error_code = ""
         """
-        Error code for programs: "", bad-request, refused, rate, no-connection, timeout or defect.
+        Error code for programs, as on Zenoh; "" if there is no error.
         LCM Type: string
         """
 

@@ -179,8 +179,14 @@ def test_a_viewer_cannot_declare_a_liveliness_token(
     token.undeclare()
 
 
-@pytest.mark.parametrize("selector", ["mocap/lab/recording?set=start", "mocap/*/recording?set=start"])
-def test_a_viewer_cannot_control_a_recording(viewer: zenoh.Session, selector: str) -> None:
+@pytest.mark.parametrize(
+    "selector",
+    [
+        *("mocap/lab/recording?set=start", "mocap/*/recording?set=start"),
+        *("mocap/lab/take?set=start", "mocap/*/take?set=start", "mocap/lab/take"),
+    ],
+)
+def test_a_viewer_cannot_control_a_recording_or_a_take(viewer: zenoh.Session, selector: str) -> None:
     assert list(viewer.get(selector, timeout=5)) == []
 
 

@@ -28,6 +28,9 @@ from gateway.worker_thread import WorkerThread
 MAX_AFTER_S: Final = 3600.0
 """How long a take that is saved may go on."""
 
+MAX_SAVES: Final = 16
+"""How many takes of a source may be saved at a time, each with links to the same segments."""
+
 _TIMEOUT_S: Final = 4.0
 """How long a peer waits for the disk."""
 
@@ -153,6 +156,11 @@ class RecordedTakes:
             raise QueryError(
                 "the gateway keeps no messages to save, because takes.keep_last_s is 0 in its configuration",
                 code="nothing-yet",
+            )
+        if after_s > 0 and len(recording.saves) >= MAX_SAVES:
+            raise QueryError(
+                f"{MAX_SAVES} takes of source {source!r} are being saved already; wait until one is complete",
+                code="refused",
             )
         now_s = time.monotonic()
         folder = self._folder.directory / source / (name or default_name(source))

@@ -9,6 +9,7 @@ from gateway.errors import QueryError
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerFile, ServerParameters
+from gateway.outputs.takes.recorded_takes import MAX_SAVES
 from gateway.outputs.takes.stored import MAX_PIECE_BYTES
 from gateway.takes.reader import log_paths
 from tests.recording_output import RecordingLab, events, frames, recording_lab
@@ -230,3 +231,14 @@ async def test_two_gateways_do_not_share_a_folder(tmp_path: Path) -> None:
 def _maintained(lab: RecordingLab) -> RecordingLab:
     lab.output.maintain()
     return lab
+
+
+async def test_takes_that_are_being_saved_are_bounded(tmp_path: Path) -> None:
+    async with recording_lab(tmp_path, keep_last_s=60) as lab:
+        lab.publish()
+        for _ in range(MAX_SAVES):
+            await lab.takes.save("lab", 30, 60)
+        with pytest.raises(QueryError, match="16 takes of source 'lab' are being saved already") as caught:
+            await lab.takes.save("lab", 30, 60)
+        assert caught.value.code == "refused"
+        await lab.takes.save("lab", 30)

@@ -1,0 +1,119 @@
+"""Peers that start, stop, save and read takes without end: the healthy source loses nothing."""
+
+import asyncio
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import rtc3d
+
+from gateway.outputs.lcm.connection import open_lcm
+from gateway.outputs.lcm.settings import lcm_queries_url
+from tests.gateway_process import simulator
+from tests.hostile.gateway_under_attack import GatewayUnderAttack, RunningGateway
+from tests.hostile.test_askers import ask, check, wait_for_frames
+
+pytestmark = pytest.mark.netns
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[int]:
+    """The port of the server whose takes are attacked."""
+    with simulator("--rate", "200", "--analog-rate", "200") as (port, _):
+        yield port
+
+
+def attacked(gateway_under_attack: GatewayUnderAttack, port: int, folder: Path) -> object:
+    folder.mkdir()
+    return gateway_under_attack(
+        {"lab": {"port": port, "remote_control": True}},
+        {"takes": {"enabled": True, "directory": str(folder), "keep_last_s": 10.0}},
+    )
+
+
+def num_takes(folder: Path) -> int:
+    return len(list((folder / "lab").glob("*")))
+
+
+async def test_floods_of_commands_on_zenoh(
+    server: int, tmp_path: Path, gateway_under_attack: GatewayUnderAttack
+) -> None:
+    folder = tmp_path / "takes"
+    commands = (
+        *("set=start;name={}", "set=stop", "set=save;last=10;after=3600;name=s{}", "set=save", "set=start"),
+        *("read={};offset=0", "read=x;offset=-1", "read=x;offset=nan", "set=start;name=" + 900 * "x"),
+        *(
+            "set=save;last=nan",
+            "set=save;last=1e9",
+            "set=stop;name={}",
+            "x{}=1",
+            "set={}",
+            "read=../lab{}",
+            "",
+        ),
+    )
+    async with attacked(gateway_under_attack, server, folder) as gateway:  # type: ignore[attr-defined]
+        await wait_for_frames(gateway)
+        selectors = [f"mocap/lab/take?{command}" for command in commands]
+        wildcards = [f"mocap/{key}?set=start" for key in ("**", "*/take", "lab/*", "lab/t$*")]
+        replies, _ = await asyncio.gather(ask(gateway, 6000, *selectors), ask(gateway, 2000, *wildcards))
+        assert replies["bad-request"] > 500
+        assert replies["rate"] > 100
+        await still_works(gateway)
+    check(gateway)
+    assert num_takes(folder) < 4 * 60
+
+
+async def test_floods_of_reads_on_zenoh(
+    server: int, tmp_path: Path, gateway_under_attack: GatewayUnderAttack
+) -> None:
+    folder = tmp_path / "takes"
+    async with attacked(gateway_under_attack, server, folder) as gateway:  # type: ignore[attr-defined]
+        await wait_for_frames(gateway)
+        (folder / "lab").mkdir(exist_ok=True)
+        with (folder / "lab/long.lcmlog").open("wb") as file:
+            file.truncate(2_000_000_000)
+        selector = "mocap/lab/take?read=long;offset={}"
+        replies = await ask(gateway, 4000, f"{selector}000", f"{selector}000000", f"{selector}00000000000")
+        assert replies["ok"] > 10
+        assert replies["rate"] > 1000
+        await still_works(gateway)
+    check(gateway)
+
+
+async def test_floods_of_commands_on_lcm(
+    server: int, tmp_path: Path, gateway_under_attack: GatewayUnderAttack
+) -> None:
+    folder = tmp_path / "takes"
+    request = rtc3d.command_request_t()
+    request.requester, request.command = "flood", "take"
+    async with attacked(gateway_under_attack, server, folder) as gateway:  # type: ignore[attr-defined]
+        await wait_for_frames(gateway)
+        connection = open_lcm(lcm_queries_url(gateway.lcm_url))
+        options = [
+            ["set=start"],
+            ["set=stop"],
+            ["set=save"],
+            [],
+            ["read=x"],
+            ["x" * 3000],
+            ["set=start"] * 300,
+        ]
+        for number in range(200):  # 2 s
+            for each in options * 10:
+                request.request_id = number
+                request.options, request.num_options = each, len(each)
+                connection.publish("MOCAP_LAB_COMMAND_REQUEST", request.encode())
+            await asyncio.sleep(0.01)
+        await still_works(gateway)
+    check(gateway)
+    assert num_takes(folder) < 4 * 60
+
+
+async def still_works(gateway: RunningGateway) -> None:
+    """Check that a peer that asks calmly gets an answer."""
+    for _ in range(30):
+        if (await ask(gateway, 1, "mocap/lab/take")).get("ok"):
+            return
+        await asyncio.sleep(0.5)
+    raise AssertionError("the gateway lists no takes any more")
