@@ -13,6 +13,7 @@ from gateway.cli.lcm_client import ask_lcm
 from gateway.cli.zenoh_client import ZenohClient, ZenohReply
 from gateway.errors import OutputError, QueryError
 from gateway.messages.topics import zenoh_key
+from gateway.outputs.contract import CONTROL_OPTION
 from gateway.outputs.lcm.settings import effective_lcm_url
 from gateway.outputs.zenoh.subscriber import open_zenoh
 
@@ -62,11 +63,13 @@ class GatewayAddress(NamedTuple):
     def ask(self, options: Mapping[str, str]) -> TakeReplies:
         """Ask ``source``, or every source that is found, with these options.
 
-        Of several gateways, those that record no takes are left out. Raises QueryError, OutputError.
+        If some of several sources reply as wanted, others are left out whose gateway records no takes, or,
+        if takes are to be stopped, that have no running one. Raises QueryError, OutputError.
         """
         replies = self._ask_lcm(options) if self.is_lcm else self._ask_zenoh(options)
         if self.source is None and replies.received:
-            problems = [problem for problem in replies.problems if problem.code != "disabled"]
+            expected = {"disabled", "nothing-yet"} if options.get(CONTROL_OPTION) == "stop" else {"disabled"}
+            problems = [problem for problem in replies.problems if problem.code not in expected]
             return TakeReplies(replies.received, problems)
         return replies
 

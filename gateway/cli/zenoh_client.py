@@ -42,10 +42,15 @@ class ZenohClient:
         self._busy: QueryError | None = None  # what a gateway said that gets too many queries
 
     def sources(self, limits: TimeLimits) -> list[str]:
-        """Return the sources that gateways serve, sorted. Raises QueryError if none is found in time."""
-        while not (served := served_sources(self._session, self._prefix)):
-            if limits.discovery_is_over:
+        """Return the sources that gateways serve, sorted. Raises QueryError if none is found in time.
+
+        Gateways are found one after the other, so this looks until the sources stay the same.
+        """
+        served: list[str] = []
+        while (found := served_sources(self._session, self._prefix)) != served or not served:
+            if not found and limits.discovery_is_over:
                 self._require_gateway(None)
+            served = found
             time.sleep(RETRY_S)
         return served
 
