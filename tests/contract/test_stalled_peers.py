@@ -49,6 +49,22 @@ PATIENT = {
 """Keys with which Zenoh keeps a stalled link for 7 s (given in µs) instead of 5 s: past RETURNS_WITHIN_S."""
 
 
+SUBSCRIBER = """
+import sys, time, zenoh
+
+def opened():
+    while True:
+        try:
+            return zenoh.open(zenoh.Config.from_json5(sys.argv[1]))
+        except zenoh.ZError:  # the output does not listen yet
+            time.sleep(0.1)
+
+session = opened()
+session.declare_subscriber("mocap/**", lambda _: print("received", flush=True))
+sys.stdin.read()
+"""
+
+
 class StalledPeer(NamedTuple):
     """An output, what makes its peer stall, and the causes of the drops that follow."""
 
@@ -91,13 +107,8 @@ async def zenoh_subscriber_that_stops_reading() -> AsyncIterator[StalledPeer]:
     endpoint = free_endpoint()
     output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer", listen=endpoint) | PATIENT))
     keys = json.dumps(zenoh_keys("client", connect=endpoint) | PATIENT)
-    program = (
-        "import zenoh, sys; session = zenoh.open(zenoh.Config.from_json5(sys.argv[1]));"
-        "session.declare_subscriber('mocap/**', lambda _: print('received', flush=True));"
-        "sys.stdin.read()"
-    )
     subscriber = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-c", program, keys), stdin=PIPE, stdout=PIPE
+        *(sys.executable, "-c", SUBSCRIBER, keys), stdin=PIPE, stdout=PIPE
     )
 
     async def stall() -> None:
