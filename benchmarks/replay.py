@@ -34,6 +34,7 @@ _ITEMS: Final = {
 }
 _ANALOG_HZ: Final = 2000
 _FRAME_EVERY: Final = 10
+_TAKE_S: Final = 20.0
 _ENDPOINT: Final = "tcp/127.0.0.1:7531"
 _URL: Final = "udpm://239.255.76.67:7731?ttl=0"
 _REPORT: Final = re.compile(
@@ -61,7 +62,7 @@ _RUNS: Final = (
 
 def expected_s(quick: bool) -> float:
     """Return the approximate duration in s."""
-    return 3.5 * _seconds(quick) + 5 * len(_RUNS)
+    return 3 * _seconds(quick) + 6 * len(_RUNS)
 
 
 def _seconds(quick: bool) -> float:
@@ -128,10 +129,12 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
     runs = []
     with tempfile.TemporaryDirectory() as folder:
         take = Path(folder) / "take.lcmlog"
-        _write_take(take, _seconds(quick))
+        _write_take(take, _TAKE_S)
         for index, (rate, outputs, options, who) in enumerate(_RUNS):
             progress.step(f"rate {rate} on {outputs}, {who} subscribes", index / len(_RUNS))
             command = [sys.executable, "-m", "gateway", "replay", str(take), "--rate", rate, *options]
+            if rate != "max":
+                command += ["--to", str(min(_TAKE_S, _seconds(quick) * float(rate)))]
             if who == _NOBODY:
                 text, num_received = run_measured(command), None
             else:

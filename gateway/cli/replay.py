@@ -6,7 +6,6 @@ import gc
 import re
 import signal
 import sys
-import time
 from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
@@ -204,20 +203,22 @@ class _Run:
             "left": lambda: player.seek(-_SEEK_US),
             "right": lambda: player.seek(_SEEK_US),
         }
-        begin_s = time.monotonic()
         try:
             with keys(actions) as has_keys:
                 hints = "space: pause, ←/→: 10 s, q: quit" if has_keys else ""
-                with closing(Progress(self._notes, player, take_length_us(self._reader), hints)) as progress:
+                with closing(
+                    Progress(
+                        self._notes, player, take_length_us(self._reader, self._selection.stop_us), hints
+                    )
+                ) as progress:
                     async with playing(player):
                         while player.is_alive and not stop.is_set():
                             progress.show()
                             with contextlib.suppress(TimeoutError):
                                 await asyncio.wait_for(stop.wait(), _SHOW_S)
         finally:
-            seconds = time.monotonic() - begin_s
             if player.num_messages:
-                print_report(self._out, self._notes, player, publication, self._reader, seconds)
+                print_report(self._out, self._notes, player, publication, self._reader)
 
     def _note(self, text: str) -> None:
         self._notes.print(Text(text), soft_wrap=True)

@@ -94,12 +94,7 @@ class Progress:
 
 
 def print_report(
-    console: Console,
-    notes: Console,
-    player: Player,
-    publication: Publication,
-    reader: TakeReader,
-    seconds: float,
+    console: Console, notes: Console, player: Player, publication: Publication, reader: TakeReader
 ) -> None:
     """Print the messages per component on ``console``, and on ``notes`` what was left out and why."""
     outputs = sorted({refusal.output for refusal in publication.refusals})
@@ -114,7 +109,7 @@ def print_report(
         cells = [f"{refused[output]:,}" for output in outputs]
         table.add_row(key, f"{publication.num_messages[key]:,}", *cells)
     console.print(table)
-    total = publication.num_messages.total()
+    total, seconds = publication.num_messages.total(), player.seconds
     text = f"{total:,} messages in {seconds:.1f} s ({total / max(seconds, 1e-6):,.0f} messages/s)"
     late = player.lateness
     if late.num_messages:

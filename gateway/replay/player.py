@@ -61,6 +61,7 @@ class Player:
         self._is_repeated = is_repeated
         self._max_gap_s = max_gap_s
         self._on_jump = on_jump
+        self._started_s = self._ended_s = 0.0
         self._begun_s = 0.0  # when the present wait, or the present message, was to begin
         self._changed = threading.Condition()  # of these four
         self._is_paused = False
@@ -82,6 +83,11 @@ class Player:
     def is_paused(self) -> bool:
         """Whether the replay pauses."""
         return self._is_paused
+
+    @property
+    def seconds(self) -> float:
+        """How long the thread ran; call it after its end."""
+        return self._ended_s - self._started_s
 
     def pause(self, is_paused: bool) -> None:
         """Pause, or continue at the same place."""
@@ -113,12 +119,15 @@ class Player:
     # In the thread.
 
     def _run(self) -> None:
+        self._started_s = time.monotonic()
         try:
             start_us: int | None = self._selection.start_us
             while start_us is not None:
                 start_us = self._next_start(start_us)
         except BaseException as error:  # noqa: BLE001 - it belongs to whoever waits for the thread
             self.error = error
+        finally:
+            self._ended_s = time.monotonic()
 
     def _next_start(self, start_us: int) -> int | None:
         """Replay from a position on; return where to go on, None if this was the end."""

@@ -10,13 +10,17 @@ from gateway.takes.reader import TakeReader
 _TAIL_BYTES: Final = 4 * 1024 * 1024
 
 
-def take_length_us(reader: TakeReader) -> int | None:
+def take_length_us(reader: TakeReader, stop_us: int | None = None) -> int | None:
     """Return the time from the first to the last event, in µs; None if the end of the take is damaged.
 
-    It is wrong if somebody has set the clock meanwhile.
+    If the replay stops earlier, at ``stop_us``, that is the end.
+    It is wrong if somebody has set the clock during the recording.
     """
     last_utime = _last_utime(reader.logs[-1].path)
-    return None if last_utime is None else max(0, last_utime - reader.start_utime)
+    if last_utime is None:
+        return stop_us
+    length_us = max(0, last_utime - reader.start_utime)
+    return length_us if stop_us is None else min(length_us, stop_us)
 
 
 def _last_utime(log: Path) -> int | None:

@@ -194,7 +194,8 @@ async def test_pause_continue_and_seek(tmp_path: Path) -> None:
         player.pause(False)
         await wait_until_async(lambda: player.num_messages > 2)
         player.pause(True)
-        player.seek(20_000_000)
+        player.seek(10_000_000)
+        player.seek(10_000_000)
         await wait_until_async(lambda: player.position_us >= 20_000_000)
         num_messages = player.num_messages
         assert player.is_paused
