@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import lcm
 import numpy as np
 import pytest
 
@@ -474,3 +475,74 @@ def test_a_take_without_anything_for_c3d_is_an_error(tmp_path: Path) -> None:
     ):
         export_messages(tmp_path, [event], "out.c3d")
     assert not list(tmp_path.glob("*.c3d"))
+
+
+def stepped(message: Message, step_us: int) -> Message:
+    """Return a message whose times on the gateway's clock are later by a step."""
+    channel, data = message
+    utime, capture_utime = (int.from_bytes(data[at : at + 8], "big") + step_us for at in (8, 16))
+    return channel, data[:8] + utime.to_bytes(8, "big") + capture_utime.to_bytes(8, "big") + data[24:]
+
+
+@pytest.mark.parametrize("step_us", [-3_600_000_000, -50_000, 3_600_000_000])
+def test_a_step_of_the_clock_changes_nothing(tmp_path: Path, step_us: int) -> None:
+    messages = list(scene_messages(SCENE, 100))
+    half = len(messages) // 2
+    later = [stepped(message, step_us) for message in messages[half:]]
+    job = export_messages(
+        tmp_path, [description(), parameters(SCENE.parameters), *messages[:half], *later], "out.c3d"
+    )
+    assert job.notes == []
+    content = read_ezc3d(tmp_path / "out.c3d")
+    recorded = SCENE.items(ComponentType.MARKERS, np.arange(100))
+    assert np.array_equal(float32(content["data"]["points"][0]), recorded["x"].T, equal_nan=True)
+    expected = SCENE.items(ComponentType.ANALOG, np.arange(1000)).T
+    assert np.array_equal(float32(content["data"]["analogs"][0, :3]), expected)
+
+
+def test_a_new_session_of_one_stream_keeps_the_samples_of_the_other(tmp_path: Path) -> None:
+    messages = []
+    for channel, data in scene_messages(SCENE, 100):
+        is_later = int.from_bytes(data[24:32], "big") >= 40
+        session = 2 if channel.endswith("3D") and is_later else 1
+        messages.append((channel, data[:32] + session.to_bytes(4, "big") + data[36:]))
+    job = export_messages(tmp_path, [parameters(SCENE.parameters), *messages], "out.c3d")
+    files = [read_ezc3d(path)["data"] for path in job.files.paths]
+    assert [file["points"].shape[2] for file in files] == [40, 60]
+    together = np.concatenate([file["analogs"] for file in files], axis=2)[0, :3]
+    assert np.array_equal(float32(together), SCENE.items(ComponentType.ANALOG, np.arange(1000)).T)
+
+
+def test_time_stamps_that_do_not_progress(tmp_path: Path) -> None:
+    lost = {12, 13}
+    messages = [
+        (channel, data[:44] + bytes(8) + data[52:])
+        for channel, data in scene_messages(SCENE, 60)
+        if not (channel.endswith("3D") and int.from_bytes(data[24:32], "big") in lost)
+    ]
+    export_messages(tmp_path, [description(), parameters(SCENE.parameters), *messages], "out.c3d")
+    content = read_ezc3d(tmp_path / "out.c3d")["data"]
+    points = float32(content["points"][0])
+    empty = np.flatnonzero(np.isnan(points).all(axis=0)).tolist()
+    left_out = 12 - empty[0]  # at the beginning: the times of capture decide, which have a jitter
+    assert left_out in {0, 1}
+    assert empty == [12 - left_out, 13 - left_out]
+    recorded = float32(SCENE.items(ComponentType.MARKERS, np.arange(60))["x"].T)
+    assert np.array_equal(points[:, 20 - left_out], recorded[:, 20], equal_nan=True)
+
+
+def test_a_take_of_lcm_logger_and_one_in_a_folder(tmp_path: Path) -> None:
+    messages = [parameters(SCENE.parameters), *scene_messages(SCENE, 40)]
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    for number, part in enumerate((messages[:500], messages[500:])):
+        log = lcm.EventLog(str(folder / f"take-{number}.lcmlog"), "w")
+        for place, (channel, data) in enumerate(part):
+            log.write_event(1_800_000_000_000_000 + place, channel, data)
+        log.close()
+    job = ExportJob(folder, tmp_path / "out.c3d")
+    export_take(job)
+    content = read_ezc3d(tmp_path / "out.c3d")
+    assert np.array_equal(
+        float32(content["data"]["analogs"][0, :3]), SCENE.items(ComponentType.ANALOG, np.arange(400)).T
+    )
