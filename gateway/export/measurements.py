@@ -13,7 +13,7 @@ from gateway.takes.component_rows import Array
 from gateway.takes.series import Series
 from gateway.takes.take import TakeSource
 
-_SAME_CLOCK_S: Final = 0.5
+_SAME_CLOCK_S: Final = 0.2
 """Two time stamps are of the same measurement if they differ from the times of capture equally, within
 this."""
 

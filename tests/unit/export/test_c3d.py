@@ -546,3 +546,15 @@ def test_a_take_of_lcm_logger_and_one_in_a_folder(tmp_path: Path) -> None:
     assert np.array_equal(
         float32(content["data"]["analogs"][0, :3]), SCENE.items(ComponentType.ANALOG, np.arange(400)).T
     )
+
+
+def test_measurements_without_a_pause_keep_their_own_samples(tmp_path: Path) -> None:
+    other = SyntheticScene(markers=5, tools=0, analog=3, plates=2, rate_hz=100, analog_rate_hz=1000, seed=9)
+    second = [stepped(message, 1_010_000) for message in scene_messages(other, 120, sequence=5000)]
+    job = export_messages(
+        tmp_path, [parameters(SCENE.parameters), *scene_messages(SCENE, 100), *second], "walk.c3d"
+    )
+    files = [read_ezc3d(path)["data"] for path in job.files.paths]
+    for file, scene, count in zip(files, (SCENE, other), (1000, 1200), strict=True):
+        expected = scene.items(ComponentType.ANALOG, np.arange(count)).T
+        assert np.array_equal(float32(file["analogs"][0, :3]), expected)
