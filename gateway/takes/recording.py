@@ -28,7 +28,8 @@ _HEADER: Final = struct.Struct(">4sq8sii")
 """The header of an event (event_log.py), with the time as the eight bytes that the message has, too."""
 
 _pack_header: Final = _HEADER.pack
-_UTIME: Final = slice(8, 16)
+_UTIME_START: Final = 8
+_UTIME_STOP: Final = 16
 """Where a message of the gateway has its ``utime``, after the fingerprint."""
 
 _Result = TypeVar("_Result")
@@ -57,17 +58,19 @@ class LogFile:
         number = self.num_messages
         for channel, message in messages:
             # Like encode_event, but without copying each message twice (benchmarks/own_cost.py).
-            pieces.append(_pack_header(SYNC, number, message[_UTIME], len(channel), len(message)))
+            pieces.append(
+                _pack_header(SYNC, number, message[_UTIME_START:_UTIME_STOP], len(channel), len(message))
+            )
             pieces.append(channel)
             pieces.append(message)
             number += 1
-        rest = memoryview(b"".join(pieces))
-        num_bytes = len(rest)
+        events = memoryview(b"".join(pieces))
+        num_bytes = 0
         try:
-            while rest:
-                rest = rest[os.write(self._descriptor, rest) :]
+            while num_bytes < len(events):
+                num_bytes += os.write(self._descriptor, events[num_bytes:])
         except OSError:
-            num_messages, num_bytes = _complete(messages, num_bytes - len(rest))
+            num_messages, num_bytes = _complete(messages, num_bytes)
             # The next event must follow a complete one.
             os.ftruncate(self._descriptor, self.num_bytes + num_bytes)
             os.lseek(self._descriptor, self.num_bytes + num_bytes, os.SEEK_SET)
@@ -204,7 +207,7 @@ class Recorder:
 
 def utime_of(message: bytes) -> int:
     """Return the ``utime`` of a message of the gateway, in µs since the Unix epoch."""
-    return int.from_bytes(message[_UTIME], "big", signed=True)
+    return int.from_bytes(message[_UTIME_START:_UTIME_STOP], "big", signed=True)
 
 
 def _complete(messages: Sequence[tuple[bytes, bytes]], num_bytes: int) -> tuple[int, int]:

@@ -339,10 +339,9 @@ class RecordedTakes:
             return "the output takes is not open; start it first"
         return self._watch.problem or self.disk.problem
 
-    @property
-    def queued_bytes(self) -> int:
-        """How many bytes wait for the disk."""
-        return 0 if self._recorder is None else self._recorder.queued_bytes
+    async def written(self) -> None:
+        """Wait until everything that was published so far is in the files."""
+        await asyncio.wrap_future(self._started_recorder().call(lambda: None))
 
     def refusal(self) -> OutputError | None:
         """Return the error for a message that is published while the output is not open."""
