@@ -77,3 +77,13 @@ def test_a_file_without_events_is_no_log(tmp_path: Path, content: bytes) -> None
     path.write_bytes(content)
     with pytest.raises(TakeError, match=r"foreign\.lcmlog (has|is)"):
         read(path)
+
+
+@pytest.mark.parametrize("more", [-50, -1, 1, 3, 27, 29, 500, 10**6, 2**31 - 1])
+def test_a_damaged_size_costs_one_event(tmp_path: Path, more: int) -> None:
+    size = len(MESSAGES[3][3]) + more
+    damaged = EVENTS[3][:24] + (size & 0xFFFFFFFF).to_bytes(4, "big") + EVENTS[3][28:]
+    path = tmp_path / "damaged.lcmlog"
+    path.write_bytes(b"".join([*EVENTS[:3], damaged, *EVENTS[4:]]))
+    events, _ = read(path)
+    assert [number for number, *_ in events if number != 3] == [0, 1, 2, *range(4, 500)]

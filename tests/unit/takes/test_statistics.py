@@ -131,6 +131,12 @@ def test_changes_of_parameters_say_what_changed(tmp_path: Path) -> None:
     assert source.components["3d"].visibility == {"a": 1, "b": 1, "c": 1, "marker 1": 1}
 
 
+def test_versions_that_start_again_with_the_gateway_keep_their_own_labels(tmp_path: Path) -> None:
+    again = parameters(labelled("b"), 1, utime=START_UTIME + 15_000)
+    source = lab(tmp_path, [parameters(labelled("a"), 1), markers(1, 0), again, markers(1, 2)])
+    assert source.components["3d"].visibility == {"a": 1, "b": 1}
+
+
 def test_events_are_counted_by_id_with_their_labels(tmp_path: Path) -> None:
     events = [(7, 0, -1, -1, -1), (16, 0, -1, -1, -1), (7, 0, -1, -1, -1)]
     definition = Parameters(events=ParametersEvents((EventDefinition("0x10", "jump"),)))
