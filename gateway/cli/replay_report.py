@@ -53,7 +53,7 @@ class Progress:
         self._hints = hints
         self._console = console
         self._live = Live(console=console, auto_refresh=False, transient=True)
-        self._before = time.monotonic(), player.position_us, 0
+        self._before = time.monotonic(), player.position_us, 0, 0
         self._line_s = time.monotonic()
         if console.is_terminal:
             self._live.start()
@@ -73,8 +73,8 @@ class Progress:
     def _text(self) -> str:
         player = self._player
         now_s, position_us, num_messages = time.monotonic(), player.position_us, player.num_messages
-        before_s, before_us, before_messages = self._before
-        self._before = now_s, position_us, num_messages
+        before_s, before_us, before_messages, before_passes = self._before
+        self._before = now_s, position_us, num_messages, player.num_passes
         passed_s = max(now_s - before_s, 1e-6)
         parts = [time_text(position_us)]
         if self._length_us:
@@ -84,7 +84,8 @@ class Progress:
         if player.is_paused:
             parts.append("paused")
         else:
-            parts.append(f"{max(0.0, (position_us - before_us) / 1e6 / passed_s):,.2f}×")
+            if position_us >= before_us and player.num_passes == before_passes:
+                parts.append(f"{(position_us - before_us) / 1e6 / passed_s:,.2f}×")
             parts.append(f"{(num_messages - before_messages) / passed_s:,.0f} messages/s")
             if player.lateness.num_messages:
                 parts.append(f"late by {1e3 * player.lateness.quantile_s(0.99):.1f} ms (p99)")
