@@ -2,7 +2,7 @@
 
 import threading
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Final
 
@@ -12,8 +12,6 @@ Messages = Sequence[tuple[bytes, bytes]]
 """Messages, each with its channel."""
 
 RETRY_S: Final = 0.25
-_CHUNK_BYTES: Final = 256 * 1024
-"""How much is written at once: the disk accepts all of it, or nothing."""
 
 
 class FileSink:
@@ -55,24 +53,19 @@ class FileSink:
 
     def write(self, messages: Messages) -> None:
         """Write messages; wait while the disk does not accept them."""
-        for chunk in _chunks(messages):
-            self._write(chunk)
-
-    def _write(self, messages: Messages) -> None:
-        while True:
+        rest = messages
+        while rest:
             gives_up = self._gives_up.is_set()
             try:
-                messages = messages[self._log.append(messages) :]
+                rest = rest[self._log.append(rest) :]
             except OSError as error:
                 self._failed(error)
                 if gives_up:
-                    self.lost.update(channel for channel, _ in messages)
+                    self.lost.update(channel for channel, _ in rest)
                     return
                 self._gives_up.wait(RETRY_S)
             else:
-                if not messages:
-                    self.problem = ""
-                    return
+                self.problem = ""
 
     def _failed(self, error: OSError) -> None:
         if not self.problem:
@@ -94,14 +87,3 @@ class FileSink:
         except OSError as error:
             self.is_unsafe = True
             self._failed(error)
-
-
-def _chunks(messages: Messages) -> Iterator[Messages]:
-    start = num_bytes = 0
-    for index, (_, message) in enumerate(messages):
-        if num_bytes + len(message) > _CHUNK_BYTES and index > start:
-            yield messages[start:index]
-            start, num_bytes = index, 0
-        num_bytes += len(message)
-    if start < len(messages):
-        yield messages[start:]

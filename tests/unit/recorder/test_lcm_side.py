@@ -1,0 +1,110 @@
+"""Recording from LCM, whatever is sent there."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import rtc3d
+
+from gateway.messages.stamp import PREFIX
+from gateway.outputs.lcm.connection import open_lcm
+from gateway.recorder.file_sink import FileSink
+from gateway.recorder.lcm_side import LcmSide
+from gateway.recorder.series import FINGERPRINTS
+from gateway.recorder.take_recording import MAX_SOURCES, TakeRecording
+from gateway.recorder.target import Target
+from gateway.takes.event_log import EventLogReader
+from tests.networks import lcm_url
+from tests.waiting import wait_until
+
+pytestmark = pytest.mark.netns
+
+
+class Lab:
+    """A publisher on LCM, and a recording of the source Lab-1, or of all sources."""
+
+    def __init__(self, folder: Path, *sources: str) -> None:
+        target = Target(folder / "walk")
+        url = lcm_url()
+        self.path = folder / "walk.lcmlog"
+        self.lcm = open_lcm(url)
+        self.recording = TakeRecording(lambda names: FileSink(target.open(names)))
+        self.side = LcmSide(url, "MOCAP", sources, None, self.recording)
+
+    def markers(self, sequence: int) -> bytes:
+        return FINGERPRINTS["3d"] + PREFIX.pack(1_000_000, 1_000_000, sequence, 1, 1) + bytes(16)
+
+    def status(self, source: str) -> bytes:
+        message = rtc3d.status_t()
+        message.utime, message.source = 1_000_000, source
+        encoded: bytes = message.encode()
+        return encoded
+
+    def channels(self) -> list[str]:
+        """End the recording and return the channels in the file."""
+        self.recording.stop()
+        assert self.recording.close(10)
+        assert self.recording.defect is None
+        return [event.channel for event in EventLogReader(self.path).events()]
+
+
+@pytest.fixture
+def lab(tmp_path: Path) -> Iterator[Lab]:
+    lab = Lab(tmp_path)
+    yield lab
+    lab.side.close()
+
+
+def names(lab: Lab) -> set[str]:
+    return {source.name for source in lab.recording.sources_now}
+
+
+def test_the_status_says_the_name_of_a_source(lab: Lab) -> None:
+    lab.lcm.publish("MOCAP_LAB_1_3D", lab.markers(1))
+    wait_until(lambda: names(lab) == {"lab_1"})
+    lab.lcm.publish("MOCAP_LAB_1_STATUS", lab.status("Robot"))  # the name of another source
+    lab.lcm.publish("MOCAP_LAB_1_STATUS", lab.status("Lab-1"))
+    wait_until(lambda: names(lab) == {"Lab-1"})
+
+
+def test_what_is_no_message_of_a_gateway_is_left_out(lab: Lab) -> None:
+    lab.lcm.publish("MOCAP_LAB_3D", lab.markers(1))
+    for channel in (
+        "MOCAP_LAB_3D",
+        "MOCAP_LAB_STATUS",
+        "MOCAP__",
+        "MOCAP_LAB_6D_",
+        "MOCAP_X",
+        "MOCAP_LAB_TAKE",
+    ):
+        for message in (b"", b"x" * 39, bytes(1000), FINGERPRINTS["status"] + bytes(40), FINGERPRINTS["6d/"]):
+            lab.lcm.publish(channel, message)
+    lab.lcm.publish("MOCAP_LAB_ANALOG", lab.markers(2))  # markers on a channel of analog data
+    lab.lcm.publish("MOCAP_LAB_PARAMETERS_REQUEST", rtc3d.parameters_request_t().encode())
+    lab.lcm.publish("MOCAP_LAB_3D", lab.markers(2))
+    wait_until(lambda: lab.recording.num_foreign > 10)
+    wait_until(
+        lambda: sum(series.key == "3d" and series.num_messages for series in lab.recording.all_series) == 2
+    )
+    channels = lab.channels()
+    assert channels.count("MOCAP_LAB_3D") == 2
+    assert "MOCAP_LAB_ANALOG" not in channels
+    assert "MOCAP_LAB_PARAMETERS_REQUEST" not in channels
+
+
+def test_sources_are_bounded(lab: Lab) -> None:
+    for number in range(200):
+        lab.lcm.publish(f"MOCAP_S{number}_3D", lab.markers(1))
+    wait_until(lambda: lab.recording.num_beyond == 200 - MAX_SOURCES)
+    assert len(lab.recording.sources) == MAX_SOURCES
+
+
+def test_only_the_chosen_sources_are_received(tmp_path: Path) -> None:
+    lab = Lab(tmp_path, "Lab-1")
+    for channel in ("MOCAP_LAB_1_3D", "MOCAP_LAB_10_3D", "MOCAP_ROBOT_3D", "XMOCAP_LAB_1_3D"):
+        lab.lcm.publish(channel, lab.markers(1))
+    lab.lcm.publish("MOCAP_LAB_1_STATUS", lab.status("Lab-1"))
+    wait_until(lambda: lab.recording.num_messages == 2)
+    assert names(lab) == {"Lab-1"}
+    assert lab.channels() == ["MOCAP_LAB_1_TAKE", "MOCAP_LAB_1_3D", "MOCAP_LAB_1_STATUS"]
+    lab.side.close()
