@@ -160,9 +160,9 @@ class LcmRig:
 
 
 class TakesRig:
-    """A folder that comes and goes, with a running take of each source."""
+    """A folder that comes and goes, with a running take of each source. A file takes its place meanwhile."""
 
-    remedies = ("is the disk mounted", "does its disk respond")
+    remedies = ("choose a folder", "does its disk respond")
 
     def __init__(self) -> None:
         self.names = LCM_CHANNELS
@@ -187,8 +187,10 @@ class TakesRig:
 
     def cut(self) -> None:
         self._folder.rename(self._folder.with_name("gone"))
+        self._folder.write_text("no folder")
 
     def restore(self) -> None:
+        self._folder.unlink()
         self._folder.with_name("gone").rename(self._folder)
 
     def close(self) -> None:

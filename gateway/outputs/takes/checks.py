@@ -26,8 +26,13 @@ def check_takes(
 ) -> list[Finding]:
     """Check that takes can be recorded; ``loads`` say how long the disk lasts."""
     directory = settings.effective_directory
+    if not directory.exists():
+        note = _takes.note(
+            "folder", f"{directory} does not exist yet", "The gateway creates it when it starts."
+        )
+        return [note, *(_takes.not_tested(check, "the folder does not exist yet") for check in CHECKS[1:])]
     try:
-        check_directory(directory, is_own=settings.directory is None)
+        check_directory(directory)
         with _probe(directory):
             pass
     except OSError as error:

@@ -16,7 +16,7 @@ _REMEDIES: Final = {
     errno.EACCES: "let the gateway write there",
     errno.EPERM: "let the gateway write there",
     errno.EROFS: "mount it so that the gateway can write",
-    errno.ENOENT: "is the disk mounted? If so, create the folder",
+    errno.ENOENT: "is the disk mounted? If so, create the folder, or start the gateway again",
     errno.ENOTDIR: "choose a folder as takes.directory",
 }
 

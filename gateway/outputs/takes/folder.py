@@ -74,13 +74,12 @@ class TakeEntry:
 class TakesFolder:
     """The folder of the takes of all sources: DIRECTORY/SOURCE/NAME.lcmlog, or a folder NAME of saved logs.
 
-    Other files do not belong to the gateway: it leaves them alone. ``is_own`` says that the gateway may
-    create the folder. One that is configured may be on a disk that is not mounted now.
+    Other files do not belong to the gateway: it leaves them alone.
     """
 
-    def __init__(self, directory: Path, *, is_own: bool) -> None:
+    def __init__(self, directory: Path) -> None:
         self.directory = directory
-        self._is_own = is_own
+        self._was_open = False
         self._lock: int | None = None
         self._opening = threading.Lock()
         self._times: dict[tuple[Path, int, int], tuple[int, float]] = {}  # of takes, by path, size and time
@@ -90,7 +89,13 @@ class TakesFolder:
     def open(self) -> str:
         """Check whether takes can be written here; return what is wrong, or "". May be called again."""
         try:
-            check_directory(self.directory, is_own=self._is_own)
+            if (
+                not self._was_open
+            ):  # later, a folder that is missing is on a disk that is not mounted any more
+                with contextlib.suppress(FileExistsError):  # a file is there instead, as check_directory says
+                    self.directory.mkdir(parents=True, exist_ok=True)
+            check_directory(self.directory)
+            self._was_open = True
             with self._opening:
                 return self._take_lock()
         except OSError as error:
@@ -269,10 +274,8 @@ def add_c3d(take: Path, c3d_file: Path) -> Path:
     return path
 
 
-def check_directory(directory: Path, *, is_own: bool) -> None:
-    """Check that files can be created in a folder; create it if it ``is_own``. Raises OSError."""
-    if is_own:
-        directory.mkdir(parents=True, exist_ok=True)
+def check_directory(directory: Path) -> None:
+    """Check that files can be created in a folder. Raises OSError."""
     if not stat.S_ISDIR(directory.stat().st_mode):
         raise NotADirectoryError(errno.ENOTDIR, "it is not a folder")
     if not os.access(directory, os.W_OK | os.X_OK):

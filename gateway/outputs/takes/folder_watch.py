@@ -24,7 +24,7 @@ class FolderWatch:
     """Checks the folder of ``settings`` in a thread of its own, because its disk may not respond."""
 
     def __init__(self, settings: TakesSettings) -> None:
-        self.folder = TakesFolder(settings.effective_directory, is_own=settings.directory is None)
+        self.folder = TakesFolder(settings.effective_directory)
         self.is_checked = False
         """Whether it has been checked once."""
         self.excess_bytes = 0

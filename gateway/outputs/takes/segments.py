@@ -113,7 +113,8 @@ class RollingSegments(LogSink):
         return self._log
 
     def _new_log(self, utime: int) -> LogFile:
-        self._folder.mkdir(parents=True, exist_ok=True)
+        for folder in (self._folder.parent, self._folder):  # not those above: their disk may be missing
+            folder.mkdir(exist_ok=True)
         name = f"{default_name(self.header.description.source)}-{self._num_segments:06}"
         log = self.header.begin_log(self._folder / f"{name}{SUFFIX}", name, utime)
         self._num_segments += 1

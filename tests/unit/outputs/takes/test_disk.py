@@ -88,15 +88,17 @@ async def test_a_take_that_ends_on_a_full_disk_counts_what_is_missing(tmp_path: 
     assert amounts(losses.report()) == {"not written": (stopped.num_lost, stopped.num_lost)}
 
 
-async def test_a_folder_that_is_missing_is_not_created(tmp_path: Path) -> None:
-    lab = RecordingLab(tmp_path / "takes")
+async def test_a_folder_that_does_not_exist_is_created_at_the_start_only(tmp_path: Path) -> None:
+    lab = RecordingLab(tmp_path / "disk" / "takes")
     lab.output.start()
     try:
+        await until_problem(lab, "")
+        (tmp_path / "disk").rename(tmp_path / "unmounted")
         await until_problem(lab, "No such file or directory; is the disk mounted?")
         with pytest.raises(QueryError, match="is the disk mounted") as refused:
             await lab.takes.start("lab", "walk")
         assert refused.value.code == "disk"
-        (tmp_path / "takes").mkdir()
+        (tmp_path / "unmounted").rename(tmp_path / "disk")
         await until_problem(lab, "")
         await lab.takes.start("lab", "walk")
     finally:
