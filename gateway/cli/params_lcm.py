@@ -4,6 +4,7 @@ import rtc3d
 
 from gateway.cli.lcm_client import ask_lcm
 from gateway.cli.params_query import ParametersReply, Replies, Sections
+from gateway.messages.parameters_text import xml_bytes
 
 
 def query_lcm(
@@ -30,7 +31,7 @@ def query_lcm(
         timeout_s=timeout_s,
     )
     received = [
-        ParametersReply(name, sections, reply.xml.encode(), reply.age_s)
+        ParametersReply(name, sections, xml_bytes(reply.xml), reply.age_s)
         for name, reply in replies.received.items()
     ]
     return Replies(received, replies.problems)

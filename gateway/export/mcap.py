@@ -18,6 +18,7 @@ from gateway.export.job import ExportJob, nothing_to_export
 from gateway.export.mcap_file import McapFile
 from gateway.messages.decode import decode
 from gateway.messages.encode import ITEMS_OFFSET
+from gateway.messages.parameters_text import xml_bytes
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_changes import differ_in_statistics_only
@@ -130,7 +131,7 @@ class _SourceExport:
             decoded = decode(message)
         except ProtocolError:
             return  # open_take has counted it
-        xml: bytes = decoded.xml.encode(errors="surrogatepass")
+        xml = xml_bytes(decoded.xml)
         if self._num_attached and differ_in_statistics_only(self._xml, xml):
             return
         self._xml = xml

@@ -6,6 +6,15 @@ from typing import Final
 _DECLARED_ENCODING: Final = re.compile(r"""\s*<\?xml[^>]*\sencoding\s*=\s*["']([A-Za-z0-9._-]+)["']""")
 
 
+def xml_text(xml: bytes) -> str:
+    """Return XML as text (UTF-8, otherwise Latin-1), without the NULs at its end (field note 9)."""
+    body = xml.rstrip(b"\0")
+    try:
+        return body.decode()
+    except UnicodeDecodeError:
+        return body.decode("latin-1")
+
+
 def xml_bytes(text: str) -> bytes:
     """Return the XML of a ``parameters_t`` or ``parameters_reply_t`` as the server sent it.
 

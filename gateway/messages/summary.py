@@ -8,6 +8,7 @@ import rtc3d
 
 from gateway.errors import ParametersError
 from gateway.losses import counts_text
+from gateway.messages.parameters_text import xml_bytes
 from gateway.rtc3d.parameters_xml import parse_parameters
 
 _MAX_SHOWN: Final = 4
@@ -23,13 +24,13 @@ def summarise(message: Any) -> str:
             text = f"#{message.sequence} {_clock(message.clock)} ({message.components})"
         case rtc3d.parameters_t():
             version = f"session {message.session}, version {message.parameters_version}"
-            text = f"#{message.sequence} {version}: {summarise_xml(message.xml.encode())}"
+            text = f"#{message.sequence} {version}: {summarise_xml(xml_bytes(message.xml))}"
         case rtc3d.parameters_request_t():
             sections = " ".join(message.sections) or "all"
             fresh = ", fresh" if message.fresh else ""
             text = f"request {message.request_id} from {message.requester!r}: {sections}{fresh}"
         case rtc3d.parameters_reply_t():
-            content = message.error or f"{summarise_xml(message.xml.encode())}, {message.age_s:.1f} s old"
+            content = message.error or f"{summarise_xml(xml_bytes(message.xml))}, {message.age_s:.1f} s old"
             text = f"reply {message.request_id} to {message.requester!r}: {content}"
         case rtc3d.command_request_t():
             command = " ".join([message.command, *message.options])

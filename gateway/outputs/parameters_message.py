@@ -4,6 +4,7 @@ from typing import Final
 
 import rtc3d
 
+from gateway.messages.parameters_text import xml_text
 from gateway.outputs.contract import ServerParameters
 
 _UTIME: Final = slice(8, 16)
@@ -29,12 +30,3 @@ def encode_parameters(
 def published_again(message: bytes, utime: int) -> bytes:
     """Return an encoded ``parameters_t`` as of a later time, in µs since the Unix epoch."""
     return message[: _UTIME.start] + utime.to_bytes(8, "big", signed=True) + message[_UTIME.stop :]
-
-
-def xml_text(xml: bytes) -> str:
-    """Return XML as text (UTF-8, otherwise Latin-1), without the NULs at its end (field note 9)."""
-    body = xml.rstrip(b"\0")
-    try:
-        return body.decode()
-    except UnicodeDecodeError:
-        return body.decode("latin-1")

@@ -12,6 +12,7 @@ import rtc3d
 
 from gateway.errors import OutputError, ProtocolError
 from gateway.messages.decode import decode
+from gateway.messages.parameters_text import xml_bytes
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.settings import lcm_queries_url
@@ -138,7 +139,7 @@ class LcmSide:
         parameters = None
         if not reply.error:
             parameters = self._recording.parameters_message(
-                source, reply.xml.encode(), None, reply.parameters_version, min(max(0.0, reply.age_s), 1e9)
+                source, xml_bytes(reply.xml), None, reply.parameters_version, min(max(0.0, reply.age_s), 1e9)
             )
         self._recording.answered(source, parameters)
 

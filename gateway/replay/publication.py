@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple
 from gateway.errors import OutputError, ParametersError, ProtocolError
 from gateway.messages.decode import decode, message_type
 from gateway.messages.encode import CONTENT_OFFSET, lcm_type_name
+from gateway.messages.parameters_text import xml_bytes
 from gateway.messages.topics import Topic, lcm_channel, unique_name
 from gateway.outputs.contract import Output, ServerParameters
 from gateway.rtc3d.parameters_xml import parse_parameters
@@ -138,7 +139,7 @@ class Publication:
             self.num_surplus += 1
             return
         parameters = ServerParameters(
-            recorded.xml.encode(), recorded.session, recorded.parameters_version, message=message
+            xml_bytes(recorded.xml), recorded.session, recorded.parameters_version, message=message
         )
         before = source.parameters
         source.parameters, source.published_s = parameters, time.monotonic()

@@ -10,9 +10,10 @@ from typing import Any, Final
 import rtc3d
 
 from gateway.messages.host_time import now_utime
+from gateway.messages.parameters_text import xml_text
 from gateway.outputs.contract import QueryService, ServerParameters
 from gateway.outputs.lcm.requests import LONG_REPLY_BYTES, ReplyContent, RequestKind
-from gateway.outputs.parameters_message import encode_parameters, xml_text
+from gateway.outputs.parameters_message import encode_parameters
 from gateway.outputs.send_thread import SendThread
 
 REPEAT_S: Final = 5.0

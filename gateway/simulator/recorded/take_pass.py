@@ -1,13 +1,13 @@
 """Reading a take from its beginning to its end: the moments of one source."""
 
 import itertools
-import re
 from collections.abc import Iterator
 from typing import Final
 
 from gateway.errors import ProtocolError
 from gateway.messages.decode import decode, prefix_of
 from gateway.messages.encode import CONTENT_OFFSET
+from gateway.messages.parameters_text import xml_bytes
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.simulator.recorded.frame_contents import is_whole
 from gateway.simulator.recorded.moments import Moment, MomentBuilder, Recorded
@@ -22,8 +22,6 @@ _RANGE_SLACK_US: Final = 5_000_000
 
 _MAX_VERSIONS: Final = 1000
 """How many versions of the parameters are remembered: a faulty server can change them all the time."""
-
-_LATIN_1: Final = re.compile(r"""\s*<\?xml[^>]*encoding\s*=\s*["'](iso-8859-1|latin-?1)["']""", re.IGNORECASE)
 
 
 class TakePass:
@@ -74,7 +72,7 @@ class TakePass:
         except ProtocolError:
             self.num_malformed += 1
             return
-        xml = _xml_bytes(content.xml)
+        xml = xml_bytes(content.xml)
         if not xml:  # the server gives no parameters any more
             self._newest = None
             self._versions.pop(content.parameters_version, None)
@@ -105,13 +103,3 @@ class TakePass:
                 self._versions.get(prefix.parameters_version) or self._newest or self.default,
             )
         )
-
-
-def _xml_bytes(text: str) -> bytes:
-    """Return the XML of a ``parameters_t`` as the server encoded it."""
-    if _LATIN_1.match(text):
-        try:
-            return text.encode("latin-1")
-        except UnicodeEncodeError:
-            pass
-    return text.encode()
