@@ -48,7 +48,7 @@ def _head(statistics: TakeStatistics) -> Iterator[str]:
     yield f"{safe_text(str(statistics.path))}: {_bytes(statistics.num_bytes)}{files}"
     yield (
         f"{_local_time(statistics.start_utime)}, {_duration(statistics.seconds)}, "
-        f"{statistics.num_messages} messages"
+        f"{_count(statistics.num_messages, 'message')}"
     )
 
 

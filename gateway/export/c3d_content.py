@@ -75,7 +75,7 @@ def content_of(job: ExportJob, measurement: Measurement) -> C3dContent:
     first, stop = _complete_rows(measurement, analog or forces, samples)
     left_out = measurement.grid.num_rows - (stop - first)
     if left_out:
-        job.note(f"{left_out} frames at the ends were left out: the take has no analog samples for them")
+        job.note(f"frames at the ends were left out because they have no analog samples: {left_out}")
     parameters = base.series.parameters_of(0)
     unit = (base.series.unit if markers else parameters.markers and parameters.markers.unit) or "mm"
     plates = plan_plates(job, parameters, unit, analog, forces)

@@ -85,6 +85,12 @@ def plan_plates(
     plans: list[PlatePlan] = []
     num_channels = 0 if analog is None else analog.num_items
     plates = parameters.force.plates if parameters.force else ()
+    unknown = 0 if forces is None else forces.num_items - len(plates)
+    if unknown > 0:
+        job.note(
+            f"forces of plates without parameters were left out: {unknown}, because their corners are not "
+            "known; export to .csv has them"
+        )
     for index, plate in enumerate(plates[:MAX_LIST]):
         name = f"force plate {index + 1}" + (f" ({plate.label})" if plate.label else "")
         geometry = geometry_of(plate, unit)

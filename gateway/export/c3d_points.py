@@ -21,7 +21,7 @@ def encode_points(markers: Array, step: float) -> Array:
     the residual.
     """
     words = markers.copy()
-    steps = np.clip(np.round(np.nan_to_num(markers[..., 3]) / step), 0, _MAX_STEPS)
+    steps = np.clip(np.round(np.nan_to_num(markers[..., 3]).astype(np.float64) / step), 0, _MAX_STEPS)
     words[..., 3] = steps * _BOTH_BYTES
     words[np.isnan(markers[..., :3]).any(axis=2)] = _MISSING
     return words
@@ -42,7 +42,7 @@ def residual_step(blocks: Iterable[Array]) -> float:
             different, is_exact = different[[0, -1]], False
     if not len(different):
         return 1.0
-    multiples = different / different[0]
+    multiples = different.astype(np.float64) / different[0]  # a damaged one may be 1e-40
     is_exact = is_exact and multiples[-1] <= _MAX_STEPS + 0.5
     is_exact = is_exact and bool(np.allclose(multiples, np.round(multiples), rtol=1e-5))
     return float(different[0] if is_exact else different[-1] / np.float32(_MAX_STEPS))

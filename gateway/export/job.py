@@ -62,6 +62,11 @@ class ExportJob:
             )
             count = sum(take.unknown.values())
             self.note(f"messages of other programs were left out: {count}, on the channels {channels}")
+        for source in take.sources.values():
+            if not source.parameters:
+                self.note(
+                    f"the take has no parameters of {source.name}: labels, units and rates are not known"
+                )
         if components is None:
             self.note_malformed(take)
         return take

@@ -2,6 +2,7 @@
 
 import math
 import os
+import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -426,9 +427,24 @@ def test_a_long_recording_has_all_its_frames(tmp_path: Path) -> None:
     assert np.array_equal(read_independently(tmp_path / "out.c3d").points[:, 0, 0], expected)
 
 
+def test_residuals_of_a_damaged_frame_cause_no_warning(tmp_path: Path) -> None:
+    items = [(1.0, 2.0, 3.0, 1e-40), (1.0, 2.0, 3.0, 0.5), (1.0, 2.0, 3.0, math.inf)]
+    frames = [frame(ComponentType.MARKERS, items, n) for n in range(3)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        export_messages(tmp_path, [labelled("a", "b", "c"), *frames], "out.c3d")
+    residuals = read_independently(tmp_path / "out.c3d").points[0, :, 3]
+    assert residuals[0] == 0
+    assert residuals[1] == pytest.approx(0.5, rel=1e-3)
+
+
 def test_a_take_without_parameters(tmp_path: Path) -> None:
-    messages = [message for message in scene_messages(SCENE, 20) if "FORCE" not in message[0]]
-    export_messages(tmp_path, [description(), *messages], "out.c3d")
+    job = export_messages(tmp_path, [description(), *scene_messages(SCENE, 20)], "out.c3d")
+    assert job.notes == [
+        "the take has no parameters of lab: labels, units and rates are not known",
+        "forces of plates without parameters were left out: 2, because their corners are not known; "
+        "export to .csv has them",
+    ]
     content = read_ezc3d(tmp_path / "out.c3d")
     assert content["parameters"]["POINT"]["LABELS"]["value"] == [f"marker {n}" for n in range(1, 6)]
     assert content["parameters"]["POINT"]["RATE"]["value"].tolist() == [100]
