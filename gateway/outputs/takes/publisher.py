@@ -34,11 +34,6 @@ class TakesPublisher:
         """Whether messages are recorded now."""
         return bool(self._targets)
 
-    @property
-    def is_closed(self) -> bool:
-        """Whether the publisher is closed."""
-        return self._is_closed
-
     def set_targets(self, recorder: Recorder | None, targets: list[tuple[Any, bytes]]) -> None:
         """Record in these sinks, under these channels, from now on."""
         self._recorder = recorder

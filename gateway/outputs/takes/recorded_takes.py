@@ -8,16 +8,17 @@ from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, Final
 
 from gateway.errors import OutputError, QueryError, TakeError
 from gateway.messages.host_time import now_utime
 from gateway.outputs.takes.disk import Disk, disk_problem
+from gateway.outputs.takes.disk_calls import DiskReader, disk_result
 from gateway.outputs.takes.folder import ROLLING, TakesFolder, add_c3d
 from gateway.outputs.takes.folder_watch import FolderWatch
 from gateway.outputs.takes.header import FileHeader, SourceDescription
 from gateway.outputs.takes.names import check_name, default_name
-from gateway.outputs.takes.segments import RollingSegments, Save
+from gateway.outputs.takes.segments import RollingSegments
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.source_recording import SourceRecording
 from gateway.outputs.takes.stored import SourceTakes, StoredTake, TakePiece
@@ -31,23 +32,16 @@ MAX_AFTER_S: Final = 3600.0
 MAX_SAVES: Final = 16
 """How many takes of a source may be saved at a time, each with links to the same segments."""
 
-_TIMEOUT_S: Final = 4.0
-"""How long a peer waits for the disk."""
-
 _CLOSE_S: Final = 0.8
 """How long the end of the gateway waits for the disk."""
-
-_Result = TypeVar("_Result")
 
 logger = logging.getLogger(__name__)
 
 
 class RecordedTakes:
-    """The takes of all sources. Call it in the event loop; no call waits for the disk for long.
+    """The takes of all sources (see Takes). Call it in the event loop; no call waits for the disk for long.
 
-    The methods for peers raise QueryError: bad-request for a name or number that cannot be, a take that
-    exists or is running already, or does not exist; nothing-yet if there is nothing to stop or save; disk if
-    the folder cannot be used. The text is for the peer. ``server`` returns HOST:PORT of a source's server.
+    ``server`` returns HOST:PORT of a source's server.
     """
 
     def __init__(self, settings: TakesSettings, max_queued_bytes: int = MAX_QUEUED_BYTES) -> None:
@@ -59,7 +53,7 @@ class RecordedTakes:
         self._recorder: Recorder | None = None
         self._is_closed = False
         self._recordings: dict[str, SourceRecording] = {}
-        self._read_thread = WorkerThread("takes-read")
+        self._reader = DiskReader()
         self._copy_thread = WorkerThread("takes-copy")
 
     @property
@@ -69,10 +63,7 @@ class RecordedTakes:
     # For peers.
 
     async def start(self, source: str, name: str = "") -> StoredTake:
-        """Start a take and return it; everything that is published after this call is in it.
-
-        "" means a name of source and time. A source has one running take.
-        """
+        """See Takes."""
         return await self.begin(source, name, has_free_name=not name)
 
     def begin(self, source: str, name: str, *, has_free_name: bool) -> Coroutine[Any, Any, StoredTake]:
@@ -105,11 +96,11 @@ class RecordedTakes:
         self, recorder: Recorder, recording: SourceRecording, take: TakeFile, created: Future[None]
     ) -> StoredTake:
         try:
-            await self._done(created, take.path)
+            await disk_result(created, take.path)
         except QueryError:
             take.cancel()
             recorder.call(take.discard)
-            self._detach(recording, take)
+            recording.detach(take)
             raise
         logger.info("takes: recording %s", take.path)
         return StoredTake(take.name, 0, take.utime, 0.0, is_running=True)
@@ -120,7 +111,7 @@ class RecordedTakes:
         return None if recording is None else recording.take
 
     async def stop(self, source: str) -> StoredTake:
-        """End the running take, and return it when everything is on the disk."""
+        """See Takes."""
         return await self.end(source)
 
     def end(self, source: str) -> Coroutine[Any, Any, StoredTake]:
@@ -129,20 +120,17 @@ class RecordedTakes:
         take = recording.take
         if take is None:
             raise QueryError(f"no take of source {source!r} is running", code="nothing-yet")
-        return self._ended(take, self._end_take(recorder, recording, take))
+        return self._ended(take, recording.end_take(recorder, take))
 
     async def _ended(self, take: TakeFile, ended: Future[None]) -> StoredTake:
-        await self._done(ended, take.path)
-        stored = await self._read(partial(self._folder.take_at, take.stem), take.path)
+        await disk_result(ended, take.path)
+        stored = await self._reader.read(partial(self._folder.take_at, take.stem), take.path)
         return stored._replace(num_lost=take.num_lost)
 
     async def save(
         self, source: str, last_s: float = math.inf, after_s: float = 0.0, name: str = ""
     ) -> StoredTake:
-        """Keep the last ``last_s`` seconds as a take, which goes on for ``after_s`` seconds.
-
-        Returns it at once; it is running until it is complete.
-        """
+        """See Takes."""
         recording, recorder = self._announced(source), self._open_recorder()
         if name:
             check_name(name)
@@ -166,37 +154,41 @@ class RecordedTakes:
         folder = self._folder.directory / source / (name or default_name(source))
         since_s = now_s - last_s
         call = partial(segments.save, folder, since_s, has_free_name=not name, goes_on=after_s > 0)
-        save = await self._done(recorder.call(call), folder)
+        save = await disk_result(recorder.call(call), folder)
         if after_s > 0:
             loop = asyncio.get_running_loop()
             delay_s = max(0.0, now_s + after_s - time.monotonic())
-            recording.saves[save] = loop.call_later(delay_s, self._end_save, recorder, recording, save)
+            recording.saves[save] = loop.call_later(delay_s, recording.end_save, recorder, save)
         else:
             recording.ended(save.folder)
         logger.info("takes: saving %s", save.folder)
-        stored = await self._read(partial(self._folder.take_at, save.folder), folder)
+        stored = await self._reader.read(partial(self._folder.take_at, save.folder), folder)
         return stored._replace(is_running=after_s > 0)
 
     async def list(self, source: str) -> SourceTakes:
-        """Return the takes of a source."""
+        """See Takes."""
         recording = self._announced(source)
         folder, running = self._folder, recording.running_names
-        takes = await self._read(partial(folder.takes, source, running), folder.directory)
+        takes = await self._reader.read(partial(folder.takes, source, running), folder.directory)
         current: StoredTake | None = None
         if recording.take is not None:
-            stored = await self._read(partial(folder.take_at, recording.take.stem), recording.take.path)
+            stored = await self._reader.read(
+                partial(folder.take_at, recording.take.stem), recording.take.path
+            )
             current = stored._replace(is_running=True, num_lost=recording.take.num_lost)
             takes = [current if take.name == current.name else take for take in takes]
         kept_s = 0.0 if recording.segments is None else recording.segments.kept_s()
         return SourceTakes(current, takes, kept_s)
 
     async def read(self, source: str, name: str, offset: int) -> TakePiece:
-        """Return up to MAX_PIECE_BYTES of a take; an empty piece at its end."""
+        """See Takes."""
         self._announced(source)
         check_name(name)
         if offset < 0:
             raise QueryError(f"expected an offset of 0 or more; found {offset}")
-        return await self._read(partial(self._folder.read, source, name, offset), self._folder.directory)
+        return await self._reader.read(
+            partial(self._folder.read, source, name, offset), self._folder.directory
+        )
 
     def _announced(self, source: str) -> SourceRecording:
         recording = self._recordings.get(source)
@@ -215,22 +207,6 @@ class RecordedTakes:
             raise QueryError(problem, code="disk")
         return recorder
 
-    async def _read(self, call: Callable[[], _Result], path: Path) -> _Result:
-        return await self._done(self._read_thread.submit(call), path)
-
-    async def _done(self, future: Future[_Result], path: Path) -> _Result:
-        """Return the result of a call in a thread. Raises QueryError in place of errors of the disk."""
-        try:
-            async with asyncio.timeout(_TIMEOUT_S):
-                return await asyncio.shield(asyncio.wrap_future(future))  # what was asked for happens later
-        except TimeoutError:
-            text = f"the disk of {path} did not respond within {_TIMEOUT_S:g} s; check it"
-            raise QueryError(text, code="disk") from None
-        except OSError as error:
-            raise QueryError(disk_problem(path, error), code="disk") from error
-        except TakeError as error:
-            raise QueryError(str(error), code="disk") from error
-
     # Sources.
 
     def recording(self, source: str) -> SourceRecording:
@@ -246,8 +222,8 @@ class RecordedTakes:
     def withdraw(self, source: str) -> None:
         """End everything that is recorded of a source, and accept no takes of it."""
         recording = self._recordings.pop(source, None)
-        if recording is not None:
-            self._end(recording)
+        if recording is not None and self._recorder is not None:
+            recording.end(self._recorder)
 
     def _keep(self, recording: SourceRecording) -> None:
         """Begin rolling segments of a source if they are switched on."""
@@ -268,41 +244,6 @@ class RecordedTakes:
         source = recording.source
         description = SourceDescription(source, self.settings.prefix, self.server(source))
         return FileHeader(description, recording.parameters)
-
-    def _detach(self, recording: SourceRecording, take: TakeFile) -> None:
-        recording.remove(take)
-        if recording.take is take:
-            recording.take = None
-
-    def _end_take(self, recorder: Recorder, recording: SourceRecording, take: TakeFile) -> Future[None]:
-        self._detach(recording, take)
-        recording.ended(take.stem)
-        take.give_up()
-        return recorder.call(take.end)
-
-    def _end_save(self, recorder: Recorder, recording: SourceRecording, save: Save) -> None:
-        timer = recording.saves.pop(save, None)
-        if timer is not None:
-            timer.cancel()
-        recording.ended(save.folder)
-        if recording.segments is not None:
-            recorder.call(partial(recording.segments.end_save, save))
-
-    def _end_segments(self, recorder: Recorder, recording: SourceRecording) -> None:
-        for save in [*recording.saves]:
-            self._end_save(recorder, recording, save)
-        segments, recording.segments = recording.segments, None
-        if segments is not None:
-            recording.remove(segments)
-            segments.give_up()
-            recorder.call(segments.close)
-
-    def _end(self, recording: SourceRecording) -> None:
-        recorder = self._recorder
-        if recorder is not None:
-            if recording.take is not None:
-                self._end_take(recorder, recording, recording.take)
-            self._end_segments(recorder, recording)
 
     def add_c3d(self, source: str, c3d_file: Path) -> None:
         """Link or copy a C3D file beside the take to which it belongs, if there is one."""
@@ -384,10 +325,7 @@ class RecordedTakes:
                 f"{names} ends, because {limit}, and no other take can be deleted; raise takes.max_bytes",
                 frames=0,
             )
-            if recording.take is not None:
-                self._end_take(recorder, recording, recording.take)
-            for save in [*recording.saves]:
-                self._end_save(recorder, recording, save)
+            recording.end_takes(recorder)
         if not recordings:
             for recording in self._recordings.values():
                 if recording.segments is not None:
@@ -409,15 +347,14 @@ class RecordedTakes:
             if segments is not None and settings.keep_last_s and _same_files(settings, before):
                 recorder.call(partial(segments.keep, settings.keep_last_s))
             elif segments is not None or settings.keep_last_s:
-                self._end_segments(recorder, recording)
+                recording.end_segments(recorder)
                 self._keep(recording)
 
     def cancel_timers(self) -> None:
         """Forget when takes that are being saved would end, because the gateway stops."""
         for recording in self._recordings.values():
             for timer in recording.saves.values():
-                if timer is not None:
-                    timer.cancel()
+                timer.cancel()
 
     def close(self) -> None:
         """End all takes and wait for the disk, but not for long. Called in a thread."""
@@ -427,7 +364,7 @@ class RecordedTakes:
         recorder = self._recorder
         if recorder is not None:
             for recording in self._recordings.values():
-                self._end(recording)
+                recording.end(recorder)
             if not recorder.close(_CLOSE_S):
                 logger.warning(
                     "takes: the disk of %s does not respond; %d bytes are not written",

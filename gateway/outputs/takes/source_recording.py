@@ -72,7 +72,7 @@ class SourceRecording:
         self.take: TakeFile | None = None
         """The running take."""
         self.segments: RollingSegments | None = None
-        self.saves: dict[Save, asyncio.TimerHandle | None] = {}
+        self.saves: dict[Save, asyncio.TimerHandle] = {}
         """The takes that are being saved, and what will end them."""
         self.parameters: bytes | None = None
         """The newest ``parameters_t``."""
@@ -193,3 +193,47 @@ class SourceRecording:
         if self._newest_take is not None and time.monotonic() - self._newest_take[1] <= C3D_WAIT_S:
             return self._newest_take[0]
         return None
+
+    def detach(self, take: TakeFile) -> None:
+        """Record nothing in a take from now on."""
+        self.remove(take)
+        if self.take is take:
+            self.take = None
+
+    def end_take(self, recorder: Recorder, take: TakeFile) -> Future[None]:
+        """End a take; the future is done when its file is complete."""
+        self.detach(take)
+        self.ended(take.stem)
+        take.give_up()
+        return recorder.call(take.end)
+
+    def end_save(self, recorder: Recorder, save: Save) -> None:
+        """End a take that is being saved."""
+        timer = self.saves.pop(save, None)
+        if timer is not None:
+            timer.cancel()
+        self.ended(save.folder)
+        if self.segments is not None:
+            recorder.call(partial(self.segments.end_save, save))
+
+    def end_takes(self, recorder: Recorder) -> None:
+        """End the running take, and those that are being saved."""
+        if self.take is not None:
+            self.end_take(recorder, self.take)
+        for save in [*self.saves]:
+            self.end_save(recorder, save)
+
+    def end_segments(self, recorder: Recorder) -> None:
+        """End the rolling segments, and the takes that are being saved from them."""
+        for save in [*self.saves]:
+            self.end_save(recorder, save)
+        segments, self.segments = self.segments, None
+        if segments is not None:
+            self.remove(segments)
+            segments.give_up()
+            recorder.call(segments.close)
+
+    def end(self, recorder: Recorder) -> None:
+        """End everything that is recorded."""
+        self.end_takes(recorder)
+        self.end_segments(recorder)

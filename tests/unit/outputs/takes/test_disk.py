@@ -13,7 +13,7 @@ import pytest
 
 from gateway.errors import OutputError, QueryError
 from gateway.losses import Losses
-from gateway.outputs.takes import recorded_takes
+from gateway.outputs.takes import disk_calls
 from tests.losses import amounts
 from tests.recording_output import RecordingLab, frames, recording_lab
 from tests.waiting import wait_until_async
@@ -144,7 +144,7 @@ async def test_a_take_whose_file_is_removed_continues_in_a_new_one(
 async def test_a_disk_that_does_not_respond_is_reported_and_delays_nobody(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorded_takes, "_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.2)
     async with recording_lab(tmp_path) as lab:
         lab.path("").mkdir()
         os.mkfifo(lab.path("walk.lcmlog.x"))

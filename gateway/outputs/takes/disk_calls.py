@@ -1,0 +1,41 @@
+"""Waiting for calls that need the disk, on behalf of peers."""
+
+import asyncio
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Final, TypeVar
+
+from gateway.errors import QueryError, TakeError
+from gateway.outputs.takes.disk import disk_problem
+from gateway.worker_thread import WorkerThread
+
+_TIMEOUT_S: Final = 4.0
+"""How long a peer waits for the disk."""
+
+_Result = TypeVar("_Result")
+
+
+class DiskReader:
+    """A thread that reads the disk for peers."""
+
+    def __init__(self) -> None:
+        self._thread = WorkerThread("takes-read")
+
+    async def read(self, call: Callable[[], _Result], path: Path) -> _Result:
+        """Return the result of ``call``, which reads ``path``. Raises QueryError."""
+        return await disk_result(self._thread.submit(call), path)
+
+
+async def disk_result(future: Future[_Result], path: Path) -> _Result:
+    """Return the result of a call that needs the disk of ``path``. Raises QueryError if the disk fails."""
+    try:
+        async with asyncio.timeout(_TIMEOUT_S):
+            return await asyncio.shield(asyncio.wrap_future(future))  # what was asked for happens later
+    except TimeoutError:
+        text = f"the disk of {path} did not respond within {_TIMEOUT_S:g} s; check it"
+        raise QueryError(text, code="disk") from None
+    except OSError as error:
+        raise QueryError(disk_problem(path, error), code="disk") from error
+    except TakeError as error:
+        raise QueryError(str(error), code="disk") from error
