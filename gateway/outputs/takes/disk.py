@@ -28,13 +28,17 @@ class Disk:
 
     def __init__(self) -> None:
         self.problem = ""
-        """What is wrong and what to do; "" if the newest attempt to write succeeded."""
+        """What is wrong and what to do; "" if the newest attempt succeeded, and after the end of a file."""
         self._failures = FailureLog(logger, "takes", HOLD_S)
 
     def failed(self, path: Path, error: OSError) -> None:
         """Note that ``path`` could not be written."""
         self.problem = disk_problem(path, error)
         self._failures.failed(self.problem)
+
+    def ended(self) -> None:
+        """Forget the problem, because a file has ended: whether it is over, the next one tells."""
+        self.problem = ""
 
     def succeeded(self) -> None:
         """Note that something was written."""

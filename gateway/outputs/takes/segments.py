@@ -217,6 +217,7 @@ class RollingSegments(LogSink):
             self._delete_oldest()
         with contextlib.suppress(OSError):
             self._folder.rmdir()
+        self.disk.ended()
 
 
 def _new_folder(folder: Path, *, has_free_name: bool) -> Path:

@@ -115,3 +115,4 @@ class TakeFile(LogSink):
                 log.close()
             except OSError as error:
                 self.disk.failed(self.path, error)
+            self.disk.ended()

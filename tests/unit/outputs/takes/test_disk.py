@@ -88,6 +88,21 @@ async def test_a_take_that_ends_on_a_full_disk_counts_what_is_missing(tmp_path: 
     assert amounts(losses.report()) == {"not written": (stopped.num_lost, stopped.num_lost)}
 
 
+async def test_a_take_can_start_after_one_that_ended_on_a_full_disk(tmp_path: Path) -> None:
+    async with recording_lab(tmp_path) as lab:
+        await lab.takes.start("lab", "walk")
+        with files_of_at_most(100_000):
+            for _ in range(100):
+                lab.publish(size=1000)
+            await wait_until_async(lambda: not lab.output.health().connected)
+            await lab.takes.stop("lab")
+        await lab.takes.start("lab", "next")
+        published = lab.publish()
+        await lab.takes.stop("lab")
+        assert lab.output.health().connected
+    assert frames(lab.path("next.lcmlog")) == [published]
+
+
 async def test_a_folder_that_does_not_exist_is_created_at_the_start_only(tmp_path: Path) -> None:
     lab = RecordingLab(tmp_path / "disk" / "takes")
     lab.output.start()
