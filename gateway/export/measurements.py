@@ -180,7 +180,8 @@ def named_measurements(job: ExportJob, keys: tuple[str, ...], what: str) -> list
 
 
 def _measurements(source: TakeSource, keys: tuple[str, ...]) -> list[Measurement]:
-    runs = {key: series.runs() for key, series in source.series.items()}
+    # A server may send a frame without items while it sees nothing: that is no measurement of its own.
+    runs = {key: series.without_empty_frames().runs() for key, series in source.series.items()}
     base_key = next((key for key in keys if key in runs), None)
     base_runs = [] if base_key is None else runs[base_key]
     return [Measurement(source, runs, run, grid) for run in base_runs for grid in place(run)]

@@ -247,6 +247,15 @@ class Series:
             runs.append(Series(self.component, columns, recorded, self._parameters, self.start_utime))
         return runs
 
+    def without_empty_frames(self) -> "Series":
+        """Return the frames that have items; all frames if none has."""
+        has_items = self._num_items > 0
+        if has_items.all() or not has_items.any():
+            return self
+        columns = {name: values[has_items] for name, values in self._columns.items()}
+        recorded = {num_items: items for num_items, items in self._recorded.items() if num_items}
+        return Series(self.component, columns, recorded, self._parameters, self.start_utime)
+
     @cached_property
     def _layouts(self) -> dict[tuple[int, int], Description]:
         """What describes rows, by index in ``_parameters`` and number of items, as they appear."""

@@ -438,6 +438,15 @@ def test_residuals_of_a_damaged_frame_cause_no_warning(tmp_path: Path) -> None:
     assert residuals[1] == pytest.approx(0.5, rel=1e-3)
 
 
+def test_frames_without_items_begin_no_new_measurement(tmp_path: Path) -> None:
+    frames = [frame(ComponentType.MARKERS, [] if n % 5 == 2 else visible((n, 2, 3)), n) for n in range(20)]
+    job = export_messages(tmp_path, [labelled("a"), *frames], "out.c3d")
+    assert job.notes == ["out.c3d: 4 of 20 frames are missing in the take; they are empty"]
+    content = read_independently(tmp_path / "out.c3d")
+    assert content.is_visible[:, 0].tolist() == [n % 5 != 2 for n in range(20)]
+    assert content.points[3, 0, 0] == 3
+
+
 def test_a_take_without_parameters(tmp_path: Path) -> None:
     job = export_messages(tmp_path, [description(), *scene_messages(SCENE, 20)], "out.c3d")
     assert job.notes == [
