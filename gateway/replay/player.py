@@ -147,7 +147,7 @@ class Player:
         if not self.num_messages:
             raise TakeError(
                 f"{self._reader.path} has no messages to replay with these options; "
-                "check --source, --component, --from and --to"
+                f"check --source ({', '.join(self._reader.source_names)}), --component, --from and --to"
             )
         if not self._is_repeated:
             return None
