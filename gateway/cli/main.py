@@ -1,6 +1,6 @@
 """The command line ``rtc3d-gateway``.
 
-Exit status: 0 success, 1 failure, 2 wrong command line or configuration, 130 Ctrl-C.
+Exit status: 0 success, 1 failure, 2 wrong command line or configuration, 130 Ctrl-C or SIGTERM.
 ``params`` has three more.
 """
 
@@ -52,7 +52,7 @@ app.add_typer(take.app, name="take")
 def main() -> NoReturn:
     """Run the command line and end the process, whatever happens, without a traceback.
 
-    Ctrl-C gives status 130. It is no failure if the reader of stdout is gone (… | head).
+    Ctrl-C and SIGTERM give status 130. It is no failure if the reader of stdout is gone (… | head).
     """
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
@@ -69,6 +69,7 @@ def main() -> NoReturn:
 def _handle_interrupts(handler: Callable[[int, FrameType | None], Any]) -> None:
     if signal.getsignal(signal.SIGINT) is not signal.SIG_IGN:  # ignored by nohup, and by shells for `&`
         signal.signal(signal.SIGINT, handler)
+    signal.signal(signal.SIGTERM, handler)  # its default action would leave unfinished files behind
 
 
 def _run() -> int:

@@ -1,6 +1,7 @@
 """``rtc3d-gateway export`` as a user types it: what it prints, and which files are there afterwards."""
 
 import resource
+import signal
 import subprocess
 from pathlib import Path
 
@@ -13,6 +14,7 @@ from tests.gateway_process import PROGRAM
 from tests.recorded_scenes import record_scene
 from tests.takes import frame, parameters, write_take
 from tests.unit.export.exported import read_ezc3d
+from tests.waiting import wait_until
 
 SCENE = SyntheticScene(markers=20, tools=0, analog=8, plates=1, rate_hz=100, analog_rate_hz=1000)
 EXTENSIONS = (".c3d", ".trc", ".csv", ".mcap")
@@ -70,6 +72,17 @@ def test_what_exists_is_never_overwritten(take: Path, tmp_path: Path, extension:
     assert f"{existing} exists already, and nothing is overwritten" in done.stderr
     assert names(tmp_path) == [existing.name]
     assert existing.read_text() == "mine"
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_an_export_that_is_stopped_leaves_no_file(tmp_path: Path, number: signal.Signals) -> None:
+    scene = SyntheticScene(markers=300, tools=0, analog=200, plates=0, rate_hz=100, analog_rate_hz=1000)
+    record_scene(tmp_path / "long.lcmlog", scene, 1000)
+    process = subprocess.Popen([*PROGRAM, "export", tmp_path / "long.lcmlog", tmp_path / "long.csv"])
+    wait_until(lambda: len(names(tmp_path)) > 1)
+    process.send_signal(number)
+    assert process.wait(timeout=30) == 130
+    assert names(tmp_path) == ["long.lcmlog"]
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
