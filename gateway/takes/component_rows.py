@@ -1,7 +1,7 @@
 """Decoding many messages of one component at once, with numpy and without a loop over items."""
 
 from collections.abc import Sequence
-from typing import Any, Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +30,7 @@ NATIVE_ITEM_DTYPES: Final[dict[ComponentType, np.dtype[Any]]] = {
 }
 """ITEM_DTYPES in the byte order of this computer."""
 
-Array = npt.NDArray[Any]
+Array: TypeAlias = npt.NDArray[Any]
 
 
 class Rows(NamedTuple):
