@@ -15,7 +15,7 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 # What a wheel is built from.
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-integration test-hostile test-others test-compiled check lint types contracts generated docs lcm-types fuzz soak stops \
+.PHONY: demo lock test test-integration test-takes test-hostile test-others test-compiled check lint types contracts generated docs lcm-types fuzz soak stops \
     mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clean
 
 demo: .venv/runtime
@@ -25,11 +25,12 @@ demo: .venv/runtime
 test: .venv/installed
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) tests/with-netns $(BIN)/pytest $(ARGS)
 
-# `make test` in three parts, of which `make check` runs two at the same time.
-test-integration: ARGS := tests/integration
+# `make test` in four parts, of which `make check` runs two at the same time.
+test-integration: ARGS := 'tests/integration --ignore=tests/integration/takes'
+test-takes: ARGS := tests/integration/takes
 test-hostile: ARGS := tests/hostile
 test-others: ARGS := '--ignore=tests/integration --ignore=tests/hostile'
-test-integration test-hostile test-others: .venv/installed
+test-integration test-takes test-hostile test-others: .venv/installed
 	$(MAKE) --no-print-directory test ARGS=$(ARGS)
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
@@ -45,7 +46,7 @@ test-compiled: build/compiled/complete
 # Two parts at a time. Each run of pytest has a network namespace of its own, so they do not disturb each other.
 check: .venv/installed
 	$(MAKE) --jobs=2 --output-sync=target --no-print-directory lint types contracts generated docs wheelhouse compiled
-	$(MAKE) --jobs=2 --output-sync=target --no-print-directory test-integration test-hostile test-others test-compiled
+	$(MAKE) --jobs=2 --output-sync=target --no-print-directory test-integration test-takes test-hostile test-others test-compiled
 
 lint: .venv/installed
 	$(BIN)/ruff format --check
