@@ -22,8 +22,8 @@ from gateway.cli.take_fetch import fetch_take
 from gateway.cli.take_gateway import GatewayAddress, TakeReplies
 from gateway.cli.take_list import ListedTake, write_list
 from gateway.errors import QueryError
-from gateway.outputs.takes.names import check_name
 from gateway.safe_text import safe_json, safe_text
+from gateway.takes.names import check_name
 
 _NameArgument = Annotated[
     str | None,

@@ -14,8 +14,8 @@ from gateway.cli.take_list import size_text
 from gateway.cli.zenoh_client import ZenohReply
 from gateway.errors import QueryError
 from gateway.outputs.contract import READ_OPTION
-from gateway.outputs.takes.names import check_name
 from gateway.takes.event_log import EventBoundary
+from gateway.takes.names import check_name
 from gateway.takes.new_file import NewFiles
 from gateway.takes.reader import SUFFIX
 

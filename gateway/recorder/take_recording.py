@@ -1,24 +1,20 @@
 """A recording of what gateways publish: from the messages that arrive to the thread that writes them."""
 
 import functools
-import socket
 import threading
 import time
 from collections import deque
 from collections.abc import Callable, Collection
 from typing import Final
 
-import rtc3d
-
-from gateway import __version__
 from gateway.messages.host_time import now_utime
-from gateway.messages.limits import encode_within_limits
 from gateway.messages.topics import MAX_CHANNEL_LENGTH, unique_name
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.parameters_message import encode_parameters, published_again
 from gateway.recorder.file_sink import FileSink
 from gateway.recorder.sequence_check import PREFIX_END
 from gateway.recorder.series import RecordedSource, Series
+from gateway.takes.description import encode_take
 from gateway.takes.recording import MAX_QUEUED_BYTES, Recorder
 
 MAX_SOURCES: Final = 64
@@ -257,20 +253,22 @@ class TakeRecording:
     def _describe(self, source: RecordedSource) -> None:
         assert self.sink is not None  # noqa: S101 - see _begin
         status = source.decoded_status()
-        message = rtc3d.take_t()
-        message.utime = source.first_utime or now_utime()
-        message.name = self.sink.path.stem
-        message.source, message.channels = source.name, source.channels
-        message.server = status.server if status is not None else ""
-        message.gateway_version = status.gateway_version if status is not None else ""
-        message.recorder = f"rtc3d-gateway record {__version__}"
-        message.host = socket.gethostname()
-        description = [(f"{source.channels}_TAKE".encode(), encode_within_limits(message))]
+        utime = source.first_utime or now_utime()
+        take = encode_take(
+            utime=utime,
+            name=self.sink.path.stem,
+            source=source.name,
+            channels=source.channels,
+            server=status.server if status is not None else "",
+            gateway_version=status.gateway_version if status is not None else "",
+            recorder="rtc3d-gateway record",
+        )
+        description = [(f"{source.channels}_TAKE".encode(), take)]
         parameters = source.first_parameters
         series = self._find_series(source, "parameters", f"{source.channels}_PARAMETERS")
         if parameters is not None and series is not None:
             if source.has_made_first:
-                parameters = published_again(parameters, message.utime)
+                parameters = published_again(parameters, utime)
             series.add(parameters)
             description.append((series.channel, parameters))
         self._recorder.call(functools.partial(self.sink.write, description))

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from gateway.errors import TakeError
-from gateway.outputs.takes.names import default_name, numbered
+from gateway.takes.names import default_name, numbered
 from gateway.takes.reader import SUFFIX
 from gateway.takes.recording import LogFile
 

@@ -15,9 +15,9 @@ from typing import Final
 
 from gateway.errors import QueryError, TakeError
 from gateway.outputs.takes.disk import disk_problem
-from gateway.outputs.takes.names import check_name, default_name, numbered
 from gateway.outputs.takes.stored import MAX_PIECE_BYTES, StoredTake, TakePiece
 from gateway.takes.event_log import EventLogReader
+from gateway.takes.names import check_name, default_name, numbered
 from gateway.takes.new_file import NewFiles
 from gateway.takes.reader import SUFFIX, log_paths
 

@@ -1,15 +1,12 @@
 """What each file of a take begins with: its description, and the newest parameters of the source."""
 
-import socket
 from dataclasses import dataclass
 from pathlib import Path
 
-import rtc3d
-
 from gateway import __version__
-from gateway.messages.limits import encode_within_limits
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.parameters_message import published_again
+from gateway.takes.description import encode_take
 from gateway.takes.recording import LogFile
 
 
@@ -27,16 +24,15 @@ class SourceDescription:
 
     def take_message(self, name: str, utime: int) -> bytes:
         """Return the ``take_t`` of a file that begins at ``utime``, in µs since the Unix epoch."""
-        message = rtc3d.take_t()
-        message.utime = utime
-        message.name = name
-        message.source = self.source
-        message.channels = lcm_channel(self.prefix, self.source)
-        message.server = self.server
-        message.gateway_version = __version__
-        message.recorder = f"rtc3d-gateway {__version__}"
-        message.host = socket.gethostname()
-        return encode_within_limits(message)
+        return encode_take(
+            utime=utime,
+            name=name,
+            source=self.source,
+            channels=lcm_channel(self.prefix, self.source),
+            server=self.server,
+            gateway_version=__version__,
+            recorder="rtc3d-gateway",
+        )
 
 
 class FileHeader:

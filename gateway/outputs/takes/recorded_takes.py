@@ -17,12 +17,12 @@ from gateway.outputs.takes.disk_calls import DiskReader, disk_result
 from gateway.outputs.takes.folder import ROLLING, TakesFolder, add_c3d
 from gateway.outputs.takes.folder_watch import FolderWatch
 from gateway.outputs.takes.header import FileHeader, SourceDescription
-from gateway.outputs.takes.names import check_name, default_name
 from gateway.outputs.takes.segments import RollingSegments
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.source_recording import SourceRecording
 from gateway.outputs.takes.stored import SourceTakes, StoredTake, TakePiece
 from gateway.outputs.takes.take_file import TakeFile
+from gateway.takes.names import check_name, default_name
 from gateway.takes.recording import MAX_QUEUED_BYTES, Recorder
 from gateway.worker_thread import WorkerThread
 

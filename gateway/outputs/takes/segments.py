@@ -15,7 +15,7 @@ from gateway.losses import Losses
 from gateway.outputs.takes.disk import Disk
 from gateway.outputs.takes.header import FileHeader
 from gateway.outputs.takes.log_sink import LogSink
-from gateway.outputs.takes.names import default_name, numbered
+from gateway.takes.names import default_name, numbered
 from gateway.takes.reader import SUFFIX
 from gateway.takes.recording import LogFile
 

@@ -8,7 +8,7 @@ from gateway.losses import Losses
 from gateway.outputs.takes.disk import Disk
 from gateway.outputs.takes.header import FileHeader
 from gateway.outputs.takes.log_sink import LogSink, Messages
-from gateway.outputs.takes.names import numbered
+from gateway.takes.names import numbered
 from gateway.takes.reader import SUFFIX
 from gateway.takes.recording import LogFile
 

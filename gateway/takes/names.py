@@ -1,4 +1,4 @@
-"""The names of takes, which come from peers, and the channels in their files."""
+"""The names of takes: the rule for those that peers choose, and default names."""
 
 import re
 import time
