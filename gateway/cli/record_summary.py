@@ -10,7 +10,7 @@ from rich.text import Text
 
 from gateway.cli.record_progress import size_text
 from gateway.recorder.file_sink import FileSink
-from gateway.recorder.series import POSE, RecordedSource, Series
+from gateway.recorder.series import POSE, RecordedSeries, RecordedSource
 from gateway.recorder.take_recording import MAX_SERIES, MAX_SOURCES, TakeRecording
 from gateway.safe_text import safe_text
 
@@ -30,7 +30,7 @@ class SeriesCounts(NamedTuple):
     num_unwritten: int
 
 
-def counts_of(series: Sequence[Series], lost_on_disk: Counter[bytes]) -> SeriesCounts:
+def counts_of(series: Sequence[RecordedSeries], lost_on_disk: Counter[bytes]) -> SeriesCounts:
     """Return the counts of some series together."""
     num_unwritten = sum(each.num_refused + lost_on_disk[each.channel] for each in series)
     num_messages = sum(each.num_messages for each in series)
@@ -44,7 +44,7 @@ def counts_of(series: Sequence[Series], lost_on_disk: Counter[bytes]) -> SeriesC
     )
 
 
-def _rate_hz(series: Series) -> float:
+def _rate_hz(series: RecordedSeries) -> float:
     duration_us = series.check.last_utime - series.check.first_utime
     return 1e6 * (series.num_messages - 1) / duration_us if duration_us > 0 else 0.0
 
@@ -85,8 +85,8 @@ def print_summary(recording: TakeRecording, out: TextIO) -> bool:
     return not problems
 
 
-def _rows(source: RecordedSource) -> Iterator[tuple[str, list[Series]]]:
-    rows: defaultdict[str, list[Series]] = defaultdict(list)
+def _rows(source: RecordedSource) -> Iterator[tuple[str, list[RecordedSeries]]]:
+    rows: defaultdict[str, list[RecordedSeries]] = defaultdict(list)
     for series in source.series:
         if series.is_recorded and series.num_messages:
             rows[series.row].append(series)

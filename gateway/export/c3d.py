@@ -8,7 +8,7 @@ import numpy as np
 
 from gateway.errors import TakeError
 from gateway.export.c3d_content import C3dContent, content_of
-from gateway.export.c3d_format import BLOCK_BYTES, MAX_FRAMES, MAX_WORD, Shape, exact_rate
+from gateway.export.c3d_format import BLOCK_BYTES, MAX_FRAMES, MAX_WORD, Shape, rate_in_float32
 from gateway.export.c3d_groups import encode_head_that_fits
 from gateway.export.c3d_points import encode_points, residual_step
 from gateway.export.job import ExportJob
@@ -71,7 +71,7 @@ def _shape(content: C3dContent, path: Path) -> Shape:
             f"{path.name} would have {content.num_points} markers and {content.num_channels} analog "
             f"channels with {samples} samples in each frame, more than a C3D file can have; export to .csv"
         )
-    rate_hz = exact_rate(content.measurement.grid.rate_hz, samples)
+    rate_hz = rate_in_float32(content.measurement.grid.rate_hz, samples)
     return Shape(content.num_points, content.num_channels, samples, content.num_frames, rate_hz, 1.0)
 
 

@@ -63,7 +63,7 @@ class Shape(NamedTuple):
     scale: float
 
 
-def exact_rate(rate_hz: float, samples_per_frame: int) -> float:
+def rate_in_float32(rate_hz: float, samples_per_frame: int) -> float:
     """Return the nearest rate whose product with ``samples_per_frame`` is exact in 32 bits.
 
     Readers divide ANALOG:RATE by POINT:RATE and need exactly ``samples_per_frame``.

@@ -17,7 +17,7 @@ from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber, no_gateway
-from gateway.recorder.series import FINGERPRINTS, POSE, RecordedSource, Series
+from gateway.recorder.series import FINGERPRINTS, POSE, RecordedSeries, RecordedSource
 from gateway.recorder.take_recording import MAX_SERIES, TakeRecording
 
 START_S: Final = 1.2
@@ -49,7 +49,7 @@ class LcmSide:
         self._prefix = prefix
         self._names = {lcm_channel(prefix, name): name for name in sources}
         self._recording = recording
-        self._series: dict[str, Series | None] = {}  # by channel; None: not recorded
+        self._series: dict[str, RecordedSeries | None] = {}  # by channel; None: not recorded
         self._asked_s: dict[str, float] = {}  # when a source was asked, by its channels
         self._requester = f"rtc3d-gateway record {uuid.uuid4()}"
         self._by_request_id: dict[int, RecordedSource] = {}
@@ -85,7 +85,7 @@ class LcmSide:
         if series.key == "status" and not series.source.has_known_name:
             self._name(series.source, message)
 
-    def _find_series(self, channel: str, message: bytes) -> Series | None:
+    def _find_series(self, channel: str, message: bytes) -> RecordedSeries | None:
         """Return the series of a channel that was not recorded before; None, counted, if it cannot be."""
         if channel in self._series:
             self._recording.ignore(beyond_limit=True)

@@ -1,4 +1,4 @@
-"""What is recorded: the sources, and the messages of each of their keys."""
+"""What `record` has received: the sources, and the messages of each of their keys."""
 
 import math
 import time
@@ -33,7 +33,7 @@ _WAIT_S: Final = 1.5
 """How long the messages of a new source wait for its description; each second brings a status."""
 
 
-class Series:
+class RecordedSeries:
     """The messages of one key of a source. ``row`` is its line in the table: the key, or 6d/* for poses."""
 
     def __init__(self, source: "RecordedSource", key: str, channel: str, *, is_recorded: bool) -> None:
@@ -79,7 +79,7 @@ class RecordedSource:
         self.channels = channels
         self.has_known_name = False
         """Whether a gateway or the user has said the name; otherwise, it is made from the channels."""
-        self.series_by_key: dict[str, Series] = {}
+        self.series_by_key: dict[str, RecordedSeries] = {}
         self.heard_s: float | None = None
         """When the newest message arrived, on the monotonic clock; None before the first."""
         self.status: bytes | None = None
@@ -99,7 +99,7 @@ class RecordedSource:
         self._found_s = time.monotonic()
 
     @property
-    def series(self) -> list[Series]:
+    def series(self) -> list[RecordedSeries]:
         """The series so far; other threads may add some at any time."""
         return [*self.series_by_key.values()]
 

@@ -13,7 +13,7 @@ from gateway.outputs.contract import ServerParameters
 from gateway.outputs.parameters_message import encode_parameters, published_again
 from gateway.recorder.file_sink import FileSink
 from gateway.recorder.sequence_check import PREFIX_END
-from gateway.recorder.series import RecordedSource, Series
+from gateway.recorder.series import RecordedSeries, RecordedSource
 from gateway.takes.description import encode_take
 from gateway.takes.recording import MAX_QUEUED_BYTES, Recorder
 
@@ -63,7 +63,7 @@ class TakeRecording:
         self._components = components
         self._lock = threading.Lock()
         self._recorder = Recorder("record")
-        self._held: deque[tuple[Series, bytes]] = deque()
+        self._held: deque[tuple[RecordedSeries, bytes]] = deque()
         self._held_bytes = 0
         self._is_starting = True
         self._start_end_s = time.monotonic() + start_s
@@ -82,7 +82,7 @@ class TakeRecording:
             return [*self.sources.values()]
 
     @property
-    def all_series(self) -> list[Series]:
+    def all_series(self) -> list[RecordedSeries]:
         """The series of all sources so far."""
         with self._lock:
             return [series for source in self.sources.values() for series in source.series]
@@ -113,17 +113,17 @@ class TakeRecording:
                 source = self.sources[channels] = RecordedSource(name, channels)
             return source
 
-    def series(self, source: RecordedSource, key: str, channel: str) -> Series | None:
+    def series(self, source: RecordedSource, key: str, channel: str) -> RecordedSeries | None:
         """Return the series of a key, new or not, on this channel or a similar one; None if too many."""
         with self._lock:
             return self._find_series(source, key, channel)
 
-    def _find_series(self, source: RecordedSource, key: str, channel: str) -> Series | None:
+    def _find_series(self, source: RecordedSource, key: str, channel: str) -> RecordedSeries | None:
         series = source.series_by_key.get(key)
         if series is None and self._num_series < MAX_SERIES:
             taken = {each.channel.decode() for each in source.series}
             free = unique_name(channel, taken, MAX_CHANNEL_LENGTH)
-            series = Series(source, key, free, is_recorded=self._is_wanted(key))
+            series = RecordedSeries(source, key, free, is_recorded=self._is_wanted(key))
             source.series_by_key[key] = series
             self._num_series += 1
         return series
@@ -135,7 +135,7 @@ class TakeRecording:
 
     # Messages and answers. Any thread.
 
-    def receive(self, series: Series, message: bytes) -> None:
+    def receive(self, series: RecordedSeries, message: bytes) -> None:
         """Record a message."""
         with self._lock:
             if self._is_closed:
@@ -163,7 +163,7 @@ class TakeRecording:
             self.defect = self.defect or defect
             self.num_defects += 1
 
-    def receive_parameters(self, series: Series, message: bytes, *, is_made: bool) -> None:
+    def receive_parameters(self, series: RecordedSeries, message: bytes, *, is_made: bool) -> None:
         """Record a ``parameters_t``, published or ``is_made`` here, unless it repeats the newest one."""
         with self._lock:
             source = series.source
@@ -211,7 +211,7 @@ class TakeRecording:
         if self.first_heard_s is None:
             self.first_heard_s = source.heard_s
 
-    def _put(self, series: Series, message: bytes) -> None:
+    def _put(self, series: RecordedSeries, message: bytes) -> None:
         if self._is_starting or not series.source.is_described:
             if self._held_bytes + len(message) > MAX_QUEUED_BYTES:
                 series.num_refused += 1

@@ -13,7 +13,7 @@ import zenoh
 from gateway.messages.topics import lcm_channel, zenoh_key
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX
 from gateway.outputs.zenoh.subscriber import no_gateway, served_sources
-from gateway.recorder.series import POSE, RecordedSource, Series
+from gateway.recorder.series import POSE, RecordedSeries, RecordedSource
 from gateway.recorder.take_recording import MAX_SERIES, MAX_XML_BYTES, TakeRecording
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 
@@ -47,7 +47,7 @@ class ZenohSide:
         self._prefix = prefix
         self._sources = sources
         self._recording = recording
-        self._series: dict[str, Series | None] = {}  # by key; None: not recorded
+        self._series: dict[str, RecordedSeries | None] = {}  # by key; None: not recorded
         self._asked_s: dict[str, float] = {}  # when the description of a source was queried, by its name
         for name in self._served():
             self._source(name)
@@ -84,7 +84,7 @@ class ZenohSide:
         else:
             self._recording.receive(series, sample.payload.to_bytes())
 
-    def _find_series(self, key: str) -> Series | None:
+    def _find_series(self, key: str) -> RecordedSeries | None:
         """Return the series of a key that was not recorded before; None, counted, if it cannot be."""
         if key in self._series:
             self._recording.ignore(beyond_limit=True)
@@ -106,7 +106,7 @@ class ZenohSide:
             self._recording.ignore(beyond_limit=True)
         return series
 
-    def _receive_parameters(self, series: Series, sample: zenoh.Sample) -> None:
+    def _receive_parameters(self, series: RecordedSeries, sample: zenoh.Sample) -> None:
         if len(sample.payload) > MAX_XML_BYTES:
             self._recording.ignore(beyond_limit=False)
             return

@@ -4,7 +4,7 @@ from collections.abc import Generator
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-from gateway.replay.timeline import Timeline
+from gateway.replay.timeline import ReplayTimeline
 from gateway.takes.reader import TakeReader
 
 _PARAMETERS: Final = "parameters"
@@ -40,7 +40,7 @@ class Selection:
 
 
 def play_list(
-    reader: TakeReader, selection: Selection, timeline: Timeline, start_us: int
+    reader: TakeReader, selection: Selection, timeline: ReplayTimeline, start_us: int
 ) -> Generator[Entry]:
     """Yield the selected messages from ``start_us`` on, after the parameters that are valid there.
 

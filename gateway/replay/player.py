@@ -11,7 +11,7 @@ from gateway.errors import TakeError
 from gateway.replay.pace import Lateness, Pace
 from gateway.replay.play_list import Entry, Selection, play_list
 from gateway.replay.publication import Publication
-from gateway.replay.timeline import MAX_GAP_S, Jump, Timeline
+from gateway.replay.timeline import MAX_GAP_S, Jump, ReplayTimeline
 from gateway.takes.reader import TakeReader
 
 _FINE_S: Final = 0.005
@@ -131,7 +131,7 @@ class Player:
 
     def _next_start(self, start_us: int) -> int | None:
         """Replay from a position on; return where to go on, None if this was the end."""
-        timeline = Timeline(self._max_gap_s, partial(self._report, start_us))
+        timeline = ReplayTimeline(self._max_gap_s, partial(self._report, start_us))
         with closing(play_list(self._reader, self._selection, timeline, start_us)) as entries:
             is_complete = self._play(entries, start_us)
         with self._changed:

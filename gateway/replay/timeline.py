@@ -25,7 +25,7 @@ class Jump(NamedTuple):
     is_skipped: bool
 
 
-class Timeline:
+class ReplayTimeline:
     """Gives each message a position: µs since the first one, as if nobody had set a clock meanwhile.
 
     A message whose time is before the newest position, or more than ``max_gap_s`` after it, follows at once,

@@ -6,7 +6,7 @@ from typing import Final
 
 from gateway.rtc3d.components import FRAME_NUMBER_AND_TIMESTAMP, ComponentType
 from gateway.simulator.recorded.parameters import RecordedParameters
-from gateway.simulator.recorded.timeline import Timeline
+from gateway.simulator.recorded.timeline import TakeTimeline
 
 _REORDER_US: Final = 500_000
 """Components of one frame, recorded on two connections, are at most so far apart in a take."""
@@ -61,7 +61,7 @@ class MomentBuilder:
     """
 
     def __init__(self) -> None:
-        self._timeline = Timeline()
+        self._timeline = TakeTimeline()
         self._waiting: list[Moment] = []  # in the order of their times
         self._by_timestamp: dict[int, Moment] = {}  # the newest ones of those that wait
         self._newest: Moment | None = None

@@ -20,7 +20,7 @@ _DRIFT: Final = 1e-3
 """Two clocks may differ by this much of the elapsed time; a crystal is off by 1e-4 at most."""
 
 
-class Timeline:
+class TakeTimeline:
     """Places the messages of one source on the time of its take, in µs from the first one.
 
     A server has one clock, which all its components share. Its time stamps are followed while they advance

@@ -9,7 +9,7 @@ from gateway.messages.decode import decode
 from gateway.messages.encode import MESSAGE_TYPES
 from gateway.messages.stamp import PREFIX
 from gateway.recorder.file_sink import FileSink
-from gateway.recorder.series import FINGERPRINTS, RecordedSource, Series
+from gateway.recorder.series import FINGERPRINTS, RecordedSeries, RecordedSource
 from gateway.recorder.take_recording import MAX_SERIES, MAX_SOURCES, TakeRecording
 from gateway.recorder.target import Target
 from gateway.rtc3d.components import ComponentType
@@ -54,7 +54,7 @@ class Recorded:
         assert source is not None
         return source
 
-    def series(self, name: str, key: str) -> Series:
+    def series(self, name: str, key: str) -> RecordedSeries:
         source = self.source(name)
         series = self.recording.series(source, key, f"{source.channels}_{key.upper()}")
         assert series is not None

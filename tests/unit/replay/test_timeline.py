@@ -1,6 +1,6 @@
 import pytest
 
-from gateway.replay.timeline import Jump, Timeline
+from gateway.replay.timeline import Jump, ReplayTimeline
 
 START = 1_700_000_000_000_000
 HOUR = 3_600_000_000
@@ -11,7 +11,7 @@ class Placed:
 
     def __init__(self, max_gap_s: float = 10.0) -> None:
         self.jumps: list[Jump] = []
-        self._timeline = Timeline(max_gap_s, self.jumps.append)
+        self._timeline = ReplayTimeline(max_gap_s, self.jumps.append)
 
     def place(self, *utimes: int, source: str = "lab") -> list[int]:
         return [self._timeline.place(source, START + utime) for utime in utimes]

@@ -3,7 +3,7 @@ from collections.abc import Iterable
 import pytest
 
 from gateway.rtc3d.components import ComponentType
-from gateway.simulator.recorded.timeline import Timeline
+from gateway.simulator.recorded.timeline import TakeTimeline
 
 START = 1_700_000_000_000_000
 PERIOD_US = 10_000
@@ -12,7 +12,7 @@ MARKERS, ANALOG = ComponentType.MARKERS, ComponentType.ANALOG
 
 def times(messages: Iterable[tuple[int, int]]) -> list[int]:
     """Return the times of (time stamp, time of capture since START) of one component."""
-    timeline = Timeline()
+    timeline = TakeTimeline()
     return [timeline.time_us(MARKERS, 1, stamp, START + captured) for stamp, captured in messages]
 
 
@@ -27,7 +27,7 @@ def test_time_stamps_count_while_capture_times_agree_with_them() -> None:
 
 
 def test_all_components_share_the_clock_of_the_server() -> None:
-    timeline = Timeline()
+    timeline = TakeTimeline()
     assert timeline.time_us(MARKERS, 1, 1_000_000, START) == 0
     assert timeline.time_us(ANALOG, 2, 1_000_500, START + 30_000) == 500
 
@@ -73,7 +73,7 @@ def test_a_recording_computer_whose_clock_was_set_does_not_matter(step: int) -> 
 
 
 def test_the_clock_may_be_set_back_when_two_components_follow() -> None:
-    timeline = Timeline()
+    timeline = TakeTimeline()
     placed = []
     for k in range(300):
         captured = START + k * PERIOD_US - (3_600_000_000 if k >= 100 else 0)
