@@ -32,6 +32,9 @@ class LogSink(ABC):
         self.num_lost = 0
         """How many messages the disk did not accept."""
         self._losses = losses
+        self._log: LogFile | None = None  # the present one
+        self._is_in_place = True
+        """Whether the present log had its path when this was checked last."""
         self._gives_up = threading.Event()
 
     @property
@@ -42,10 +45,6 @@ class LogSink(ABC):
     @abstractmethod
     def log_for(self, utime: int) -> LogFile:
         """Return the log for messages from ``utime`` on, in µs since the Unix epoch. Raises OSError."""
-
-    @abstractmethod
-    def sync(self) -> None:
-        """Store on the disk what was written."""
 
     def give_up(self) -> None:
         """Lose what the disk does not accept at once from now on. Any thread may call it."""
@@ -73,6 +72,25 @@ class LogSink(ABC):
                     break
             else:
                 self.disk.succeeded()
+
+    def sync(self) -> None:
+        """Store on the disk what was written."""
+        if self._log is not None:
+            try:
+                self._log.sync()
+            except OSError as error:
+                self.disk.failed(self.path, error)
+            self._is_in_place = self._log.is_in_place()
+
+    def _close_log(self) -> LogFile | None:
+        """Store everything, close the present log and return it."""
+        log, self._log = self._log, None
+        if log is not None:
+            try:
+                log.close()
+            except OSError as error:
+                self.disk.failed(self.path, error)
+        return log
 
     def lose(self, messages: Messages) -> None:
         """Count messages that are not written."""

@@ -72,10 +72,8 @@ class RollingSegments(LogSink):
         self._keep_s = keep_s
         self._folder = folder
         self._segments: deque[_Segment] = deque()
-        self._log: LogFile | None = None
         self._log_began_s = 0.0
         self._num_segments = 0  # so far: no name is used twice
-        self._is_in_place = True
         self._saves: list[Save] = []
 
     @property
@@ -120,25 +118,11 @@ class RollingSegments(LogSink):
         self._num_segments += 1
         return log
 
-    def sync(self) -> None:
-        """See LogSink."""
-        if self._log is not None:
-            try:
-                self._log.sync()
-            except OSError as error:
-                self.disk.failed(self.path, error)
-            self._is_in_place = self._log.is_in_place()
-
     def _end_segment(self) -> None:
-        log, self._log = self._log, None
-        if log is None:
-            return
-        try:
-            log.close()
-        except OSError as error:
-            self.disk.failed(self.path, error)
-        self._segments.append(_Segment(log.path, self._log_began_s, time.monotonic()))
-        self._delete_expired()
+        log = self._close_log()
+        if log is not None:
+            self._segments.append(_Segment(log.path, self._log_began_s, time.monotonic()))
+            self._delete_expired()
 
     def _delete_expired(self) -> None:
         oldest_s = time.monotonic() - self._keep_s
@@ -203,11 +187,6 @@ class RollingSegments(LogSink):
         if save in self._saves:
             self._saves.remove(save)
             self._end_segment()
-
-    @property
-    def saves(self) -> list[Save]:
-        """The takes to which segments are added."""
-        return [*self._saves]
 
     def close(self) -> None:
         """End all takes, and delete the segments: what was saved stays."""

@@ -39,8 +39,6 @@ class TakeFile(LogSink):
         """When it was started, in µs since the Unix epoch."""
         self._folder = folder
         self._has_free_name = has_free_name
-        self._log: LogFile | None = None
-        self._is_in_place = True
         self._is_cancelled = False
 
     @property
@@ -91,15 +89,6 @@ class TakeFile(LogSink):
         if self._log is not None:
             super().write(messages)
 
-    def sync(self) -> None:
-        """See LogSink."""
-        if self._log is not None:
-            try:
-                self._log.sync()
-            except OSError as error:
-                self.disk.failed(self.path, error)
-            self._is_in_place = self._log.is_in_place()
-
     def discard(self) -> None:
         """End the take and delete its file, because it was cancelled."""
         log = self._log
@@ -109,10 +98,5 @@ class TakeFile(LogSink):
 
     def end(self) -> None:
         """Store everything and close the file."""
-        log, self._log = self._log, None
-        if log is not None:
-            try:
-                log.close()
-            except OSError as error:
-                self.disk.failed(self.path, error)
+        if self._close_log() is not None:
             self.disk.ended()
