@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from gateway.takes.component_rows import Array
-from gateway.takes.series import Series
+from gateway.takes.series import Series, regular_step
 
 MAX_GAP_S: Final = 10.0
 """After a longer gap, a new grid begins."""
@@ -50,7 +50,7 @@ def place(run: Series, *, by_time_stamps: bool = True) -> list[Grid]:
     stamps = run.timestamp_us[order]
     has_time_stamps = by_time_stamps and _progresses(stamps)
     times = stamps if has_time_stamps else run.capture_utime[order]
-    period_us = _period_us(times, sequence)
+    period_us = regular_step(np.diff(times)[np.diff(sequence) == 1])
     rate_hz = _rate_hz(period_us, run.rate_hz)
     if has_time_stamps and period_us:
         distances = np.diff(times) / period_us
@@ -67,16 +67,6 @@ def place(run: Series, *, by_time_stamps: bool = True) -> list[Grid]:
 
 def _progresses(stamps: Array) -> bool:
     return len(stamps) == 1 or bool((np.diff(stamps) > 0).mean() > 0.5)
-
-
-def _period_us(times: Array, sequence: Array) -> float | None:
-    """Return the typical distance of two frames that follow each other; None if there are no two."""
-    steps = np.diff(times)[np.diff(sequence) == 1]
-    steps = steps[steps > 0]
-    if not len(steps):
-        return None
-    median = np.median(steps)
-    return float(steps[abs(steps - median) <= median / 2].mean())
 
 
 def _rate_hz(period_us: float | None, announced_hz: float | None) -> float:

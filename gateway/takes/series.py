@@ -137,11 +137,11 @@ class Series:
         If the time stamps are constant, it is computed from the times of arrival.
         """
         for times in (self.timestamp_us, self.utime):
-            steps = np.diff(times)[(np.diff(self.sequence) == 1) & (np.diff(self.session) == 0)]
-            steps = steps[steps > 0]
-            if len(steps):
-                median = np.median(steps)
-                return float(1e6 / steps[abs(steps - median) <= median / 2].mean())
+            step_us = regular_step(
+                np.diff(times)[(np.diff(self.sequence) == 1) & (np.diff(self.session) == 0)]
+            )
+            if step_us is not None:
+                return 1e6 / step_us
         return None
 
     @cached_property
@@ -316,6 +316,18 @@ class SeriesBuilder:
         if not len(columns["utime"]):
             return None
         return Series(self._component, columns, recorded, parameters, start_utime)
+
+
+def regular_step(steps: Array) -> float | None:
+    """Return the mean of the steps, without those that are not positive or differ from the others by half.
+
+    Returns None if there are none.
+    """
+    steps = steps[steps > 0]
+    if not len(steps):
+        return None
+    median = np.median(steps)
+    return float(steps[abs(steps - median) <= median / 2].mean())
 
 
 def _one_row_per_event(rows: Rows) -> tuple[Array, dict[int, Array]]:
