@@ -38,8 +38,14 @@ FINGERPRINT_BYTES: Final = 8
 CONTENT_OFFSET: Final = FINGERPRINT_BYTES + PREFIX.size
 """The offset of the component's content in a message: 40."""
 
-ITEMS_OFFSET: Final = CONTENT_OFFSET + 16
-"""The offset of the items in a message, after frame number, time stamp and count: 56."""
+VERSION_OFFSET: Final = CONTENT_OFFSET - 4
+"""The offset of the version of the parameters; in a ``parameters_t``, the XML follows it."""
+
+COUNT_OFFSET: Final = CONTENT_OFFSET + 12
+"""The offset of the number of items, after frame number and time stamp: 52."""
+
+ITEMS_OFFSET: Final = COUNT_OFFSET + 4
+"""The offset of the items: 56."""
 
 _SEQUENCE_OFFSET: Final = FINGERPRINT_BYTES + 16
 _TIMESTAMP_OFFSET: Final = CONTENT_OFFSET + 4

@@ -7,12 +7,12 @@ from collections import deque
 from collections.abc import Callable, Collection
 from typing import Final
 
+from gateway.messages.encode import VERSION_OFFSET
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import MAX_CHANNEL_LENGTH, unique_name
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.parameters_message import encode_parameters, published_again
 from gateway.recorder.file_sink import FileSink
-from gateway.recorder.sequence_check import PREFIX_END
 from gateway.recorder.series import RecordedSeries, RecordedSource
 from gateway.takes.description import encode_take
 from gateway.takes.recording import MAX_QUEUED_BYTES, Recorder
@@ -24,7 +24,7 @@ MAX_SERIES: Final = 4096
 MAX_XML_BYTES: Final = 16 * 1024 * 1024
 
 _MIN_UTIME: Final = -(1 << 63)
-_VERSION: Final = slice(PREFIX_END - 4, None)
+_VERSION: Final = slice(VERSION_OFFSET, None)
 """The part of a ``parameters_t`` by which it is known: its version and its XML."""
 
 

@@ -12,7 +12,7 @@ import rtc3d
 
 from gateway.errors import ProtocolError, TakeError
 from gateway.messages.decode import message_type
-from gateway.messages.encode import MESSAGE_TYPES
+from gateway.messages.encode import MESSAGE_TYPES, VERSION_OFFSET
 from gateway.safe_text import safe_text
 from gateway.takes.event_log import Event, EventLogReader
 from gateway.takes.source_names import NAMED_WITHIN_EVENTS, SourceNames
@@ -26,9 +26,6 @@ _BATCH_MESSAGES: Final = 20_000
 
 _EVENT_BYTES: Final = 40
 """About so many bytes of a file belong to an event beside its message."""
-
-_VERSION_OFFSET: Final = 36
-"""Where a ``parameters_t`` has the version, followed by the XML."""
 
 _MAX_ROUTES: Final = 10_000
 
@@ -148,10 +145,10 @@ class TakeReader:
             if batch is None:
                 self.unknown[channel] += 1
                 continue
-            is_news = batch.key == "parameters" and newest.get(batch.source) != message[_VERSION_OFFSET:]
+            is_news = batch.key == "parameters" and newest.get(batch.source) != message[VERSION_OFFSET:]
             if is_news or num_bytes >= _BATCH_BYTES or num_messages >= _BATCH_MESSAGES:
                 if is_news:
-                    newest[batch.source] = message[_VERSION_OFFSET:]
+                    newest[batch.source] = message[VERSION_OFFSET:]
                 self.read_bytes += num_bytes + num_messages * _EVENT_BYTES
                 yield [filled for filled in batches.values() if filled is not None and filled.messages]
                 num_bytes = num_messages = 0

@@ -9,6 +9,7 @@ from typing import Any, Final, Protocol
 
 from gateway.errors import QueryError
 from gateway.log import HOLD_S, FailureLog
+from gateway.messages.encode import COUNT_OFFSET, ITEMS_OFFSET
 from gateway.outputs.contract import Publisher
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.takes.stored import StoredTake
@@ -21,9 +22,7 @@ LOST_S: Final = 60.0
 """A measurement has ended if nothing is known of it for so long, because the connection is lost."""
 
 _NUM_EVENTS: Final = struct.Struct(">i")
-_NUM_EVENTS_OFFSET: Final = 52
 _EVENT_ID: Final = struct.Struct(">I20x")  # an event has 24 bytes, its id first
-_EVENTS_OFFSET: Final = 56
 
 logger = logging.getLogger(__name__)
 
@@ -193,6 +192,6 @@ class EventPublisher:
 
 def event_ids(message: bytes) -> list[int]:
     """Return the ids of the events in an ``events_t``, each as an unsigned number."""
-    (number,) = _NUM_EVENTS.unpack_from(message, _NUM_EVENTS_OFFSET)
-    end = _EVENTS_OFFSET + number * _EVENT_ID.size
-    return [event_id for (event_id,) in _EVENT_ID.iter_unpack(message[_EVENTS_OFFSET:end])]
+    (number,) = _NUM_EVENTS.unpack_from(message, COUNT_OFFSET)
+    end = ITEMS_OFFSET + number * _EVENT_ID.size
+    return [event_id for (event_id,) in _EVENT_ID.iter_unpack(message[ITEMS_OFFSET:end])]
