@@ -170,13 +170,13 @@ class RecordedTakes:
         recording = self._announced(source)
         folder, running = self._folder, recording.running_names
         takes = await self._reader.read(partial(folder.takes, source, running), folder.directory)
+        take = recording.take
         current: StoredTake | None = None
-        if recording.take is not None:
-            stored = await self._reader.read(
-                partial(folder.take_at, recording.take.stem), recording.take.path
-            )
-            current = stored._replace(is_running=True, num_lost=recording.take.num_lost)
-            takes = [current if take.name == current.name else take for take in takes]
+        if take is not None:
+            stored = await self._reader.read(partial(folder.take_at, take.stem), take.path)
+            if recording.take is take:  # otherwise, it has just ended
+                current = stored._replace(is_running=True, num_lost=take.num_lost)
+                takes = [current if each.name == current.name else each for each in takes]
         kept_s = 0.0 if recording.segments is None else recording.segments.kept_s()
         return SourceTakes(current, takes, kept_s)
 

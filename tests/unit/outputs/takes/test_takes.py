@@ -1,6 +1,9 @@
 """Takes that peers start, stop, list and read."""
 
+import asyncio
+from collections.abc import Coroutine
 from pathlib import Path
+from typing import Any
 
 import lcm
 import pytest
@@ -9,8 +12,9 @@ from gateway.errors import QueryError
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerFile, ServerParameters
+from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.recorded_takes import MAX_SAVES
-from gateway.outputs.takes.stored import MAX_PIECE_BYTES
+from gateway.outputs.takes.stored import MAX_PIECE_BYTES, StoredTake
 from gateway.takes.reader import log_paths
 from tests.recording_output import RecordingLab, events, frames, recording_lab
 from tests.waiting import wait_until_async
@@ -121,6 +125,27 @@ async def test_names_may_have_letters_of_any_script(tmp_path: Path) -> None:
             await lab.takes.start("lab", name)
             await lab.takes.stop("lab")
             assert lab.path(f"{name}.lcmlog").is_file()
+
+
+async def test_a_take_that_ends_while_it_is_listed_is_not_running(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with recording_lab(tmp_path) as lab:
+        await lab.takes.start("lab", "walk")
+        loop, take_at = asyncio.get_running_loop(), TakesFolder.take_at
+        ends: list[Coroutine[Any, Any, StoredTake]] = []
+
+        async def end() -> None:
+            ends.append(lab.takes.end("lab"))
+
+        def end_and_read(folder: TakesFolder, path: Path) -> StoredTake:
+            if not ends:
+                asyncio.run_coroutine_threadsafe(end(), loop).result()
+            return take_at(folder, path)
+
+        monkeypatch.setattr(TakesFolder, "take_at", end_and_read)
+        assert (await lab.takes.list("lab")).running is None
+        assert (await ends[0]).name == "walk"
 
 
 async def test_takes_are_listed_and_read_in_pieces(tmp_path: Path) -> None:
