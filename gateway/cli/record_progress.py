@@ -20,7 +20,7 @@ _TERMINAL_S: Final = 0.5
 _LINE_S: Final = 5.0
 _CHECK_S: Final = 1.0
 _SLOW_BYTES: Final = 8 * 1024 * 1024
-"""If so much waits for the disk, it is too slow."""
+"""If more than this waits for the disk, it is too slow."""
 
 _MAX_LOSS_LINES: Final = 20
 
@@ -41,7 +41,7 @@ class RecordProgress:
         self._num_lost = 0
         self._num_refused = 0
         self._num_loss_lines = 0
-        self._reported: set[str] = set()  # what was reported and still is so
+        self._reported: set[str] = set()  # what was reported and still holds
         console = Console(stderr=True)
         self._live: Live | None = None
         if console.is_terminal:

@@ -63,8 +63,8 @@ class GatewayAddress(NamedTuple):
     def ask(self, options: Mapping[str, str]) -> TakeReplies:
         """Ask ``source``, or every source that is found, with these options.
 
-        If some of several sources reply as wanted, others are left out whose gateway records no takes, or,
-        if takes are to be stopped, that have no running one. Raises QueryError, OutputError.
+        If all sources are asked and one replies as wanted, those are left out whose gateway records no takes
+        and, if takes are to be stopped, those without a running take. Raises QueryError, OutputError.
         """
         replies = self._ask_lcm(options) if self.is_lcm else self._ask_zenoh(options)
         if self.source is None and replies.received:

@@ -39,7 +39,7 @@ class ZenohClient:
         self._subject = subject
         self.problems: list[QueryError] = []
         self._unique_names: dict[tuple[str, str], str] = {}  # by source and the gateway's Zenoh id
-        self._busy: QueryError | None = None  # what a gateway said that gets too many queries
+        self._busy: QueryError | None = None  # what gateways replied that get too many queries
 
     def sources(self, limits: TimeLimits) -> list[str]:
         """Return the sources that gateways serve, sorted. Raises QueryError if none is found in time.
@@ -80,7 +80,7 @@ class ZenohClient:
     ) -> list[str]:
         """Send queries and return those without any reply, as happens while Zenoh reconnects.
 
-        That a gateway gets too many queries is no reply either.
+        A refusal because of too many queries does not count as a reply.
         """
         handlers = {
             # NONE keeps the replies of all gateways: several may serve sources of the same name.

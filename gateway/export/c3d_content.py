@@ -12,7 +12,7 @@ from gateway.rtc3d.parameters import Parameters
 from gateway.takes.component_rows import Array
 
 _MAX_TRIMMED_S: Final = 1.0
-"""Frames at the ends for which analog samples are missing are left out if they are no more than this."""
+"""Frames at either end that lack analog samples are left out, up to this duration."""
 
 _RATIO_TOLERANCE: Final = 0.02
 

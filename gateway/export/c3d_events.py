@@ -14,7 +14,7 @@ from gateway.takes.series import Series
 
 _MINUTE_S: Final = 60.0
 _MARGIN_S: Final = 1.0
-"""An event so shortly before the first frame or after the last one belongs to the measurement."""
+"""An event within this time before the first frame or after the last one belongs to the measurement."""
 
 
 def event_times_us(events: Series) -> Array:

@@ -78,7 +78,7 @@ class PlatePlan(NamedTuple):
 def plan_plates(
     job: ExportJob, parameters: Parameters, unit: str, analog: Placed | None, forces: Placed | None
 ) -> list[PlatePlan]:
-    """Return how the plates are written that can be written; the others are reported.
+    """Return how each plate is written; plates that cannot be written are reported.
 
     ``analog`` and ``forces`` have the same rate. ``unit`` is that of the points.
     """

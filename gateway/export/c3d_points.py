@@ -15,9 +15,9 @@ _MISSING: Final = (0.0, 0.0, 0.0, -1.0)
 def encode_points(markers: Array, step: float) -> Array:
     """Return the words of points from markers, both of shape (frames, markers, 4).
 
-    A point that is missing is 0, 0, 0, -1. The fourth word of another one is a number of two bytes: in
-    c3d.org's guide and in NDI's files, the low one is the residual in steps and the high one tells the
-    cameras; in ezc3d it is the other way round. The protocol does not tell the cameras, so both bytes have
+    A point that is missing is 0, 0, 0, -1. The fourth word of a visible one has two bytes. In c3d.org's guide
+    and in NDI's files, the low byte is the residual in steps, and the high byte says which cameras saw the
+    marker; ezc3d reads them the other way round. The protocol says nothing about cameras, so both bytes have
     the residual.
     """
     words = markers.copy()

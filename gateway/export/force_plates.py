@@ -64,7 +64,7 @@ def own_channels(plate: Plate, analog: ParametersAnalog | None) -> tuple[int, ..
 
 
 def possible_types(plate: Plate, num_channels: int) -> tuple[int, ...]:
-    """Return the types that a plate with so many channels can have, the most likely one first."""
+    """Return the types that a plate with this many channels can have, the most likely one first."""
     if num_channels == 8:
         return (EIGHT_FORCES,)
     if num_channels != 6:

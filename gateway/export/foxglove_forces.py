@@ -45,7 +45,7 @@ _SHAFT_M: Final = 0.015
 _HEAD_M: Final = 0.04
 
 _LIFETIME: Final = Duration(1)
-"""An arrow disappears after so many seconds without another message."""
+"""An arrow disappears if no other message comes for this many seconds."""
 
 _Vector = tuple[float, float, float]
 
@@ -145,8 +145,8 @@ def _newton_metres(unit: str) -> float:
 def _arrow(plate: _Plate, load: tuple[float, ...]) -> list[ArrowPrimitive]:
     """Return the arrow of a load (§7.5); [] if it is too small or not known.
 
-    The moments are about the centre of the surface. So the force F acts at n × M / (n · F) from there, where
-    n is the normal: the point of the surface about which the moment has no part in the surface.
+    The moments are about the centre of the surface. The force F acts at n × M / (n · F) from there, where n
+    is the normal: about this point, the moment has no component within the surface.
     """
     fx, fy, fz, mx, my, mz = load
     nx, ny, nz = plate.normal

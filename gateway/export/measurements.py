@@ -19,11 +19,11 @@ this."""
 
 _MAX_FILES: Final = 1000
 _COMPARED: Final = 9
-"""How many pairs of frames are compared for it."""
+"""How many pairs of frames are compared to decide this."""
 
 _SECOND_US: Final = 1_000_000
 _MARGIN_US: Final = 1_000_000
-"""What is captured so shortly before or after a measurement may belong to it."""
+"""Frames captured within this time before or after a measurement may belong to it."""
 
 
 class Part(NamedTuple):

@@ -12,7 +12,7 @@ from gateway.takes.reader import SUFFIX
 from gateway.takes.recording import LogFile
 
 _MAX_NAMED: Final = 3
-"""The default name has the names of so many sources at most."""
+"""The default name has the names of at most this many sources."""
 
 
 class Target:

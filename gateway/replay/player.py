@@ -15,13 +15,13 @@ from gateway.replay.timeline import MAX_GAP_S, Jump, ReplayTimeline
 from gateway.takes.reader import TakeReader
 
 _FINE_S: Final = 0.005
-"""A wait for a condition may end so much too late; the rest is slept."""
+"""A wait for a condition may end this much too late, so the last part of a wait is slept."""
 
 STALL_S: Final = 1.0
 """A process that was stopped for longer does not catch up: the rest of the take is played later."""
 
 _PASS_S: Final = 0.01
-"""A repeated take begins again at the earliest after so long, however short it is."""
+"""A repeated take begins again after this time at the earliest, however short it is."""
 
 
 class Player:
@@ -67,7 +67,7 @@ class Player:
         self._is_paused = False
         self._is_stopping = False
         self._seek_us: int | None = None
-        self._must_attend = False  # to one of these three
+        self._must_attend = False  # whether one of these three is set; read for each message
         self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
 
     def start(self) -> None:
@@ -96,7 +96,7 @@ class Player:
             self._notify()
 
     def seek(self, delta_us: int) -> None:
-        """Continue at another place, so far from the present one."""
+        """Continue at another place, this far from the present one."""
         with self._changed:
             present_us = self.position_us if self._seek_us is None else self._seek_us
             self._seek_us = max(self._selection.start_us, present_us + delta_us)

@@ -8,7 +8,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d_server.scene import FrameSource, Scene
 
 LEAD_US: Final = 1_000_000
-"""With ``once``, a measurement begins so long after a request for frames. So a client with several
+"""With ``once``, a measurement begins this long after a request for frames. So a client with several
 connections, such as a gateway, gets the first frames on all of them."""
 
 MAX_LEAD_US: Final = 2_000_000

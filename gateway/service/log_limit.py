@@ -1,4 +1,4 @@
-"""The last line of defence against a log that grows without limit: so many lines a minute, of bounded length.
+"""The last defence against a log that grows without limit: bounded lines, and a bounded number a minute.
 
 Each message is limited where it is logged, too (see ``gateway.log``). This limit is for what nobody expected,
 such as defects, and for many messages that come together.
@@ -17,7 +17,7 @@ from gateway.token_bucket import TokenBucket
 
 BURST_LINES: Final = 25
 LINES_PER_MINUTE: Final = 20
-"""For each source, and for everything that belongs to none: so many lines at once, and so many a minute."""
+"""How many lines at once, and how many a minute, for each source and for everything without a source."""
 
 TOTAL_BURST_LINES: Final = 30
 TOTAL_LINES_PER_MINUTE: Final = 30

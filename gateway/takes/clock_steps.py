@@ -16,7 +16,7 @@ _MIN_STEP_US: Final = 500_000
 
 _MAX_DEVIATION_US: Final = 100_000
 _CONFIRMING_WINDOWS: Final = 5
-"""In so many windows in a row, the clock stays where it was set. A network that stood still catches up."""
+"""A step counts if the clock stays there for this many windows: after a stall, a network catches up."""
 
 _MAX_PAUSE_WINDOWS: Final = 60
 

@@ -15,7 +15,7 @@ _MAX_STEP_US: Final = 1_000_000
 """Frames that are further apart do not count for the rate: a pause lies between them."""
 
 _MAX_LAYOUTS: Final = 1000
-"""For so many different labels and numbers of items, the visibility is counted."""
+"""For how many different labels and numbers of items the visibility is counted."""
 
 _MAX_EVENT_IDS: Final = 1000
 _CARRIED: Final = ("utime", "sequence", "session", "timestamp_us", "frame_number")

@@ -27,7 +27,7 @@ MAX_LISTED_DAMAGE: Final = 100
 """How many places of damage are listed; all are counted."""
 
 _MAX_NAMES: Final = 1000
-"""So many names of channels are decoded once only."""
+"""How many names of channels are kept, so that each is decoded only once."""
 
 _READ_BYTES: Final = 1024 * 1024
 _AHEAD_BYTES: Final = 32 * 1024 * 1024

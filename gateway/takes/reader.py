@@ -22,10 +22,10 @@ SUFFIX: Final = ".lcmlog"
 
 _BATCH_BYTES: Final = 4 * 1024 * 1024
 _BATCH_MESSAGES: Final = 20_000
-"""A batch ends with so many bytes, or so many messages."""
+"""A batch ends at this many bytes or messages, whichever comes first."""
 
 _EVENT_BYTES: Final = 40
-"""About so many bytes of a file belong to an event beside its message."""
+"""About how many bytes of a file an event has besides its message."""
 
 _MAX_ROUTES: Final = 10_000
 

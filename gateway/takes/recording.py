@@ -211,7 +211,7 @@ def utime_of(message: bytes) -> int:
 
 
 def _complete(messages: Sequence[tuple[bytes, bytes]], num_bytes: int) -> tuple[int, int]:
-    """Return how many messages have complete events in so many bytes, and the size of those."""
+    """Return how many events are complete in the first ``num_bytes`` bytes, and the size of those."""
     complete_bytes = 0
     for number, (channel, message) in enumerate(messages):
         event_bytes = _HEADER.size + len(channel) + len(message)

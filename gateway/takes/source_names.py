@@ -10,7 +10,7 @@ from gateway.messages.decode import decode, message_type
 from gateway.takes.event_log import Event
 
 NAMED_WITHIN_EVENTS: Final = 50_000
-"""Within so many events, each source has been named: by its description, or by its status once a second."""
+"""Each source is named within this many events: by its description, or by its status once a second."""
 
 _POSE: Final = "_6D_"
 

@@ -53,7 +53,7 @@ class TakeSource:
 
 
 _MAX_LATE_US: Final = 10_000_000
-"""So long after the end of the range that was asked for, no message belongs to it any more."""
+"""This long after the end of a range, no more messages belong to it."""
 
 _FIELDS: Final = {"3d": "markers", "6d": "tools", "analog": "analog", "force": "forces", "event": "events"}
 """The fields of TakeSource by the keys of components."""

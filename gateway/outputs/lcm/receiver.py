@@ -62,7 +62,7 @@ class LcmReceiver:
             self._thread.start()
 
     def add(self, channel: str, take: Take) -> None:
-        """Receive on one more channel, to the end.
+        """Receive on one more channel, until ``close``.
 
         LCM's Python module would free a subscription while the receiving thread may be using it.
         """

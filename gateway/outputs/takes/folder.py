@@ -89,9 +89,8 @@ class TakesFolder:
     def open(self) -> str:
         """Check whether takes can be written here; return what is wrong, or "". May be called again."""
         try:
-            if (
-                not self._was_open
-            ):  # later, a folder that is missing is on a disk that is not mounted any more
+            # If a folder is missing later, its disk is not mounted any more.
+            if not self._was_open:
                 with contextlib.suppress(FileExistsError):  # a file is there instead, as check_directory says
                     self.directory.mkdir(parents=True, exist_ok=True)
             check_directory(self.directory)
@@ -129,7 +128,7 @@ class TakesFolder:
                 os.close(lock)
 
     def recover(self) -> None:
-        """Keep the segments that a gateway has left behind, which was killed, as a take. Raises OSError."""
+        """Keep the segments that a killed gateway has left behind as a take. Raises OSError."""
         rolling = self.directory / ROLLING
         for folder in sorted(rolling.iterdir()) if rolling.is_dir() else ():
             segments = log_paths_or_none(folder)

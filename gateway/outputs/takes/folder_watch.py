@@ -15,7 +15,7 @@ _SILENT_S: Final = 5.0
 """How long a check of the folder may take; after that, the disk does not respond."""
 
 _REST: Final = 50
-"""The folder is not checked for this many times as long as the newest check took."""
+"""After a check, the next one waits for this many times the duration of the check."""
 
 _DAY_S: Final = 86_400.0
 

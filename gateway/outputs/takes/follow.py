@@ -19,7 +19,7 @@ END_S: Final = 2.0
 """For how long the server must send No Data until a take of a measurement ends."""
 
 LOST_S: Final = 60.0
-"""A measurement has ended if nothing is known of it for so long, because the connection is lost."""
+"""A measurement counts as ended after the connection has been lost for this long."""
 
 _NUM_EVENTS: Final = struct.Struct(">i")
 _EVENT_ID: Final = struct.Struct(">I20x")  # an event has 24 bytes, its id first

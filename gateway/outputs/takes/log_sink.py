@@ -1,4 +1,4 @@
-"""Writing messages to event logs until the disk accepts them, or until nobody wants to wait any longer."""
+"""Writing messages to event logs, again and again while the disk does not accept them."""
 
 import threading
 from abc import ABC, abstractmethod

@@ -203,7 +203,7 @@ class RecordedTakes:
 
     def _open_recorder(self) -> Recorder:
         recorder, problem = self._started_recorder(), self.problem
-        if problem and self._watch.is_checked:  # otherwise, creating a file will tell
+        if problem and self._watch.is_checked:  # otherwise, creating the file shows it
             raise QueryError(problem, code="disk")
         return recorder
 

@@ -24,7 +24,7 @@ SEGMENT_S: Final = 10.0
 
 MAX_SEGMENTS: Final = 360
 _MAX_FILES: Final = 999
-"""A saved take has at most so many files, which have numbers of three digits."""
+"""The maximum number of files of a saved take: they are numbered with three digits."""
 
 logger = logging.getLogger(__name__)
 

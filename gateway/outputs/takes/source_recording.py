@@ -24,7 +24,7 @@ from gateway.takes.recording import Recorder
 from gateway.worker_thread import WorkerThread
 
 C3D_WAIT_S: Final = 60.0
-"""A C3D file that the server sends so soon after a take belongs to it."""
+"""A C3D file that the server sends within this time after a take belongs to the take."""
 
 _LONG_XML_BYTES: Final = 32 * 1024
 """Longer parameters are encoded by a thread: 16 MB take 30 ms."""

@@ -1,4 +1,4 @@
-"""What peers are told about takes."""
+"""How takes are described to peers."""
 
 from collections.abc import Sequence
 from typing import Final, NamedTuple

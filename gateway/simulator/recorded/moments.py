@@ -9,7 +9,7 @@ from gateway.simulator.recorded.parameters import RecordedParameters
 from gateway.simulator.recorded.timeline import TakeTimeline
 
 _REORDER_US: Final = 500_000
-"""Components of one frame, recorded on two connections, are at most so far apart in a take."""
+"""Components of one frame that were recorded on two connections are at most this far apart in a take."""
 
 _RELEASE_US: Final = 50_000
 """Moments are released together, because each release costs more than a moment."""

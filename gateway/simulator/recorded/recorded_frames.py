@@ -22,7 +22,7 @@ LATE_US: Final = 3_000_000
 
 _GAP_PERIODS: Final = 2.5
 _MAX_GAP_US: Final = 5_000_000
-"""If the slowest component pauses for so many of its periods, a faster one sets the rate."""
+"""If the slowest component pauses for this many of its periods, a faster one sets the rate."""
 
 _SAME_GAP: Final = 1.01  # rates within this factor are one rate: servers round them
 _EVENTS_ONLY: Final = -1.0  # the gap of moments that have only events; components without a rate have 0
@@ -50,8 +50,8 @@ class RecordedFrames:
     The slowest component of the choice sets the rate (§5.3.5): there is a frame at each moment that has it,
     with the newest content of the others since the frame before. So components of one rate are all in a
     frame. While the slowest one pauses, or as long as it does not exist, the next slower one sets the rate,
-    and so on. A choice of which the take has nothing so far has the frames of all components, without their
-    content: events are sent with them.
+    and so on. As long as the take has had none of the chosen components, each frame of the others becomes one
+    without content, so that events are sent in time.
 
     ``requested`` are the components of a command; an empty sequence means all. ``rates_hz`` are the measured
     rates of components, for those whose rate the server does not announce.

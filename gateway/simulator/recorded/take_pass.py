@@ -15,10 +15,10 @@ from gateway.simulator.recorded.parameters import RecordedParameters
 from gateway.takes.reader import TakeMessage, TakeReader
 
 _MAX_LATE_CAPTURE_US: Final = 3_600_000_000
-"""A capture so long before the arrival, or after it, is not plausible."""
+"""A time of capture this far from the arrival is not plausible."""
 
 _RANGE_SLACK_US: Final = 5_000_000
-"""Messages of one moment are at most so far apart in a take; the end of a range is certain after this."""
+"""Messages of one moment are at most this far apart in a take, so a range is complete after this time."""
 
 _MAX_VERSIONS: Final = 1000
 """How many versions of the parameters are remembered: a faulty server can change them all the time."""

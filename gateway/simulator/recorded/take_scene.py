@@ -25,11 +25,11 @@ from gateway.worker_thread import WorkerThread
 
 _AHEAD_US: Final = 3_000_000
 _MAX_AHEAD_BYTES: Final = 64 * 1024 * 1024
-"""So much of a take is read ahead, whichever is less. With more objects, garbage collection takes longer."""
+"""How much of a take is read ahead, whichever is less: with more objects, garbage collection takes longer."""
 
 _BATCH_BYTES: Final = 1024 * 1024
 _BATCH_MOMENTS: Final = 200
-"""So much is read at once, whichever is less: it takes some milliseconds, and frames are sent meanwhile."""
+"""How much is read at once, whichever is less: this takes some milliseconds, while frames are sent."""
 
 _KEPT_US: Final = 1_000_000
 """Moments of the past that a new client may need: the newest frame, and those of a stream that goes on."""
@@ -39,10 +39,10 @@ _WAITING_US: Final = 10_000
 """How often the scene is advanced, and how often while little of it is in memory."""
 
 _PREVIEW_MOMENTS: Final = 3000
-"""The numbers and rates of components without parameters are those of so many moments at the beginning."""
+"""Without parameters, the numbers of items and the rates are those of this many moments at the beginning."""
 
 _SOURCES_WITHIN: Final = 20_000
-"""All sources of a take have a message among so many at its beginning."""
+"""Each source of a take has a message among this many at its beginning."""
 
 _LEAST_SHARE: Final = 0.005
 
@@ -261,7 +261,7 @@ def _read_batch(moments: Iterator[Moment]) -> _Batch:
 def _chosen_source(reader: TakeReader, source: str | None) -> str:
     """Return the source to play. Raises TakeError if the take has several, or others only.
 
-    Sources with few messages, compared with the others, are none: a damaged channel looks like a source.
+    Sources with few messages, compared with the others, do not count: a damaged channel looks like a source.
     """
     counts = Counter(
         message.source

@@ -11,10 +11,10 @@ _MAX_STEP_US: Final = 1_000_000
 """If the clock of the recording computer was set, time stamps still advance by at most this much."""
 
 _PROOF_US: Final = 1_000_000
-"""After time stamps were not plausible, they must advance like the time of capture for so long."""
+"""After time stamps were not plausible, they must advance like the time of capture for this long."""
 
 _MAX_PAUSE_US: Final = 86_400_000_000
-"""A longer pause is none: the computer's clock was set, or a time is damaged."""
+"""A longer pause is no real one: the computer's clock was set, or a time is damaged."""
 
 _DRIFT: Final = 1e-3
 """Two clocks may differ by this much of the elapsed time; a crystal is off by 1e-4 at most."""
@@ -27,7 +27,7 @@ class TakeTimeline:
     as the time of capture does. They do not if the server restarts, if they wrap around, or if they are no
     times at all. Then the time of capture counts until they have proved themselves for a second. If it is
     the time of capture that jumps, because somebody has set the recording computer's clock, the time stamps
-    are followed on.
+    still count.
     """
 
     def __init__(self) -> None:
