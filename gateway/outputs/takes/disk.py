@@ -37,7 +37,7 @@ class Disk:
         self._failures.failed(self.problem)
 
     def ended(self) -> None:
-        """Forget the problem, because a file has ended: whether it is over, the next one tells."""
+        """Forget the problem, because a file has ended; the next one shows whether it persists."""
         self.problem = ""
 
     def succeeded(self) -> None:
