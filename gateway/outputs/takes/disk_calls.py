@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Final, TypeVar
 
 from gateway.errors import QueryError, TakeError
-from gateway.outputs.takes.disk import disk_problem
+from gateway.outputs.takes.disk import Disk, disk_problem
 from gateway.worker_thread import WorkerThread
 
 _TIMEOUT_S: Final = 4.0
@@ -27,13 +27,17 @@ class DiskReader:
         return await disk_result(self._thread.submit(call), path)
 
 
-async def disk_result(future: Future[_Result], path: Path) -> _Result:
-    """Return the result of a call that needs the disk of ``path``. Raises QueryError if the disk fails."""
+async def disk_result(future: Future[_Result], path: Path, disk: Disk | None = None) -> _Result:
+    """Return the result of a call that needs the disk of ``path``. Raises QueryError if the disk fails.
+
+    ``disk`` knows why the thread that writes is late: for example, rolling segments wait for room.
+    """
     try:
         async with asyncio.timeout(_TIMEOUT_S):
             return await asyncio.shield(asyncio.wrap_future(future))  # what was asked for happens later
     except TimeoutError:
-        text = f"the disk of {path} did not respond within {_TIMEOUT_S:g} s; check it"
+        problem = "" if disk is None else disk.problem
+        text = problem or f"the disk of {path} did not respond within {_TIMEOUT_S:g} s; check it"
         raise QueryError(text, code="disk") from None
     except OSError as error:
         raise QueryError(disk_problem(path, error), code="disk") from error

@@ -96,7 +96,7 @@ class RecordedTakes:
         self, recorder: Recorder, recording: SourceRecording, take: TakeFile, created: Future[None]
     ) -> StoredTake:
         try:
-            await disk_result(created, take.path)
+            await disk_result(created, take.path, self.disk)
         except QueryError:
             take.cancel()
             recorder.call(take.discard)
@@ -123,7 +123,7 @@ class RecordedTakes:
         return self._ended(take, recording.end_take(recorder, take))
 
     async def _ended(self, take: TakeFile, ended: Future[None]) -> StoredTake:
-        await disk_result(ended, take.path)
+        await disk_result(ended, take.path, self.disk)
         stored = await self._reader.read(partial(self._folder.take_at, take.stem), take.path)
         return stored._replace(num_lost=take.num_lost)
 
@@ -154,7 +154,7 @@ class RecordedTakes:
         folder = self._folder.directory / source / (name or default_name(source))
         since_s = now_s - last_s
         call = partial(segments.save, folder, since_s, has_free_name=not name, goes_on=after_s > 0)
-        save = await disk_result(recorder.call(call), folder)
+        save = await disk_result(recorder.call(call), folder, self.disk)
         if after_s > 0:
             loop = asyncio.get_running_loop()
             delay_s = max(0.0, now_s + after_s - time.monotonic())

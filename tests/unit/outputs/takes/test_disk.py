@@ -156,6 +156,21 @@ async def test_a_take_whose_file_is_removed_continues_in_a_new_one(
     assert any("was removed while it was recorded" in each for each in caplog.messages)
 
 
+async def test_stopping_a_take_while_segments_wait_for_a_full_disk_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.2)
+    async with recording_lab(tmp_path, keep_last_s=60) as lab:
+        await lab.takes.start("lab", "walk")
+        with files_of_at_most(100_000):
+            for _ in range(100):
+                lab.publish(size=1000)
+            await wait_until_async(lambda: not lab.output.health().connected)
+            with pytest.raises(QueryError, match="cannot be written: File too large"):
+                await lab.takes.stop("lab")
+        await wait_until_async(lambda: lab.output.health().connected)
+
+
 async def test_a_disk_that_does_not_respond_is_reported_and_delays_nobody(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
