@@ -125,6 +125,8 @@ class RecordedTakes:
     async def _ended(self, take: TakeFile, ended: Future[None]) -> StoredTake:
         await disk_result(ended, take.path, self.disk)
         stored = await self._reader.read(partial(self._folder.take_at, take.stem), take.path)
+        size = f"{stored.seconds:.1f} s, {stored.num_bytes / 1e6:.1f} MB"
+        logger.info("takes: %s is complete: %s, %d messages lost", take.path, size, take.num_lost)
         return stored._replace(num_lost=take.num_lost)
 
     async def save(
