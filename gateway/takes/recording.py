@@ -9,10 +9,11 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, Final, Protocol, TypeVar
+from typing import Final, Protocol, TypeVar
 
 from gateway.log import DefectLog
 from gateway.takes.event_log import SYNC
+from gateway.worker_thread import make_call
 
 MAX_QUEUED_BYTES: Final = 64 * 1024 * 1024
 """How much may wait for the disk; at 1.3 MB/s, the disk may stand still for 50 s."""
@@ -151,7 +152,7 @@ class Recorder:
         The future can be cancelled before; then nothing is called.
         """
         done: Future[_Result] = Future()
-        self._queue.append(lambda: _make(done, function))
+        self._queue.append(lambda: make_call(done, function))
         self._wake.set()
         return done
 
@@ -219,12 +220,3 @@ def _complete(messages: Sequence[tuple[bytes, bytes]], num_bytes: int) -> tuple[
             return number, complete_bytes
         complete_bytes += event_bytes
     return len(messages), complete_bytes
-
-
-def _make(done: Future[Any], function: Callable[[], Any]) -> None:
-    if not done.set_running_or_notify_cancel():
-        return
-    try:
-        done.set_result(function())
-    except BaseException as error:  # noqa: BLE001 - it belongs to the caller
-        done.set_exception(error)
