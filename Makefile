@@ -46,7 +46,7 @@ test-compiled: build/compiled/complete
 # Two parts at a time. Each run of pytest has a network namespace of its own, so they do not disturb each other.
 check: .venv/installed
 	$(MAKE) --jobs=2 --output-sync=target --no-print-directory lint types contracts generated docs wheelhouse compiled
-	$(MAKE) --jobs=2 --output-sync=target --no-print-directory test-integration test-takes test-hostile test-others test-compiled
+	$(MAKE) --jobs=2 --keep-going --output-sync=target --no-print-directory test-integration test-takes test-hostile test-others test-compiled
 
 lint: .venv/installed
 	$(BIN)/ruff format --check

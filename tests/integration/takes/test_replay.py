@@ -298,7 +298,7 @@ async def test_nothing_that_matches_is_an_error(tmp_path: Path, subscribers: Sub
     path = write_take(tmp_path / "take.lcmlog", some_messages())
     ended = await replay(path, "--lcm", "--url", subscribers.url, "--source", "stage")
     assert ended.status == 1
-    assert "check --source, --component, --from and --to" in ended.stderr
+    assert "check --source (lab), --component, --from and --to" in ended.stderr
 
 
 async def test_a_folder_and_several_sources(tmp_path: Path, subscribers: Subscribers) -> None:
