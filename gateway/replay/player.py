@@ -124,7 +124,7 @@ class Player:
             start_us: int | None = self._selection.start_us
             while start_us is not None:
                 start_us = self._next_start(start_us)
-        except BaseException as error:  # noqa: BLE001 - it belongs to whoever waits for the thread
+        except BaseException as error:  # noqa: BLE001 - the waiting thread raises it
             self.error = error
         finally:
             self._ended_s = time.monotonic()

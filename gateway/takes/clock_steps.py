@@ -12,7 +12,7 @@ MAX_LISTED_STEPS: Final = 100
 
 _WINDOW_US: Final = 1_000_000
 _MIN_STEP_US: Final = 500_000
-"""Smaller steps cannot be told from frames that arrived late."""
+"""Smaller steps look like frames that arrived late."""
 
 _MAX_DEVIATION_US: Final = 100_000
 _CONFIRMING_WINDOWS: Final = 5

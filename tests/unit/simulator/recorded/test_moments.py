@@ -18,7 +18,7 @@ Content = dict[ComponentType, int]
 
 
 class Take:
-    """Components added one after the other; frame numbers tell them apart."""
+    """Components added one after the other, each with another frame number."""
 
     def __init__(self) -> None:
         self.builder = MomentBuilder()

@@ -29,7 +29,7 @@ SECOND_US = 1_000_000
 
 
 def moment(due_us: int, numbers: Mapping[str, int], parameters: RecordedParameters = NONE) -> Moment:
-    """Return a moment with components without items, told apart by their frame numbers."""
+    """Return a moment with components without items and with different frame numbers."""
     contents = {
         COMPONENTS_BY_KEY[key]: struct.pack(">iqi", number, 7_000_000 + due_us, 0)
         if key != "event"
