@@ -1,6 +1,5 @@
 """A whole gateway that publishes into memory, for tests against any server."""
 
-import asyncio
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any
@@ -10,6 +9,7 @@ from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.memory import MemoryOutput
 from tests.configurations import make_settings
+from tests.running_gateway import running_gateway
 from tests.waiting import wait_until_async
 
 
@@ -56,11 +56,5 @@ async def run_gateway(port: int, **settings: Any) -> AsyncIterator[MemoryGateway
         ),
         [output],
     )
-    stop = asyncio.Event()
-    task = asyncio.create_task(gateway.run(stop))
-    try:
+    async with running_gateway(gateway, stop_timeout_s=5):
         yield MemoryGateway(gateway, output)
-    finally:
-        stop.set()
-        async with asyncio.timeout(5):
-            await task

@@ -24,6 +24,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import SECTIONS
 from tests.configurations import make_settings
 from tests.networks import free_endpoint, free_port, open_zenoh, zenoh_keys
+from tests.running_gateway import running_gateway
 from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
 from tests.spec_parameters import in_root, spec_xml
 from tests.waiting import wait_until_async
@@ -165,15 +166,8 @@ async def run_gateway(
         spool=SpoolSettings(directory=None if spool is None else str(spool)),
         metrics=MetricsSettings(enabled=False),
     )
-    gateway = Gateway(settings)
-    stop = asyncio.Event()
-    task = asyncio.create_task(gateway.run(stop))
-    try:
+    async with running_gateway(Gateway(settings)) as gateway:
         yield gateway
-    finally:
-        stop.set()
-        async with asyncio.timeout(20):
-            await task
 
 
 def output_queries(gateway: Gateway) -> Any:

@@ -1,6 +1,5 @@
 """Takes of simulated servers, with a gateway in between."""
 
-import asyncio
 import os
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -17,6 +16,7 @@ from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.configurations import make_settings
+from tests.running_gateway import running_gateway
 from tests.waiting import wait_until_async
 
 
@@ -28,14 +28,8 @@ async def recording_gateway(port: int, path: Path, **source: object) -> AsyncIte
         metrics=MetricsSettings(enabled=False),
         lcm=LcmSettings(url=f"file://{path}?mode=w", queries=False),
     )
-    gateway = Gateway(settings, [LcmOutput(settings.lcm)])
-    stop = asyncio.Event()
-    task = asyncio.create_task(gateway.run(stop))
-    try:
+    async with running_gateway(Gateway(settings, [LcmOutput(settings.lcm)])) as gateway:
         yield gateway
-    finally:
-        stop.set()
-        await task
 
 
 async def record(scene: Scene, path: Path, until: Callable[[Simulator, Gateway], bool]) -> Path:

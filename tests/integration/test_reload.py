@@ -32,6 +32,7 @@ from gateway.simulator.synthetic import SyntheticScene
 from tests.configurations import make_settings
 from tests.networks import free_endpoint, free_port, lcm_url, zenoh_keys
 from tests.queried_gateway import ParameterServer, query, query_all, zenoh_peer
+from tests.running_gateway import running_gateway
 from tests.servers import Client, ScriptedServer, c3d_file, ok, packet
 from tests.waiting import wait_until_async
 
@@ -74,16 +75,9 @@ class SettingsBuilder:
 
 @asynccontextmanager
 async def running(settings: Settings) -> AsyncIterator[Gateway]:
-    gateway = Gateway(settings)
-    stop = asyncio.Event()
-    task = asyncio.create_task(gateway.run(stop))
-    try:
+    async with running_gateway(Gateway(settings), stop_timeout_s=10) as gateway:
         await gateway.opened.wait()
         yield gateway
-    finally:
-        stop.set()
-        async with asyncio.timeout(10):
-            await task
 
 
 class ReceivedMarkers:

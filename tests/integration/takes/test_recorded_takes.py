@@ -27,6 +27,7 @@ from tests.configurations import make_settings
 from tests.gateway_process import program, simulator
 from tests.networks import free_endpoint, zenoh_keys
 from tests.recording_output import settings_in
+from tests.running_gateway import running_gateway
 from tests.waiting import wait_until, wait_until_async
 
 pytestmark = pytest.mark.netns
@@ -52,15 +53,9 @@ class Site:
 
 @contextlib.asynccontextmanager
 async def running(settings: Settings) -> AsyncIterator[Gateway]:
-    gateway, stop = Gateway(settings), asyncio.Event()
-    task = asyncio.create_task(gateway.run(stop))
-    try:
+    async with running_gateway(Gateway(settings), stop_timeout_s=10) as gateway:
         await gateway.opened.wait()
         yield gateway
-    finally:
-        stop.set()
-        async with asyncio.timeout(10):
-            await task
 
 
 def takes_of(gateway: Gateway) -> RecordedTakes:
