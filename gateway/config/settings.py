@@ -207,13 +207,26 @@ class OutputSettings(Section):
     """Whether to publish on this output."""
 
 
-def state_directory() -> Path:
-    """Return the folder for what the gateway keeps: that of the service, or of the user without systemd."""
+def folder_of(configured: str | None, name: str) -> Path:
+    """Return the folder in use: the configured one, or ``name`` in the state directory.
+
+    The state directory is that of the service, or of the user without systemd.
+    """
+    if configured is not None:
+        return Path(configured)
     state = os.environ.get("STATE_DIRECTORY", "").split(":")[0]
     if state:
-        return Path(state)
+        return Path(state) / name
     home = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
-    return Path(home) / "rtc3d-gateway"
+    return Path(home) / "rtc3d-gateway" / name
+
+
+def default_folder(configured: str | None, name: str) -> dict[str, Effective]:
+    """Return the effective ``directory`` of a section (see Section), if it is not a configured one."""
+    if configured is not None:
+        return {}
+    folder = folder_of(None, name)
+    return {"directory": Effective(str(folder), ("STATE_DIRECTORY", "XDG_STATE_HOME"))}
 
 
 class SpoolSettings(Section):
@@ -231,14 +244,12 @@ class SpoolSettings(Section):
     @property
     def effective(self) -> dict[str, Effective]:
         """See Section."""
-        if self.directory is not None:
-            return {}
-        return {"directory": Effective(str(self.effective_directory), ("STATE_DIRECTORY", "XDG_STATE_HOME"))}
+        return default_folder(self.directory, "c3d")
 
     @property
     def effective_directory(self) -> Path:
         """``directory``, or the default folder if it is None."""
-        return state_directory() / "c3d" if self.directory is None else Path(self.directory)
+        return folder_of(self.directory, "c3d")
 
 
 class MetricsSettings(Section):

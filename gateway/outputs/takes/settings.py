@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import Field, model_validator
 
 from gateway.config.section import Effective, expects, validation_error
-from gateway.config.settings import OutputSettings, state_directory
+from gateway.config.settings import OutputSettings, default_folder, folder_of
 from gateway.config.values import AbsoluteDirectory, Components, Switch
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, ChannelPrefix
 from gateway.rtc3d.components import WIRE_ORDER
@@ -86,11 +86,9 @@ class TakesSettings(OutputSettings):
     @property
     def effective(self) -> dict[str, Effective]:
         """See Section."""
-        if self.directory is not None:
-            return {}
-        return {"directory": Effective(str(self.effective_directory), ("STATE_DIRECTORY", "XDG_STATE_HOME"))}
+        return default_folder(self.directory, "takes")
 
     @property
     def effective_directory(self) -> Path:
         """``directory``, or the default folder if it is None."""
-        return state_directory() / "takes" if self.directory is None else Path(self.directory)
+        return folder_of(self.directory, "takes")
