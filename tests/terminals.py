@@ -19,13 +19,25 @@ LONG_RUNNING: Final = ("rtc3d-gateway simulate", "rtc3d-gateway run")
 """Commands that run until Ctrl-C."""
 
 TIMEOUT_S: Final = 60
-NUMBER: Final = re.compile(r"-?\d+(?:\\\.\d+)?")
+
+_NUMBER: Final = r"-?\d+(?:,\d{3})*(?:\.\d+)?"
+_SIZE: Final = rf"{_NUMBER}\s+(?:bytes|[kMG]B)\b"
+_DURATION: Final = rf"(?:\d+\s+h\s+)?(?:\d+\s+min\s+)?{_NUMBER}\s+s\b"
+_VARIABLE: Final = {"size": _SIZE, "duration": _DURATION, "number": _NUMBER}
+"""What differs from run to run. The unit of a size or a duration depends on how large it is."""
+
+_PARTS: Final = re.compile(
+    "|".join(f"(?P<{kind}>{expression})" for kind, expression in _VARIABLE.items())
+    + r"|(?P<any>…)|(?P<space>\s+)|(?P<text>[^\s…\d-]+|-)"
+)
 
 
 def pattern(line: str) -> str:
-    """Return a pattern that matches a line with other numbers, other white space, and any text for ``…``."""
-    escaped = re.escape(" ".join(line.split())).replace(r"\ ", r"\s+").replace(re.escape("…"), ".*")
-    return NUMBER.sub(r"-?\\d+(?:\\.\\d+)?", escaped.replace(r"\-", "-"))
+    """Return a pattern that matches a line with other sizes, durations, numbers, and any text for ``…``."""
+    kinds = _VARIABLE | {"any": ".*", "space": r"\s+"}
+    return "".join(
+        kinds.get(part.lastgroup or "", re.escape(part[0])) for part in _PARTS.finditer(line.strip())
+    )
 
 
 class Terminal:

@@ -175,6 +175,8 @@ class _Run:
         async with open_publication(destinations, are_required=are_required, warn=self._note) as publication:
             if not stop.is_set():
                 await self._play(publication, stop)
+        if not publication.num_messages:
+            self._note("nothing was replayed")
         return not publication.refusals
 
     async def _play(self, publication: Publication, stop: asyncio.Event) -> None:

@@ -78,6 +78,10 @@ class Received:
     def payloads(self, key: str) -> list[bytes]:
         return [payload for payload, _ in self.samples[key]]
 
+    async def wait_for(self, key: str, payloads: list[bytes]) -> None:
+        """Wait until a Zenoh key had exactly these: some may be on their way when ``replay`` ends."""
+        await wait_until_async(lambda: self.payloads(key) == payloads)
+
 
 class Subscribers:
     """A Zenoh session and an LCM subscriber. ``options`` let ``replay`` publish to them."""
@@ -129,10 +133,10 @@ async def test_subscribers_get_every_byte_in_order_under_a_prefix_of_its_own(
     assert ended.status == 0, ended.stderr
     received = subscribers.received
     expected = by_channel(messages)
-    assert by_channel(received.messages) == expected
-    assert {key.split("/")[0] for key in received.samples} == {"replay"}
+    await wait_until_async(lambda: by_channel(received.messages) == expected)
     for key in RECORDED:
-        assert received.payloads(f"replay/lab/{key}") == expected[lcm_channel("REPLAY", "lab", key)]
+        await received.wait_for(f"replay/lab/{key}", expected[lcm_channel("REPLAY", "lab", key)])
+    assert {key.split("/")[0] for key in received.samples} == {"replay"}
     parameters_seen = list(dict.fromkeys(received.samples["replay/lab/parameters"]))
     assert [(xml, json.loads(attachment)["parameters_version"]) for xml, attachment in parameters_seen] == [
         (XML, 1),
@@ -151,8 +155,8 @@ async def test_as_fast_as_possible_a_zenoh_subscriber_gets_everything(
     assert ended.status == 0, ended.stderr
     expected = by_channel(messages)
     for key in RECORDED:
-        received = subscribers.received.payloads(f"replay/lab/{key}")
-        assert received == expected[lcm_channel("REPLAY", "lab", key)]
+        messages_of_key = expected[lcm_channel("REPLAY", "lab", key)]
+        await subscribers.received.wait_for(f"replay/lab/{key}", messages_of_key)
 
 
 async def test_the_parameters_of_a_replay_can_be_queried(tmp_path: Path, subscribers: Subscribers) -> None:
@@ -195,8 +199,10 @@ async def test_a_replay_does_not_mix_with_what_somebody_else_publishes(
             assert "choose another --prefix" in ended.stderr
         ended = await replay(path, *subscribers.options, "--prefix", "site/two", "--to", "0.1")
         assert ended.status == 0, ended.stderr
-    assert len(by_channel(subscribers.received.messages, "SITE_TWO")["SITE_TWO_LAB_3D"]) == 21
-    assert len(subscribers.received.payloads("site/two/lab/3d")) == 21
+    received = subscribers.received
+    expected = by_channel(some_messages(), "SITE_TWO")["SITE_TWO_LAB_3D"][:21]
+    await wait_until_async(lambda: by_channel(received.messages, "SITE_TWO")["SITE_TWO_LAB_3D"] == expected)
+    await received.wait_for("site/two/lab/3d", expected)
 
 
 async def test_an_output_that_does_not_open_is_left_out_unless_it_was_asked_for(
@@ -207,7 +213,8 @@ async def test_an_output_that_does_not_open_is_left_out_unless_it_was_asked_for(
     ended = await replay(path, *nowhere, "--url", subscribers.url)
     assert ended.status == 0
     assert "not replayed there: zenoh" in ended.stderr
-    assert by_channel(subscribers.received.messages) == by_channel(some_messages(frames=20))
+    expected = by_channel(some_messages(frames=20))
+    await wait_until_async(lambda: by_channel(subscribers.received.messages) == expected)
     ended = await replay(path, *nowhere, "--zenoh")
     assert ended.status == 1
     assert "zenoh" in ended.stderr
@@ -249,8 +256,9 @@ async def test_a_log_of_lcm_logger_is_replayed(tmp_path: Path, subscribers: Subs
         await wait_until_async(lambda: messages[-1][1] in log.read_bytes())
     ended = await replay(log, *subscribers.options)
     assert ended.status == 0, ended.stderr
-    assert by_channel(subscribers.received.messages) == by_channel(messages)
-    assert subscribers.received.payloads("replay/lab/3d") == by_channel(messages)["REPLAY_LAB_3D"]
+    expected = by_channel(messages)
+    await wait_until_async(lambda: by_channel(subscribers.received.messages) == expected)
+    await subscribers.received.wait_for("replay/lab/3d", expected["REPLAY_LAB_3D"])
     assert "of other programs or versions were left out, on PROBE" in ended.stderr
 
 
@@ -310,5 +318,6 @@ async def test_a_folder_and_several_sources(tmp_path: Path, subscribers: Subscri
     write_take(folder / "take-002.lcmlog", merged[600:])
     ended = await replay(folder, *subscribers.options, "--rate", "4")
     assert ended.status == 0, ended.stderr
-    assert by_channel(subscribers.received.messages) == by_channel(merged)
-    assert len(subscribers.received.payloads("replay/stage-2/3d")) == 200
+    expected = by_channel(merged)
+    await wait_until_async(lambda: by_channel(subscribers.received.messages) == expected)
+    await subscribers.received.wait_for("replay/stage-2/3d", expected["REPLAY_STAGE_2_3D"])

@@ -3,6 +3,7 @@
 import contextlib
 import os
 import pty
+import re
 import select
 import signal
 import subprocess
@@ -14,13 +15,15 @@ from typing import Any, Final
 
 import pytest
 
+from gateway.rtc3d.components import ComponentType
 from tests.gateway_process import PROGRAM
 from tests.networks import lcm_url
-from tests.takes import START_UTIME, description, markers, parameters, write_take
+from tests.takes import START_UTIME, description, frame, markers, parameters, write_take
 
 pytestmark = pytest.mark.netns
 
 XML: Final = b"<Parameters></Parameters>"
+SOME_MESSAGES: Final = re.compile(r"[1-9]\d* messages/s")
 _TIMEOUT_S: Final = 20.0
 
 
@@ -62,26 +65,31 @@ class Terminal:
         return bool(flags & termios.ICANON and flags & termios.ECHO)
 
 
-@pytest.fixture
-def terminal(tmp_path: Path) -> Iterator[Terminal]:
-    messages = [description(), parameters(XML)]
-    messages += [markers(1, number, utime=START_UTIME + 10_000 * number) for number in range(12_000)]
-    path = write_take(tmp_path / "take.lcmlog", messages)
+@contextlib.contextmanager
+def replay_in_terminal(take: Path, *options: str) -> Iterator[Terminal]:
     master, end = pty.openpty()
     # The terminal controls the program, as when a shell starts it.
-    command = ["setsid", "--ctty", *PROGRAM, "replay", str(path), "--lcm", "--url", lcm_url()]
+    command = ["setsid", "--ctty", *PROGRAM, "replay", str(take), "--lcm", "--url", lcm_url(), *options]
     environ = {**os.environ, "TERM": "xterm", "COLUMNS": "150"}
 
     with subprocess.Popen(command, stdin=end, stdout=end, stderr=end, env=environ) as process:
-        found = Terminal(master, process)
         try:
-            found.wait_for(lambda text: "messages/s" in text)
-            assert not found.shows_keys()
-            yield found
+            yield Terminal(master, process)
         finally:
             process.kill()
             os.close(master)
             os.close(end)
+
+
+@pytest.fixture
+def terminal(tmp_path: Path) -> Iterator[Terminal]:
+    """A terminal in which some messages have been replayed."""
+    messages = [description(), parameters(XML)]
+    messages += [markers(1, number, utime=START_UTIME + 10_000 * number) for number in range(12_000)]
+    with replay_in_terminal(write_take(tmp_path / "take.lcmlog", messages)) as terminal:
+        terminal.wait_for(SOME_MESSAGES.search)
+        assert not terminal.shows_keys()
+        yield terminal
 
 
 def test_space_pauses_and_continues_and_q_quits(terminal: Terminal) -> None:
@@ -114,6 +122,24 @@ def test_every_signal_restores_the_terminal(terminal: Terminal, number: signal.S
     assert terminal.shows_keys()
 
 
+@pytest.mark.parametrize("end", ["q", signal.SIGTERM], ids=["q", "SIGTERM"])
+def test_a_replay_that_ends_before_the_first_message_says_so(
+    tmp_path: Path, end: str | signal.Signals
+) -> None:
+    messages = [description(), markers(1, 0), frame(ComponentType.EVENT, [(1, 0, -1, -1, -1)], 100)]
+    take = write_take(tmp_path / "take.lcmlog", messages)
+    with replay_in_terminal(take, "--component", "event", "--rate", "0.01") as terminal:  # due after 100 s
+        terminal.wait_for(lambda text: " 0 messages/s" in text)
+        if isinstance(end, signal.Signals):
+            terminal.process.send_signal(end)
+        else:
+            terminal.press(end)
+        assert terminal.wait_for_end() == 0
+        assert "nothing was replayed" in terminal.text
+        assert "component" not in terminal.text
+        assert terminal.shows_keys()
+
+
 def test_an_error_restores_the_terminal(terminal: Terminal, tmp_path: Path) -> None:
     take = tmp_path / "take.lcmlog"
     take.unlink()
@@ -129,8 +155,7 @@ def test_while_it_is_stopped_the_terminal_has_its_own_settings(terminal: Termina
     os.waitid(os.P_PID, terminal.process.pid, os.WSTOPPED)
     assert terminal.shows_keys()
     terminal.process.send_signal(signal.SIGCONT)
-    terminal.wait_for(lambda text: "messages/s" in text)
-    assert not terminal.shows_keys()
+    terminal.wait_for(lambda _: not terminal.shows_keys())
     terminal.press("q")
     assert terminal.wait_for_end() == 0
     assert terminal.shows_keys()
