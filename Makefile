@@ -36,7 +36,7 @@ test-integration test-takes test-hostile test-others: .venv/installed
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.
 COMPILED_TESTS := tests/packaging/test_compiled.py tests/contract tests/property tests/unit/test_log.py \
-    $(addprefix tests/unit/,messages outputs publish queries recorder rtc3d stream takes) \
+    $(addprefix tests/unit/,messages outputs publish queries recorder rtc3d stream subscriber takes) \
     tests/integration/test_gateway.py tests/integration/test_streams.py \
     tests/integration/test_faults.py::test_data_flows_again_after_several_faults_at_once
 

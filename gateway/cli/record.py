@@ -22,15 +22,11 @@ from gateway.cli.options import (
 )
 from gateway.cli.record_progress import RecordProgress
 from gateway.cli.record_summary import print_summary
-from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url
-from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
-from gateway.outputs.zenoh.subscriber import open_zenoh
 from gateway.recorder.file_sink import FileSink
-from gateway.recorder.lcm_side import START_S, LcmSide
-from gateway.recorder.sides import RecordingSide
 from gateway.recorder.take_recording import TakeRecording
 from gateway.recorder.target import Target
-from gateway.recorder.zenoh_side import ZenohSide
+from gateway.subscriber.lcm_side import START_S
+from gateway.subscriber.sides import SubscriberSide, Transport, subscribe_all
 
 _TICK_S: Final = 0.1
 _CLOSE_S: Final = 0.5
@@ -74,13 +70,8 @@ def record(
     )
     sources = list(dict.fromkeys(source or ()))
     try:
-        side: RecordingSide
-        if lcm:
-            lcm_url = effective_lcm_url(url)
-            side = LcmSide(lcm_url, prefix or DEFAULT_LCM_PREFIX, sources, component, recording)
-        else:
-            session = open_zenoh(connect, zenoh_config)
-            side = ZenohSide(session, prefix or DEFAULT_ZENOH_PREFIX, sources, component, recording)
+        transport = Transport(lcm, connect, zenoh_config, url, prefix)
+        side = subscribe_all(transport, sources, component, recording)
         progress = RecordProgress(recording, side, sources)
         try:
             _run(recording, side, progress, stop, seconds)
@@ -114,7 +105,7 @@ def _stop_signals() -> threading.Event:
 
 def _run(
     recording: TakeRecording,
-    side: RecordingSide,
+    side: SubscriberSide,
     progress: RecordProgress,
     stop: threading.Event,
     seconds: float | None,

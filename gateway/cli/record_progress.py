@@ -10,9 +10,9 @@ from rich.live import Live
 from rich.text import Text
 
 from gateway.recorder.series import RecordedSource
-from gateway.recorder.sides import RecordingSide
 from gateway.recorder.take_recording import TakeRecording
 from gateway.safe_text import safe_text
+from gateway.subscriber.sides import SubscriberSide
 
 SILENCE_S: Final = 2.0
 _NO_DATA_S: Final = 3.0
@@ -28,7 +28,7 @@ _MAX_LOSS_LINES: Final = 20
 class RecordProgress:
     """Writes to stderr: on a terminal, a line that changes; otherwise, one line every few seconds."""
 
-    def __init__(self, recording: TakeRecording, side: RecordingSide, wanted: list[str]) -> None:
+    def __init__(self, recording: TakeRecording, side: SubscriberSide, wanted: list[str]) -> None:
         self._recording = recording
         self._side = side
         self._wanted = wanted

@@ -10,9 +10,11 @@ from rich.text import Text
 
 from gateway.cli.record_progress import size_text
 from gateway.recorder.file_sink import FileSink
-from gateway.recorder.series import POSE, RecordedSeries, RecordedSource
-from gateway.recorder.take_recording import MAX_SERIES, MAX_SOURCES, TakeRecording
+from gateway.recorder.series import RecordedSeries, RecordedSource
+from gateway.recorder.take_recording import TakeRecording
 from gateway.safe_text import safe_text
+from gateway.subscriber.reception import MAX_SERIES, MAX_SOURCES
+from gateway.subscriber.series import POSE
 
 _ORDER: Final = ("3d", "6d", f"{POSE}*", "analog", "force", "event", "status", "clock", "parameters")
 _MAX_NOTES: Final = 10

@@ -24,7 +24,7 @@ from gateway.messages.stamp import PREFIX
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
-from gateway.recorder.series import FINGERPRINTS
+from gateway.subscriber.series import FINGERPRINTS
 from gateway.takes.event_log import EventLogReader
 from gateway.takes.reader import TakeReader
 from tests.gateway_process import PROGRAM, program, simulator

@@ -9,10 +9,12 @@ from gateway.messages.decode import decode
 from gateway.messages.encode import MESSAGE_TYPES
 from gateway.messages.stamp import PREFIX
 from gateway.recorder.file_sink import FileSink
-from gateway.recorder.series import FINGERPRINTS, RecordedSeries, RecordedSource
-from gateway.recorder.take_recording import MAX_SERIES, MAX_SOURCES, TakeRecording
+from gateway.recorder.series import RecordedSeries, RecordedSource
+from gateway.recorder.take_recording import TakeRecording
 from gateway.recorder.target import Target
 from gateway.rtc3d.components import ComponentType
+from gateway.subscriber.reception import MAX_SERIES, MAX_SOURCES
+from gateway.subscriber.series import FINGERPRINTS
 from gateway.takes.event_log import EventLogReader
 from gateway.takes.reader import TakeReader
 from tests.waiting import wait_until

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 import pytest
 
 from gateway.messages.stamp import NOT_PUBLISHED, PREFIX
-from gateway.recorder.sequence_check import SequenceCheck
+from gateway.subscriber.sequence_check import SequenceCheck
 
 SESSION = 3
 

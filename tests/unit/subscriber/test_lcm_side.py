@@ -9,10 +9,11 @@ import rtc3d
 from gateway.messages.stamp import PREFIX
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.recorder.file_sink import FileSink
-from gateway.recorder.lcm_side import LcmSide
-from gateway.recorder.series import FINGERPRINTS
-from gateway.recorder.take_recording import MAX_SOURCES, TakeRecording
+from gateway.recorder.take_recording import TakeRecording
 from gateway.recorder.target import Target
+from gateway.subscriber.lcm_side import LcmSide
+from gateway.subscriber.reception import MAX_SOURCES
+from gateway.subscriber.series import FINGERPRINTS
 from gateway.takes.event_log import EventLogReader
 from tests.networks import lcm_url
 from tests.waiting import wait_until

@@ -1,4 +1,4 @@
-"""Receiving from gateways on LCM for a recording."""
+"""Receiving from gateways on LCM ."""
 
 import logging
 import math
@@ -6,7 +6,7 @@ import re
 import time
 import uuid
 from collections.abc import Collection
-from typing import Final
+from typing import Any, Final
 
 import rtc3d
 
@@ -17,8 +17,8 @@ from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber, no_gateway
-from gateway.recorder.series import FINGERPRINTS, POSE, RecordedSeries, RecordedSource
-from gateway.recorder.take_recording import MAX_SERIES, TakeRecording
+from gateway.subscriber.reception import MAX_SERIES, Reception
+from gateway.subscriber.series import FINGERPRINTS, POSE, Series, Source
 
 START_S: Final = 1.2
 """Each source is heard within this time, because it sends a status once a second."""
@@ -43,16 +43,16 @@ class LcmSide:
         prefix: str,
         sources: Collection[str],
         components: Collection[str] | None,
-        recording: TakeRecording,
+        reception: Reception[Any, Any],
     ) -> None:
         self._url = url
         self._prefix = prefix
         self._names = {lcm_channel(prefix, name): name for name in sources}
-        self._recording = recording
-        self._series: dict[str, RecordedSeries | None] = {}  # by channel; None: not recorded
+        self._reception = reception
+        self._series: dict[str, Series | None] = {}  # by channel; None: left out
         self._asked_s: dict[str, float] = {}  # when a source was asked, by its channels
         self._requester = f"rtc3d-gateway record {uuid.uuid4()}"
-        self._by_request_id: dict[int, RecordedSource] = {}
+        self._by_request_id: dict[int, Source] = {}
         self._subscribers = [
             LcmSubscriber(
                 open_lcm(receiving_url(url)), _pattern(prefix, [*self._names], components), self._receive
@@ -72,23 +72,23 @@ class LcmSide:
         try:
             self._record(channel, message)
         except Exception as defect:  # noqa: BLE001 - the other messages are recorded
-            self._recording.failed(defect)
+            self._reception.failed(defect)
 
     def _record(self, channel: str, message: bytes) -> None:
         series = self._series.get(channel) or self._find_series(channel, message)
         if series is None:
             return
         if series.key == "parameters" and series.accepts(message):
-            self._recording.receive_parameters(series, message, is_made=False)
+            self._reception.receive_parameters(series, message, is_made=False)
             return
-        self._recording.receive(series, message)
+        self._reception.receive(series, message)
         if series.key == "status" and not series.source.has_known_name:
             self._name(series.source, message)
 
-    def _find_series(self, channel: str, message: bytes) -> RecordedSeries | None:
-        """Return the series of a channel that was not recorded before; None, counted, if it cannot be."""
+    def _find_series(self, channel: str, message: bytes) -> Series | None:
+        """Return the series of a channel that was not received before; None, counted, if it cannot be."""
         if channel in self._series:
-            self._recording.ignore(beyond_limit=True)
+            self._reception.ignore(beyond_limit=True)
             return None
         if channel.endswith(("_REQUEST", "_REPLY", "_RECONNECTED")):
             return None
@@ -99,25 +99,25 @@ class LcmSide:
         else:
             channels = channel.removesuffix(f"_{key.upper()}") if key else channel
         if not key or channels in {"", channel}:
-            self._recording.ignore(beyond_limit=False)
+            self._reception.ignore(beyond_limit=False)
             return None
         source = self._source(channels)
-        series = None if source is None else self._recording.series(source, key, channel)
+        series = None if source is None else self._reception.series(source, key, channel)
         if len(self._series) < 2 * MAX_SERIES:
             self._series[channel] = series
         if series is None:
-            self._recording.ignore(beyond_limit=True)
+            self._reception.ignore(beyond_limit=True)
         return series
 
-    def _source(self, channels: str) -> RecordedSource | None:
+    def _source(self, channels: str) -> Source | None:
         name = self._names.get(channels)
         guess = channels.removeprefix(f"{self._prefix}_").lower()
-        source = self._recording.source(name or guess, channels, is_known=False)
+        source = self._reception.source(name or guess, channels, is_known=False)
         if source is not None and name is not None:
             source.has_known_name = True
         return source
 
-    def _name(self, source: RecordedSource, status: bytes) -> None:
+    def _name(self, source: Source, status: bytes) -> None:
         """Take the name of a source from its status: its channels have capital letters only."""
         try:
             name = decode(status).source
@@ -138,24 +138,24 @@ class LcmSide:
             return
         parameters = None
         if not reply.error:
-            parameters = self._recording.parameters_message(
+            parameters = self._reception.parameters_message(
                 source, xml_bytes(reply.xml), None, reply.parameters_version, min(max(0.0, reply.age_s), 1e9)
             )
-        self._recording.answered(source, parameters)
+        self._reception.answered(source, parameters)
 
     # In the thread of the command.
 
     def tick(self) -> None:
         """Ask for the parameters of sources that wait for their description."""
         now_s = time.monotonic()
-        for source in self._recording.sources_now:
+        for source in self._reception.sources_now:
             if source.has_answer or not source.is_waiting:
                 continue
             if now_s - self._asked_s.get(source.channels, -math.inf) > _AGAIN_S:
                 self._asked_s[source.channels] = now_s
                 self._ask(source)
 
-    def _ask(self, source: RecordedSource) -> None:
+    def _ask(self, source: Source) -> None:
         request = rtc3d.parameters_request_t()
         request.requester = self._requester
         request.request_id = len(self._by_request_id)
@@ -166,11 +166,11 @@ class LcmSide:
             logger.debug("asking for the parameters of %s: %s", source.name, error)
 
     def silence(self) -> str:
-        """See RecordingSide."""
+        """See SubscriberSide."""
         return no_gateway(" ".join(self._names) or self._prefix, self._url)
 
     def close(self) -> None:
-        """See RecordingSide."""
+        """See SubscriberSide."""
         for subscriber in self._subscribers:
             subscriber.close()
 

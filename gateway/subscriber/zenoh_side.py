@@ -1,4 +1,4 @@
-"""Receiving from gateways on Zenoh for a recording."""
+"""Receiving from gateways on Zenoh ."""
 
 import json
 import math
@@ -13,9 +13,9 @@ import zenoh
 from gateway.messages.topics import lcm_channel, zenoh_key
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX
 from gateway.outputs.zenoh.subscriber import no_gateway, served_sources
-from gateway.recorder.series import POSE, RecordedSeries, RecordedSource
-from gateway.recorder.take_recording import MAX_SERIES, MAX_XML_BYTES, TakeRecording
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
+from gateway.subscriber.reception import MAX_SERIES, MAX_XML_BYTES, Reception
+from gateway.subscriber.series import POSE, Series, Source
 
 _QUERY_S: Final = 1.0
 _AGAIN_S: Final = 0.3
@@ -41,13 +41,13 @@ class ZenohSide:
         prefix: str,
         sources: Collection[str],
         components: Collection[str] | None,
-        recording: TakeRecording,
+        reception: Reception[Any, Any],
     ) -> None:
         self._session = session
         self._prefix = prefix
         self._sources = sources
-        self._recording = recording
-        self._series: dict[str, RecordedSeries | None] = {}  # by key; None: not recorded
+        self._reception = reception
+        self._series: dict[str, Series | None] = {}  # by key; None: left out
         self._asked_s: dict[str, float] = {}  # when the description of a source was queried, by its name
         for name in self._served():
             self._source(name)
@@ -61,10 +61,10 @@ class ZenohSide:
         found = served_sources(self._session, self._prefix)
         return [name for name in found if not self._sources or name in self._sources]
 
-    def _source(self, name: str) -> RecordedSource | None:
+    def _source(self, name: str) -> Source | None:
         if not _SOURCE_NAME.fullmatch(name):
             return None
-        return self._recording.source(name, lcm_channel(DEFAULT_LCM_PREFIX, name), is_known=True)
+        return self._reception.source(name, lcm_channel(DEFAULT_LCM_PREFIX, name), is_known=True)
 
     # In Zenoh's threads.
 
@@ -72,7 +72,7 @@ class ZenohSide:
         try:
             self._record(sample)
         except Exception as defect:  # noqa: BLE001 - the other messages are recorded
-            self._recording.failed(defect)
+            self._reception.failed(defect)
 
     def _record(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
@@ -82,41 +82,41 @@ class ZenohSide:
         if series.key == "parameters":
             self._receive_parameters(series, sample)
         else:
-            self._recording.receive(series, sample.payload.to_bytes())
+            self._reception.receive(series, sample.payload.to_bytes())
 
-    def _find_series(self, key: str) -> RecordedSeries | None:
-        """Return the series of a key that was not recorded before; None, counted, if it cannot be."""
+    def _find_series(self, key: str) -> Series | None:
+        """Return the series of a key that was not received before; None, counted, if it cannot be."""
         if key in self._series:
-            self._recording.ignore(beyond_limit=True)
+            self._reception.ignore(beyond_limit=True)
             return None
         name, _, path = key.removeprefix(f"{self._prefix}/").partition("/")
         if path in _NO_KEYS:
             return None
         label = unquote(path.removeprefix(POSE)) if path.startswith(POSE) else None
         if not _SOURCE_NAME.fullmatch(name) or (label is None and path not in _PLAIN_KEYS):
-            self._recording.ignore(beyond_limit=False)
+            self._reception.ignore(beyond_limit=False)
             return None
         source = self._source(name)
         names = (path,) if label is None else ("6d", label)
         channel = "" if source is None else lcm_channel(source.channels, *names)
-        series = None if source is None else self._recording.series(source, path, channel)
+        series = None if source is None else self._reception.series(source, path, channel)
         if len(self._series) < 2 * MAX_SERIES:
             self._series[key] = series
         if series is None:
-            self._recording.ignore(beyond_limit=True)
+            self._reception.ignore(beyond_limit=True)
         return series
 
-    def _receive_parameters(self, series: RecordedSeries, sample: zenoh.Sample) -> None:
+    def _receive_parameters(self, series: Series, sample: zenoh.Sample) -> None:
         if len(sample.payload) > MAX_XML_BYTES:
-            self._recording.ignore(beyond_limit=False)
+            self._reception.ignore(beyond_limit=False)
             return
-        self._recording.receive_parameters(
+        self._reception.receive_parameters(
             series, self._parameters_message(series.source, sample), is_made=True
         )
 
-    def _parameters_message(self, source: RecordedSource, sample: zenoh.Sample) -> bytes:
+    def _parameters_message(self, source: Source, sample: zenoh.Sample) -> bytes:
         facts = _facts(sample)
-        return self._recording.parameters_message(
+        return self._reception.parameters_message(
             source,
             sample.payload.to_bytes(),
             _int32(facts.get("session")),
@@ -124,28 +124,28 @@ class ZenohSide:
             _age_s(facts.get("age_s")),
         )
 
-    def _answered_parameters(self, source: RecordedSource, reply: zenoh.Reply) -> None:
+    def _answered_parameters(self, source: Source, reply: zenoh.Reply) -> None:
         if reply.ok is not None:
             if len(reply.ok.payload) <= MAX_XML_BYTES:
-                self._recording.answered(source, self._parameters_message(source, reply.ok))
+                self._reception.answered(source, self._parameters_message(source, reply.ok))
         elif reply.err is not None and str(reply.err.encoding).partition(";")[2] not in {"", "busy", "rate"}:
-            self._recording.answered(source, None)
+            self._reception.answered(source, None)
 
-    def _answered_status(self, source: RecordedSource, reply: zenoh.Reply) -> None:
+    def _answered_status(self, source: Source, reply: zenoh.Reply) -> None:
         if reply.ok is not None:
-            self._recording.answered_status(source, reply.ok.payload.to_bytes())
+            self._reception.answered_status(source, reply.ok.payload.to_bytes())
 
     # In the thread of the command.
 
     def tick(self) -> None:
         """Query the parameters and the status of sources that wait for their description."""
         now_s = time.monotonic()
-        for source in self._recording.sources_now:
+        for source in self._reception.sources_now:
             if source.is_waiting and now_s - self._asked_s.get(source.name, -math.inf) > _AGAIN_S:
                 self._asked_s[source.name] = now_s
                 self._ask(source)
 
-    def _ask(self, source: RecordedSource) -> None:
+    def _ask(self, source: Source) -> None:
         key = zenoh_key(self._prefix, source.name)
         if not source.has_answer:
             self._session.get(
@@ -159,11 +159,11 @@ class ZenohSide:
             )
 
     def silence(self) -> str:
-        """See RecordingSide."""
+        """See SubscriberSide."""
         return no_gateway(self._prefix, self._sources, served_sources(self._session, self._prefix))
 
     def close(self) -> None:
-        """See RecordingSide."""
+        """See SubscriberSide."""
         self._session.close()
 
 

@@ -1,0 +1,1 @@
+"""What gateways publish now, decoded for programs that show it."""

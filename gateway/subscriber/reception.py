@@ -1,0 +1,182 @@
+"""What is received from gateways: by source and key, bounded, with everything that is left out counted."""
+
+import threading
+import time
+from abc import ABC, abstractmethod
+from typing import Final, Generic, TypeVar
+
+from gateway.messages.encode import VERSION_OFFSET
+from gateway.messages.host_time import now_utime
+from gateway.messages.topics import MAX_CHANNEL_LENGTH, unique_name
+from gateway.outputs.contract import ServerParameters
+from gateway.outputs.parameters_message import encode_parameters
+from gateway.subscriber.series import Series, Source
+
+MAX_SOURCES: Final = 64
+MAX_SERIES: Final = 4096
+"""The most sources, and keys of all sources together. Names come from the network."""
+
+MAX_XML_BYTES: Final = 16 * 1024 * 1024
+
+_MIN_UTIME: Final = -(1 << 63)
+_VERSION: Final = slice(VERSION_OFFSET, None)
+"""The part of a ``parameters_t`` by which it is known: its version and its XML."""
+
+SourceT = TypeVar("SourceT", bound=Source)
+SeriesT = TypeVar("SeriesT", bound=Series)
+
+
+class Reception(ABC, Generic[SourceT, SeriesT]):
+    """The sources that were received, and their series. All methods may be called in any thread.
+
+    A subclass says what happens with the messages. Its methods ``_new_…`` and ``_take…`` are called under
+    ``_lock``.
+    """
+
+    def __init__(self) -> None:
+        self.sources: dict[str, SourceT] = {}
+        """By the beginning of their channels."""
+        self.num_foreign = 0
+        """How many messages were left out, because they are none of a gateway."""
+        self.num_beyond = 0
+        """How many messages were left out, because there are too many sources or keys."""
+        self.defect: Exception | None = None
+        """The first defect of this program; ``num_defects`` messages were left out because of such."""
+        self.num_defects = 0
+        self.first_heard_s: float | None = None
+        """When the first message arrived, on the monotonic clock; None before."""
+        self._lock = threading.Lock()
+        self._num_series = 0
+        self._is_closed = False
+
+    @property
+    def sources_now(self) -> list[SourceT]:
+        """The sources so far."""
+        with self._lock:
+            return [*self.sources.values()]
+
+    @property
+    def all_series(self) -> list[SeriesT]:
+        """The series of all sources so far."""
+        with self._lock:
+            return [series for source in self.sources.values() for series in source.series]
+
+    # What is received.
+
+    def source(self, name: str, channels: str, *, is_known: bool) -> SourceT | None:
+        """Return the source ``name``, new or not, whose channels begin with ``channels``; None if too many.
+
+        If its name ``is_known``, other names have other channels.
+        """
+        with self._lock:
+            if is_known:
+                found = next((each for each in self.sources.values() if each.name == name), None)
+                channels = unique_name(channels, self.sources) if found is None else found.channels
+            source = self.sources.get(channels)
+            if source is None and len(self.sources) < MAX_SOURCES:
+                source = self.sources[channels] = self._new_source(name, channels)
+            return source
+
+    def series(self, source: SourceT, key: str, channel: str) -> SeriesT | None:
+        """Return the series of a key, new or not, on this channel or a similar one; None if too many."""
+        with self._lock:
+            return self._find_series(source, key, channel)
+
+    def _find_series(self, source: SourceT, key: str, channel: str) -> SeriesT | None:
+        series: SeriesT | None = source.series_by_key.get(key)
+        if series is None and self._num_series < MAX_SERIES:
+            taken = {each.channel.decode() for each in source.series}
+            free = unique_name(channel, taken, MAX_CHANNEL_LENGTH)
+            series = source.series_by_key[key] = self._new_series(source, key, free)
+            self._num_series += 1
+        return series
+
+    def receive(self, series: SeriesT, message: bytes) -> None:
+        """Take a message."""
+        with self._lock:
+            if self._is_closed:
+                return
+            if not series.accepts(message):
+                self.num_foreign += 1
+                return
+            series.count(message)
+            self._hear(series.source)
+            if series.key == "status":
+                series.source.status = message
+            self._take(series, message)
+
+    def ignore(self, *, beyond_limit: bool) -> None:
+        """Count a message that is left out."""
+        with self._lock:
+            self.num_foreign += not beyond_limit
+            self.num_beyond += beyond_limit
+
+    def failed(self, defect: Exception) -> None:
+        """Note a defect in this program: a message is left out, but the others are not."""
+        with self._lock:
+            self.defect = self.defect or defect
+            self.num_defects += 1
+
+    # Parameters and status.
+
+    def receive_parameters(self, series: SeriesT, message: bytes, *, is_made: bool) -> None:
+        """Take a ``parameters_t``, published or ``is_made`` here, unless it repeats the newest one."""
+        with self._lock:
+            source = series.source
+            source.has_answer = True
+            self._hear(source)
+            former = source.parameters
+            if self._is_closed or (former is not None and former[_VERSION] == message[_VERSION]):
+                return
+            source.parameters = message
+            self._take_parameters(series, message, is_first=former is None, is_made=is_made)
+
+    def parameters_message(
+        self, source: SourceT, xml: bytes, session: int | None, version: int, age_s: float = 0.0
+    ) -> bytes:
+        """Return parameters from Zenoh, or from an answer, as ``parameters_t``.
+
+        Its times are on the gateway's clock, as far as its messages show.
+        """
+        with self._lock:
+            utime = source.last_utime or now_utime()
+            parameters = ServerParameters(xml, source.session if session is None else session, version)
+            sequence, source.num_parameters = source.num_parameters, source.num_parameters + 1
+        arrived_utime = max(utime - round(1e6 * age_s), _MIN_UTIME)
+        return encode_parameters(parameters, utime=utime, arrived_utime=arrived_utime, sequence=sequence)
+
+    def answered(self, source: SourceT, parameters: bytes | None) -> None:
+        """Take the answer to the query for the parameters; None if there are none."""
+        with self._lock:
+            source.has_answer = True
+            if parameters is not None and source.parameters is None:
+                self._take_answer(source, parameters)
+
+    def answered_status(self, source: SourceT, message: bytes) -> None:
+        """Take the answer to a query for the status."""
+        with self._lock:
+            source.status = source.status or message
+
+    def _hear(self, source: Source) -> None:
+        source.heard_s = time.monotonic()
+        if self.first_heard_s is None:
+            self.first_heard_s = source.heard_s
+
+    # For subclasses.
+
+    @abstractmethod
+    def _new_source(self, name: str, channels: str) -> SourceT: ...
+
+    @abstractmethod
+    def _new_series(self, source: SourceT, key: str, channel: str) -> SeriesT: ...
+
+    @abstractmethod
+    def _take(self, series: SeriesT, message: bytes) -> None:
+        """Take a message that was counted."""
+
+    def _take_parameters(self, series: SeriesT, message: bytes, *, is_first: bool, is_made: bool) -> None:
+        """Take parameters that differ from the newest ones, and are the source's newest ones now."""
+
+    def _take_answer(self, source: SourceT, parameters: bytes) -> None:
+        """Take the answer to the query for the parameters, before any were published."""
+        source.parameters = parameters

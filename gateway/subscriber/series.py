@@ -1,0 +1,119 @@
+"""What was received: the sources, and the messages of each of their keys."""
+
+import time
+from typing import Any, Final
+
+import rtc3d
+
+from gateway.errors import ProtocolError
+from gateway.messages.decode import decode
+from gateway.messages.encode import MESSAGE_TYPES
+from gateway.rtc3d.components import COMPONENTS_BY_KEY
+from gateway.subscriber.sequence_check import PREFIX_END, SequenceCheck
+
+POSE: Final = "6d/"
+"""What the keys of tool poses begin with."""
+
+TYPES_BY_KEY: Final[dict[str, type[Any]]] = {
+    **{component.key: message_type for component, message_type in MESSAGE_TYPES.items()},
+    "status": rtc3d.status_t,
+    "clock": rtc3d.clock_t,
+    "parameters": rtc3d.parameters_t,
+    POSE: rtc3d.tool_pose_t,
+}
+"""The types of the messages by the part of their keys below the source."""
+
+FINGERPRINTS: Final[dict[str, bytes]] = {
+    key: message_type._get_packed_fingerprint()  # noqa: SLF001 - lcm-gen offers no other way
+    for key, message_type in TYPES_BY_KEY.items()
+}
+
+
+class Series:
+    """The messages of one key of a source. ``row`` is its line in tables: the key, or 6d/* for poses."""
+
+    def __init__(self, source: "Source", key: str, channel: str) -> None:
+        self.source = source
+        self.key = key
+        self.row = f"{POSE}*" if key.startswith(POSE) else key
+        self.channel = channel.encode()
+        self.check = SequenceCheck()
+        self.num_messages = 0
+        """How many messages have arrived."""
+        self.num_bytes = 0
+        self._fingerprint = FINGERPRINTS[POSE if key.startswith(POSE) else key]
+
+    @property
+    def has_data(self) -> bool:
+        """Whether these are messages of frames."""
+        return self.key in COMPONENTS_BY_KEY or self.key.startswith(POSE)
+
+    def accepts(self, message: bytes) -> bool:
+        """Whether the message has the type of the series."""
+        return message[:8] == self._fingerprint and len(message) >= PREFIX_END
+
+    def count(self, message: bytes) -> None:
+        """Count a message that has arrived, and those that are missing before it."""
+        self.add(message)
+        self.check.add(message)
+
+    def add(self, message: bytes) -> None:
+        """Count a message whose number does not matter."""
+        self.num_messages += 1
+        self.num_bytes += len(message)
+
+
+class Source:
+    """A source of which something was received. ``channels`` is the beginning of its channels."""
+
+    def __init__(self, name: str, channels: str) -> None:
+        self.name = name
+        self.channels = channels
+        self.has_known_name = False
+        """Whether a gateway or the user has said the name; otherwise, it is made from the channels."""
+        self.heard_s: float | None = None
+        """When the newest message arrived, on the monotonic clock; None before the first."""
+        self.status: bytes | None = None
+        """The newest status, or that of a query."""
+        self.parameters: bytes | None = None
+        """The newest ``parameters_t``."""
+        self.num_parameters = 0
+        """How many ``parameters_t`` were made of the parameters from Zenoh."""
+        self.has_answer = False
+        """Whether a gateway has answered the query for the parameters, or published them."""
+        self.series_by_key: dict[str, Any] = {}
+        self.found_s = time.monotonic()
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether a query for the parameters or the status is still to be answered."""
+        return self.status is None or not self.has_answer
+
+    @property
+    def series(self) -> list[Any]:
+        """The series so far; other threads may add some at any time."""
+        return [*self.series_by_key.values()]
+
+    @property
+    def first_utime(self) -> int | None:
+        """The time of its first message, in µs since the Unix epoch; None before."""
+        times = [each.check.first_utime for each in self.series if each.check.first_utime]
+        return min(times, default=None)
+
+    @property
+    def last_utime(self) -> int | None:
+        """The time of its newest message, in µs since the Unix epoch; None before the first."""
+        times = [each.check.last_utime for each in self.series if each.check.last_utime]
+        return max(times, default=None)
+
+    @property
+    def session(self) -> int:
+        """The newest session."""
+        return max((each.check.session for each in self.series), default=0)
+
+    def decoded_status(self) -> Any | None:
+        """Return the newest status as ``status_t``; None if there is none that can be read."""
+        try:
+            return None if self.status is None else decode(self.status)
+        except ProtocolError:
+            return None

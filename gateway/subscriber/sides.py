@@ -1,0 +1,52 @@
+"""Subscribing to everything that gateways publish, on Zenoh or on LCM."""
+
+from collections.abc import Collection
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol
+
+from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url
+from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
+from gateway.outputs.zenoh.subscriber import open_zenoh
+from gateway.subscriber.lcm_side import LcmSide
+from gateway.subscriber.reception import Reception
+from gateway.subscriber.zenoh_side import ZenohSide
+
+
+class SubscriberSide(Protocol):
+    """A subscriber that hands what it receives to a Reception."""
+
+    def tick(self) -> None:
+        """Query what is not known yet of new sources. Called often, in one thread."""
+
+    def silence(self) -> str:
+        """Return why nothing may have arrived: no gateway, or none with these sources. It may take 1 s."""
+
+    def close(self) -> None:
+        """Unsubscribe. It may block while a peer does not read."""
+
+
+class Transport(NamedTuple):
+    """Where to subscribe: on LCM if ``is_lcm``, otherwise on Zenoh. None means the default."""
+
+    is_lcm: bool = False
+    connect: str | None = None
+    zenoh_config: Path | None = None
+    url: str | None = None
+    prefix: str | None = None
+
+
+def subscribe_all(
+    transport: Transport,
+    sources: Collection[str],
+    components: Collection[str] | None,
+    reception: Reception[Any, Any],
+) -> SubscriberSide:
+    """Subscribe to these sources (all, if empty) and components (None: all).
+
+    Raises OutputError if Zenoh or LCM does not open, and ConfigError if Zenoh rejects the configuration file.
+    """
+    if transport.is_lcm:
+        url = effective_lcm_url(transport.url)
+        return LcmSide(url, transport.prefix or DEFAULT_LCM_PREFIX, sources, components, reception)
+    session = open_zenoh(transport.connect, transport.zenoh_config)
+    return ZenohSide(session, transport.prefix or DEFAULT_ZENOH_PREFIX, sources, components, reception)
