@@ -13,12 +13,16 @@ from typing import Final
 
 import pytest
 import uvloop
+from hypothesis import settings
 
 from gateway.log import HOLD_S
 
 # uvloop starts a process by a fork, after which Python runs in the child for a moment. A garbage collection
 # that finds a Zenoh session there waits for threads that the child does not have; the parent waits for it.
 os.register_at_fork(before=gc.disable, after_in_parent=gc.enable)
+
+settings.register_profile("gateway", deadline=None)  # a deadline would fail on a busy machine
+settings.load_profile("gateway")
 
 _WHEELHOUSE: Final = Path(__file__).parents[1] / "build/wheelhouse/complete"
 

@@ -193,7 +193,5 @@ class ManyFaults(RuleBasedStateMachine):
 def test_data_flows_again_after_several_faults_at_once() -> None:
     run_state_machine_as_test(
         ManyFaults,
-        settings=settings(
-            max_examples=8, stateful_step_count=8, deadline=None, suppress_health_check=list(HealthCheck)
-        ),
+        settings=settings(max_examples=8, stateful_step_count=8, suppress_health_check=list(HealthCheck)),
     )

@@ -117,7 +117,7 @@ def _no_log() -> Iterator[None]:
 
 
 @example([(None, 2**58, None, 0, 33, 0)], "all")  # time stamps that wrap around
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60)
 @given(st.lists(steps, min_size=1, max_size=8), st.sampled_from(("all", "latest")))
 def test_any_time_stamps_can_be_published(
     phases: list[tuple[int | None, int, int | None, int, int, int]], backlog: str

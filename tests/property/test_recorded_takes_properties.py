@@ -20,7 +20,7 @@ STEPS = st.lists(
 )
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=25)
 @given(steps=STEPS)
 def test_a_take_is_what_was_published(steps: list[tuple[str, int]]) -> None:
     with tempfile.TemporaryDirectory() as folder:

@@ -132,7 +132,6 @@ def test_visible_markers_have_a_small_residual(scene: SyntheticScene) -> None:
     assert residuals.max() < 1.0
 
 
-@settings(deadline=None)
 @given(first=st.integers(0, 10**9), cut=st.integers(0, 40))
 def test_a_sample_does_not_depend_on_the_others_in_one_call(first: int, cut: int) -> None:
     scene = SyntheticScene(markers=100, tools=10, analog=3, plates=2)
@@ -232,7 +231,7 @@ def test_events_do_not_depend_on_how_the_time_is_divided(times_us: list[int]) ->
     assert all(times_us[0] <= event[1] < times_us[-1] for event in whole)
 
 
-@settings(deadline=None, max_examples=50)
+@settings(max_examples=50)
 @given(
     markers=st.integers(0, 30),
     tools=st.integers(0, 12),
