@@ -15,7 +15,7 @@ from gateway.log import HOLD_S, DefectLog, FailureLog, log_fields
 from gateway.messages.limits import encode_within_limits
 from gateway.outputs.contract import Answer, ServerFile, ServerParameters
 from gateway.outputs.encodings import C3D
-from gateway.outputs.guard import health
+from gateway.outputs.guard import health, query_results
 from gateway.publish.fan_out import FanOut
 from gateway.publish.status_messages import clock_message, status_message
 from gateway.queries.known_parameters import ServerAnswer
@@ -202,7 +202,11 @@ class Source:
             server=f"{self.settings.host}:{self.settings.port}",
             sequence=self.sequence,
             streams=self.rated_statuses,
-            outputs=[(status, health(output)) for output, status in self.fan_out.outputs],
+            outputs=[
+                (status, health(output), query_results(output, self.name))
+                for output, status in self.fan_out.outputs
+            ],
+            stall_timeout_s=self.settings.stall_timeout_s,
         )
         return encode_within_limits(message)
 

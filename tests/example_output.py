@@ -4,7 +4,7 @@ Its "network" is this process: messages go to the subscriptions with the same ad
 ability, so that tests can check that each of them needs nothing but this module.
 """
 
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Mapping
 from typing import Any, Final
 
@@ -134,7 +134,7 @@ class ExampleOutput(Output):
         self.files: list[tuple[str, Mapping[str, Any]]] = []
         self.num_maintained = 0
         self._service: QueryService | None = None
-        self._results: Counter[str] = Counter()
+        self._results: defaultdict[str, Counter[str]] = defaultdict(Counter)
 
     def start(self) -> None:
         """Open, unless the address is UNREACHABLE."""
@@ -207,12 +207,12 @@ class ExampleOutput(Output):
         assert self._service is not None
         source, *path = key.split("/")
         answer = await self._service.answer(source, tuple(path), options)
-        self._results["ok"] += 1
+        self._results[source]["ok"] += 1
         return answer
 
     @property
-    def query_results(self) -> Mapping[str, int]:
-        """How many queries were answered."""
+    def query_results(self) -> Mapping[str, Mapping[str, int]]:
+        """How many queries were answered, by source."""
         return self._results
 
     @property

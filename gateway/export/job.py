@@ -61,7 +61,9 @@ class ExportJob:
                 ", …" if len(take.unknown) > _MAX_NAMED else ""
             )
             count = sum(take.unknown.values())
-            self.note(f"messages of other programs were left out: {count}, on the channels {channels}")
+            self.note(
+                f"messages of other programs or versions were left out: {count}, on the channels {channels}"
+            )
         for source in take.sources.values():
             if not source.parameters:
                 self.note(

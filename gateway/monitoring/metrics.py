@@ -8,6 +8,7 @@ bounded.
 import platform
 import resource
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from http import HTTPStatus
 from importlib.metadata import version
@@ -270,7 +271,9 @@ class GatewayCollector(Collector):
                 sample
                 for output in self._gateway.outputs
                 if (results := output.query_results) is not None
-                for sample in _samples((output.name,), results, ("ok",))
+                for sample in _samples(
+                    (output.name,), sum(map(Counter, results.values()), Counter()), ("ok",)
+                )
             ],
         )
 

@@ -5,11 +5,10 @@ from collections.abc import Iterable, Sequence
 from gateway.config.settings import SourceSettings
 from gateway.gateway import Gateway
 from gateway.losses import Loss, last_minute_text
-from gateway.monitoring.health import unusable_frames
 from gateway.outputs.guard import health as output_health
 from gateway.outputs.status import OutputHealth
-from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
+from gateway.stream.status_text import source_text, stream_text, unusable_frames
 
 
 def status_lines(gateway: Gateway) -> list[str]:
@@ -36,12 +35,11 @@ def source_line(source: SourceSettings, streams: Sequence[tuple[StreamStatus, fl
     server = f"{source.host}:{source.port}"
     texts = []
     for status, rate_hz in streams:
-        text = unusable_frames(status, source.stall_timeout_s) or _stream_text(server, status, rate_hz)
-        texts.append(", ".join(filter(None, (text, last_minute_text(status.losses.report())))))
-    if len(set(texts)) == 1:
-        return f"{source.name}: {texts[0]}"
-    named = (f"{status.components} {text}" for (status, _), text in zip(streams, texts, strict=True))
-    return f"{source.name}: {', '.join(named)}"
+        problem = unusable_frames(status, source.stall_timeout_s)
+        text = problem or stream_text(status.state, server, rate_hz, status.tries)
+        lost = last_minute_text(status.losses.report())
+        texts.append((status.components, f"{text}, {lost}" if lost else text))
+    return f"{source.name}: {source_text(texts)}"
 
 
 def output_lines(outputs: Iterable[tuple[str, OutputHealth]]) -> list[str]:
@@ -55,20 +53,3 @@ def loss_lines(losses: Iterable[tuple[str, Sequence[Loss]]]) -> list[str]:
     ``losses`` are pairs of the route, such as "lab to zenoh", and what was lost on it.
     """
     return [f"{route}: {text}" for route, lost in losses if (text := last_minute_text(lost))]
-
-
-def _stream_text(server: str, status: StreamStatus, rate_hz: float) -> str:
-    match status.state:
-        case StreamState.STREAMING:
-            return f"streaming {rate_hz:.1f} Hz"
-        case StreamState.IDLE:
-            return f"connected to {server}, no frames requested"
-        case StreamState.NO_MEASUREMENT:
-            return f"connected to {server}, no measurement running"
-        case StreamState.HANDSHAKING:
-            return f"connected to {server}, handshake in progress"
-        case StreamState.STALLED:
-            return f"no frames from {server}"
-        case StreamState.CONNECTING | StreamState.WAITING:
-            tries = f", {status.tries} {'try' if status.tries == 1 else 'tries'}" if status.tries else ""
-            return f"waiting for {server}{tries}"

@@ -61,21 +61,24 @@ class Admission:
         self._long_bytes = TokenBucket(limits.reply_bytes_per_s, monotonic=monotonic)
         self._refusals = TokenBucket(REFUSALS_PER_S, monotonic=monotonic)
         self._num_pending = 0
-        self._results: Counter[str] = Counter()
+        self._results: dict[str, Counter[str]] = {}  # by source
 
     @property
-    def results(self) -> Counter[str]:
-        """The number of questions by result: ok, the code of the error in the reply, or NO_REPLY."""
+    def results(self) -> dict[str, Counter[str]]:
+        """By source, the number of questions by result: ok, the code of the error, or NO_REPLY."""
         with self._lock:
-            return self._results.copy()
+            return {source: results.copy() for source, results in self._results.items()}
 
     @property
     def num_pending(self) -> int:
         """How many questions have been admitted and are not finished."""
         return self._num_pending
 
-    def admit(self, key: str) -> Refusal | None:
-        """Admit a question about ``key``, until ``finished`` is called for it; or return why not."""
+    def admit(self, source: str, key: str) -> Refusal | None:
+        """Admit a question about ``key``, until ``finished`` is called for it; or return why not.
+
+        It is counted for ``source``, one of the gateway's.
+        """
         with self._lock:
             refusal = self._refusal(key)
             if refusal is None:
@@ -83,15 +86,18 @@ class Admission:
                 self._keys[key].take()
                 self._num_pending += 1
             else:
-                self._results[refusal.error.code if refusal.is_sent else NO_REPLY] += 1
+                self._count_result(source, refusal.error.code if refusal.is_sent else NO_REPLY)
             return refusal
 
-    def finished(self, result: str) -> None:
+    def finished(self, source: str, result: str) -> None:
         """Count the result of a question that was admitted; "" if it has none."""
         with self._lock:
             self._num_pending -= 1
             if result:
-                self._results[result] += 1
+                self._count_result(source, result)
+
+    def _count_result(self, source: str, result: str) -> None:
+        self._results.setdefault(source, Counter())[result] += 1
 
     def count(self, num_answers: int) -> None:
         """Count further answers to a question that has more than one."""

@@ -301,8 +301,11 @@ class Output(ABC):
         """Stop answering queries. Called before ``close``."""
 
     @property
-    def query_results(self) -> Mapping[str, int] | None:
-        """The number of queries by result, ok or the code of the error; None if the output answers none."""
+    def query_results(self) -> Mapping[str, Mapping[str, int]] | None:
+        """By source, the number of queries by result; None if the output answers none.
+
+        The result is ok, the code of the error in the reply, or no-reply.
+        """
         return None
 
     @property

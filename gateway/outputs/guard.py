@@ -1,6 +1,6 @@
 """Calls of outputs that may raise although the contract forbids it: a defect in one must not stop others."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from logging import getLogger
 from typing import Final, TypeVar
 from weakref import WeakKeyDictionary
@@ -32,6 +32,12 @@ def health(output: Output) -> OutputHealth:
     except Exception as defect:  # noqa: BLE001 - other outputs continue
         log_defect(output, defect)
         return OutputHealth(False, f"{defect_text(defect)}; report this with the log")
+
+
+def query_results(output: Output, source: str) -> Mapping[str, int]:
+    """Return the number of queries about ``source`` by result; empty if the output answers none."""
+    results = guarded(output, lambda: output.query_results, None) or {}
+    return results.get(source, {})
 
 
 def log_defect(output: Output, defect: Exception) -> None:

@@ -1,7 +1,7 @@
 """The LCM messages that report the state of a source: ``status_t`` and ``clock_t``."""
 
-from collections import Counter
-from collections.abc import Iterable, Sequence
+import socket
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Final
 
 import rtc3d
@@ -12,9 +12,11 @@ from gateway.messages.host_time import host_clock, now_utime
 from gateway.outputs.status import OutputHealth, OutputStatus
 from gateway.stream.clock import ServerClock
 from gateway.stream.status import StreamStatus
+from gateway.stream.status_text import unusable_frames
 
 _COPIED_FIELDS: Final = (
     "components",
+    "tries",
     "byte_order",
     "rate",
     "session",
@@ -37,11 +39,13 @@ def status_message(
     server: str,
     sequence: int,
     streams: Sequence[tuple[StreamStatus, float]],
-    outputs: Iterable[tuple[OutputStatus, OutputHealth]],
+    outputs: Iterable[tuple[OutputStatus, OutputHealth, Mapping[str, int]]],
+    stall_timeout_s: float,
 ) -> rtc3d.status_t:
     """Return the status of one source.
 
-    ``server`` is HOST:PORT. ``streams`` are pairs of a stream's status and its frame rate in Hz.
+    ``server`` is HOST:PORT. ``streams`` are pairs of a stream's status and its frame rate in Hz. Each output
+    comes with its health and the number of queries about the source by result.
     """
     message = rtc3d.status_t()
     message.utime = message.capture_utime = now_utime()
@@ -51,9 +55,10 @@ def status_message(
     message.source = source
     message.server = server
     message.gateway_version = __version__
-    message.streams = [_stream_message(stream, rate_hz) for stream, rate_hz in streams]
+    message.host = socket.gethostname()
+    message.streams = [_stream_message(stream, rate_hz, stall_timeout_s) for stream, rate_hz in streams]
     message.num_streams = len(message.streams)
-    message.outputs = [_output_message(output, health) for output, health in outputs]
+    message.outputs = [_output_message(*output) for output in outputs]
     message.num_outputs = len(message.outputs)
     return message
 
@@ -83,11 +88,12 @@ def clock_model(clock: ServerClock) -> rtc3d.clock_model_t:
     return model
 
 
-def _stream_message(stream: StreamStatus, rate_hz: float) -> rtc3d.stream_status_t:
+def _stream_message(stream: StreamStatus, rate_hz: float, stall_timeout_s: float) -> rtc3d.stream_status_t:
     message = rtc3d.stream_status_t()
     for name in _COPIED_FIELDS:
         setattr(message, name, getattr(stream, name))
     message.state = stream.state.value
+    message.problem = unusable_frames(stream, stall_timeout_s)
     message.frame_rate_hz = rate_hz
     message.lag_ms = 1000 * stream.lag_s
     message.clock = clock_model(stream.clock)
@@ -98,7 +104,9 @@ def _stream_message(stream: StreamStatus, rate_hz: float) -> rtc3d.stream_status
     return message
 
 
-def _output_message(output: OutputStatus, health: OutputHealth) -> rtc3d.output_status_t:
+def _output_message(
+    output: OutputStatus, health: OutputHealth, queries: Mapping[str, int]
+) -> rtc3d.output_status_t:
     message = rtc3d.output_status_t()
     message.name = output.name
     message.connected = health.connected
@@ -107,10 +115,12 @@ def _output_message(output: OutputStatus, health: OutputHealth) -> rtc3d.output_
     message.num_messages = len(message.messages)
     message.drops = _losses(output.losses)
     message.num_drops = len(message.drops)
+    message.queries = _counts(queries)
+    message.num_queries = len(message.queries)
     return message
 
 
-def _counts(counter: Counter[str]) -> list[rtc3d.count_t]:
+def _counts(counter: Mapping[str, int]) -> list[rtc3d.count_t]:
     messages = []
     for name, count in sorted(counter.items()):
         message = rtc3d.count_t()

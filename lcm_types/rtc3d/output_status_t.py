@@ -12,11 +12,11 @@ import rtc3d
 class output_status_t(object):
     """ The status of one output (zenoh or lcm) for this source. """
 
-    __slots__ = ["name", "connected", "problem", "num_messages", "messages", "num_drops", "drops"]
+    __slots__ = ["name", "connected", "problem", "num_messages", "messages", "num_drops", "drops", "num_queries", "queries"]
 
-    __typenames__ = ["string", "boolean", "string", "int32_t", "rtc3d.count_t", "int32_t", "rtc3d.loss_t"]
+    __typenames__ = ["string", "boolean", "string", "int32_t", "rtc3d.count_t", "int32_t", "rtc3d.loss_t", "int32_t", "rtc3d.count_t"]
 
-    __dimensions__ = [None, None, None, None, ["num_messages"], None, ["num_drops"]]
+    __dimensions__ = [None, None, None, None, ["num_messages"], None, ["num_drops"], None, ["num_queries"]]
 
     def __init__(self):
         self.name = ""
@@ -45,6 +45,14 @@ class output_status_t(object):
 
         self.drops = []
         """ LCM Type: rtc3d.loss_t[num_drops] """
+        self.num_queries = 0
+        """
+        Number of queries of peers about this source, by result: "ok", the code of the error in the reply, or "no-reply".
+        LCM Type: int32_t
+        """
+
+        self.queries = []
+        """ LCM Type: rtc3d.count_t[num_queries] """
 
     def encode(self):
         buf = BytesIO()
@@ -70,6 +78,10 @@ class output_status_t(object):
         for i0 in range(self.num_drops):
             assert self.drops[i0]._get_packed_fingerprint() == rtc3d.loss_t._get_packed_fingerprint()
             self.drops[i0]._encode_one(buf)
+        buf.write(struct.pack(">i", self.num_queries))
+        for i0 in range(self.num_queries):
+            assert self.queries[i0]._get_packed_fingerprint() == rtc3d.count_t._get_packed_fingerprint()
+            self.queries[i0]._encode_one(buf)
 
     @staticmethod
     def decode(data: bytes):
@@ -97,13 +109,17 @@ class output_status_t(object):
         self.drops = []
         for i0 in range(self.num_drops):
             self.drops.append(rtc3d.loss_t._decode_one(buf))
+        self.num_queries = struct.unpack(">i", buf.read(4))[0]
+        self.queries = []
+        for i0 in range(self.num_queries):
+            self.queries.append(rtc3d.count_t._decode_one(buf))
         return self
 
     @staticmethod
     def _get_hash_recursive(parents):
         if output_status_t in parents: return 0
         newparents = parents + [output_status_t]
-        tmphash = (0x6c38707991e3cfd0+ rtc3d.count_t._get_hash_recursive(newparents)+ rtc3d.loss_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0xa997c07419cd8b77+ rtc3d.count_t._get_hash_recursive(newparents)+ rtc3d.loss_t._get_hash_recursive(newparents)+ rtc3d.count_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

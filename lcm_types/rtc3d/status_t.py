@@ -12,11 +12,11 @@ import rtc3d
 class status_t(object):
     """ The status of the gateway and its connections to one source, published once per second. """
 
-    __slots__ = ["utime", "capture_utime", "sequence", "session", "parameters_version", "source", "server", "gateway_version", "num_streams", "streams", "num_outputs", "outputs"]
+    __slots__ = ["utime", "capture_utime", "sequence", "session", "parameters_version", "source", "server", "gateway_version", "host", "num_streams", "streams", "num_outputs", "outputs"]
 
-    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "string", "string", "string", "int32_t", "rtc3d.stream_status_t", "int32_t", "rtc3d.output_status_t"]
+    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "string", "string", "string", "string", "int32_t", "rtc3d.stream_status_t", "int32_t", "rtc3d.output_status_t"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, None, None, ["num_streams"], None, ["num_outputs"]]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, ["num_streams"], None, ["num_outputs"]]
 
     def __init__(self):
         self.utime = 0
@@ -59,6 +59,12 @@ class status_t(object):
 
         self.gateway_version = ""
         """ LCM Type: string """
+        self.host = ""
+        """
+        The name of the gateway's computer.
+        LCM Type: string
+        """
+
         self.num_streams = 0
         """ LCM Type: int32_t """
         self.streams = []
@@ -87,6 +93,10 @@ class status_t(object):
         __gateway_version_encoded = self.gateway_version.encode('utf-8')
         buf.write(struct.pack('>I', len(__gateway_version_encoded)+1))
         buf.write(__gateway_version_encoded)
+        buf.write(b"\0")
+        __host_encoded = self.host.encode('utf-8')
+        buf.write(struct.pack('>I', len(__host_encoded)+1))
+        buf.write(__host_encoded)
         buf.write(b"\0")
         buf.write(struct.pack(">i", self.num_streams))
         for i0 in range(self.num_streams):
@@ -117,6 +127,8 @@ class status_t(object):
         self.server = buf.read(__server_len)[:-1].decode('utf-8', 'replace')
         __gateway_version_len = struct.unpack('>I', buf.read(4))[0]
         self.gateway_version = buf.read(__gateway_version_len)[:-1].decode('utf-8', 'replace')
+        __host_len = struct.unpack('>I', buf.read(4))[0]
+        self.host = buf.read(__host_len)[:-1].decode('utf-8', 'replace')
         self.num_streams = struct.unpack(">i", buf.read(4))[0]
         self.streams = []
         for i0 in range(self.num_streams):
@@ -131,7 +143,7 @@ class status_t(object):
     def _get_hash_recursive(parents):
         if status_t in parents: return 0
         newparents = parents + [status_t]
-        tmphash = (0x15685d12b81a2d14+ rtc3d.stream_status_t._get_hash_recursive(newparents)+ rtc3d.output_status_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x7c17e8a39b6c83+ rtc3d.stream_status_t._get_hash_recursive(newparents)+ rtc3d.output_status_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

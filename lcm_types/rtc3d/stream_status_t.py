@@ -12,11 +12,11 @@ import rtc3d
 class stream_status_t(object):
     """ The status of one stream of a source: a TCP session with the requested components and rate. """
 
-    __slots__ = ["components", "state", "byte_order", "rate", "frame_rate_hz", "session", "frames_in", "bytes_in", "reconnects", "restarts", "lag_ms", "clock", "num_drops", "drops", "num_limitations", "limitations", "last_error", "last_error_utime"]
+    __slots__ = ["components", "state", "problem", "tries", "byte_order", "rate", "frame_rate_hz", "session", "frames_in", "bytes_in", "reconnects", "restarts", "lag_ms", "clock", "num_drops", "drops", "num_limitations", "limitations", "last_error", "last_error_utime"]
 
-    __typenames__ = ["string", "string", "string", "string", "float", "int32_t", "int64_t", "int64_t", "int64_t", "int64_t", "float", "rtc3d.clock_model_t", "int32_t", "rtc3d.loss_t", "int32_t", "string", "string", "int64_t"]
+    __typenames__ = ["string", "string", "string", "int64_t", "string", "string", "float", "int32_t", "int64_t", "int64_t", "int64_t", "int64_t", "float", "rtc3d.clock_model_t", "int32_t", "rtc3d.loss_t", "int32_t", "string", "string", "int64_t"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_drops"], None, ["num_limitations"], None, None]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, None, None, None, None, ["num_drops"], None, ["num_limitations"], None, None]
 
     def __init__(self):
         self.components = ""
@@ -29,6 +29,18 @@ class stream_status_t(object):
         """
         connecting, handshaking, idle, no measurement, streaming, stalled or waiting to reconnect.
         LCM Type: string
+        """
+
+        self.problem = ""
+        """
+        Why nothing is published although frames arrive; "" if that is not so.
+        LCM Type: string
+        """
+
+        self.tries = 0
+        """
+        Attempts to connect since the server last accepted a request to stream.
+        LCM Type: int64_t
         """
 
         self.byte_order = ""
@@ -119,6 +131,11 @@ class stream_status_t(object):
         buf.write(struct.pack('>I', len(__state_encoded)+1))
         buf.write(__state_encoded)
         buf.write(b"\0")
+        __problem_encoded = self.problem.encode('utf-8')
+        buf.write(struct.pack('>I', len(__problem_encoded)+1))
+        buf.write(__problem_encoded)
+        buf.write(b"\0")
+        buf.write(struct.pack(">q", self.tries))
         __byte_order_encoded = self.byte_order.encode('utf-8')
         buf.write(struct.pack('>I', len(__byte_order_encoded)+1))
         buf.write(__byte_order_encoded)
@@ -163,6 +180,9 @@ class stream_status_t(object):
         self.components = buf.read(__components_len)[:-1].decode('utf-8', 'replace')
         __state_len = struct.unpack('>I', buf.read(4))[0]
         self.state = buf.read(__state_len)[:-1].decode('utf-8', 'replace')
+        __problem_len = struct.unpack('>I', buf.read(4))[0]
+        self.problem = buf.read(__problem_len)[:-1].decode('utf-8', 'replace')
+        self.tries = struct.unpack(">q", buf.read(8))[0]
         __byte_order_len = struct.unpack('>I', buf.read(4))[0]
         self.byte_order = buf.read(__byte_order_len)[:-1].decode('utf-8', 'replace')
         __rate_len = struct.unpack('>I', buf.read(4))[0]
@@ -187,7 +207,7 @@ class stream_status_t(object):
     def _get_hash_recursive(parents):
         if stream_status_t in parents: return 0
         newparents = parents + [stream_status_t]
-        tmphash = (0xd074a25ffd94ea6f+ rtc3d.clock_model_t._get_hash_recursive(newparents)+ rtc3d.loss_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x8e63e76bb9d9307+ rtc3d.clock_model_t._get_hash_recursive(newparents)+ rtc3d.loss_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

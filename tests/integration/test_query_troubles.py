@@ -51,7 +51,7 @@ async def test_queries_beyond_the_limit_are_refused_as_busy(monkeypatch: pytest.
         assert {reply.payload for reply in await asyncio.gather(*waiting)} == {server.xml}
         assert (await query(peer, "mocap/lab/status")).payload
         # A reply can arrive before it is counted.
-        await wait_until_async(lambda: queries.results == {"busy": 1, "ok": 3})
+        await wait_until_async(lambda: queries.results == {"lab": {"busy": 1, "ok": 3}})
 
 
 async def test_queries_end_at_once_when_the_gateway_closes() -> None:

@@ -26,7 +26,8 @@ STATUS = status_message(
     server="192.0.2.20:3020",
     sequence=1,
     streams=[(StreamStatus("3d", limitations=["no parameters"]), 60.0)],
-    outputs=[(OutputStatus("zenoh"), OutputHealth(True))],
+    outputs=[(OutputStatus("zenoh"), OutputHealth(True), {"ok": 1})],
+    stall_timeout_s=2.0,
 )
 CLOCK = clock_message(1, 2, StreamStatus("3d"))
 valid = st.sampled_from(

@@ -83,7 +83,12 @@ class Lab:
 
     def check(self) -> None:
         status = status_message(
-            source="lab", server="s", sequence=1, streams=[(self.status, 1e39)], outputs=[]
+            source="lab",
+            server="s",
+            sequence=1,
+            streams=[(self.status, 1e39)],
+            outputs=[],
+            stall_timeout_s=2.0,
         )
         for message in (encode_within_limits(status), encode_within_limits(clock_message(1, 1, self.status))):
             decoded = decode(message)

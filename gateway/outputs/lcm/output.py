@@ -98,8 +98,8 @@ class LcmOutput(Output):
             await self._queries.close()
 
     @property
-    def query_results(self) -> Mapping[str, int] | None:
-        """The number of requests by result; None before ``serve_queries``."""
+    def query_results(self) -> Mapping[str, Mapping[str, int]] | None:
+        """By source, the number of requests by result; None before ``serve_queries``."""
         return None if self._queries is None else self._queries.results
 
     def close(self) -> None:

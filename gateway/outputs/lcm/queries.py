@@ -1,7 +1,7 @@
 """What the LCM output does besides its data: it answers requests of peers, and publishes parameters."""
 
 import asyncio
-from collections import Counter
+from collections.abc import Mapping
 
 import lcm
 
@@ -53,7 +53,7 @@ class LcmQueries:
         self._parameters = LcmParameters(loop, self._publish_parameters, self._long_sender)
 
     @property
-    def results(self) -> Counter[str]:
+    def results(self) -> Mapping[str, Mapping[str, int]]:
         """See Admission."""
         return self._requests.results
 

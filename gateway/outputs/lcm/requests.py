@@ -8,8 +8,8 @@ import asyncio
 import contextlib
 import functools
 import logging
-from collections import Counter, defaultdict
-from collections.abc import Awaitable, Callable, Sequence
+from collections import defaultdict
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from gateway.errors import OutputError, QueryError
@@ -92,7 +92,7 @@ class LcmRequests:
         self._defects = QueryDefects(logger)
 
     @property
-    def results(self) -> Counter[str]:
+    def results(self) -> Mapping[str, Mapping[str, int]]:
         """See Admission."""
         return self._admission.results
 
@@ -118,13 +118,13 @@ class LcmRequests:
         if len(data) > MAX_REQUEST_BYTES or data[:8] != kind.request._get_packed_fingerprint():  # noqa: SLF001 - see decode.py
             self._count_malformed(kind, source, data)
             return
-        refusal = self._admission.admit(source)
+        refusal = self._admission.admit(source, source)
         if refusal is not None:
             self._refuse(kind, source, data, refusal)
             return
         request = _decoded(kind, data)
         if request is None:
-            self._admission.finished("")
+            self._admission.finished(source, "")
             self._count_malformed(kind, source, data)
             return
         with contextlib.suppress(RuntimeError):  # the loop has just ended
@@ -157,7 +157,7 @@ class LcmRequests:
 
     def _start_answer(self, kind: RequestKind, source: str, request: Any) -> None:
         if not self._service.serves(source):
-            self._admission.finished("")
+            self._admission.finished(source, "")
             return
         with log_fields(source=source):
             task = asyncio.create_task(self._answer(kind, source, request))
@@ -176,9 +176,8 @@ class LcmRequests:
             content = self._defects.log(source, defect, query)
         finally:
             # Before the reply is sent: its receiver may ask again at once. Cancelled, it has no result.
-            self._admission.finished(
-                "" if content is None else content.code if isinstance(content, QueryError) else "ok"
-            )
+            result = "" if content is None else content.code if isinstance(content, QueryError) else "ok"
+            self._admission.finished(source, result)
         if isinstance(content, QueryError):
             self._send_error(kind, source, request, content)
         else:

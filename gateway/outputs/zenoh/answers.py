@@ -121,7 +121,7 @@ class ZenohAnswers:
     def receive(self, source: str, query: zenoh.Query) -> None:
         """Take a query about ``source``, or refuse it."""
         selected = str(query.key_expr)
-        refusal = self._admission.admit(selected[:MAX_KEY_CHARS])
+        refusal = self._admission.admit(source, selected[:MAX_KEY_CHARS])
         if refusal is not None:
             self._refuse(source, query, refusal)
             return
@@ -193,7 +193,7 @@ class ZenohAnswers:
             with self._lock:
                 self._open.pop(question.identity, None)
         if outcome is None:  # the source has been removed
-            self._drop(question.queries)
+            self._drop(question.queries, question.source)
         else:
             self._send(question.queries, question.source, outcome)
 
@@ -222,12 +222,12 @@ class ZenohAnswers:
         """Drop the pending queries, and close the sender. Peers see at once that no reply follows."""
         self._is_closed = True
         with self._lock:
-            queries = [query for question in self._open.values() for query in question.queries]
+            questions = list(self._open.values())
             self._waiting.clear()
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        self._sender.close(functools.partial(self._drop_now, queries))
+        self._sender.close(functools.partial(self._drop_all, questions))
         self._long_sender.close()
 
     # In any thread.
@@ -240,7 +240,7 @@ class ZenohAnswers:
         for query in queries:
             reply = functools.partial(self._reply, query, source, outcome)
             if not sender.offer(reply, num_bytes // len(queries)):
-                self._drop([query])
+                self._drop([query], source)
                 if not self._is_closed:
                     self._losses[source].lost(
                         "answer beyond the queue",
@@ -249,19 +249,23 @@ class ZenohAnswers:
                         frames=0,
                     )
 
-    def _drop(self, queries: list[zenoh.Query]) -> None:
+    def _drop(self, queries: list[zenoh.Query], source: str) -> None:
         """Let the peers see that no reply follows."""
-        self._sender.submit(functools.partial(self._drop_now, queries))
+        self._sender.submit(functools.partial(self._drop_now, queries, source))
 
     def _log_defect(self, source: str, selector: str, defect: Exception) -> QueryError:
         return self._defects.log(source, defect, f"query {safe_text(selector)}")
 
     # In a thread that sends. Zenoh's calls may block.
 
-    def _drop_now(self, queries: list[zenoh.Query]) -> None:
+    def _drop_all(self, questions: list[_Question]) -> None:
+        for question in questions:
+            self._drop_now(question.queries, question.source)
+
+    def _drop_now(self, queries: list[zenoh.Query], source: str) -> None:
         for query in queries:
             query.drop()
-            self._admission.finished(NO_REPLY)
+            self._admission.finished(source, NO_REPLY)
 
     def _reply(self, query: zenoh.Query, source: str, outcome: Mapping[str, Answer] | QueryError) -> None:
         result = "ok"
@@ -278,7 +282,7 @@ class ZenohAnswers:
             result = "defect"
             self._log_defect(source, str(query.key_expr), problem)
         finally:
-            self._admission.finished(result)
+            self._admission.finished(source, result)
 
     def _reply_all(self, query: zenoh.Query, answers: Mapping[str, Answer]) -> None:
         """Reply with each of the answers. Raises QueryError if there is none, or too many bytes."""

@@ -7,7 +7,7 @@ import logging
 import math
 import threading
 import time
-from collections import Counter, defaultdict
+from collections import defaultdict
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import Any, Final, NamedTuple
@@ -93,7 +93,7 @@ class ZenohQueries:
         self._is_closed = False
 
     @property
-    def results(self) -> Counter[str]:
+    def results(self) -> Mapping[str, Mapping[str, int]]:
         """See Admission."""
         return self._admission.results
 

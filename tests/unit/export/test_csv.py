@@ -181,7 +181,7 @@ def test_damage_and_malformed_messages_are_reported(tmp_path: Path) -> None:
     job = export_messages(tmp_path, [*messages, ("SPY", b"other program")], "walk.csv")
     assert len(read_csv(tmp_path / "walk-3d.csv")[1]) == 5
     assert job.notes == [
-        "messages of other programs were left out: 1, on the channels SPY",
+        "messages of other programs or versions were left out: 1, on the channels SPY",
         "malformed messages of 3d of lab were left out: 1",
     ]
 

@@ -361,7 +361,7 @@ def test_what_cannot_be_exported_is_reported(tmp_path: Path) -> None:
         "malformed messages of 3d of lab were left out: 3",
         "malformed messages of parameters of lab were left out: 1",
         "messages from before 1970 or after 2106 in 3d of lab were left out: 2",
-        "messages of other programs were left out: 1, on the channels MOCAP_LAB_OTHER",
+        "messages of other programs or versions were left out: 1, on the channels MOCAP_LAB_OTHER",
     ]
     assert len(read_mcap(tmp_path / "walk.mcap").topics["/lab/markers"]) == 1
 

@@ -36,12 +36,17 @@ def tool_pose_messages() -> list[bytes]:
 def status_of(**stream: Any) -> bytes:
     """Return a status message of one stream with these counters, and of two outputs."""
     outputs = [
-        (OutputStatus("zenoh"), OutputHealth(True)),
-        (OutputStatus("lcm"), OutputHealth(False, "no multicast: ip route add")),
+        (OutputStatus("zenoh"), OutputHealth(True), {"ok": 3}),
+        (OutputStatus("lcm"), OutputHealth(False, "no multicast: ip route add"), {}),
     ]
     streams = [(StreamStatus("3d 6d", **stream), 59.96)]
     message = status_message(
-        source="lab", server="192.0.2.20:3020", sequence=17, streams=streams, outputs=outputs
+        source="lab",
+        server="192.0.2.20:3020",
+        sequence=17,
+        streams=streams,
+        outputs=outputs,
+        stall_timeout_s=2.0,
     )
     return bytes(message.encode())
 

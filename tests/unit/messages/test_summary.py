@@ -88,7 +88,8 @@ def test_the_summary_of_a_status_says_what_was_lost_and_why() -> None:
         server="192.0.2.20:3020",
         sequence=17,
         streams=[(status, 0.0)],
-        outputs=[(OutputStatus("zenoh", losses=losses.report()), OutputHealth(True))],
+        outputs=[(OutputStatus("zenoh", losses=losses.report()), OutputHealth(True), {})],
+        stall_timeout_s=2.0,
     )
     assert summarise(decode(message.encode())) == (
         "#17 lab at 192.0.2.20:3020: [3d 6d] waiting to reconnect 0.0 Hz, 0 frames, 0 reconnects, "

@@ -28,10 +28,10 @@ def asked(admission: Admission, key: str, times: int) -> Counter[str]:
     """Ask ``times`` times; return the codes of the refusals; ok is for what was admitted."""
     results: Counter[str] = Counter()
     for _ in range(times):
-        refusal = admission.admit(key)
+        refusal = admission.admit("lab", key)
         results["ok" if refusal is None else refusal.error.code] += 1
         if refusal is None:
-            admission.finished("ok")
+            admission.finished("lab", "ok")
     return results
 
 
@@ -59,7 +59,7 @@ def test_an_admitted_question_with_many_answers_counts_as_many(clock: Clock) -> 
 def test_a_refusal_says_which_limit_and_its_setting(clock: Clock) -> None:
     admission = Admission(LIMITS, clock)
     asked(admission, "lab/3d", 10)
-    refusal = admission.admit("lab/3d")
+    refusal = admission.admit("lab", "lab/3d")
     assert refusal is not None
     assert str(refusal.error) == (
         "the gateway answers 10 queries a second like this one; ask less often, subscribe instead, or raise "
@@ -67,7 +67,7 @@ def test_a_refusal_says_which_limit_and_its_setting(clock: Clock) -> None:
     )
     for number in range(9):
         asked(admission, f"lab/{number}", 10)
-    refusal = admission.admit("lab/6d")
+    refusal = admission.admit("lab", "lab/6d")
     assert refusal is not None
     assert "100 queries a second in total" in str(refusal.error)
     assert "zenoh.max_queries_per_s" in str(refusal.error)
@@ -75,12 +75,12 @@ def test_a_refusal_says_which_limit_and_its_setting(clock: Clock) -> None:
 
 def test_questions_in_progress_are_limited(clock: Clock) -> None:
     admission = Admission(LIMITS._replace(pending=3), clock)
-    assert [admission.admit("a") for _ in range(3)] == [None] * 3
-    refusal = admission.admit("b")
+    assert [admission.admit("lab", "a") for _ in range(3)] == [None] * 3
+    refusal = admission.admit("lab", "b")
     assert refusal is not None
     assert (refusal.error.code, refusal.cause) == ("busy", "queue")
-    admission.finished("ok")
-    assert admission.admit("b") is None
+    admission.finished("lab", "ok")
+    assert admission.admit("lab", "b") is None
     assert admission.num_pending == 3
 
 
@@ -90,7 +90,7 @@ def test_refusals_are_limited_and_everything_is_counted(
     monkeypatch.setattr(admission_module, "REFUSALS_PER_S", 5.0)
     admission = Admission(LIMITS, clock)
     assert asked(admission, "lab/3d", 30) == {"ok": 10, "rate": 20}
-    assert admission.results == {"ok": 10, "rate": 5, NO_REPLY: 15}
+    assert admission.results == {"lab": {"ok": 10, "rate": 5, NO_REPLY: 15}}
 
 
 def test_the_number_of_known_keys_is_limited(clock: Clock) -> None:
@@ -118,6 +118,14 @@ def test_the_bytes_of_replies_have_a_rate_and_long_replies_their_own(clock: Cloc
 
 def test_an_admitted_question_without_result_only_frees_its_place(clock: Clock) -> None:
     admission = Admission(LIMITS, clock)
-    admission.admit("a")
-    admission.finished("")
+    admission.admit("lab", "a")
+    admission.finished("lab", "")
     assert (admission.num_pending, admission.results) == (0, {})
+
+
+def test_results_are_counted_for_each_source(clock: Clock) -> None:
+    admission = Admission(LIMITS, clock)
+    for source, result in (("lab", "ok"), ("hall", "nothing-yet"), ("lab", "ok")):
+        admission.admit(source, f"{source}/3d")
+        admission.finished(source, result)
+    assert admission.results == {"lab": {"ok": 2}, "hall": {"nothing-yet": 1}}

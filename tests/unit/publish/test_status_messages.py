@@ -1,4 +1,5 @@
 import logging
+import socket
 from collections import Counter
 from typing import Any
 
@@ -50,7 +51,7 @@ def test_the_status_message_has_every_field() -> None:
     stream.losses.lost("frame rejected", "too short")
     lost = Losses(logging.getLogger("tests"), "lab to zenoh")
     lost.lost("no router", "start it", messages=7, frames=2)
-    quiet = StreamStatus("analog", session=1, parameters_version=5)
+    quiet = StreamStatus("analog", session=1, parameters_version=5, tries=2)
     zenoh = OutputStatus("zenoh", Counter({"6d": 8, "3d": 9}), lost.report())
     lcm = OutputStatus("lcm")
     before = now_utime()
@@ -60,7 +61,11 @@ def test_the_status_message_has_every_field() -> None:
             server="192.0.2.20:3020",
             sequence=17,
             streams=[(stream, 59.5), (quiet, 0.0)],
-            outputs=[(zenoh, OutputHealth(True)), (lcm, OutputHealth(False, "no multicast"))],
+            outputs=[
+                (zenoh, OutputHealth(True), {"ok": 5, "nothing-yet": 1}),
+                (lcm, OutputHealth(False, "no multicast"), {}),
+            ],
+            stall_timeout_s=2.0,
         )
     )
     assert before <= message["utime"] <= now_utime()
@@ -73,11 +78,14 @@ def test_the_status_message_has_every_field() -> None:
         "source": "lab",
         "server": "192.0.2.20:3020",
         "gateway_version": __version__,
+        "host": socket.gethostname(),
         "num_streams": 2,
         "streams": [
             {
                 "components": "3d 6d",
                 "state": "streaming",
+                "problem": "frames come, and all are rejected: too short",
+                "tries": 0,
                 "byte_order": "little",
                 "rate": "Frequency:60",
                 "frame_rate_hz": 59.5,
@@ -101,6 +109,8 @@ def test_the_status_message_has_every_field() -> None:
             {
                 "components": "analog",
                 "state": "waiting to reconnect",
+                "problem": "",
+                "tries": 2,
                 "byte_order": "",
                 "rate": "",
                 "frame_rate_hz": 0.0,
@@ -129,6 +139,8 @@ def test_the_status_message_has_every_field() -> None:
                 "messages": [{"name": "3d", "count": 9}, {"name": "6d", "count": 8}],
                 "num_drops": 1,
                 "drops": [{"cause": "no router", "messages": 7, "frames": 2}],
+                "num_queries": 2,
+                "queries": [{"name": "nothing-yet", "count": 1}, {"name": "ok", "count": 5}],
             },
             {
                 "name": "lcm",
@@ -138,6 +150,8 @@ def test_the_status_message_has_every_field() -> None:
                 "messages": [],
                 "num_drops": 0,
                 "drops": [],
+                "num_queries": 0,
+                "queries": [],
             },
         ],
     }
@@ -188,8 +202,9 @@ def test_the_offset_of_a_server_that_counts_from_any_number_fits_its_field(first
 
 def test_counts_are_sorted_by_name() -> None:
     output = OutputStatus("zenoh", Counter("cab"))
-    outputs = [(output, OutputHealth(True))]
+    outputs = [(output, OutputHealth(True), {"rate": 1, "ok": 2})]
     message = encoded_and_decoded(
-        status_message(source="lab", server="s", sequence=0, streams=[], outputs=outputs)
+        status_message(source="lab", server="s", sequence=0, streams=[], outputs=outputs, stall_timeout_s=2.0)
     )
     assert [count["name"] for count in message["outputs"][0]["messages"]] == ["a", "b", "c"]
+    assert [count["name"] for count in message["outputs"][0]["queries"]] == ["ok", "rate"]

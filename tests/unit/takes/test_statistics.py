@@ -176,3 +176,11 @@ def test_damage_and_foreign_messages_are_reported(tmp_path: Path) -> None:
         (len(log) + 7 - 28 - 5 - 1, 33),
     ]
     assert (statistics.num_damaged, statistics.damaged_bytes, statistics.is_complete) == (2, 40, False)
+
+
+def test_a_status_of_an_earlier_version_is_counted_and_leaves_the_rest(tmp_path: Path) -> None:
+    earlier = bytes.fromhex("3d9c34c617e4ba2e") + bytes(40)  # the fingerprint of status_t in 0.1.0
+    messages = [markers(2, 0), ("MOCAP_LAB_STATUS", earlier), markers(2, 1)]
+    statistics = take_statistics(write_take(tmp_path / "earlier.lcmlog", messages))
+    assert statistics.unknown == {"MOCAP_LAB_STATUS": 1}
+    assert statistics.sources["lab"].components["3d"].num_messages == 2

@@ -33,7 +33,7 @@ async def test_a_command_gets_the_answer_of_the_service_as_json(lab: Lab) -> Non
     assert json.loads(reply.content) == {"name": "walk-1"}
     assert (reply.error, reply.error_code) == ("", "")
     assert lab.service.commands_received == [("lab", ("take",), {"set": "start", "name": "walk-1"})]
-    assert lab.output.query_results == {"ok": 1}
+    assert lab.output.query_results == {"lab": {"ok": 1}}
 
 
 async def test_an_error_of_the_service_is_the_reply(lab: Lab) -> None:

@@ -34,7 +34,7 @@ async def test_a_reply_has_the_answer_of_the_service(lab: Lab) -> None:
     assert reply.parameters_version == 4
     assert lab.service.received == [("lab", ["3d", "force"], True)]
     assert lab.service.log_fields == [{"source": "lab"}]
-    assert lab.output.query_results == {"ok": 1}
+    assert lab.output.query_results == {"lab": {"ok": 1}}
 
 
 async def test_sources_are_served_whenever_they_are_announced(lab: Lab) -> None:
@@ -56,7 +56,7 @@ async def test_an_error_of_the_service_is_the_reply(lab: Lab) -> None:
     [reply] = await lab.receive()
     assert (reply.request_id, reply.requester) == (7, "test")
     assert (reply.xml, reply.error, reply.error_code) == ("", "the server refuses", "refused")
-    assert lab.output.query_results == {"refused": 1}
+    assert lab.output.query_results == {"lab": {"refused": 1}}
 
 
 async def test_a_defect_is_logged_and_reported_in_the_reply(
@@ -70,7 +70,7 @@ async def test_a_defect_is_logged_and_reported_in_the_reply(
         "a defect in the gateway: ZeroDivisionError('of the test')",
         "defect",
     )
-    assert lab.output.query_results == {"defect": 1}
+    assert lab.output.query_results == {"lab": {"defect": 1}}
     [record] = caplog.records
     assert record.message == "lab: LCM request 7 of 'test'"
     assert record.exc_info is not None
@@ -125,7 +125,7 @@ async def test_requests_beyond_the_rate_get_an_error_and_are_counted() -> None:
     assert {reply.requester for reply in refused} == {"test"}
     assert "raise lcm.max_queries_per_source_per_s" in refused[0].error
     assert lab.lost("lab") == {"request beyond the rate": (len(refused), 0)}
-    assert lab.output.query_results == {"ok": 8 - len(refused), "rate": len(refused)}
+    assert lab.output.query_results == {"lab": {"ok": 8 - len(refused), "rate": len(refused)}}
     await lab.output.stop_queries()
 
 

@@ -120,7 +120,7 @@ async def test_queries_beyond_the_rate_get_an_error_and_are_counted(caplog: pyte
         codes = await lab.codes("mocap/lab/status", 60)
         assert 10 <= codes["ok"] <= 40
         assert codes == {"ok": codes["ok"], "rate": 60 - codes["ok"]}
-        assert lab.output.query_results == codes
+        assert lab.output.query_results == {"lab": codes}
         assert amounts(lab.losses.report()) == {"query beyond the rate": (codes["rate"], 0)}
         [warning] = [record.message for record in caplog.records if "refused" in record.message]
         assert "10 queries a second like this one" in warning

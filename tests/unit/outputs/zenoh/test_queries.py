@@ -110,7 +110,7 @@ async def test_the_service_receives_source_path_and_options(lab: Lab) -> None:
     options = {"format": "json", "fresh": "", "a": "b=c"}
     assert lab.service.received == [("lab", ("parameters", "3d"), options)]
     assert lab.service.log_fields == {"source": "lab"}
-    await wait_until_async(lambda: lab.output.query_results == {"ok": 1})
+    await wait_until_async(lambda: lab.output.query_results == {"lab": {"ok": 1}})
 
 
 async def test_a_selector_with_wildcards_gets_one_reply_for_each_key(lab: Lab) -> None:
@@ -145,7 +145,7 @@ async def test_a_selector_that_matches_nothing_is_an_error_with_the_accepted_key
     reply = await lab.query(selector)
     assert (reply.error, reply.code) == (error, "bad-request")
     assert lab.service.received == []
-    await wait_until_async(lambda: lab.output.query_results == {"bad-request": 1})
+    await wait_until_async(lambda: lab.output.query_results == {"lab": {"bad-request": 1}})
 
 
 async def test_errors_are_replies_with_their_code_and_are_counted(
@@ -162,7 +162,7 @@ async def test_errors_are_replies_with_their_code_and_are_counted(
     [record] = caplog.records
     assert record.message == "lab: query mocap/lab/status?a=1"
     assert record.exc_info is not None
-    await wait_until_async(lambda: lab.output.query_results == {"refused": 2, "defect": 1})
+    await wait_until_async(lambda: lab.output.query_results == {"lab": {"refused": 2, "defect": 1}})
 
 
 async def test_sources_are_served_between_announcement_and_withdrawal(lab: Lab) -> None:
