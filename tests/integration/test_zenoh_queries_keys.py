@@ -2,6 +2,7 @@
 
 import asyncio
 import json
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -128,6 +129,18 @@ async def test_the_status_is_answered_as_message_or_as_json() -> None:
         assert reply.encoding == "application/x-lcm;rtc3d.status_t"
         assert rtc3d.status_t.decode(reply.payload).source == "lab"
         assert (await query(peer, "mocap/lab/status?format=json")).json["server"] == f"127.0.0.1:{port}"
+
+
+async def test_the_status_counts_the_queries_about_the_source_by_result() -> None:
+    async with gateway_with_server() as (_, _, gateway, peer):
+        assert (await query(peer, "mocap/lab/nowhere")).code == "bad-request"
+        [output] = gateway.outputs
+        await wait_until_async(lambda: output.query_results == {"lab": {"bad-request": 1}})
+        gateway.sources[0].publish_status()
+        status = rtc3d.status_t.decode((await query(peer, "mocap/lab/status")).payload)
+        [zenoh] = status.outputs
+        assert [(count.name, count.count) for count in zenoh.queries] == [("bad-request", 1)]
+        assert status.host == socket.gethostname()
 
 
 def run_with_types_of(schema: bytes, folder: Path, code: str, stdin: bytes = b"") -> list[str]:
