@@ -39,6 +39,10 @@ _NEEDS: Final = {
         _WHEELHOUSE.exists(),
         "installs from build/wheelhouse without a network: run make wheelhouse first",
     ),
+    "chromium": (
+        Path("/usr/bin/chromium").exists(),
+        "needs a browser: install Debian's package chromium",
+    ),
     "systemd": (
         os.geteuid() == 0 and Path("/lib/systemd/systemd").exists(),
         "boots its own systemd: needs root and an installed systemd",
