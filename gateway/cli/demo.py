@@ -3,8 +3,6 @@
 from typing import Annotated
 
 import typer
-import uvloop
-from rich.console import Console
 
 from gateway.cli.options import (
     AnalogOption,
@@ -15,11 +13,7 @@ from gateway.cli.options import (
     RateOption,
     ToolsOption,
 )
-from gateway.demo import run_demo
-from gateway.rtc3d_server.scene import Scene
 from gateway.service.log_format import LogLevel, set_up_log
-from gateway.simulator.c3d_scene import C3dScene
-from gateway.simulator.synthetic import SyntheticScene
 
 
 def demo(
@@ -36,6 +30,14 @@ def demo(
     c3d: C3dOption = None,
 ) -> None:
     """Run a self-contained demo: simulator, gateway and two subscribers. Counts lost messages."""
+    import uvloop
+    from rich.console import Console
+
+    from gateway.demo import run_demo
+    from gateway.rtc3d_server.scene import Scene
+    from gateway.simulator.c3d_scene import C3dScene
+    from gateway.simulator.synthetic import SyntheticScene
+
     set_up_log(LogLevel.WARNING)
     scene: Scene
     if c3d is not None:

@@ -2,19 +2,17 @@
 
 import sys
 from pathlib import Path
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
-import uvloop
-from rich.console import Console
 
-from gateway.cli.options import ConfigOption, ServerOption, ZenohConfigOption, configuration_from_options
-from gateway.doctor.all_checks import run_checks, run_checks_without_settings
-from gateway.doctor.report import Report
-from gateway.doctor.source_checks import CONNECTION
+from gateway.cli.options import ConfigOption, ServerOption, ZenohConfigOption
 from gateway.errors import ConfigError
 from gateway.safe_text import safe_lines
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
+
+if TYPE_CHECKING:
+    from gateway.doctor.report import Report
 
 _INSTALLED_CONFIG: Final = Path("/etc/rtc3d-gateway/gateway.yaml")
 
@@ -39,6 +37,11 @@ def doctor(
 
     Without options, it uses the installed configuration, /etc/rtc3d-gateway/gateway.yaml.
     """
+    import uvloop
+    from rich.console import Console
+
+    from gateway.doctor.report import Report
+
     set_up_log(LogLevel.ERROR, LogFormat.TEXT)  # warnings would repeat the findings
     report = Report(Console(quiet=as_json))
     uvloop.run(
@@ -59,7 +62,7 @@ def doctor(
 
 
 async def _report_findings(
-    report: Report,
+    report: "Report",
     config: Path | None,
     server: str | None,
     seconds: float,
@@ -68,6 +71,10 @@ async def _report_findings(
     zenoh_config: Path | None,
     as_json: bool,
 ) -> None:
+    from gateway.cli.configuration import configuration_from_options
+    from gateway.doctor.all_checks import run_checks, run_checks_without_settings
+    from gateway.doctor.source_checks import CONNECTION
+
     if config is None and server is None and _INSTALLED_CONFIG.exists():
         config = _INSTALLED_CONFIG
     try:

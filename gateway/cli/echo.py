@@ -5,11 +5,10 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from typing import Annotated, Final, TextIO
+from typing import TYPE_CHECKING, Annotated, Final, TextIO
 
 import typer
 
-from gateway.cli.message_lines import json_line, text_line
 from gateway.cli.options import (
     ComponentOption,
     ConnectOption,
@@ -18,8 +17,9 @@ from gateway.cli.options import (
     UrlOption,
     ZenohConfigOption,
 )
-from gateway.outputs.kind import SubscriptionRequest
-from gateway.outputs.registry import OUTPUTS
+
+if TYPE_CHECKING:
+    from gateway.outputs.kind import SubscriptionRequest
 
 QUEUE_MESSAGES: Final = 10_000
 """How many messages may wait to be printed."""
@@ -29,6 +29,8 @@ Messages = queue.Queue[tuple[str, bytes]]
 
 
 def _output_names() -> str:
+    from gateway.outputs.registry import OUTPUTS
+
     return ", ".join(name for name, kind in OUTPUTS.items() if kind.subscribe is not None)
 
 
@@ -37,7 +39,7 @@ def echo(
     lcm: Annotated[bool, typer.Option("--lcm", help="Subscribe on LCM.")] = False,
     output: Annotated[
         str | None,
-        typer.Option(metavar="NAME", help=f"Subscribe on this output, one of: {_output_names()}."),
+        typer.Option(metavar="NAME", help="Subscribe on the output with this name, such as zenoh or lcm."),
     ] = None,
     source: SourceOption = None,
     component: ComponentOption = None,
@@ -55,6 +57,8 @@ def echo(
     name = output or ("lcm" if lcm else "zenoh")
     if zenoh_config is not None and name != "zenoh":
         raise typer.BadParameter("--zenoh-config is for subscribing on Zenoh")
+    from gateway.outputs.kind import SubscriptionRequest
+
     request = SubscriptionRequest(source, component, prefix, connect or url, zenoh_config)
     with subscribed(name, request) as messages:
         try:
@@ -67,8 +71,10 @@ def echo(
 
 
 @contextmanager
-def subscribed(output: str, request: SubscriptionRequest) -> Iterator[Messages]:
+def subscribed(output: str, request: "SubscriptionRequest") -> Iterator[Messages]:
     """Provide a queue of the messages of an output; raises OutputError if it does not open."""
+    from gateway.outputs.registry import OUTPUTS
+
     subscribe = OUTPUTS[output].subscribe if output in OUTPUTS else None
     if subscribe is None:
         raise typer.BadParameter(
@@ -95,6 +101,8 @@ def print_messages(
 
     Stops earlier when ``timeout_s`` has passed. ``count`` None means no limit.
     """
+    from gateway.cli.message_lines import json_line, text_line
+
     printed = 0
     deadline_s = None if timeout_s is None else time.monotonic() + timeout_s
     line = json_line if as_json else text_line

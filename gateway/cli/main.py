@@ -18,17 +18,7 @@ from typing import Annotated, Any, Final, NoReturn
 import typer
 
 from gateway import version_text
-from gateway.cli import config, take
-from gateway.cli.check import check
-from gateway.cli.demo import demo
-from gateway.cli.doctor import doctor
-from gateway.cli.echo import echo
-from gateway.cli.export import export
-from gateway.cli.params import params
-from gateway.cli.record import record
-from gateway.cli.replay import replay
-from gateway.cli.run import run
-from gateway.cli.simulate import simulate
+from gateway.cli.commands import LazyGroup
 from gateway.errors import ConfigError, GatewayError
 from gateway.safe_text import safe_lines
 from gateway.service.process_end import end_process
@@ -38,15 +28,13 @@ _OUTPUT_ERRORS: Final = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, err
 
 app = typer.Typer(
     name="rtc3d-gateway",
+    cls=LazyGroup,
     help="Publish data of RTC3D motion-capture servers (NDI First Principles, WaveFront) on Zenoh and LCM.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["--help", "-h"]},
 )
-for command in (run, check, doctor, simulate, demo, echo, params, record, replay, export):
-    app.command()(command)
-app.add_typer(config.app, name="config")
-app.add_typer(take.app, name="take")
 
 
 def main() -> NoReturn:

@@ -1,23 +1,19 @@
-"""Options that several commands share."""
+"""Options that several commands share.
 
-import os
+This module imports nothing that takes long, so that ``COMMAND --help`` is quick: the checks of values import
+what they need.
+"""
+
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Final
 
 import typer
-from pydantic import TypeAdapter, ValidationError
 
 from gateway.config.environment import VARIABLE_PREFIX
-from gateway.config.loading import Configuration, read, read_server
-from gateway.config.section import describe, join_or
-from gateway.config.values import Host, SourceName
-from gateway.outputs.lcm.settings import LcmUrl
-from gateway.outputs.registry import settings_type
-from gateway.outputs.zenoh.settings import KeyPrefix
-from gateway.rtc3d.components import COMPONENTS_BY_KEY
-from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
+from gateway.config.words import describe, join_or
+from gateway.rtc3d.component_types import COMPONENTS_BY_KEY
 from gateway.service.log_format import LogFormat, LogLevel
 
 _RECORDED: Final = (*COMPONENTS_BY_KEY, "status", "clock", "parameters")
@@ -61,17 +57,54 @@ C3dOption = Annotated[
 ]
 
 
-def _checked(kind: Any) -> Callable[[str | None], str | None]:
-    """Return a callback for an option whose value must be valid as ``kind``, a type of the configuration."""
-    adapter = TypeAdapter(kind)
+def _host() -> Any:
+    from gateway.config.values import Host
+
+    return Host
+
+
+def _source_name() -> Any:
+    from gateway.config.values import SourceName
+
+    return SourceName
+
+
+def _key_prefix() -> Any:
+    from gateway.outputs.zenoh.settings import KeyPrefix
+
+    return KeyPrefix
+
+
+def _lcm_url() -> Any:
+    from gateway.outputs.lcm.settings import LcmUrl
+
+    return LcmUrl
+
+
+def _checked(kind: Callable[[], Any]) -> Callable[[str | None], str | None]:
+    """Return a callback for an option whose value must be valid as a type of the configuration."""
 
     def check(text: str | None) -> str | None:
+        if text is None:
+            return None
+        from pydantic import TypeAdapter, ValidationError
+
         try:
-            return None if text is None else adapter.validate_python(text)
+            return str(TypeAdapter(kind()).validate_python(text))
         except ValidationError as error:
             raise typer.BadParameter(error.errors(include_url=False)[0]["msg"]) from None
 
     return check
+
+
+checked_host = _checked(_host)
+"""Checks that an option is a host name or an IP address."""
+
+checked_key_prefix = _checked(_key_prefix)
+"""Checks that an option is the beginning of a Zenoh key."""
+
+_checked_source = _checked(_source_name)
+_checked_lcm_url = _checked(_lcm_url)
 
 
 def _one_of(components: Sequence[str]) -> Callable[[str | None], str | None]:
@@ -104,7 +137,7 @@ def _checked_endpoint(text: str | None) -> str | None:
 
 SourceOption = Annotated[
     str | None,
-    typer.Option(callback=_checked(SourceName), help="Only this source; the default is all sources."),
+    typer.Option(callback=_checked_source, help="Only this source; the default is all sources."),
 ]
 ComponentOption = Annotated[
     str | None,
@@ -114,7 +147,7 @@ SourcesOption = Annotated[
     list[str] | None,
     typer.Option(
         "--source",
-        callback=_checked_each(_checked(SourceName)),
+        callback=_checked_each(_checked_source),
         help="Only this source; can be repeated. The default is all sources.",
     ),
 ]
@@ -150,13 +183,13 @@ ZenohConfigOption = Annotated[
 UrlOption = Annotated[
     str | None,
     typer.Option(
-        callback=_checked(LcmUrl), help="LCM URL; the default is $LCM_DEFAULT_URL, else LCM's default URL."
+        callback=_checked_lcm_url, help="LCM URL; the default is $LCM_DEFAULT_URL, else LCM's default URL."
     ),
 ]
 PrefixOption = Annotated[
     str | None,
     typer.Option(
-        callback=_checked(KeyPrefix),
+        callback=checked_key_prefix,
         help="The gateway's prefix; the default is mocap on Zenoh, MOCAP on LCM.",
     ),
 ]
@@ -164,45 +197,7 @@ QueriesUrlOption = Annotated[
     str | None,
     typer.Option(
         metavar="URL",
-        callback=_checked(LcmUrl),
+        callback=_checked_lcm_url,
         help="LCM URL of requests and replies: the gateway's lcm.queries_url.",
     ),
 ]
-
-
-checked_host = _checked(Host)
-"""Checks that an option is a host name or an IP address."""
-
-checked_key_prefix = _checked(KeyPrefix)
-"""Checks that an option is the beginning of a Zenoh key."""
-
-
-def configuration_from_options(config: Path | None, server: str | None) -> Configuration:
-    """Return the configuration from ``--config`` or ``--server``, and the environment.
-
-    Raises ConfigError if it is not valid; BadParameter if both options are given, or if neither is given and
-    no environment variable is set.
-    """
-    if server is not None and config is None:
-        return read_server(*_host_and_port(server), settings_type())
-    if server is None and (
-        config is not None or any(name.startswith(VARIABLE_PREFIX) for name in os.environ)
-    ):
-        return read(config, settings_type())
-    raise typer.BadParameter("give either --config FILE or --server HOST[:PORT]")
-
-
-def _host_and_port(server: str) -> tuple[str, int]:
-    """Split HOST, HOST:PORT or [IPV6]:PORT; the default port is that of First Principles."""
-    if server.startswith("["):
-        host, _, rest = server[1:].partition("]")
-        port = rest.removeprefix(":")
-    elif server.count(":") == 1:
-        host, _, port = server.partition(":")
-    else:
-        host, port = server, ""
-    if not port:
-        return host, FIRST_PRINCIPLES_PORT
-    if not (port.isdecimal() and 0 < int(port) < 65536):
-        raise typer.BadParameter(f"{server!r}: the port must be a number from 1 to 65535")
-    return host, int(port)

@@ -5,7 +5,6 @@ from typing import Annotated
 
 import typer
 
-from gateway.cli.gateway_queries import exit_with
 from gateway.cli.options import (
     ConnectOption,
     PrefixOption,
@@ -14,11 +13,6 @@ from gateway.cli.options import (
     UrlOption,
     ZenohConfigOption,
 )
-from gateway.cli.params_lcm import query_lcm
-from gateway.cli.params_output import write_replies
-from gateway.cli.params_zenoh import query_zenoh
-from gateway.outputs.lcm.settings import effective_lcm_url
-from gateway.outputs.zenoh.subscriber import open_zenoh
 from gateway.rtc3d.parameters import SECTIONS
 
 
@@ -58,6 +52,14 @@ def params(
     wanted = tuple(dict.fromkeys(sections or ()))
     if unknown := set(wanted) - set(SECTIONS):
         raise typer.BadParameter(f"unknown section {min(unknown)!r}; known sections: {', '.join(SECTIONS)}")
+
+    from gateway.cli.gateway_queries import exit_with
+    from gateway.cli.params_lcm import query_lcm
+    from gateway.cli.params_output import write_replies
+    from gateway.cli.params_zenoh import query_zenoh
+    from gateway.outputs.lcm.settings import effective_lcm_url
+    from gateway.outputs.zenoh.subscriber import open_zenoh
+
     if lcm:
         replies, problems = query_lcm(
             prefix or "MOCAP",

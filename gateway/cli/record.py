@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Final
+from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
 
@@ -20,13 +20,11 @@ from gateway.cli.options import (
     UrlOption,
     ZenohConfigOption,
 )
-from gateway.cli.record_progress import RecordProgress
-from gateway.cli.record_summary import print_summary
-from gateway.recorder.file_sink import FileSink
-from gateway.recorder.take_recording import TakeRecording
-from gateway.recorder.target import Target
-from gateway.subscriber.lcm_side import START_S
-from gateway.subscriber.sides import SubscriberSide, Transport, subscribe_all
+
+if TYPE_CHECKING:
+    from gateway.cli.record_progress import RecordProgress
+    from gateway.recorder.take_recording import TakeRecording
+    from gateway.subscriber.sides import SubscriberSide
 
 _TICK_S: Final = 0.1
 _CLOSE_S: Final = 0.5
@@ -63,6 +61,14 @@ def record(
         raise typer.BadParameter("--connect and --zenoh-config are for recording from Zenoh")
     if url is not None and not lcm:
         raise typer.BadParameter("--url is for recording from LCM; add --lcm")
+    from gateway.cli.record_progress import RecordProgress
+    from gateway.cli.record_summary import print_summary
+    from gateway.recorder.file_sink import FileSink
+    from gateway.recorder.take_recording import TakeRecording
+    from gateway.recorder.target import Target
+    from gateway.subscriber.lcm_side import START_S
+    from gateway.subscriber.sides import Transport, subscribe_all
+
     stop = _stop_signals()
     target = Target(file)
     recording = TakeRecording(
@@ -104,9 +110,9 @@ def _stop_signals() -> threading.Event:
 
 
 def _run(
-    recording: TakeRecording,
-    side: SubscriberSide,
-    progress: RecordProgress,
+    recording: "TakeRecording",
+    side: "SubscriberSide",
+    progress: "RecordProgress",
     stop: threading.Event,
     seconds: float | None,
 ) -> None:
@@ -122,7 +128,7 @@ def _run(
             return
 
 
-def _end(recording: TakeRecording, progress: RecordProgress) -> None:
+def _end(recording: "TakeRecording", progress: "RecordProgress") -> None:
     """Write everything that has arrived. A disk that is full loses it; for a slow one, wait."""
     recording.stop()
     if recording.sink is not None:

@@ -1,23 +1,13 @@
 """``rtc3d-gateway replay``: publish a take again."""
 
-import asyncio
-import contextlib
 import gc
 import re
-import signal
 import sys
-from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Annotated, Final
 
 import typer
-import uvloop
-from pydantic import TypeAdapter, ValidationError
-from rich.console import Console
-from rich.text import Text
 
-from gateway.cli.keyboard import keys
 from gateway.cli.options import (
     ComponentsOption,
     ConnectOption,
@@ -27,26 +17,14 @@ from gateway.cli.options import (
     ZenohConfigOption,
     checked_key_prefix,
 )
-from gateway.cli.replay_report import Progress, jump_text, print_report
-from gateway.outputs.lcm.settings import ChannelPrefix
-from gateway.replay.destinations import Destination, ZenohAddress, lcm_destination, zenoh_destination
-from gateway.replay.play_list import Selection
-from gateway.replay.player import Player
-from gateway.replay.publication import Publication
-from gateway.replay.replay import open_publication, playing
-from gateway.replay.take_length import take_length_us
-from gateway.replay.timeline import MAX_GAP_S, Jump
+from gateway.replay.timeline import MAX_GAP_S
 from gateway.service.log_format import LogLevel, set_up_log
-from gateway.takes.reader import TakeReader
 
-_SEEK_US: Final = 10_000_000
 _SWITCH_S: Final = 0.0005
 """How long another thread that runs Python, such as that of the progress, may keep the replay waiting."""
 
-_SHOW_S: Final = 0.25
 _MAX_RATE: Final = 1000.0
 _MIN_RATE: Final = 0.01
-_STOP_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGQUIT)
 
 
 def _checked_rate(text: str) -> str:
@@ -115,6 +93,13 @@ def replay(
         raise typer.BadParameter("give either --listen, or --connect and --zenoh-config")
     if to_s is not None and to_s <= from_s:
         raise typer.BadParameter("--to must be greater than --from")
+    import uvloop
+
+    from gateway.cli.replay_run import ReplayRun
+    from gateway.replay.destinations import ZenohAddress, lcm_destination, zenoh_destination
+    from gateway.replay.play_list import Selection
+    from gateway.takes.reader import TakeReader
+
     set_up_log(LogLevel.WARNING)
     sys.setswitchinterval(_SWITCH_S)
     gc.freeze()  # or a full garbage collection looks through all modules, which takes 20 ms
@@ -130,13 +115,17 @@ def replay(
         None if to_s is None else round(to_s * 1e6),
     )
     pace = None if rate == "max" else float(rate)
-    run = _Run(TakeReader(file), selection, pace, is_repeated=loop, max_gap_s=max_gap)
+    run = ReplayRun(TakeReader(file), selection, pace, is_repeated=loop, max_gap_s=max_gap)
     if not uvloop.run(run.replay(destinations, are_required=zenoh or lcm)):
         raise typer.Exit(1)
 
 
 def lcm_prefix(prefix: str) -> str:
     """Return the prefix of LCM channels for one of Zenoh keys; raises BadParameter if there is none."""
+    from pydantic import TypeAdapter, ValidationError
+
+    from gateway.outputs.lcm.settings import ChannelPrefix
+
     channels = re.sub(r"[^A-Z0-9]+", "_", prefix.upper())
     try:
         return str(TypeAdapter(ChannelPrefix).validate_python(channels))
@@ -145,82 +134,3 @@ def lcm_prefix(prefix: str) -> str:
             f"--prefix {prefix} gives {channels} on LCM, where at most 16 characters are possible; "
             "choose a shorter one, or --zenoh"
         ) from None
-
-
-class _Run:
-    """One run of the command."""
-
-    def __init__(
-        self,
-        reader: TakeReader,
-        selection: Selection,
-        rate: float | None,
-        *,
-        is_repeated: bool,
-        max_gap_s: float,
-    ) -> None:
-        self._reader = reader
-        self._selection = selection
-        self._rate = rate
-        self._is_repeated = is_repeated
-        self._max_gap_s = max_gap_s
-        self._out = Console()
-        self._notes = Console(stderr=True)
-
-    async def replay(self, destinations: Sequence[Destination], *, are_required: bool) -> bool:
-        """Replay until the end, q or a signal; return whether the outputs took everything."""
-        stop = asyncio.Event()
-        for number in _STOP_SIGNALS:
-            asyncio.get_running_loop().add_signal_handler(number, stop.set)
-        async with open_publication(destinations, are_required=are_required, warn=self._note) as publication:
-            if not stop.is_set():
-                await self._play(publication, stop)
-        if not publication.num_messages:
-            self._note("nothing was replayed")
-        return not publication.refusals
-
-    async def _play(self, publication: Publication, stop: asyncio.Event) -> None:
-        loop = asyncio.get_running_loop()
-
-        def on_jump(jump: Jump) -> None:
-            loop.call_soon_threadsafe(self._note, jump_text(jump))
-
-        player = Player(
-            self._reader,
-            self._selection,
-            publication,
-            rate=self._rate,
-            is_repeated=self._is_repeated,
-            max_gap_s=self._max_gap_s,
-            on_jump=on_jump,
-        )
-
-        def toggle_pause() -> None:
-            player.pause(not player.is_paused)
-            publication.show_streaming(not player.is_paused)
-
-        actions = {
-            "space": toggle_pause,
-            "q": stop.set,
-            "left": lambda: player.seek(-_SEEK_US),
-            "right": lambda: player.seek(_SEEK_US),
-        }
-        try:
-            with keys(actions) as has_keys:
-                hints = "space: pause, ←/→: 10 s, q: quit" if has_keys else ""
-                with closing(
-                    Progress(
-                        self._notes, player, take_length_us(self._reader, self._selection.stop_us), hints
-                    )
-                ) as progress:
-                    async with playing(player):
-                        while player.is_alive and not stop.is_set():
-                            progress.show()
-                            with contextlib.suppress(TimeoutError):
-                                await asyncio.wait_for(stop.wait(), _SHOW_S)
-        finally:
-            if player.num_messages:
-                print_report(self._out, self._notes, player, publication, self._reader)
-
-    def _note(self, text: str) -> None:
-        self._notes.print(Text(text), soft_wrap=True)

@@ -5,19 +5,8 @@ import signal
 import sys
 from typing import Final
 
-import uvloop
-
-from gateway.cli.options import (
-    ConfigOption,
-    LogFormatOption,
-    LogLevelOption,
-    ServerOption,
-    configuration_from_options,
-)
-from gateway.service.daemon import serve
+from gateway.cli.options import ConfigOption, LogFormatOption, LogLevelOption, ServerOption
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
-from gateway.service.log_limit import LogLimit
-from gateway.service.process_end import end_at_once
 
 SWITCH_INTERVAL_S: Final = 0.0005
 """How long a thread that runs Python keeps the event loop waiting for its lock. Every message to an output
@@ -31,8 +20,16 @@ def run(
     log_format: LogFormatOption = LogFormat.AUTO,
 ) -> None:
     """Run the gateway until Ctrl-C or SIGTERM. SIGHUP reloads the configuration."""
+    from gateway.service.process_end import end_at_once
+
     for number in (signal.SIGINT, signal.SIGTERM):  # until the daemon handles them
         signal.signal(number, end_at_once)
+    import uvloop
+
+    from gateway.cli.configuration import configuration_from_options
+    from gateway.service.daemon import serve
+    from gateway.service.log_limit import LogLimit
+
     limit = LogLimit()
     set_up_log(log_level, log_format, limit)
     sys.setswitchinterval(SWITCH_INTERVAL_S)

@@ -1,15 +1,13 @@
 """``rtc3d-gateway simulate``: simulate an RTC3D server."""
 
-import asyncio
-import contextlib
 import gc
 import signal
 import sys
+from contextlib import suppress
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-import uvloop
 
 from gateway.cli.options import (
     AnalogOption,
@@ -25,17 +23,17 @@ from gateway.cli.options import (
 )
 from gateway.cli.run import SWITCH_INTERVAL_S
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
-from gateway.rtc3d_server.scene import Scene
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
-from gateway.simulator.c3d_scene import C3dScene
-from gateway.simulator.faults.kinds import describe_kinds, parse_fault
-from gateway.simulator.recorded.take_scene import TakeScene
-from gateway.simulator.scenario import Scenario, load_scenario
-from gateway.simulator.simulator import Simulator
+
+if TYPE_CHECKING:
+    from gateway.simulator.scenario import Scenario
+    from gateway.simulator.simulator import Simulator
 
 
 def _list_faults(wanted: bool) -> None:
     if wanted:
+        from gateway.simulator.faults.kinds import describe_kinds
+
         print(describe_kinds())
         raise typer.Exit
 
@@ -104,6 +102,15 @@ def simulate(
         raise typer.BadParameter("--source, --from and --to need --take")
     if from_s is not None and to_s is not None and to_s <= from_s:
         raise typer.BadParameter(f"--to {to_s:g} is not after --from {from_s:g}")
+    import uvloop
+
+    from gateway.rtc3d_server.scene import Scene
+    from gateway.simulator.c3d_scene import C3dScene
+    from gateway.simulator.faults.kinds import parse_fault
+    from gateway.simulator.recorded.take_scene import TakeScene
+    from gateway.simulator.scenario import Scenario, load_scenario
+    from gateway.simulator.simulator import Simulator
+
     set_up_log(log_level, log_format)
     scene_options: dict[str, float] = {
         "markers": markers,
@@ -139,12 +146,14 @@ def _is_on_command_line(context: typer.Context, option: str) -> bool:
     return source is not None and source.name == "COMMANDLINE"
 
 
-async def _run_simulator(simulator: Simulator, scenario: Scenario, seconds: float | None) -> None:
+async def _run_simulator(simulator: "Simulator", scenario: "Scenario", seconds: float | None) -> None:
+    import asyncio
+
     stop = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         asyncio.get_running_loop().add_signal_handler(number, stop.set)
     async with simulator:
         print(f"RTC3D server on {simulator.host}:{simulator.port}; press Ctrl-C to stop", flush=True)
         simulator.faults.play(scenario.faults, seed=scenario.seed, scene=scenario.scene)
-        with contextlib.suppress(TimeoutError):
+        with suppress(TimeoutError):
             await asyncio.wait_for(stop.wait(), seconds)

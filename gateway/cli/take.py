@@ -6,14 +6,9 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
-from gateway.cli.file_progress import file_progress
 from gateway.cli.take_control import add_commands
-from gateway.cli.take_json import statistics_json
-from gateway.cli.take_report import write_report
 from gateway.safe_text import safe_json
-from gateway.takes.statistics import take_statistics
 
 app = typer.Typer(
     no_args_is_help=True, help="Inspect recordings (takes), and control those of running gateways."
@@ -31,6 +26,13 @@ def info(
 
     The exit status is 1 only if there is no recording that can be read.
     """
+    from rich.console import Console
+
+    from gateway.cli.file_progress import file_progress
+    from gateway.cli.take_json import statistics_json
+    from gateway.cli.take_report import write_report
+    from gateway.takes.statistics import take_statistics
+
     with file_progress(f"reading {file.name}") as progress:
         statistics = take_statistics(file, progress)
     if as_json:

@@ -1,15 +1,10 @@
 """``rtc3d-gateway take``: start, stop, save, list and fetch takes of running gateways."""
 
-import json
-import sys
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
-from rich.console import Console
 
-from gateway.cli.gateway_queries import exit_with
 from gateway.cli.options import (
     ConnectOption,
     PrefixOption,
@@ -18,12 +13,6 @@ from gateway.cli.options import (
     UrlOption,
     ZenohConfigOption,
 )
-from gateway.cli.take_fetch import fetch_take
-from gateway.cli.take_gateway import GatewayAddress, TakeReplies
-from gateway.cli.take_list import ListedTake, write_list
-from gateway.errors import QueryError
-from gateway.safe_text import safe_json, safe_text
-from gateway.takes.names import check_name
 
 _NameArgument = Annotated[
     str | None,
@@ -32,7 +21,6 @@ _NameArgument = Annotated[
 _LcmOption = Annotated[bool, typer.Option("--lcm", help="Ask on LCM instead of Zenoh.")]
 _JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object, with the sources as keys.")]
 _TimeoutOption = Annotated[float, typer.Option(min=0.1, help="How many seconds to wait for replies.")]
-_Seconds = Annotated[float, typer.Option(min=0.0)]
 
 
 def start(
@@ -51,9 +39,10 @@ def start(
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """
-    address = _address(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout)
-    options = {"set": "start"} | _named(name)
-    _control(address, options, as_json, lambda take: f"take {take.name!r} is running")
+    from gateway.cli.take_actions import gateway_address, start_take
+
+    address = gateway_address(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout)
+    start_take(address, name, as_json=as_json)
 
 
 def stop(
@@ -71,8 +60,10 @@ def stop(
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """
-    address = _address(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout)
-    _control(address, {"set": "stop"}, as_json, lambda take: f"take {take.name!r} is stopped: {_facts(take)}")
+    from gateway.cli.take_actions import gateway_address, stop_take
+
+    address = gateway_address(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout)
+    stop_take(address, as_json=as_json)
 
 
 def save(
@@ -98,18 +89,13 @@ def save(
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """
-    address = _address(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout)
-    options = {"set": "save"}
-    if last is not None:
-        options["last"] = _decimal(last)
-    if after:
-        options["after"] = _decimal(after)
-    options |= _named(name)
-    goes_on = f", and goes on for {after:g} s" if after else ""
-    _control(address, options, as_json, lambda take: f"take {take.name!r} is saved: {_facts(take)}{goes_on}")
+    from gateway.cli.take_actions import gateway_address, save_take
+
+    address = gateway_address(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout)
+    save_take(address, name, last, after, as_json=as_json)
 
 
-def list_takes(
+def list_(
     source: SourceOption = None,
     as_json: _JsonOption = False,
     lcm: _LcmOption = False,
@@ -124,13 +110,10 @@ def list_takes(
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """
-    address = _address(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout)
-    replies = _ask(address, {})
-    if as_json:
-        _print_json(replies.received)
-    else:
-        write_list(replies.received, Console(file=sys.stdout))
-    exit_with(replies.problems)
+    from gateway.cli.take_actions import gateway_address, list_takes
+
+    address = gateway_address(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout)
+    list_takes(address, as_json=as_json)
 
 
 def fetch(
@@ -149,72 +132,14 @@ def fetch(
 
     Exit status 3: no gateway found; 5: no reply in time; 1: anything else.
     """
-    address = _address(source, False, connect, zenoh_config, None, None, prefix, timeout)
-    try:
-        fetched = fetch_take(address, name, file)
-    except QueryError as error:
-        exit_with([error])
-        raise  # never reached
-    print(safe_text(fetched))
+    from gateway.cli.take_actions import copy_take, gateway_address
+
+    address = gateway_address(source, False, connect, zenoh_config, None, None, prefix, timeout)
+    copy_take(address, name, file)
 
 
 def add_commands(app: typer.Typer) -> None:
     """Add the commands of this module to ``take``."""
     for command in (start, stop, save, fetch):
         app.command()(command)
-    app.command("list")(list_takes)
-
-
-def _address(
-    source: str | None,
-    lcm: bool,
-    connect: str | None,
-    zenoh_config: Path | None,
-    url: str | None,
-    queries_url: str | None,
-    prefix: str | None,
-    timeout_s: float,
-) -> GatewayAddress:
-    if lcm and (zenoh_config is not None or connect is not None):
-        raise typer.BadParameter("--connect and --zenoh-config are for Zenoh, not for --lcm")
-    if not lcm and (url is not None or queries_url is not None):
-        raise typer.BadParameter("--url and --queries-url are for LCM; give --lcm, too")
-    return GatewayAddress(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout_s)
-
-
-def _named(name: str | None) -> dict[str, str]:
-    """Return the option for the name of a take, "" and None for its default. Raises QueryError."""
-    if not name:
-        return {}
-    check_name(name)  # here, too: a name could contain further options
-    return {"name": name}
-
-
-def _ask(address: GatewayAddress, options: Mapping[str, str]) -> TakeReplies:
-    try:
-        return address.ask(options)
-    except QueryError as error:
-        return TakeReplies({}, [error])
-
-
-def _control(address: GatewayAddress, options: Mapping[str, str], as_json: bool, text: Any) -> None:
-    replies = _ask(address, options)
-    if as_json:
-        _print_json(replies.received)
-    else:
-        for source, content in replies.received.items():
-            print(safe_text(f"{source}: {text(ListedTake(content))}"))
-    exit_with(replies.problems)
-
-
-def _facts(take: ListedTake) -> str:
-    return f"{take.duration_text}, {take.size_text}{take.lost_text}"
-
-
-def _print_json(replies: Mapping[str, Any]) -> None:
-    print(safe_json(json.dumps(replies, indent=2, ensure_ascii=False)))
-
-
-def _decimal(seconds: float) -> str:
-    """Return a number of seconds without an exponent."""
-    return f"{seconds:.3f}".rstrip("0").rstrip(".")
+    app.command("list")(list_)

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 from gateway.config.secrets import is_secret_key
-from gateway.config.section import describe
+from gateway.config.words import describe
 from gateway.config.yaml_document import Document, Location, Position, is_encodable, read_yaml
 
 VARIABLE_PREFIX: Final = "RTC3D_GATEWAY__"

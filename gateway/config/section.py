@@ -1,7 +1,6 @@
 """The base class of all parts of the configuration: frozen, and with the gateway's error texts."""
 
-import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from typing import Any, Final, NamedTuple, Self
 
 from pydantic import (
@@ -15,7 +14,7 @@ from pydantic import (
 )
 from pydantic_core import InitErrorDetails, PydanticCustomError
 
-from gateway.config.secrets import mask_secrets_in_text
+from gateway.config.words import describe, spelling_hint
 
 UNKNOWN_KEY: Final = "unknown_key"
 """The error type of a key that does not exist; all other errors are about a value or its absence."""
@@ -83,35 +82,6 @@ def expects(what: str) -> WrapValidator:
             raise validation_error(f"found {describe(value)}{hint}; expected {what}") from None
 
     return WrapValidator(check)
-
-
-def describe(value: object) -> str:
-    """Return a value as part of a sentence: printable, on one line, of limited length, without passwords."""
-    match value:
-        case None:
-            return "nothing"
-        case bool():
-            return "true" if value else "false"
-        case Mapping():
-            return "a mapping" if value else "an empty mapping"
-        case list() | tuple():
-            return "a list" if value else "an empty list"
-        case str():
-            text = mask_secrets_in_text(value)
-            return repr(text if len(text) <= 60 else text[:60] + "…")
-    return str(value)
-
-
-def join_or(words: Iterable[str]) -> str:
-    """Return "a, b or c"."""
-    *others, last = words
-    return f"{', '.join(others)} or {last}" if others else last
-
-
-def spelling_hint(word: object, known: Iterable[str]) -> str:
-    """Return " (did you mean 'x'?)" if ``word`` is similar to ``x``, a member of ``known``; else ""."""
-    near = difflib.get_close_matches(str(word).lower()[:60], known, n=1)
-    return f" (did you mean {near[0]!r}?)" if near else ""
 
 
 def _line_error(text: str, location: tuple[str | int, ...], kind: str) -> InitErrorDetails:

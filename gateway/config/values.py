@@ -6,7 +6,8 @@ from typing import Annotated, Final, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, PlainSerializer, PlainValidator, TypeAdapter
 
-from gateway.config.section import Section, describe, expects, join_or, spelling_hint, validation_error
+from gateway.config.section import Section, expects, validation_error
+from gateway.config.words import describe, join_or, spelling_hint
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, WIRE_ORDER, ByteOrder, ComponentType
 

@@ -9,7 +9,7 @@ from typing import Any, Final, NamedTuple
 
 import yaml
 
-from gateway.config.section import describe
+from gateway.config.words import describe
 from gateway.errors import ConfigError
 
 MAX_VALUES: Final = 5_000

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Final
 
-from gateway.config.section import join_or
+from gateway.config.words import join_or
 from gateway.errors import TakeError
 from gateway.export.c3d import export_c3d
 from gateway.export.csv_files import export_csv

@@ -1,61 +1,34 @@
 """The five components of data frames (§7.3 to §7.7): names, items as numpy arrays, encoding."""
 
 import struct
-from enum import IntEnum
 from typing import Any, Final, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
+from gateway.rtc3d.component_types import COMPONENTS_BY_KEY, WIRE_ORDER, ComponentType
+
+__all__ = [
+    "COMPONENTS_BY_KEY",
+    "COMPONENT_HEADER",
+    "COMPONENT_HEADER_BYTES",
+    "FRAME_NUMBER_AND_TIMESTAMP",
+    "ITEM_DTYPES",
+    "LONG_EVENT",
+    "MISSING",
+    "MISSING_RELIABILITY",
+    "SHORT_EVENT",
+    "WIRE_ORDER",
+    "ByteOrder",
+    "Component",
+    "ComponentType",
+    "Items",
+    "big_endian_content",
+    "encode_component",
+]
+
 ByteOrder = Literal["big", "little"]
 Items: TypeAlias = npt.NDArray[Any]
-
-
-class _Names(NamedTuple):
-    """The names of one component."""
-
-    key: str
-    command_word: str
-    item_noun: str
-
-
-class ComponentType(IntEnum):
-    """The component types of §7.2; ``_NAMES`` below has their names."""
-
-    MARKERS = 1
-    ANALOG = 2
-    FORCE = 3
-    TOOLS = 4
-    EVENT = 5
-
-    @property
-    def key(self) -> str:
-        """The name in keys, in channels (upper-case) and in settings: 3d, 6d, analog, force or event."""
-        return _NAMES[self].key
-
-    @property
-    def command_word(self) -> str:
-        """The name in commands (§5.3.5): 3D, 6D, Analog, Force or Events."""
-        return _NAMES[self].command_word
-
-    @property
-    def item_noun(self) -> str:
-        """What the items are called: markers, tools, channels, plates or events."""
-        return _NAMES[self].item_noun
-
-
-_NAMES: Final = {
-    ComponentType.MARKERS: _Names("3d", "3D", "markers"),
-    ComponentType.TOOLS: _Names("6d", "6D", "tools"),
-    ComponentType.ANALOG: _Names("analog", "Analog", "channels"),
-    ComponentType.FORCE: _Names("force", "Force", "plates"),
-    ComponentType.EVENT: _Names("event", "Events", "events"),
-}
-
-WIRE_ORDER: Final = tuple(_NAMES)
-"""All components, in the order in which servers put them into a frame (field note 5)."""
-
-COMPONENTS_BY_KEY: Final = {component.key: component for component in WIRE_ORDER}
 
 MISSING: Final = np.uint32(0xFFFFFFFF).view(np.float32)
 """All fields of a missing tool, and x, y, z of a missing marker: 32 bits set, a NaN (§7.3, field note 7)."""

@@ -6,9 +6,10 @@ from urllib.parse import urlsplit, urlunsplit
 
 from pydantic import AfterValidator, Field, TypeAdapter
 
-from gateway.config.section import Effective, expects, join_or
+from gateway.config.section import Effective, expects
 from gateway.config.settings import OutputSettings
 from gateway.config.values import ByteLimit, Host, MaxRates, QueryRate, Switch
+from gateway.config.words import join_or
 from gateway.outputs.lcm.connection import DEFAULT_GROUP, DEFAULT_PORT
 
 DEFAULT_LCM_PREFIX: Final = "MOCAP"

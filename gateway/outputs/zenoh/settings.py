@@ -9,9 +9,10 @@ from typing import Annotated, Any, ClassVar, Final
 import zenoh
 from pydantic import AfterValidator, Field, PlainValidator, ValidationInfo
 
-from gateway.config.section import describe, expects, validation_error
+from gateway.config.section import expects, validation_error
 from gateway.config.settings import OutputSettings
 from gateway.config.values import ByteLimit, MaxRates, QueryRate, Switch
+from gateway.config.words import describe
 from gateway.outputs.zenoh.config import read_zenoh_config, zenoh_reason
 
 DEFAULT_ZENOH_PREFIX: Final = "mocap"

@@ -7,7 +7,8 @@ from typing import Any, Final
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from gateway.config.section import describe, spelling_hint, validation_error
+from gateway.config.section import validation_error
+from gateway.config.words import describe, spelling_hint
 from gateway.errors import ConfigError
 from gateway.simulator.faults.base import Fault
 from gateway.simulator.faults.frame_faults import FRAME_FAULTS

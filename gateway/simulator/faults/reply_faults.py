@@ -7,7 +7,8 @@ from typing import Annotated, ClassVar, Final, Literal, get_args
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from gateway.config.section import expects, join_or
+from gateway.config.section import expects
+from gateway.config.words import join_or
 from gateway.rtc3d.packets import PACKET_HEADER, Packet, PacketType, decode_text, encode_packet
 from gateway.simulator.faults.base import LastingConnectionFault
 from gateway.simulator.faults.outgoing import Reply, is_acknowledgement, packet_type_of

@@ -4,8 +4,8 @@ import pytest
 import typer
 from typer.testing import CliRunner
 
+from gateway.cli.configuration import configuration_from_options
 from gateway.cli.main import app
-from gateway.cli.options import configuration_from_options
 from gateway.config.loading import Configuration
 from gateway.config.schema import schema_text
 from gateway.errors import ConfigError
@@ -94,10 +94,10 @@ def test_schema_prints_the_schema() -> None:
 
 
 def test_check_includes_environment_variables(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert "valid; 1 source: lab" in printed("check", str(DEMO))
+    assert "valid; 1 source: lab" in printed("config", "check", str(DEMO))
     monkeypatch.setenv("RTC3D_GATEWAY__LCM__PREFIXX", "HALL2")
     with pytest.raises(ConfigError, match=r"RTC3D_GATEWAY__LCM__PREFIXX: lcm\.prefixx: unknown key"):
-        printed("check", str(DEMO))
+        printed("config", "check", str(DEMO))
 
 
 @pytest.mark.parametrize("name", ["", "#", "$*", "/", "a b", "x\n\x1b[31m", "\udcff", "a" * 100_000])

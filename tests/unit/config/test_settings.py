@@ -4,9 +4,9 @@ from typing import Any
 import pytest
 from pydantic import TypeAdapter, ValidationError
 
-from gateway.config.section import describe
 from gateway.config.settings import ReconnectSettings, SourceSettings
 from gateway.config.values import SourceName
+from gateway.config.words import describe
 from gateway.messages import topics
 from gateway.outputs.lcm.settings import ChannelPrefix, LcmSettings, lcm_queries_url
 from gateway.outputs.zenoh.settings import ZenohSettings

@@ -1,7 +1,7 @@
 import pytest
 
-from gateway.config.section import describe
 from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.config.words import describe
 from gateway.outputs.lcm.settings import DEFAULT_LCM_URL, LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import AllFrames, Frequency, FrequencyDivisor, Rate
