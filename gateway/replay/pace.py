@@ -27,6 +27,11 @@ class Pace:
         """Let ``position_us`` be due now, and later ones after it."""
         self._start_s = self._monotonic() - position_us * self._s_per_us
 
+    def change(self, rate: float, position_us: int) -> None:
+        """Continue at another rate, with ``position_us`` due now."""
+        self._s_per_us = 1e-6 / rate
+        self.start(position_us)
+
     def shift(self, delay_s: float) -> None:
         """Let everything be due later."""
         self._start_s += delay_s

@@ -5,12 +5,11 @@ import time
 from collections.abc import Callable, Generator
 from contextlib import closing
 from functools import partial
-from typing import Final
+from typing import Final, Protocol
 
 from gateway.errors import TakeError
 from gateway.replay.pace import Lateness, Pace
 from gateway.replay.play_list import Entry, Selection, play_list
-from gateway.replay.publication import Publication
 from gateway.replay.timeline import MAX_GAP_S, Jump, ReplayTimeline
 from gateway.takes.reader import TakeReader
 
@@ -20,26 +19,38 @@ _FINE_S: Final = 0.005
 STALL_S: Final = 1.0
 """A process that was stopped for longer does not catch up: the rest of the take is played later."""
 
+_PREVIEW_US: Final = 100_000
+
 _PASS_S: Final = 0.01
 """A repeated take begins again after this time at the earliest, however short it is."""
+
+
+class MessageSink(Protocol):
+    """Takes the messages of a replay, such as a Publication."""
+
+    def publish(self, source: str, key: str, message: bytes) -> None:
+        """Take one message; ``key`` is that of a TakeMessage."""
 
 
 class Player:
     """Replays a take with ``publication``, in a thread, until its end or ``stop``.
 
-    ``rate`` is how many times as fast as recorded; None is as fast as possible. ``on_jump`` is called in the
-    thread where the time of the messages jumps. The same thread reads the take, which takes 3 µs per message:
-    two threads that run Python would keep each other waiting. The system reads the file ahead.
+    ``rate`` is how many times as fast as recorded; None is as fast as possible. If it ``is_watched``, it
+    waits at the end until ``stop`` or a seek, and where it begins during a pause, it publishes 0.1 s, so that
+    a viewer shows that moment. ``on_jump`` is called in the thread where the time of the messages jumps.
+    The same thread reads the take, which takes 3 µs per message: two threads that run Python would keep each
+    other waiting. The system reads the file ahead.
     """
 
     def __init__(
         self,
         reader: TakeReader,
         selection: Selection,
-        publication: Publication,
+        publication: MessageSink,
         *,
         rate: float | None = 1.0,
         is_repeated: bool = False,
+        is_watched: bool = False,
         max_gap_s: float = MAX_GAP_S,
         on_jump: Callable[[Jump], None] = lambda _jump: None,
     ) -> None:
@@ -58,16 +69,21 @@ class Player:
         self._selection = selection
         self._publication = publication
         self._pace = None if rate is None else Pace(rate)
-        self._is_repeated = is_repeated
+        self.is_repeated = is_repeated
+        """Whether it begins again at the end. It may be changed at any time."""
+        self.is_at_end = False
+        """Whether it waits at the end."""
+        self._is_watched = is_watched
         self._max_gap_s = max_gap_s
         self._on_jump = on_jump
         self._started_s = self._ended_s = 0.0
         self._begun_s = 0.0  # when the present wait, or the present message, was to begin
-        self._changed = threading.Condition()  # of these four
+        self._changed = threading.Condition()  # of the next five
         self._is_paused = False
         self._is_stopping = False
         self._seek_us: int | None = None
-        self._must_attend = False  # whether one of these three is set; read for each message
+        self._rate: float | None = None  # to be changed to
+        self._must_attend = False  # whether one of these four is set; read for each message
         self._thread = threading.Thread(target=self._run, name="replay", daemon=True)
 
     def start(self) -> None:
@@ -102,6 +118,18 @@ class Player:
             self._seek_us = max(self._selection.start_us, present_us + delta_us)
             self._notify()
 
+    def seek_to(self, position_us: int) -> None:
+        """Continue at a position, in µs from the first message of the take."""
+        with self._changed:
+            self._seek_us = max(self._selection.start_us, position_us)
+            self._notify()
+
+    def set_rate(self, rate: float) -> None:
+        """Continue at another rate. It must have been created with a rate."""
+        with self._changed:
+            self._rate = rate
+            self._notify()
+
     def stop(self) -> None:
         """End the thread soon; ``join`` waits for it."""
         with self._changed:
@@ -109,7 +137,8 @@ class Player:
             self._notify()
 
     def _notify(self) -> None:
-        self._must_attend = self._is_stopping or self._is_paused or self._seek_us is not None
+        is_waiting = self._seek_us is not None or self._rate is not None
+        self._must_attend = self._is_stopping or self._is_paused or is_waiting
         self._changed.notify()
 
     def join(self, timeout_s: float) -> None:
@@ -149,10 +178,20 @@ class Player:
                 f"{self._reader.path} has no messages to replay with these options; "
                 f"check --source ({', '.join(self._reader.source_names)}), --component, --from and --to"
             )
-        if not self._is_repeated:
-            return None
+        if not self.is_repeated:
+            return self._wait_at_end() if self._is_watched else None
         time.sleep(_PASS_S)
         return self._selection.start_us
+
+    def _wait_at_end(self) -> int | None:
+        """Wait for a seek, and return its position; None if the replay is to stop."""
+        with self._changed:
+            self.is_at_end = True
+            self._changed.wait_for(lambda: self._is_stopping or self._seek_us is not None)
+            self.is_at_end = False
+            seek_us, self._seek_us = self._seek_us, None
+            self._notify()
+            return None if self._is_stopping else seek_us
 
     def _report(self, start_us: int, jump: Jump) -> None:
         if not self.num_passes and jump.position_us >= start_us:
@@ -161,14 +200,16 @@ class Player:
     def _play(self, entries: Generator[Entry], start_us: int) -> bool:
         """Publish messages when they are due; return False if something else is to be done before the end."""
         publish, pace = self._publication.publish, self._pace
+        preview_end_us = start_us + _PREVIEW_US if self._is_watched and self._is_paused else start_us
         is_begun = False
         for position_us, source, key, message in entries:
-            if self._must_attend and not self._attend():
+            is_preview = position_us < preview_end_us
+            if self._must_attend and not is_preview and not self._attend():
                 return False
-            if pace is not None:
+            if pace is not None and not is_preview:
                 if not is_begun and key != "parameters":
                     is_begun = True
-                    pace.start(start_us)
+                    pace.start(max(start_us, preview_end_us))
                     self._begun_s = time.monotonic()
                 if is_begun and not self._wait(pace, position_us):
                     return False
@@ -212,8 +253,12 @@ class Player:
                 lambda: self._is_stopping or self._seek_us is not None or not self._is_paused
             )
             is_continued = not self._is_stopping and self._seek_us is None
+            rate, self._rate = self._rate, None
+            self._notify()
         paused_s = time.monotonic() - began_s
         if self._pace is not None:
             self._pace.shift(paused_s)
+            if rate is not None:
+                self._pace.change(rate, self.position_us)
         self._begun_s += paused_s
         return is_continued
