@@ -152,6 +152,12 @@ class LiveData(Reception[LiveSource, Series]):
         else:
             self.receive(series, message)
 
+    def begin_again(self) -> None:
+        """Forget everything, because a recording goes on at another place."""
+        with self._lock:
+            self.sources.clear()
+            self._num_series = 0
+
     def _new_source(self, name: str, channels: str) -> LiveSource:
         return LiveSource(name, channels)
 

@@ -1,0 +1,1 @@
+"""The live 3D view in a browser."""
