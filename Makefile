@@ -16,7 +16,7 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
 .PHONY: demo lock test test-integration test-takes test-hostile test-others test-compiled check lint types contracts generated docs lcm-types fuzz soak stops \
-    mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clean
+    mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
 
 demo: .venv/runtime
 	$(BIN)/rtc3d-gateway demo
@@ -151,17 +151,22 @@ build/wheelhouse/complete: pyproject.toml requirements.txt
 	    $$(build/wheelhouse-venv/bin/python -c '$(BUILD_REQUIRES)')
 	touch $@
 
+# $(call timed,WHAT,EXPECTED TIME,COMMANDS): say what is done and how long it takes, do it quietly, say how long it took.
+define timed
+@set -e; echo '$(1) (about $(2)) …'; start=$$(date +%s); $(3); echo "Done in $$(($$(date +%s) - start)) s."
+endef
+
 # What running needs, in the versions of requirements.txt; .venv/installed adds the development tools.
 .venv/runtime: pyproject.toml requirements.txt
-	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --require-hashes --requirement requirements.txt
-	$(BIN)/pip install --quiet --no-deps --editable .
-	touch $@
+	$(call timed,Installing the gateway into .venv,30 s,$(PYTHON) -m venv .venv; \
+	    $(BIN)/pip install --quiet --require-hashes --requirement requirements.txt; \
+	    $(BIN)/pip install --quiet --no-deps --editable .)
+	@touch $@
 
 .venv/installed: .venv/runtime
-	$(BIN)/pip install --quiet --upgrade 'pip>=25.1'
-	$(BIN)/pip install --quiet --editable . --group dev
-	touch $@
+	$(call timed,Installing the development tools into .venv,1 min,$(BIN)/pip install --quiet --upgrade 'pip>=25.1'; \
+	    $(BIN)/pip install --quiet --editable . --group dev)
+	@touch $@
 
 # Renew requirements.txt: the versions of all dependencies and extras for every supported Python and platform.
 lock:
@@ -227,6 +232,14 @@ zenohd: .venv/installed
 	version=$$($(BIN)/python -c 'from importlib.metadata import version; print(version("eclipse-zenoh"))'); \
 	cargo install zenohd --quiet --version $$version --locked --root build/zenohd \
 	|| echo 'zenohd not built: the benchmarks use a Python session as the router'
+
+# Change the address of the repository in pyproject.toml and in the documents: make clone-url URL=https://…
+URL ?=
+OLD_URL = $(shell sed -n 's/^Repository = "\([^"]*\)".*/\1/p' pyproject.toml)
+
+clone-url:
+	@[ -n '$(URL)' ] || { echo 'Give the new address: make clone-url URL=https://…' >&2; exit 2; }
+	sed -i 's|$(OLD_URL)|$(URL)|g' pyproject.toml README.md docs/tutorial.md docs/how-to/service.md
 
 clean:
 	rm -rf .venv build dist mutants

@@ -9,6 +9,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -24,10 +25,12 @@ from gateway.rtc3d.components import ITEM_DTYPES
 from gateway.simulator.scenario import load_scenario
 from tests.configurations import MODEL, load
 from tests.documents import ROOT, Block, all_blocks, blocks, documents
+from tests.fresh_clones import clone_into, files_in
 
 REFERENCE = (ROOT / "docs/reference/messages.md").read_text()
 WHAT_IS_LOST = (ROOT / "docs/explanation/what-is-lost.md").read_text()
 PROGRAM = "rtc3d-gateway"
+CLONE = ("git", "clone")
 WRAPPERS = {"sudo", "tests/with-netns"}
 FOLDERS = ("benchmarks", "config", "docs", "examples", "lcm_types", "systemd", "tests")
 OTHERS = {"scrape_configs", "groups"}
@@ -124,6 +127,30 @@ def test_files_and_make_targets_that_commands_name_are_there() -> None:
         for word in (program, *arguments):
             if word.startswith(FOLDERS) and "/" in word and "/build/" not in word:
                 assert list(ROOT.glob(word.partition("::")[0])), f"{place}: {word}"
+
+
+def test_documents_clone_the_repository_that_the_project_names() -> None:
+    urls = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]
+    cloned = {place: words[2] for place, words in COMMANDS if words[:2] == CLONE}
+    assert {place.partition(":")[0] for place in cloned} >= {"README.md", "docs/tutorial.md"}
+    assert set(cloned.values()) == {urls["Repository"]}, f"run make clone-url URL=…: {cloned}"
+    assert next(iter(blocks("README.md", "sh"))).text.startswith("git clone ")
+
+
+def test_one_command_changes_the_address_of_the_repository_everywhere(tmp_path: Path) -> None:
+    clone_into(tmp_path)
+    new = "https://git.example.net/lab/gateway.git"
+    subprocess.run(["make", "clone-url", f"URL={new}"], cwd=tmp_path, check=True, capture_output=True)
+    changed = {
+        name: (tmp_path / name).read_text()
+        for name in files_in(tmp_path)
+        if (ROOT / name).read_bytes() != (tmp_path / name).read_bytes()
+    }
+    old = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["urls"]["Repository"]
+    assert tomllib.loads(changed["pyproject.toml"])["project"]["urls"]["Repository"] == new
+    pages = {place.partition(":")[0] for place, words in COMMANDS if words[:2] == CLONE}
+    assert changed.keys() == pages | {"pyproject.toml"}
+    assert not any(old in text for text in changed.values())
 
 
 def test_python_is_what_a_type_checker_takes(tmp_path: Path) -> None:

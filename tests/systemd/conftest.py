@@ -25,7 +25,7 @@ def machine() -> Iterator[Machine]:
         booted = Machine(int(process.stdout.readline()))
         clone_into(booted.path(CLONE))
         before = files_in(booted.path(CLONE))
-        booted.install_output = uvloop.run(booted.run_shell(commands("Install", 1))).text
+        booted.install_output = uvloop.run(booted.run_shell(commands("Install", 2))).text
         booted.left_in_clone = files_in(booted.path(CLONE)) - before
         yield booted
 

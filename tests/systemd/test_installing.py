@@ -141,7 +141,7 @@ async def test_upgrading_and_removing_keep_the_configuration(machine: Machine) -
     finally:
         await machine.run("mkdir", "--parents", PREFIX)
         await machine.run("cp", "--archive", "--link", "/opt/kept", VENV)
-        await machine.run_shell(WITHOUT_COMPILER + commands("Install", 1))
+        await machine.run_shell(WITHOUT_COMPILER + commands("Install", 2))
         await machine.run("rm", "-r", VENV)
         await machine.run("mv", "/opt/kept", VENV)
     assert machine.path(CONFIG).read_text() == mine
