@@ -13,6 +13,7 @@ from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import LinkError, QueryError
 from gateway.log import HOLD_S, DefectLog, FailureLog, log_fields
 from gateway.messages.limits import encode_within_limits
+from gateway.messages.stamp import NOT_PUBLISHED
 from gateway.outputs.contract import Answer, ServerFile, ServerParameters
 from gateway.outputs.encodings import C3D
 from gateway.outputs.guard import health, query_results
@@ -85,7 +86,7 @@ class Source:
         self._has_new_server = before is not None and (before.settings.host, before.settings.port) != (
             *(settings.host, settings.port),
         )
-        self.sequence: int = 0 if before is None else before.sequence
+        self.sequence: int = NOT_PUBLISHED if before is None else before.sequence
         """The sequence number of the newest status and clock messages."""
         self._newest_status: bytes = self._encoded_status()
 

@@ -107,16 +107,16 @@ async def test_status_and_clock_are_numbered(servers: Servers, spool: Spool) -> 
     lab = Lab(servers, spool)
     for _ in range(3):
         lab.source.publish_status()
-    assert [message.sequence for message in lab.messages("status")] == [1, 2, 3]
-    assert [message.sequence for message in lab.messages("clock")] == [1, 2, 3]
+    assert [message.sequence for message in lab.messages("status")] == [0, 1, 2]
+    assert [message.sequence for message in lab.messages("clock")] == [0, 1, 2]
 
 
 async def test_queries_get_the_newest_status(servers: Servers, spool: Spool) -> None:
     lab = Lab(servers, spool)
     question = Question("status")
-    assert decode((await lab.source.queries.answer(question)).payload).sequence == 0
+    assert decode((await lab.source.queries.answer(question)).payload).sequence == -1
     lab.source.publish_status()
-    assert decode((await lab.source.queries.answer(question)).payload).sequence == 1
+    assert decode((await lab.source.queries.answer(question)).payload).sequence == 0
 
 
 async def test_problems_with_the_status_are_logged_with_the_source(servers: Servers, spool: Spool) -> None:
@@ -196,7 +196,7 @@ async def test_a_source_that_replaces_another_continues_its_numbers(servers: Ser
     after = Lab(servers, spool, before.source)
     assert [(each.session, each.parameters_version) for each in after.source.statuses] == [(5, 7)]
     after.source.publish_status()
-    assert [message.sequence for message in after.messages("status")] == [2]
+    assert [message.sequence for message in after.messages("status")] == [1]
 
 
 # Tasks ---------------------------------------------------------------------------------------
