@@ -10,6 +10,7 @@ from typing import Final, Protocol
 from gateway.errors import TakeError
 from gateway.replay.pace import Lateness, Pace
 from gateway.replay.play_list import Entry, Selection, play_list
+from gateway.replay.seek_index import SeekIndex
 from gateway.replay.timeline import MAX_GAP_S, Jump, ReplayTimeline
 from gateway.takes.reader import TakeReader
 
@@ -74,6 +75,7 @@ class Player:
         self.is_at_end = False
         """Whether it waits at the end."""
         self._is_watched = is_watched
+        self._index = SeekIndex() if is_watched else None  # with it, not each pass finds all damage
         self._max_gap_s = max_gap_s
         self._on_jump = on_jump
         self._started_s = self._ended_s = 0.0
@@ -161,7 +163,7 @@ class Player:
     def _next_start(self, start_us: int) -> int | None:
         """Replay from a position on; return where to go on, None if this was the end."""
         timeline = ReplayTimeline(self._max_gap_s, partial(self._report, start_us))
-        with closing(play_list(self._reader, self._selection, timeline, start_us)) as entries:
+        with closing(play_list(self._reader, self._selection, timeline, start_us, self._index)) as entries:
             is_complete = self._play(entries, start_us)
         with self._changed:
             if self._is_stopping:

@@ -25,6 +25,14 @@ class Jump(NamedTuple):
     is_skipped: bool
 
 
+class TimelineState(NamedTuple):
+    """What a timeline knows after a message, to go on from there."""
+
+    position_us: int
+    starts: dict[str, int]
+    newest_start: int
+
+
 class ReplayTimeline:
     """Gives each message a position: µs since the first one, as if nobody had set a clock meanwhile.
 
@@ -43,6 +51,16 @@ class ReplayTimeline:
         self._max_gap_us = round(max_gap_s * 1e6)
         self._starts: dict[str, int] = {}  # by source: the time of the message that would be at position 0
         self._newest_start = 0  # the newest of these
+
+    @property
+    def state(self) -> TimelineState:
+        """What it knows now."""
+        return TimelineState(self.position_us, dict(self._starts), self._newest_start)
+
+    def go_on(self, state: TimelineState) -> None:
+        """Go on from a state."""
+        self.position_us, self._newest_start = state.position_us, state.newest_start
+        self._starts = dict(state.starts)
 
     def place(self, source: str, utime: int) -> int:
         """Return the position of the next message; ``utime`` is its time in µs since the Unix epoch."""

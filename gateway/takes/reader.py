@@ -54,6 +54,16 @@ class TakeMessage(NamedTuple):
     message: bytes
 
 
+class Place(NamedTuple):
+    """Where an event begins: the number of the file in ``TakeReader.logs``, and the offset in it in bytes."""
+
+    log: int
+    offset: int
+
+
+FIRST_PLACE: Final = Place(0, 0)
+
+
 @dataclass(slots=True)
 class MessageBatch:
     """Messages of one source and key in their order, with the times of their events in µs since 1970."""
@@ -80,6 +90,8 @@ class TakeReader:
         """Files of a folder without any event, and why, in the newest pass."""
         self.read_bytes = 0
         """How far the newest pass of ``batches`` has come."""
+        self._log = 0
+        self._offset = 0
         self._names = SourceNames(itertools.islice(self.events(), NAMED_WITHIN_EVENTS))
         self._routes: dict[tuple[str, bytes], tuple[str, str] | None] = {}  # by channel and fingerprint
         self.start_utime: int = next(self.events()).utime
@@ -95,24 +107,34 @@ class TakeReader:
         """The names of the sources in what was read so far."""
         return self._names.names
 
-    def events(self) -> Iterator[Event]:
-        """Yield all events of all files. Raises TakeError."""
+    @property
+    def place(self) -> Place:
+        """Where the newest message of ``messages`` begins."""
+        return Place(self._log, self._offset)
+
+    def events(self, start: Place = FIRST_PLACE) -> Iterator[Event]:
+        """Yield the events of all files, from a place on. Raises TakeError."""
         self.empty_files = {}
-        for log in self.logs:
+        for number, log in enumerate(self.logs[start.log :], start=start.log):
+            self._log = number
             try:
-                yield from log.events()
+                yield from log.events(start.offset if number == start.log else 0)
             except TakeError as error:
                 # After a loss of power, one file of a folder may be empty.
                 self.empty_files[log.path] = str(error)
                 if len(self.empty_files) == len(self.logs):
                     raise
 
-    def messages(self) -> Iterator[TakeMessage]:
-        """Yield the messages of a gateway, in their order. Raises TakeError, also if there are none."""
+    def messages(self, start: Place = FIRST_PLACE) -> Iterator[TakeMessage]:
+        """Yield the messages of a gateway, in their order, from a place on.
+
+        Raises TakeError, also if there are none.
+        """
         self.unknown.clear()
         routes, new_message = self._routes, tuple.__new__
-        for event in self.events():
-            _, utime, channel, message, _ = event
+        for event in self.events(start):
+            _, utime, channel, message, offset = event
+            self._offset = offset
             identity = (channel, message[:8])
             if identity not in routes:
                 self._add_route(identity)
