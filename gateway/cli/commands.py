@@ -12,6 +12,7 @@ COMMANDS: Final = {
     "doctor": "gateway.cli.doctor:doctor",
     "simulate": "gateway.cli.simulate:simulate",
     "demo": "gateway.cli.demo:demo",
+    "list": "gateway.cli.list_gateways:list_gateways",
     "echo": "gateway.cli.echo:echo",
     "params": "gateway.cli.params:params",
     "record": "gateway.cli.record:record",

@@ -8,6 +8,7 @@ import zenoh
 
 from gateway.errors import OutputError
 from gateway.messages.topics import zenoh_key
+from gateway.outputs.absent import missing_source
 from gateway.outputs.kind import Receive, SubscriptionRequest
 from gateway.outputs.zenoh.command_session import command_config
 from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason
@@ -81,7 +82,4 @@ def no_gateway(prefix: str, wanted: Collection[str], served: Collection[str]) ->
             f"no gateway found on Zenoh ({prefix}/*/alive); check that it is running with this "
             "prefix, and that --connect (or, without it, multicast) reaches the gateway or its router"
         )
-    missing = [source for source in wanted if source not in served]
-    if missing:
-        return f"no gateway serves source {missing[0]!r}; sources found: {', '.join(served)}"
-    return ""
+    return missing_source(wanted, served)

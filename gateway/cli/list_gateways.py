@@ -1,0 +1,46 @@
+"""``rtc3d-gateway list``: the gateways and sources that can be heard."""
+
+import sys
+from typing import Annotated
+
+import typer
+
+from gateway.cli.options import ConnectOption, PrefixOption, SourceOption, UrlOption, ZenohConfigOption
+
+
+def list_gateways(
+    zenoh: Annotated[bool, typer.Option("--zenoh", help="Look on Zenoh (the default).")] = False,
+    lcm: Annotated[bool, typer.Option("--lcm", help="Listen on LCM.")] = False,
+    source: SourceOption = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    connect: ConnectOption = None,
+    zenoh_config: ZenohConfigOption = None,
+    url: UrlOption = None,
+    prefix: PrefixOption = None,
+) -> None:
+    """List the gateways and sources that can be heard: states, rates, servers, hosts, versions.
+
+    Exit status 3: no gateway found.
+    """
+    if zenoh and lcm:
+        raise typer.BadParameter("give either --zenoh or --lcm")
+    if zenoh_config is not None and lcm:
+        raise typer.BadParameter("--zenoh-config is for looking on Zenoh")
+
+    from rich.console import Console
+
+    from gateway.cli.find_sources import find_sources
+    from gateway.cli.gateway_queries import exit_with
+    from gateway.cli.list_output import notes, sources_json, write_sources
+    from gateway.errors import QueryError
+    from gateway.outputs.kind import SubscriptionRequest
+
+    request = SubscriptionRequest(source, None, prefix, url if lcm else connect, zenoh_config)
+    found, absence = find_sources("lcm" if lcm else "zenoh", request)
+    if as_json:
+        print(sources_json(found))
+    elif found.sources:
+        write_sources(found, Console())
+    for note in notes(found):
+        print(f"note: {note}", file=sys.stderr)
+    exit_with([QueryError(absence, code="no-gateway")] if absence else [])

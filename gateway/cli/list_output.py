@@ -1,0 +1,104 @@
+"""The output of ``list``: a table on a terminal, a line for each source otherwise, or JSON."""
+
+import json
+import math
+from collections import Counter
+from collections.abc import Sequence
+from typing import Any, Final
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from gateway.cli.found_sources import FoundSource, FoundSources, FoundStream
+from gateway.safe_text import safe_json
+from gateway.stream.state import StreamState
+from gateway.stream.status_text import source_text
+
+_GOOD: Final = StreamState.STREAMING.value
+_STATE_WIDTH: Final = len("streaming 2000.0 Hz")
+_WIDE: Final = 80
+"""How wide a terminal must be for the state to have this width in one line."""
+
+
+def write_sources(found: FoundSources, console: Console) -> None:
+    """Write a table on a terminal; otherwise, a line for each source with tabs between the columns."""
+    if console.is_terminal:
+        console.print(_table(found.sources, _STATE_WIDTH if console.width >= _WIDE else None))
+        return
+    for source in found.sources:
+        print(_line(source), file=console.file)  # rich would expand the tabs
+
+
+def sources_json(found: FoundSources) -> str:
+    """Return the JSON object that docs/reference/commands.md describes."""
+    content = {
+        "sources": [_source_json(source) for source in found.sources],
+        "num_left_out": found.num_left_out,
+    }
+    return safe_json(json.dumps(content, indent=2, ensure_ascii=False))
+
+
+def notes(found: FoundSources) -> list[str]:
+    """Return sentences about what the list does not show, and about sources that disturb each other."""
+    texts = [
+        f"{number} gateways serve a source {name!r}, and their messages mix; rename one, or change a prefix"
+        for name, number in sorted(Counter(source.name for source in found.sources).items())
+        if number > 1
+    ]
+    if found.num_left_out:
+        texts.append(
+            f"{found.num_left_out} more sources or statuses were left out, because there are too many"
+        )
+    return texts
+
+
+def _table(sources: Sequence[FoundSource], state_width: int | None) -> Table:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for heading in ("source", "state", "components", "server", "host", "version"):
+        table.add_column(heading, overflow="fold", min_width=state_width if heading == "state" else None)
+    for source in sources:
+        rows = [(_state(stream), stream.components) for stream in source.streams]
+        if source.problem or not rows:
+            rows.append((Text(source.problem or "no streams", "red"), ""))
+        for number, (state, components) in enumerate(rows):
+            others = (source.server, source.host, source.version) if number == 0 else ("", "", "")
+            table.add_row(
+                Text(source.name if number == 0 else "", "bold"), state, *map(Text, (components, *others))
+            )
+    return table
+
+
+def _state(stream: FoundStream) -> Text:
+    is_good = stream.state == _GOOD and not stream.problem
+    return Text(stream.text, "green" if is_good else "yellow")
+
+
+def _line(source: FoundSource) -> str:
+    components = ", ".join(stream.components for stream in source.streams)
+    state = source_text([(stream.components, stream.text) for stream in source.streams])
+    texts = ", ".join(filter(None, (state, source.problem)))
+    return "\t".join((source.name, texts, components, source.server, source.host, source.version))
+
+
+def _source_json(source: FoundSource) -> dict[str, Any]:
+    return {
+        "source": source.name,
+        "gateway": source.gateway or None,
+        "problem": source.problem,
+        "server": source.server or None,
+        "host": source.host or None,
+        "version": source.version or None,
+        "streams": [_stream_json(stream) for stream in source.streams],
+    }
+
+
+def _stream_json(stream: FoundStream) -> dict[str, Any]:
+    return {
+        "components": stream.components.split(),
+        "text": stream.text,
+        "state": stream.state,
+        "problem": stream.problem,
+        "rate_hz": round(stream.rate_hz, 3) if math.isfinite(stream.rate_hz) else None,
+        "tries": stream.tries,
+    }

@@ -1,0 +1,184 @@
+"""What ``list`` prints about the sources that were found, and what it makes of hostile statuses."""
+
+import io
+import json
+import math
+from typing import Any
+
+import pytest
+import rtc3d
+from rich.cells import cell_len
+from rich.console import Console
+
+from gateway.cli.found_sources import MAX_SOURCES, MAX_STATUS_BYTES, FoundSources
+from gateway.cli.list_output import notes, sources_json, write_sources
+from gateway.messages.decode import decode
+from tests.unit.messages.samples import status_of
+
+COLUMNS = ("source", "state", "components", "server", "host", "version")
+
+
+def status(**fields: Any) -> rtc3d.status_t:
+    """Return the status of a gateway that streams, with these fields."""
+    message: rtc3d.status_t = decode(status_of())
+    for name, value in {"host": "mocap-pc", "gateway_version": "1.2.3", **fields}.items():
+        setattr(message, name, value)
+    [stream] = message.streams
+    stream.state, stream.frame_rate_hz = "streaming", 200.0
+    return message
+
+
+def found_of(*messages: rtc3d.status_t) -> FoundSources:
+    found = FoundSources()
+    for message in messages:
+        found.add_status(message.encode())
+    return found
+
+
+def printed(found: FoundSources, *, columns: int = 80, is_terminal: bool = True) -> str:
+    out = io.StringIO()
+    write_sources(found, Console(file=out, force_terminal=is_terminal, color_system=None, width=columns))
+    return out.getvalue()
+
+
+def two_streams(**fields: Any) -> rtc3d.status_t:
+    message = status(**fields)
+    second = status().streams[0]
+    second.components, second.state, second.frame_rate_hz = "analog force", "waiting to reconnect", 0.0
+    second.tries = 3
+    message.streams, message.num_streams = [*message.streams, second], 2
+    return message
+
+
+def test_a_table_has_a_line_for_each_stream() -> None:
+    lines = printed(found_of(two_streams()), columns=120).splitlines()
+    assert tuple(lines[0].split()) == COLUMNS
+    assert lines[1].split("  ")[0] == "lab"
+    assert "streaming 200.0 Hz" in lines[1]
+    assert "192.0.2.20:3020" in lines[1]
+    assert " ".join(lines[2].split()) == "waiting for 192.0.2.20:3020, 3 tries analog force"
+
+
+@pytest.mark.parametrize("columns", [40, 80, 200])
+def test_a_table_fits_the_terminal_and_loses_nothing(columns: int) -> None:
+    message = two_streams(host="撮影室のコンピューター", server="[2001:db8::1234:5678:9abc:def0]:3020")
+    text = printed(found_of(message), columns=columns)
+    assert max(map(cell_len, text.splitlines())) <= columns
+    if columns == 200:
+        assert "撮影室のコンピューター" in text
+    assert set("撮影室のコンピューター[2001:db8::1234:5678:9abc:def0]:3020") <= set(text)
+
+
+def test_without_a_terminal_there_is_one_line_for_each_source() -> None:
+    found = found_of(two_streams(source="b"), status(source="a"))
+    assert printed(found, columns=10, is_terminal=False).splitlines() == [
+        "a\tstreaming 200.0 Hz\t3d 6d\t192.0.2.20:3020\tmocap-pc\t1.2.3",
+        "b\t3d 6d streaming 200.0 Hz, analog force waiting for 192.0.2.20:3020, 3 tries\t3d 6d, analog force"
+        "\t192.0.2.20:3020\tmocap-pc\t1.2.3",
+    ]
+
+
+def test_json_has_the_fields_of_the_reference() -> None:
+    found = found_of(status())
+    found.add_silent(["lab", "hall"])
+    assert json.loads(sources_json(found)) == {
+        "sources": [
+            {
+                "source": "hall",
+                "gateway": None,
+                "problem": "its gateway does not answer",
+                "server": None,
+                "host": None,
+                "version": None,
+                "streams": [],
+            },
+            {
+                "source": "lab",
+                "gateway": None,
+                "problem": "",
+                "server": "192.0.2.20:3020",
+                "host": "mocap-pc",
+                "version": "1.2.3",
+                "streams": [
+                    {
+                        "components": ["3d", "6d"],
+                        "text": "streaming 200.0 Hz",
+                        "state": "streaming",
+                        "problem": "",
+                        "rate_hz": 200.0,
+                        "tries": 0,
+                    }
+                ],
+            },
+        ],
+        "num_left_out": 0,
+    }
+
+
+def test_two_gateways_with_the_same_source_are_both_listed_and_noted() -> None:
+    found = found_of(status(host="a"), status(host="b"), status(host="b"))
+    assert [source.host for source in found.sources] == ["a", "b"]
+    assert notes(found) == [
+        "2 gateways serve a source 'lab', and their messages mix; rename one, or change a prefix"
+    ]
+
+
+def test_the_newest_status_counts() -> None:
+    found = found_of(status(gateway_version="1"), status(gateway_version="2"))
+    assert [source.version for source in found.sources] == ["2"]
+
+
+@pytest.mark.parametrize(
+    ("message", "problem"),
+    [
+        (b"", "its status is of another version of rtc3d-gateway"),
+        (b"x" * 100, "its status is of another version of rtc3d-gateway"),
+        (rtc3d.take_t().encode(), "its status is of another version of rtc3d-gateway"),
+        (status_of()[:-7], "its status cannot be read: a status_t message of"),
+        (status_of() + bytes(MAX_STATUS_BYTES), f"its status is too long: {MAX_STATUS_BYTES + 293} bytes"),
+    ],
+    ids=["empty", "other program", "other type", "truncated", "too long"],
+)
+def test_a_status_that_cannot_be_read_is_said(message: bytes, problem: str) -> None:
+    found = FoundSources()
+    found.add_status(message, "lab", "abc")
+    [source] = found.sources
+    assert (source.name, source.gateway) == ("lab", "abc")
+    assert source.problem.startswith(problem.partition(":")[0])
+    assert source.problem.partition(":")[0] in printed(found, columns=300)
+
+
+def test_hostile_texts_do_not_reach_the_terminal() -> None:
+    evil = "\x1b[2J\r\n\t" + "x" * 10_000
+    message = two_streams(source=evil, server=evil, host=evil, gateway_version=evil)
+    message.streams[0].components = message.streams[1].state = evil
+    message.streams[0].frame_rate_hz = math.nan
+    found = found_of(message)
+    for is_terminal in (True, False):
+        text = printed(found, is_terminal=is_terminal)
+        assert not {"\x1b", "\r"} & set(text)
+    assert printed(found, is_terminal=False).count("\n") == 1
+    assert printed(found, is_terminal=False).count("\t") == len(COLUMNS) - 1
+    content = json.loads(sources_json(found))
+    assert content["sources"][0]["streams"][0]["rate_hz"] is None
+
+
+def test_thousands_of_sources_and_streams_are_bounded_and_said() -> None:
+    found = found_of(*(status(source=f"lab-{number}") for number in range(MAX_SOURCES + 7)))
+    assert len(found.sources) == MAX_SOURCES
+    assert notes(found) == ["7 more sources or statuses were left out, because there are too many"]
+    many = status()
+    many.streams, many.num_streams = many.streams * 500, 500
+    [source] = found_of(many).sources
+    assert (len(source.streams), source.problem) == (16, "it has 500 streams; 16 are shown")
+
+
+def test_the_bytes_of_all_statuses_are_bounded() -> None:
+    message = status()
+    message.streams, message.num_streams = message.streams * 1000, 1000
+    data = message.encode()
+    found = FoundSources()
+    for number in range(1000):
+        found.add_status(data, f"lab-{number}")
+    assert len(found.sources) * len(data) <= 4 * 1024 * 1024
+    assert found.num_left_out == 1000 - len(found.sources)
