@@ -20,6 +20,7 @@
     │   └── ClosedError           it was closed by the server, by the gateway, or by the network
     ├── OutputError               an output did not open or did not accept a message
     ├── SpoolError                a C3D file from a server could not be stored
+    ├── ViewError                 the live view cannot be served
     └── QueryError                a peer's query cannot be answered; the text goes to the peer
 
 A message says what happened, to which server or file, and what to do.
@@ -113,6 +114,10 @@ class OutputError(GatewayError):
 
 class SpoolError(GatewayError):
     """A C3D file from a server could not be stored."""
+
+
+class ViewError(GatewayError):
+    """The live view cannot be served: viser is not installed, or its port is in use."""
 
 
 class QueryError(GatewayError):

@@ -13,6 +13,7 @@ COMMANDS: Final = {
     "simulate": "gateway.cli.simulate:simulate",
     "demo": "gateway.cli.demo:demo",
     "list": "gateway.cli.list_gateways:list_gateways",
+    "view": "gateway.cli.view:view",
     "echo": "gateway.cli.echo:echo",
     "params": "gateway.cli.params:params",
     "record": "gateway.cli.record:record",

@@ -1,1 +1,1 @@
-"""The live 3D view in a browser."""
+"""A live 3D view in the browser; viser is imported only in this package."""

@@ -1,0 +1,108 @@
+"""``rtc3d-gateway view``: a live 3D view in the browser."""
+
+import os
+import signal
+import sys
+import threading
+import webbrowser
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated, Final
+
+import typer
+
+from gateway.cli.options import (
+    ConnectOption,
+    PrefixOption,
+    SourcesOption,
+    UrlOption,
+    ZenohConfigOption,
+    checked_host,
+)
+
+if TYPE_CHECKING:
+    from gateway.view.server import ViewServer
+
+_CLOSE_S: Final = 0.5
+"""How long to wait for Zenoh or LCM to close: a peer that does not read delays it."""
+
+_INSTALL: Final = "pip install 'rtc3d-gateway[view]'"
+
+
+def view(
+    source: SourcesOption = None,
+    lcm: Annotated[bool, typer.Option("--lcm", help="Receive from LCM; the default is from Zenoh.")] = False,
+    connect: ConnectOption = None,
+    zenoh_config: ZenohConfigOption = None,
+    url: UrlOption = None,
+    prefix: PrefixOption = None,
+    host: Annotated[
+        str, typer.Option(callback=checked_host, help="The address where the page is served.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int, typer.Option(min=0, max=65535, help="The port of the page; 0 picks a free one.")
+    ] = 8080,
+    no_browser: Annotated[bool, typer.Option("--no-browser", help="Do not open the page.")] = False,
+) -> None:
+    """Show markers, tools and forces in the browser as they arrive, until Ctrl-C."""
+    if lcm and (connect is not None or zenoh_config is not None):
+        raise typer.BadParameter("--connect and --zenoh-config are for Zenoh")
+    if url is not None and not lcm:
+        raise typer.BadParameter("--url is for LCM; add --lcm")
+    from gateway.live.live_data import LiveData
+    from gateway.subscriber.sides import Transport, subscribe_all
+
+    stop = _stop_signals()
+    server = _open_server(host, port)
+    from gateway.view.viewer import Viewer
+
+    live = LiveData()
+    side = subscribe_all(Transport(lcm, connect, zenoh_config, url, prefix), source or (), None, live)
+    try:
+        viewer = Viewer(server, live)
+        _announce(host, server.get_port(), opens_browser=not no_browser)
+        viewer.run(stop, side.tick)
+    finally:
+        closing = threading.Thread(target=side.close, name="view-close", daemon=True)
+        closing.start()
+        server.stop()
+        closing.join(_CLOSE_S)
+
+
+def _open_server(host: str, port: int) -> "ViewServer":
+    """Return the server of the page. Raises ViewError."""
+    try:
+        from gateway.view.server import open_server
+    except ImportError as error:
+        if not (error.name or "").startswith("viser"):
+            raise
+        from gateway.errors import ViewError
+
+        raise ViewError(f"the view needs viser, which is not installed; install it: {_INSTALL}") from error
+    return open_server(host, port)
+
+
+def _announce(host: str, port: int, *, opens_browser: bool) -> None:
+    """Print where the page is, and open it. A computer without a browser is no error."""
+    from gateway.view.server import address_of, is_loopback
+
+    address = address_of(host, port)
+    print(f"{address} shows the data; press Ctrl-C to stop", flush=True)
+    if not is_loopback(host):
+        print(f"note: everybody who reaches {host}:{port} can watch; there is no password", file=sys.stderr)
+    if opens_browser:
+        threading.Thread(target=webbrowser.open, args=(address,), name="open-browser", daemon=True).start()
+
+
+def _stop_signals() -> threading.Event:
+    """Return an event that the first signal sets. The second one ends the process at once."""
+    stop = threading.Event()
+
+    def handle(_number: int, _frame: FrameType | None) -> None:
+        if stop.is_set():
+            os._exit(0)
+        stop.set()
+
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        if signal.getsignal(number) is not signal.SIG_IGN:  # nohup, and shells for `&`
+            signal.signal(number, handle)
+    return stop

@@ -1,0 +1,72 @@
+"""The web server of the live view."""
+
+import ipaddress
+import socket
+
+import rich
+import viser
+
+from gateway.errors import ViewError
+
+
+class ViewServer(viser.ViserServer):
+    """A viser server that does not contact other computers."""
+
+    def request_share_url(self, verbose: bool = True) -> None:
+        """Share nothing: viser would publish the page through a server on the internet, if a page asks."""
+
+
+def open_server(host: str, port: int) -> ViewServer:
+    """Serve the page at this address; port 0 picks a free one. Raises ViewError if that is not possible."""
+    _check_address(host, port)
+    rich.get_console().quiet = True  # viser prints there, also when a browser connects
+    server = ViewServer(host, port, label="rtc3d-gateway", verbose=False)
+    if port not in {0, server.get_port()}:  # taken since; viser chose another port
+        server.stop()
+        raise ViewError(_in_use(host, port))
+    set_theme(server.gui, dark=True)
+    return server
+
+
+def address_of(host: str, port: int) -> str:
+    """Return the address that a browser on this computer opens."""
+    if host in {"", "0.0.0.0", "::"}:  # noqa: S104 - compared only
+        host = "localhost"
+    return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
+
+
+def is_loopback(host: str) -> bool:
+    """Whether only this computer can reach an address."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def _check_address(host: str, port: int) -> None:
+    """Raise ViewError if the address cannot be listened on: viser would try 1000 other ports."""
+    try:
+        family, kind, protocol, _, address = socket.getaddrinfo(
+            host or None, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
+        with socket.socket(family, kind, protocol) as test:
+            test.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            test.bind(address)
+            test.listen(1)
+    except OSError as error:
+        if isinstance(error, socket.gaierror):
+            raise ViewError(f"no address {host}: {error.strerror}; choose another one with --host") from None
+        if port and error.errno in {98, 48}:
+            raise ViewError(_in_use(host, port)) from None
+        raise ViewError(
+            f"cannot serve the page on {host}:{port}: {error.strerror}; choose with --host and --port"
+        ) from None
+
+
+def _in_use(host: str, port: int) -> str:
+    return f"port {port} of {host} is in use by another program; choose another one with --port"
+
+
+def set_theme(gui: viser.GuiApi, *, dark: bool) -> None:
+    """Choose the colours of the page, of all browsers or of one."""
+    gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False)
