@@ -5,19 +5,32 @@ from typing import Annotated
 
 import typer
 
-from gateway.cli.options import ConfigOption, ServerOption
+from gateway.cli.options import DEFAULT_CONFIG, ConfigOption, ServerOption
 
 app = typer.Typer(no_args_is_help=True, help="Check or show a configuration, or print the JSON schema.")
 
 
 @app.command()
-def check(file: Annotated[Path, typer.Argument(help="The configuration file to check.")]) -> None:
+def check(
+    file: Annotated[
+        Path | None,
+        typer.Argument(help=f"The configuration file to check; the default is {DEFAULT_CONFIG}."),
+    ] = None,
+    config: Annotated[Path | None, typer.Option("--config", "-c", help="The same as FILE.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing if the file is valid.")] = False,
+) -> None:
     """Check a configuration file and print every mistake with its line. Starts nothing."""
+    from gateway.cli.configuration import chosen_file
     from gateway.config.loading import read
     from gateway.outputs.registry import settings_type
 
-    names = [source.name for source in read(file, settings_type()).settings.sources]
-    print(f"{file}: valid; {len(names)} source{'' if len(names) == 1 else 's'}: {', '.join(names)}")
+    if file is not None and config is not None:
+        raise typer.BadParameter("give the file once, as FILE or as --config FILE")
+    path = chosen_file(file or config, None)
+    names = [source.name for source in read(path, settings_type()).settings.sources]
+    if not quiet:
+        sources = f"{len(names)} source{'' if len(names) == 1 else 's'}: {', '.join(names)}"
+        print(f"{path or 'environment'}: valid; {sources}")
 
 
 @app.command()

@@ -5,25 +5,42 @@ from pathlib import Path
 
 import typer
 
+from gateway.cli.options import DEFAULT_CONFIG
 from gateway.config.environment import VARIABLE_PREFIX
 from gateway.config.loading import Configuration, read, read_server
 from gateway.outputs.registry import settings_type
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
 
 
-def configuration_from_options(config: Path | None, server: str | None) -> Configuration:
-    """Return the configuration from ``--config`` or ``--server``, and the environment.
+def chosen_file(config: Path | None, server: str | None) -> Path | None:
+    """Return the configuration file to read: that of ``--config``, or the default if there is neither option.
 
-    Raises ConfigError if it is not valid; BadParameter if both options are given, or if neither is given and
-    no environment variable is set.
+    None means ``--server``, or that environment variables alone are the configuration. Raises BadParameter if
+    both options are given, or if there is nothing to read.
     """
-    if server is not None and config is None:
+    if config is not None and server is not None:
+        raise typer.BadParameter("give either --config FILE or --server HOST[:PORT]")
+    if config is not None or server is not None:
+        return config
+    if DEFAULT_CONFIG.exists():
+        return DEFAULT_CONFIG
+    if not any(name.startswith(VARIABLE_PREFIX) for name in os.environ):
+        raise typer.BadParameter(
+            "give either --config FILE or --server HOST[:PORT]; "
+            f"the default, {DEFAULT_CONFIG}, does not exist"
+        )
+    return None
+
+
+def configuration_from_options(config: Path | None, server: str | None) -> Configuration:
+    """Return the configuration from ``--config``, ``--server`` or the default file, and the environment.
+
+    Raises ConfigError if it is not valid; BadParameter as ``chosen_file`` does.
+    """
+    file = chosen_file(config, server)
+    if server is not None:
         return read_server(*_host_and_port(server), settings_type())
-    if server is None and (
-        config is not None or any(name.startswith(VARIABLE_PREFIX) for name in os.environ)
-    ):
-        return read(config, settings_type())
-    raise typer.BadParameter("give either --config FILE or --server HOST[:PORT]")
+    return read(file, settings_type())
 
 
 def _host_and_port(server: str) -> tuple[str, int]:

@@ -2,7 +2,7 @@
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Final
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -13,8 +13,6 @@ from gateway.service.log_format import LogFormat, LogLevel, set_up_log
 
 if TYPE_CHECKING:
     from gateway.doctor.report import Report
-
-_INSTALLED_CONFIG: Final = Path("/etc/rtc3d-gateway/gateway.yaml")
 
 
 def doctor(
@@ -32,18 +30,25 @@ def doctor(
     ] = False,
     zenoh_config: ZenohConfigOption = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    verbose: Annotated[
+        bool, typer.Option("--verbose", "-v", help="Log what the checks do, on stderr.")
+    ] = False,
+    quiet: Annotated[
+        bool, typer.Option("--quiet", "-q", help="Print only warnings and failures; nothing if all is well.")
+    ] = False,
 ) -> None:
     """Find out why no data arrives, layer by layer. Exit status 1 if a check fails.
 
-    Without options, it uses the installed configuration, /etc/rtc3d-gateway/gateway.yaml.
+    Without options, it uses the configuration of the installed service.
     """
     import uvloop
     from rich.console import Console
 
     from gateway.doctor.report import Report
 
-    set_up_log(LogLevel.ERROR, LogFormat.TEXT)  # warnings would repeat the findings
-    report = Report(Console(quiet=as_json))
+    # Without --verbose, warnings would repeat the findings.
+    set_up_log(LogLevel.DEBUG if verbose else LogLevel.ERROR, LogFormat.TEXT)
+    report = Report(Console(quiet=as_json), quiet=quiet)
     uvloop.run(
         _report_findings(
             report,
@@ -71,19 +76,18 @@ async def _report_findings(
     zenoh_config: Path | None,
     as_json: bool,
 ) -> None:
-    from gateway.cli.configuration import configuration_from_options
+    from gateway.cli.configuration import chosen_file, configuration_from_options
     from gateway.doctor.all_checks import run_checks, run_checks_without_settings
     from gateway.doctor.source_checks import CONNECTION
 
-    if config is None and server is None and _INSTALLED_CONFIG.exists():
-        config = _INSTALLED_CONFIG
+    file = chosen_file(config, server)
     try:
-        settings = configuration_from_options(config, server).settings
+        settings = configuration_from_options(file, server).settings
     except ConfigError as error:
         for finding in run_checks_without_settings(error):
             report.add(finding)
     else:
-        origin = str(config or server or "environment")
+        origin = str(file or server or "environment")
         sections = {}
         if zenoh_config is not None:
             sections["zenoh"] = settings.outputs["zenoh"].model_copy(update={"config": zenoh_config})

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from gateway.cli.options import SourceOption
+from gateway.cli.options import NoProgressOption, SourceOption
 from gateway.config.words import join_or
 from gateway.export.extensions import EXTENSIONS
 from gateway.safe_text import safe_text
@@ -29,6 +29,7 @@ def export(
             "--to", min=0, help="Where to end, in s from the first message; the default is its end."
         ),
     ] = None,
+    quiet: NoProgressOption = False,
 ) -> None:
     """Convert a take to a file of another program, such as C3D; never overwrite a file."""
     from gateway.cli.export_progress import ExportProgress
@@ -36,7 +37,7 @@ def export(
     from gateway.export.job import ExportJob
 
     job = ExportJob(file, out, source=source, from_s=from_s, to_s=to_s)
-    with ExportProgress() if sys.stderr.isatty() else nullcontext() as progress:
+    with ExportProgress() if sys.stderr.isatty() and not quiet else nullcontext() as progress:
         if progress is not None:
             job.progress = progress.show
         paths = export_take(job)

@@ -21,11 +21,16 @@ _RECORDED: Final = (*COMPONENTS_BY_KEY, "status", "clock", "parameters")
 
 _COMPONENTS: Final = (*_RECORDED, "c3d")
 
+DEFAULT_CONFIG: Final = Path("/etc/rtc3d-gateway/gateway.yaml")
+"""The configuration file of commands that are given none; ``make install`` writes it."""
+
 ConfigOption = Annotated[
     Path | None,
     typer.Option(
-        help="The configuration file (YAML); see config/gateway.yaml. Environment variables "
-        f"{VARIABLE_PREFIX}… override it or replace it."
+        "--config",
+        "-c",
+        help=f"The configuration file (YAML); the default is {DEFAULT_CONFIG}. Environment variables "
+        f"{VARIABLE_PREFIX}… override it or replace it.",
     ),
 ]
 ServerOption = Annotated[
@@ -37,6 +42,13 @@ LogLevelOption = Annotated[
     LogLevel,
     typer.Option(case_sensitive=False, help="The lowest level to log: debug, info, warning or error."),
 ]
+VerboseOption = Annotated[
+    bool, typer.Option("--verbose", "-v", help="Log everything; short for --log-level debug.")
+]
+QuietOption = Annotated[
+    bool, typer.Option("--quiet", "-q", help="Log problems only; short for --log-level warning.")
+]
+NoProgressOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no progress, only problems.")]
 LogFormatOption = Annotated[
     LogFormat,
     typer.Option(
@@ -201,3 +213,10 @@ QueriesUrlOption = Annotated[
         help="LCM URL of requests and replies: the gateway's lcm.queries_url.",
     ),
 ]
+
+
+def chosen_log_level(level: LogLevel, *, verbose: bool, quiet: bool) -> LogLevel:
+    """Return the level to log; raises BadParameter if the three options contradict each other."""
+    if verbose + quiet + (level is not LogLevel.INFO) > 1:
+        raise typer.BadParameter("give only one of --log-level, --verbose and --quiet")
+    return LogLevel.DEBUG if verbose else LogLevel.WARNING if quiet else level

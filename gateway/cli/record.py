@@ -15,6 +15,7 @@ import typer
 from gateway.cli.options import (
     ComponentsOption,
     ConnectOption,
+    NoProgressOption,
     PrefixOption,
     SourcesOption,
     UrlOption,
@@ -52,6 +53,7 @@ def record(
     zenoh_config: ZenohConfigOption = None,
     url: UrlOption = None,
     prefix: PrefixOption = None,
+    quiet: NoProgressOption = False,
 ) -> None:
     """Record what gateways publish, until Ctrl-C. The exit status is 0 only if no message is missing.
 
@@ -78,7 +80,7 @@ def record(
     try:
         transport = Transport(lcm, connect, zenoh_config, url, prefix)
         side = subscribe_all(transport, sources, component, recording)
-        progress = RecordProgress(recording, side, sources)
+        progress = RecordProgress(recording, side, sources, quiet=quiet)
         try:
             _run(recording, side, progress, stop, seconds)
             _end(recording, progress)

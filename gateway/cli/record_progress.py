@@ -26,12 +26,18 @@ _MAX_LOSS_LINES: Final = 20
 
 
 class RecordProgress:
-    """Writes to stderr: on a terminal, a line that changes; otherwise, one line every few seconds."""
+    """Writes to stderr: on a terminal, a line that changes; otherwise, one line every few seconds.
 
-    def __init__(self, recording: TakeRecording, side: SubscriberSide, wanted: list[str]) -> None:
+    If it is ``quiet``, it writes only what goes wrong.
+    """
+
+    def __init__(
+        self, recording: TakeRecording, side: SubscriberSide, wanted: list[str], *, quiet: bool
+    ) -> None:
         self._recording = recording
         self._side = side
         self._wanted = wanted
+        self._quiet = quiet
         self._start_s = self._rate_s = time.monotonic()
         self._checked_s = self._start_s
         self._shown_s = self._start_s
@@ -44,7 +50,7 @@ class RecordProgress:
         self._reported: set[str] = set()  # what was reported and still holds
         console = Console(stderr=True)
         self._live: Live | None = None
-        if console.is_terminal:
+        if console.is_terminal and not quiet:
             self._live = Live(Text(""), console=console, auto_refresh=False, transient=True)
             self._live.start()
 
@@ -56,7 +62,7 @@ class RecordProgress:
             self._checked_s = now_s
             self._check_losses()
             self._check_silence(now_s)
-        if now_s - self._shown_s >= (_LINE_S if self._live is None else _TERMINAL_S):
+        if not self._quiet and now_s - self._shown_s >= (_LINE_S if self._live is None else _TERMINAL_S):
             self._shown_s = now_s
             self._show(now_s)
 

@@ -12,6 +12,7 @@ from gateway.cli.options import (
     ComponentsOption,
     ConnectOption,
     ListenOption,
+    NoProgressOption,
     SourcesOption,
     UrlOption,
     ZenohConfigOption,
@@ -77,6 +78,7 @@ def replay(
     max_gap: Annotated[
         float, typer.Option(min=0, help="Skip longer gaps in which nothing was recorded, in s.")
     ] = MAX_GAP_S,
+    quiet: NoProgressOption = False,
 ) -> None:
     """Publish a take again on Zenoh and LCM, under a prefix of its own.
 
@@ -115,7 +117,7 @@ def replay(
         None if to_s is None else round(to_s * 1e6),
     )
     pace = None if rate == "max" else float(rate)
-    run = ReplayRun(TakeReader(file), selection, pace, is_repeated=loop, max_gap_s=max_gap)
+    run = ReplayRun(TakeReader(file), selection, pace, is_repeated=loop, max_gap_s=max_gap, quiet=quiet)
     if not uvloop.run(run.replay(destinations, are_required=zenoh or lcm)):
         raise typer.Exit(1)
 

@@ -45,21 +45,29 @@ def jump_text(jump: Jump) -> str:
 
 
 class Progress:
-    """One line on ``console`` that is kept up to date; without a terminal, one every few seconds."""
+    """One line on ``console`` that is kept up to date; without a terminal, one every few seconds.
 
-    def __init__(self, console: Console, player: Player, length_us: int | None, hints: str) -> None:
+    If it is ``quiet``, there is none.
+    """
+
+    def __init__(
+        self, console: Console, player: Player, length_us: int | None, hints: str, *, quiet: bool
+    ) -> None:
         self._player = player
         self._length_us = length_us
         self._hints = hints
         self._console = console
+        self._quiet = quiet
         self._live = Live(console=console, auto_refresh=False, transient=True)
         self._before = time.monotonic(), player.position_us, 0, 0
         self._line_s = time.monotonic()
-        if console.is_terminal:
+        if console.is_terminal and not quiet:
             self._live.start()
 
     def show(self) -> None:
         """Show where the replay is. Call it a few times a second."""
+        if self._quiet:
+            return
         if self._console.is_terminal:
             self._live.update(Text(self._text(), no_wrap=True, overflow="ellipsis"), refresh=True)
         elif time.monotonic() - self._line_s >= LINE_S:

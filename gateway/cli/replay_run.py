@@ -37,12 +37,14 @@ class ReplayRun:
         *,
         is_repeated: bool,
         max_gap_s: float,
+        quiet: bool,
     ) -> None:
         self._reader = reader
         self._selection = selection
         self._rate = rate
         self._is_repeated = is_repeated
         self._max_gap_s = max_gap_s
+        self._quiet = quiet
         self._out = Console()
         self._notes = Console(stderr=True)
 
@@ -87,11 +89,8 @@ class ReplayRun:
         try:
             with keys(actions) as has_keys:
                 hints = "space: pause, ←/→: 10 s, q: quit" if has_keys else ""
-                with closing(
-                    Progress(
-                        self._notes, player, take_length_us(self._reader, self._selection.stop_us), hints
-                    )
-                ) as progress:
+                length_us = take_length_us(self._reader, self._selection.stop_us)
+                with closing(Progress(self._notes, player, length_us, hints, quiet=self._quiet)) as progress:
                     async with playing(player):
                         while player.is_alive and not stop.is_set():
                             progress.show()

@@ -5,7 +5,15 @@ import signal
 import sys
 from typing import Final
 
-from gateway.cli.options import ConfigOption, LogFormatOption, LogLevelOption, ServerOption
+from gateway.cli.options import (
+    ConfigOption,
+    LogFormatOption,
+    LogLevelOption,
+    QuietOption,
+    ServerOption,
+    VerboseOption,
+    chosen_log_level,
+)
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
 
 SWITCH_INTERVAL_S: Final = 0.0005
@@ -16,25 +24,29 @@ releases that lock once, so that the default of 5 ms would add up to more than t
 def run(
     config: ConfigOption = None,
     server: ServerOption = None,
+    verbose: VerboseOption = False,
+    quiet: QuietOption = False,
     log_level: LogLevelOption = LogLevel.INFO,
     log_format: LogFormatOption = LogFormat.AUTO,
 ) -> None:
     """Run the gateway until Ctrl-C or SIGTERM. SIGHUP reloads the configuration."""
+    level = chosen_log_level(log_level, verbose=verbose, quiet=quiet)
     from gateway.service.process_end import end_at_once
 
     for number in (signal.SIGINT, signal.SIGTERM):  # until the daemon handles them
         signal.signal(number, end_at_once)
     import uvloop
 
-    from gateway.cli.configuration import configuration_from_options
+    from gateway.cli.configuration import chosen_file, configuration_from_options
     from gateway.service.daemon import serve
     from gateway.service.log_limit import LogLimit
 
     limit = LogLimit()
-    set_up_log(log_level, log_format, limit)
+    set_up_log(level, log_format, limit)
     sys.setswitchinterval(SWITCH_INTERVAL_S)
     # The objects of all modules stay until the end. Without this, each full garbage collection looks through
     # them and stops the event loop for some 20 ms; many tiny packets cause one every second.
     gc.freeze()
-    uvloop.run(serve(lambda: configuration_from_options(config, server).settings, limit.report))
+    file = chosen_file(config, server)
+    uvloop.run(serve(lambda: configuration_from_options(file, server).settings, limit.report))
     limit.report(at_once=True)

@@ -17,9 +17,12 @@ from gateway.cli.options import (
     LogLevelOption,
     MarkersOption,
     PlatesOption,
+    QuietOption,
     RateOption,
     ToolsOption,
+    VerboseOption,
     checked_host,
+    chosen_log_level,
 )
 from gateway.cli.run import SWITCH_INTERVAL_S
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
@@ -90,6 +93,8 @@ def simulate(
         bool,
         typer.Option("--list-faults", callback=_list_faults, is_eager=True, help="List all faults and exit."),
     ] = False,
+    verbose: VerboseOption = False,
+    quiet: QuietOption = False,
     log_level: LogLevelOption = LogLevel.INFO,
     log_format: LogFormatOption = LogFormat.AUTO,
 ) -> None:
@@ -102,6 +107,7 @@ def simulate(
         raise typer.BadParameter("--source, --from and --to need --take")
     if from_s is not None and to_s is not None and to_s <= from_s:
         raise typer.BadParameter(f"--to {to_s:g} is not after --from {from_s:g}")
+    level = chosen_log_level(log_level, verbose=verbose, quiet=quiet)
     import uvloop
 
     from gateway.rtc3d_server.scene import Scene
@@ -111,7 +117,7 @@ def simulate(
     from gateway.simulator.scenario import Scenario, load_scenario
     from gateway.simulator.simulator import Simulator
 
-    set_up_log(log_level, log_format)
+    set_up_log(level, log_format)
     scene_options: dict[str, float] = {
         "markers": markers,
         "tools": tools,

@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from gateway.cli.options import NoProgressOption
 from gateway.cli.take_control import add_commands
 from gateway.safe_text import safe_json
 
@@ -21,6 +22,7 @@ add_commands(app)
 def info(
     file: Annotated[Path, typer.Argument(help="A recording (.lcmlog), or the folder of a saved one.")],
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object.")] = False,
+    quiet: NoProgressOption = False,
 ) -> None:
     """Show what a recording contains, and what is missing: gaps, restarts, damage.
 
@@ -33,7 +35,7 @@ def info(
     from gateway.cli.take_report import write_report
     from gateway.takes.statistics import take_statistics
 
-    with file_progress(f"reading {file.name}") as progress:
+    with file_progress(f"reading {file.name}", quiet=quiet) as progress:
         statistics = take_statistics(file, progress)
     if as_json:
         print(safe_json(json.dumps(statistics_json(statistics), indent=2, ensure_ascii=False)))

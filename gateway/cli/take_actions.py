@@ -84,10 +84,10 @@ def list_takes(address: GatewayAddress, *, as_json: bool) -> None:
     exit_with(replies.problems)
 
 
-def copy_take(address: GatewayAddress, name: str, file: Path | None) -> None:
+def copy_take(address: GatewayAddress, name: str, file: Path | None, *, quiet: bool) -> None:
     """Copy a take to a file."""
     try:
-        fetched = fetch_take(address, name, file)
+        fetched = fetch_take(address, name, file, quiet=quiet)
     except QueryError as error:
         exit_with([error])
         raise  # never reached

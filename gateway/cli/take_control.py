@@ -7,6 +7,7 @@ import typer
 
 from gateway.cli.options import (
     ConnectOption,
+    NoProgressOption,
     PrefixOption,
     QueriesUrlOption,
     SourceOption,
@@ -127,6 +128,7 @@ def fetch(
     zenoh_config: ZenohConfigOption = None,
     prefix: PrefixOption = None,
     timeout: Annotated[float, typer.Option(min=0.1, help="How many seconds to wait for each piece.")] = 10.0,
+    quiet: NoProgressOption = False,
 ) -> None:
     """Copy a take from a running gateway, over Zenoh. Of one that is running, copy what there is.
 
@@ -135,7 +137,7 @@ def fetch(
     from gateway.cli.take_actions import copy_take, gateway_address
 
     address = gateway_address(source, False, connect, zenoh_config, None, None, prefix, timeout)
-    copy_take(address, name, file)
+    copy_take(address, name, file, quiet=quiet)
 
 
 def add_commands(app: typer.Typer) -> None:

@@ -32,7 +32,7 @@ class _Piece(NamedTuple):
     gateway: str
 
 
-def fetch_take(address: GatewayAddress, name: str, file: Path | None) -> str:
+def fetch_take(address: GatewayAddress, name: str, file: Path | None, *, quiet: bool = False) -> str:
     """Copy a take to ``file``, a new file or a folder; return what was done.
 
     Raises QueryError, and TakeError if the file exists or cannot be written.
@@ -44,7 +44,7 @@ def fetch_take(address: GatewayAddress, name: str, file: Path | None) -> str:
         copy = files.create(path)  # before a long transfer: the file may exist already
         session = address.open_zenoh()
         try:
-            done = _Transfer(address, session, name).copy_to(copy)
+            done = _Transfer(address, session, name).copy_to(copy, quiet=quiet)
         finally:
             session.close()
     return f"{path}: {done}"
@@ -58,7 +58,7 @@ class _Transfer:
         self._session = session
         self._name = name
 
-    def copy_to(self, file: Any) -> str:
+    def copy_to(self, file: Any, *, quiet: bool) -> str:
         """Write the take to ``file``, without the beginning of an event at its end; return a report.
 
         A take can grow meanwhile: the copy ends where it ended when the copy began.
@@ -66,7 +66,7 @@ class _Transfer:
         first = self._first_piece()
         total = first.num_bytes
         boundary = EventBoundary()
-        with file_progress(f"fetching {self._name}") as progress:
+        with file_progress(f"fetching {self._name}", quiet=quiet) as progress:
             done, piece = 0, first
             while done < total:
                 content = piece.content[: total - done]

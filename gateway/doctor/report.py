@@ -24,16 +24,22 @@ _MAX_WIDTH: Final = 100
 
 
 class Report:
-    """Prints each finding when it is added, under the name of its subject."""
+    """Prints each finding when it is added, under the name of its subject.
 
-    def __init__(self, console: Console) -> None:
+    If it is ``quiet``, it prints only warnings and failures.
+    """
+
+    def __init__(self, console: Console, *, quiet: bool = False) -> None:
         self._console = console
+        self._quiet = quiet
         self._subject = ""
         self.findings: list[Finding] = []
 
     def add(self, finding: Finding) -> None:
         """Add and print one finding."""
         self.findings.append(finding)
+        if self._quiet and finding.result not in {Result.WARNING, Result.FAILING}:
+            return
         subject = f"{finding.subject} ({finding.stream})" if finding.stream else finding.subject
         if subject != self._subject:
             self._subject = subject
@@ -50,6 +56,8 @@ class Report:
 
     def end(self) -> None:
         """Print how many checks passed, failed and were not tested, and how many warnings and notes."""
+        if self._quiet:
+            return
         counts = {result: sum(each.result is result for each in self.findings) for result in Result}
         text = (
             f"{counts[Result.PASSING]} ok, {counts[Result.FAILING]} failed, "

@@ -39,8 +39,8 @@ def row(parameter: object) -> str:
         value = default.value if isinstance(default, Enum) else default
         shown = f"`{value:g}`" if isinstance(value, float) else f"`{value}`"
     is_option = isinstance(parameter, typer.core.TyperOption)
-    name = parameter.opts[0] if is_option else (parameter.metavar or parameter.opts[0]).upper()
-    return f"| `{name}` | {shown} | {parameter.help} |"
+    names = parameter.opts if is_option else [(parameter.metavar or parameter.opts[0]).upper()]
+    return f"| {', '.join(f'`{name}`' for name in names)} | {shown} | {parameter.help} |"
 
 
 def table(command: typer.core.TyperCommand) -> str:

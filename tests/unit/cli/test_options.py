@@ -1,9 +1,12 @@
+import logging
+import signal
 from pathlib import Path
 
 import pytest
 import typer
 from typer.testing import CliRunner
 
+from gateway.cli import configuration
 from gateway.cli.configuration import configuration_from_options
 from gateway.cli.main import app
 from gateway.config.loading import Configuration
@@ -11,6 +14,15 @@ from gateway.config.schema import schema_text
 from gateway.errors import ConfigError
 from gateway.outputs.lcm.settings import LcmSettings
 from tests.configurations import MODEL
+
+
+@pytest.fixture(autouse=True)
+def default_config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the path of the default configuration, which does not exist."""
+    path = tmp_path / "default.yaml"
+    monkeypatch.setattr(configuration, "DEFAULT_CONFIG", path)
+    return path
+
 
 SOURCES = "RTC3D_GATEWAY__SOURCES"
 DEMO = Path(__file__).parents[3] / "config/demo.yaml"
@@ -57,9 +69,87 @@ def test_config_and_server_exclude_each_other() -> None:
         configuration_from_options(DEMO, "lab")
 
 
-def test_either_config_or_server_is_required() -> None:
-    with pytest.raises(typer.BadParameter, match="either --config FILE or --server"):
+def test_without_options_and_default_it_says_what_was_looked_for(default_config: Path) -> None:
+    with pytest.raises(typer.BadParameter) as raised:
         configuration_from_options(None, None)
+    assert str(raised.value) == (
+        f"give either --config FILE or --server HOST[:PORT]; the default, {default_config}, does not exist"
+    )
+
+
+@pytest.mark.parametrize("command", [("run",), ("doctor",), ("config", "show"), ("config", "check")])
+def test_commands_without_a_configuration_end_with_status_2(command: tuple[str, ...]) -> None:
+    result = CliRunner().invoke(app, command, env={"COLUMNS": "300"})
+    assert result.exit_code == 2
+    assert "give either --config FILE or --server HOST[:PORT]; the default, " in result.output
+
+
+def test_the_default_file_is_read_and_environment_variables_override_it(
+    default_config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    default_config.write_text("sources: [{name: hall, host: 192.0.2.1}]\nlcm: {prefix: FILE}\n")
+    assert prefix_of(configuration_from_options(None, None)) == "FILE"
+    monkeypatch.setenv("RTC3D_GATEWAY__LCM__PREFIX", "HALL2")
+    assert prefix_of(configuration_from_options(None, None)) == "HALL2"
+    assert configuration_from_options(None, "lab").settings.sources[0].host == "lab"
+    assert f"# {default_config}:1" in printed("config", "show")
+    assert printed("config", "check") == f"{default_config}: valid; 1 source: hall\n"
+
+
+def test_doctor_reads_the_default_file(default_config: Path) -> None:
+    default_config.write_text("sources: [{name: lab, host: a..b}]\n")
+    result = CliRunner().invoke(app, ["doctor"])
+    assert result.exit_code == 1
+    assert str(default_config) in result.output
+
+
+def test_run_reads_the_default_file(default_config: Path) -> None:
+    default_config.write_text("sources: [{name: lab, host: a..b}]\n")
+    result = CliRunner().invoke(app, ["run"])
+    assert isinstance(result.exception, ConfigError)
+    assert str(default_config) in str(result.exception)
+
+
+def test_check_takes_the_file_as_argument_or_option_and_can_be_quiet(tmp_path: Path) -> None:
+    assert printed("config", "check", "-c", str(DEMO)) == printed("config", "check", str(DEMO))
+    assert printed("config", "check", "-q", str(DEMO)) == ""
+    twice = CliRunner().invoke(app, ["config", "check", str(DEMO), "-c", str(DEMO)])
+    assert twice.exit_code == 2
+    (tmp_path / "lab.yaml").write_text("sources: []")
+    with pytest.raises(ConfigError, match=r"lab\.yaml:1:10"):
+        printed("config", "check", "--quiet", str(tmp_path / "lab.yaml"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "level"),
+    [
+        ((), "INFO"),
+        (("-v",), "DEBUG"),
+        (("--verbose",), "DEBUG"),
+        (("-q",), "WARNING"),
+        (("--quiet",), "WARNING"),
+        (("--log-level", "error"), "ERROR"),
+    ],
+)
+@pytest.mark.parametrize("command", [("run", "-c"), ("simulate", "--scenario")])
+def test_v_and_q_are_log_levels(
+    command: tuple[str, ...], arguments: tuple[str, ...], level: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    levels: list[str] = []
+    monkeypatch.setattr(logging, "basicConfig", lambda **settings: levels.append(settings["level"]))
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    CliRunner().invoke(app, [*command, "/nowhere", *arguments])
+    assert levels == [level]
+
+
+@pytest.mark.parametrize(
+    "arguments", [("-v", "-q"), ("-v", "--log-level", "error"), ("-q", "--log-level", "debug")]
+)
+@pytest.mark.parametrize("command", ["run", "simulate"])
+def test_contradicting_log_levels_are_a_mistake(command: str, arguments: tuple[str, ...]) -> None:
+    result = CliRunner().invoke(app, [command, *arguments], env={"COLUMNS": "200"})
+    assert result.exit_code == 2
+    assert "give only one of --log-level, --verbose and --quiet" in result.output
 
 
 def test_environment_variables_alone_are_a_configuration(

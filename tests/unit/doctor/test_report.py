@@ -136,3 +136,25 @@ def test_a_check_that_was_not_made_does_not_fail() -> None:
     report.add(LAB.not_tested("name", "no frames"))
     assert report.is_ok
     assert report.findings == [Finding("lab", "name", Result.NOT_TESTED, "no frames")]
+
+
+def test_a_quiet_report_has_only_warnings_and_failures() -> None:
+    out = io.StringIO()
+    report = Report(Console(file=out, width=60), quiet=True)
+    for finding in (
+        LAB.passing("name", "fine"),
+        Subject("hall").failing("TCP", "refused", "Start it."),
+        Subject("hall").not_tested("protocol", "it needs TCP"),
+        Subject("zenoh").warning("link", "slow", "Look."),
+    ):
+        report.add(finding)
+    report.end()
+    assert out.getvalue() == (
+        "hall\n"
+        "  FAIL  TCP         refused\n"
+        "                    → Start it.\n"
+        "zenoh\n"
+        "  warn  link        slow\n"
+        "                    → Look.\n"
+    )
+    assert not report.is_ok

@@ -1,0 +1,77 @@
+"""``--quiet`` of the commands that show their progress on a terminal, and of the doctor."""
+
+import os
+import pty
+import subprocess
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from tests.gateway_process import PROGRAM
+from tests.takes import description, markers, write_take
+
+HIDDEN_CURSOR: Final = b"\x1b[?25l"
+"""What a line of progress begins with."""
+
+
+def written_to_the_terminal(folder: Path, *arguments: str) -> bytes:
+    """Run the program with a terminal as stderr, and return what it writes there."""
+    terminal, child = pty.openpty()
+    environ = {**os.environ, "TERM": "xterm"}
+    with subprocess.Popen(
+        (*PROGRAM, *arguments), cwd=folder, env=environ, stdin=-3, stdout=-3, stderr=child
+    ) as process:
+        os.close(child)
+        written = b""
+        try:
+            while data := os.read(terminal, 65536):
+                written += data
+        except OSError:  # the program has closed the terminal
+            pass
+        os.close(terminal)
+    assert process.returncode in {0, 1}, written
+    return written
+
+
+@pytest.mark.netns
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("record", "new.lcmlog", "--seconds", "0.3", "--lcm"),
+        ("replay", "take.lcmlog", "--zenoh", "--rate", "max"),
+        ("export", "take.lcmlog", "take.csv"),
+        ("take", "info", "take.lcmlog"),
+    ],
+)
+def test_quiet_commands_show_no_progress(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+    write_take(
+        tmp_path / "take.lcmlog",
+        [description(), *(markers(3, sequence) for sequence in range(10))],
+    )
+    assert HIDDEN_CURSOR not in written_to_the_terminal(tmp_path, *arguments, "--quiet")
+    for file in tmp_path.glob("take*.csv"):
+        file.unlink()
+    assert HIDDEN_CURSOR in written_to_the_terminal(tmp_path, *arguments)
+
+
+def doctor(*arguments: str) -> subprocess.CompletedProcess[str]:
+    command = (*PROGRAM, "doctor", "--server", "127.0.0.1:1", "--seconds", "0.1", *arguments)
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.netns
+def test_a_quiet_doctor_prints_only_what_needs_attention() -> None:
+    shown = doctor("-q")
+    assert shown.returncode == 1
+    marks = {
+        line.split()[0] for line in shown.stdout.splitlines() if line.startswith("  ") and line[2] != " "
+    }
+    assert "FAIL" in marks
+    assert marks <= {"FAIL", "warn"}
+
+
+@pytest.mark.netns
+def test_a_verbose_doctor_logs_what_it_does() -> None:
+    assert "DEBUG" in doctor("-v").stderr
+    assert not doctor().stderr
