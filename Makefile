@@ -7,6 +7,7 @@ BIN := .venv/bin
 PREFIX := /opt/rtc3d-gateway
 CONFIG := /etc/rtc3d-gateway
 LIB := /usr/local/lib
+MAN := /usr/local/share/man/man1
 UNITS := rtc3d-gateway.service rtc3d-gateway@.service
 
 # The Python for tests of the installation. It must be one that sudo finds and that the service can read.
@@ -113,7 +114,7 @@ install:
 	$(PYTHON) -m venv $(PREFIX)/venv
 	$(PREFIX)/venv/bin/pip install --quiet --require-hashes --requirement requirements.txt
 	$(call pip,$(PREFIX)/venv/bin/python,install --quiet --upgrade --no-deps)
-	install -d $(LIB)/systemd/system $(LIB)/sysusers.d $(LIB)/tmpfiles.d /usr/local/bin
+	install -d $(LIB)/systemd/system $(LIB)/sysusers.d $(LIB)/tmpfiles.d $(MAN) /usr/local/bin
 	for unit in $(UNITS); do sed 's|/opt/rtc3d-gateway|$(PREFIX)|' systemd/$$unit >$(LIB)/systemd/system/$$unit; done
 	install -m 644 systemd/sysusers.conf $(LIB)/sysusers.d/rtc3d-gateway.conf
 	install -m 644 systemd/tmpfiles.conf $(LIB)/tmpfiles.d/rtc3d-gateway.conf
@@ -121,6 +122,8 @@ install:
 	systemd-tmpfiles --create rtc3d-gateway.conf
 	[ -e $(CONFIG)/gateway.yaml ] || install -m 644 config/gateway.yaml $(CONFIG)/gateway.yaml
 	install -m 644 config/gateway.schema.json $(CONFIG)/gateway.schema.json
+	$(PREFIX)/venv/bin/python -m gateway.cli.man_page >$(MAN)/rtc3d-gateway.1
+	chmod 644 $(MAN)/rtc3d-gateway.1
 	ln -sfn $(PREFIX)/venv/bin/rtc3d-gateway /usr/local/bin/rtc3d-gateway
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload
 	@echo 'Enter your server in $(CONFIG)/gateway.yaml; then: systemctl enable --now rtc3d-gateway'
@@ -131,7 +134,8 @@ uninstall:
 	[ ! -d /run/systemd/system ] || systemctl stop rtc3d-gateway.service 'rtc3d-gateway@*.service'
 	[ ! -d /run/systemd/system ] || systemctl disable $(UNITS)
 	rm -f $(UNITS:%=$(LIB)/systemd/system/%) $(LIB)/sysusers.d/rtc3d-gateway.conf \
-	    $(LIB)/tmpfiles.d/rtc3d-gateway.conf /usr/local/bin/rtc3d-gateway $(CONFIG)/gateway.schema.json
+	    $(LIB)/tmpfiles.d/rtc3d-gateway.conf /usr/local/bin/rtc3d-gateway $(MAN)/rtc3d-gateway.1 \
+	    $(CONFIG)/gateway.schema.json
 	rm -rf $(PREFIX)/venv
 	-rmdir $(PREFIX)
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from gateway.cli.options import DEFAULT_CONFIG, ConfigOption, ServerOption
+from gateway.cli.options import ConfigOption, ServerOption
+from gateway.config.files import DEFAULT_CONFIG
 
 app = typer.Typer(no_args_is_help=True, help="Check or show a configuration, or print the JSON schema.")
 

@@ -19,6 +19,7 @@ import typer
 
 from gateway import version_text
 from gateway.cli.commands import LazyGroup
+from gateway.cli.completion import is_completion
 from gateway.errors import ConfigError, GatewayError
 from gateway.safe_text import safe_lines
 from gateway.service.process_end import end_process
@@ -31,7 +32,6 @@ app = typer.Typer(
     cls=LazyGroup,
     help="Publish data of RTC3D motion-capture servers (NDI First Principles, WaveFront) on Zenoh and LCM.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["--help", "-h"]},
 )
@@ -64,7 +64,7 @@ def _run() -> int:
     """Run the command, and return the exit status. Errors are printed to stderr."""
     stdout = sys.stdout
     try:
-        app()
+        app(prog_name="rtc3d-gateway")
     except SystemExit as end:
         if sys.stdout is not stdout:  # typer replaces it if its reader is gone
             return 0
@@ -93,12 +93,14 @@ def _print_os_error(error: OSError) -> None:
 
 
 def _print_error(text: str) -> None:
+    if is_completion():  # it would be in the middle of the command line
+        return
     with contextlib.suppress(OSError):
         print(safe_lines(text), file=sys.stderr, flush=True)
 
 
-def _print_version(wanted: bool) -> None:
-    if wanted:
+def _print_version(context: typer.Context, wanted: bool) -> None:
+    if wanted and not context.resilient_parsing:
         print(f"rtc3d-gateway {version_text()}")
         raise typer.Exit
 

@@ -11,7 +11,9 @@ from typing import Annotated, Any, Final
 
 import typer
 
+from gateway.cli.completion import one_of, source_names
 from gateway.config.environment import VARIABLE_PREFIX
+from gateway.config.files import DEFAULT_CONFIG
 from gateway.config.words import describe, join_or
 from gateway.rtc3d.component_types import COMPONENTS_BY_KEY
 from gateway.service.log_format import LogFormat, LogLevel
@@ -20,9 +22,6 @@ _RECORDED: Final = (*COMPONENTS_BY_KEY, "status", "clock", "parameters")
 """What recordings have."""
 
 _COMPONENTS: Final = (*_RECORDED, "c3d")
-
-DEFAULT_CONFIG: Final = Path("/etc/rtc3d-gateway/gateway.yaml")
-"""The configuration file of commands that are given none; ``make install`` writes it."""
 
 ConfigOption = Annotated[
     Path | None,
@@ -149,17 +148,26 @@ def _checked_endpoint(text: str | None) -> str | None:
 
 SourceOption = Annotated[
     str | None,
-    typer.Option(callback=_checked_source, help="Only this source; the default is all sources."),
+    typer.Option(
+        callback=_checked_source,
+        autocompletion=source_names,
+        help="Only this source; the default is all sources.",
+    ),
 ]
 ComponentOption = Annotated[
     str | None,
-    typer.Option(callback=_one_of(_COMPONENTS), help=f"Only this: {join_or(_COMPONENTS)}."),
+    typer.Option(
+        callback=_one_of(_COMPONENTS),
+        autocompletion=one_of(_COMPONENTS),
+        help=f"Only this: {join_or(_COMPONENTS)}.",
+    ),
 ]
 SourcesOption = Annotated[
     list[str] | None,
     typer.Option(
         "--source",
         callback=_checked_each(_checked_source),
+        autocompletion=source_names,
         help="Only this source; can be repeated. The default is all sources.",
     ),
 ]
@@ -168,6 +176,7 @@ ComponentsOption = Annotated[
     typer.Option(
         "--component",
         callback=_checked_each(_one_of(_RECORDED)),
+        autocompletion=one_of(_RECORDED),
         help=f"Only this: {join_or(_RECORDED)}; can be repeated.",
     ),
 ]

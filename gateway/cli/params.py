@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from gateway.cli.completion import one_of
 from gateway.cli.options import (
     ConnectOption,
     PrefixOption,
@@ -19,7 +20,11 @@ from gateway.rtc3d.parameters import SECTIONS
 def params(
     sections: Annotated[
         list[str] | None,
-        typer.Argument(metavar="SECTION", help=f"Any of {', '.join(SECTIONS)}; the default is all."),
+        typer.Argument(
+            metavar="SECTION",
+            autocompletion=one_of(SECTIONS),
+            help=f"Any of {', '.join(SECTIONS)}; the default is all.",
+        ),
     ] = None,
     zenoh: Annotated[bool, typer.Option("--zenoh", help="Query on Zenoh (the default).")] = False,
     lcm: Annotated[bool, typer.Option("--lcm", help="Query on LCM.")] = False,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from gateway.cli.completion import source_names
 from gateway.cli.options import (
     AnalogOption,
     AnalogRateOption,
@@ -33,8 +34,8 @@ if TYPE_CHECKING:
     from gateway.simulator.simulator import Simulator
 
 
-def _list_faults(wanted: bool) -> None:
-    if wanted:
+def _list_faults(context: typer.Context, wanted: bool) -> None:
+    if wanted and not context.resilient_parsing:
         from gateway.simulator.faults.kinds import describe_kinds
 
         print(describe_kinds())
@@ -66,7 +67,9 @@ def simulate(
     ] = None,
     source: Annotated[
         str | None,
-        typer.Option(help="The source of the take to play; needed if it has several."),
+        typer.Option(
+            autocompletion=source_names, help="The source of the take to play; needed if it has several."
+        ),
     ] = None,
     from_s: Annotated[
         float | None,

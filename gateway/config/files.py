@@ -6,6 +6,9 @@ import stat
 from pathlib import Path
 from typing import Final
 
+DEFAULT_CONFIG: Final = Path("/etc/rtc3d-gateway/gateway.yaml")
+"""The configuration file of commands that are given none; ``make install`` writes it."""
+
 MAX_FILE_BYTES: Final = 256 * 1024
 """The size limit of a configuration file; reading and checking so much text takes less than 1 s."""
 

@@ -15,6 +15,7 @@ pytestmark = [pytest.mark.systemd, pytest.mark.wheelhouse, pytest.mark.netns, py
 PROGRAM = "/usr/local/bin/rtc3d-gateway"
 PREFIX = "/opt/rtc3d-gateway"
 VENV = f"{PREFIX}/venv"
+MAN_PAGE = "/usr/local/share/man/man1/rtc3d-gateway.1"
 UNITS = "/usr/local/lib/systemd/system"
 SCHEMA = "/etc/rtc3d-gateway/gateway.schema.json"
 SECRETS = "/etc/rtc3d-gateway/gateway.env"
@@ -25,10 +26,17 @@ WITHOUT_COMPILER = "export CC=no-such-compiler\n"
 async def test_the_program_runs_from_its_virtual_environment(machine: Machine) -> None:
     assert machine.path(PROGRAM).is_symlink()
     assert (await machine.run(PROGRAM, "--version")).text.startswith("rtc3d-gateway ")
-    await machine.run(PROGRAM, "check", CONFIG)
+    await machine.run(PROGRAM, "config", "check", CONFIG)
     where = "import gateway, os; print(os.path.realpath(gateway.__file__))"
     location = await machine.run(f"{VENV}/bin/python", "-c", where)
     assert location.text.startswith(f"{VENV}/lib")
+
+
+async def test_the_man_page_describes_the_installed_program(machine: Machine) -> None:
+    page = machine.path(MAN_PAGE).read_text()
+    assert page == (await machine.run(f"{VENV}/bin/python", "-m", "gateway.cli.man_page")).text
+    assert ".SS config check" in page
+    assert machine.path(MAN_PAGE).stat().st_mode & 0o777 == 0o644
 
 
 async def test_the_program_is_compiled_if_there_is_a_compiler(machine: Machine) -> None:
@@ -133,6 +141,7 @@ async def test_upgrading_and_removing_keep_the_configuration(machine: Machine) -
             f"{UNITS}/{UNIT}",
             f"{UNITS}/rtc3d-gateway@.service",
             SCHEMA,
+            MAN_PAGE,
         ):
             assert not machine.path(path).exists(), path
         left = await machine.run("systemctl", "list-unit-files", "rtc3d-gateway*", check=False)

@@ -1,0 +1,153 @@
+"""Completion by shells: what they offer, from where, and that nothing else is printed."""
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from gateway.cli import completion
+from gateway.cli.completion import source_names
+from gateway.cli.main import app
+from tests.gateway_process import PROGRAM
+from tests.takes import description, write_take
+
+
+@pytest.fixture(autouse=True)
+def default_config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Return the path of the default configuration, which does not exist."""
+    path = tmp_path / "default.yaml"
+    monkeypatch.setattr(completion, "DEFAULT_CONFIG", path)
+    return path
+
+
+def offered(line: str, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Return what is offered in bash for the last word of a line, which may be empty."""
+    words = line.split(" ")
+    monkeypatch.setenv(completion.VARIABLE, "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", line)
+    monkeypatch.setenv("COMP_CWORD", str(len(words) - 1))
+    result = CliRunner().invoke(app, [], prog_name="rtc3d-gateway")
+    assert (result.exit_code, result.stderr) == (0, "")
+    return result.stdout.split()
+
+
+def test_commands_and_options_are_offered(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert offered("rtc3d-gateway ech", monkeypatch) == ["echo"]
+    assert offered("rtc3d-gateway take st", monkeypatch) == ["start", "stop"]
+    assert offered("rtc3d-gateway run --ser", monkeypatch) == ["--server"]
+    assert "check" not in offered("rtc3d-gateway ", monkeypatch)
+
+
+@pytest.mark.parametrize("command", ["echo", "record x.lcmlog", "replay x.lcmlog"])
+def test_components_are_offered(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert offered(f"rtc3d-gateway {command} --component e", monkeypatch) == ["event"]
+    assert set(offered(f"rtc3d-gateway {command} --component ", monkeypatch)) >= {"3d", "6d", "status"}
+
+
+def test_sections_of_parameters_are_offered(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert offered("rtc3d-gateway params 3d a", monkeypatch) == ["analog"]
+
+
+@pytest.mark.parametrize(
+    "command", ["echo", "params", "record new.lcmlog", "take start", "take fetch walk", "simulate --port 0"]
+)
+def test_sources_of_the_default_configuration_are_offered(
+    command: str, default_config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert offered(f"rtc3d-gateway {command} --source ", monkeypatch) == []
+    default_config.write_text("sources: [{name: lab, host: a}, {name: hall, host: b}]")
+    assert offered(f"rtc3d-gateway {command} --source ", monkeypatch) == ["lab", "hall"]
+    assert offered(f"rtc3d-gateway {command} --source h", monkeypatch) == ["hall"]
+    monkeypatch.setenv("RTC3D_GATEWAY__SOURCES__1__NAME", "house")
+    assert offered(f"rtc3d-gateway {command} --source h", monkeypatch) == ["house"]
+
+
+@pytest.mark.parametrize("command", ["replay {}", "export {} walk.c3d", "simulate --take {}"])
+def test_sources_of_the_take_on_the_command_line_are_offered(
+    command: str, tmp_path: Path, default_config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    default_config.write_text("sources: [{name: lab, host: a}]")
+    take = write_take(tmp_path / "take.lcmlog", [description("hall"), description("attic")])
+    line = f"rtc3d-gateway {command.format(take)} --source "
+    assert sorted(offered(line, monkeypatch)) == ["attic", "hall"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"sources: [{name: '$(touch x)', host: a}, {name: \"a'b\", host: b}]",
+        b"sources: [{host: a}]",
+        b"sources: 3",
+        b"sources: [",
+        b"- a",
+        b"",
+        b"\xff",
+        b"x" * 1_000_000,
+    ],
+)
+def test_a_bad_configuration_offers_nothing(
+    content: bytes, default_config: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    default_config.write_bytes(content)
+    assert offered("rtc3d-gateway echo --source ", monkeypatch) == []
+
+
+@pytest.mark.parametrize("content", [b"", b"no take", b"\0" * 1000])
+def test_a_bad_take_offers_nothing(content: bytes, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "take.lcmlog").write_bytes(content)
+    assert offered(f"rtc3d-gateway replay {tmp_path / 'take.lcmlog'} --source ", monkeypatch) == []
+    assert offered(f"rtc3d-gateway replay {tmp_path} --source ", monkeypatch) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "rtc3d-gateway --version take sto",
+        "rtc3d-gateway -h take sto",
+        "rtc3d-gateway take -h sto",
+    ],
+)
+def test_options_that_print_something_print_nothing(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert offered(line, monkeypatch) == ["stop"]
+    assert offered("rtc3d-gateway simulate --list-faults --por", monkeypatch) == ["--port"]
+
+
+@pytest.mark.parametrize("line", ["rtc3d-gateway run --nosuch ", "rtc3d-gateway echo --port 'a"])
+def test_a_wrong_line_offers_nothing(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert offered(line, monkeypatch) == []
+
+
+def test_source_names_need_no_take_and_no_configuration() -> None:
+    command = typer.main.get_command(app)
+    assert source_names(typer.Context(command), "") == []
+
+
+@pytest.mark.parametrize("variables", [{}, {"COMP_WORDS": "x"}, {"COMP_WORDS": "x", "COMP_CWORD": "y"}])
+def test_without_the_variables_of_a_shell_it_fails_silently(variables: dict[str, str]) -> None:
+    environ = {**os.environ, completion.VARIABLE: "complete_bash", **variables}
+    run = subprocess.run(PROGRAM, env=environ, capture_output=True, text=True, check=False)
+    assert (run.stdout, run.stderr) == ("", "")
+
+
+SCRIPT = """
+PATH=$1:$PATH
+source <(_RTC3D_GATEWAY_COMPLETE=source_bash rtc3d-gateway)
+COMP_WORDS=(rtc3d-gateway echo --component a)
+COMP_CWORD=3
+_rtc3d_gateway_completion rtc3d-gateway
+echo "${COMPREPLY[@]}"
+"""
+
+
+def test_bash_completes_with_the_script_that_the_program_prints(tmp_path: Path) -> None:
+    program = tmp_path / "rtc3d-gateway"
+    program.write_text(f'#!/bin/sh\nexec {" ".join(PROGRAM)} "$@"\n')
+    program.chmod(0o755)
+    environ = {**os.environ, "COMP_TYPE": "9"}
+    run = subprocess.run(
+        ("bash", "-c", SCRIPT, "bash", str(tmp_path)), env=environ, capture_output=True, text=True, check=True
+    )
+    assert (run.stdout, run.stderr) == ("analog\n", "")
