@@ -16,7 +16,7 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 # What a wheel is built from.
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-integration test-takes test-hostile test-others test-compiled check lint types contracts generated docs lcm-types fuzz soak stops \
+.PHONY: demo lock test test-integration test-takes test-hostile test-others test-compiled check lint types contracts generated docs lcm-types samples fuzz soak stops \
     mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
 
 demo: .venv/runtime
@@ -73,6 +73,10 @@ docs: .venv/installed
 lcm-types: .venv/installed
 	rm -f lcm_types/rtc3d/*.py
 	$(BIN)/lcm-gen --python --ppath lcm_types lcm_types/rtc3d/*.lcm
+
+# Record the sample take and the sample C3D file again.
+samples: .venv/installed
+	$(BIN)/python examples/make_samples.py
 
 # Print what the compilation for a Python lacks: the C compiler that it would call, or its headers.
 MISSING = import os, shutil, sysconfig; \

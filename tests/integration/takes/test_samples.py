@@ -1,0 +1,123 @@
+"""The sample files in examples/: what is in them, what the commands do with them, and how they are made."""
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pytest
+
+from gateway.messages.decode import decode
+from gateway.rtc3d.components import WIRE_ORDER
+from gateway.simulator.c3d_scene import C3dScene
+from gateway.takes import open_take
+from gateway.takes.reader import TakeReader
+from gateway.takes.take import Take
+from tests.documents import ROOT
+from tests.unit.export.exported import read_ezc3d
+
+TAKE: Final = ROOT / "examples/walk.lcmlog"
+C3D: Final = ROOT / "examples/walk.c3d"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the samples made again."""
+    folder = tmp_path_factory.mktemp("samples")
+    subprocess.run([sys.executable, str(ROOT / "examples/make_samples.py"), str(folder)], check=True)
+    return folder
+
+
+def run(*arguments: str) -> str:
+    return subprocess.check_output([sys.executable, "-m", "gateway", *arguments], text=True, cwd=ROOT)
+
+
+def test_both_are_small() -> None:
+    assert max(TAKE.stat().st_size, C3D.stat().st_size) < 700_000
+
+
+def test_the_take_has_all_components_with_gaps_in_view_and_plates_with_corners() -> None:
+    source = open_take(TAKE).sources["lab"]
+    assert source.markers is not None
+    assert source.forces is not None
+    components = (source.markers, source.tools, source.analog, source.forces, source.events)
+    assert all(component is not None and len(component) for component in components)
+    visible = source.markers.is_visible.mean(axis=0)
+    assert 0.8 < visible.min() < 0.95
+    assert visible.max() == 1
+    [entry] = source.parameters
+    assert entry.parameters.force is not None
+    assert [len(plate.corners) for plate in entry.parameters.force.plates] == [4, 4]
+
+
+def test_the_forces_are_below_the_feet() -> None:
+    """The centre of pressure on each plate is between the heel and the toe that are on it."""
+    source = open_take(TAKE).sources["lab"]
+    markers, forces = source.markers, source.forces
+    assert markers is not None
+    assert forces is not None
+    labels = list(markers.labels)
+    for plate, side in enumerate("RL"):
+        loaded = forces.items["fz"][:, plate] > 400
+        assert 50 < loaded.sum() < 200
+        fz, mx, my = (forces.items[name][loaded, plate] for name in ("fz", "mx", "my"))
+        x_mm, y_mm = 200 - 1000 * my / fz, 300 + 610 * plate + 1000 * mx / fz
+        frame = np.searchsorted(markers.timestamp_us, forces.timestamp_us[loaded]).clip(max=len(markers) - 1)
+        heel, toe = (markers.positions[frame, labels.index(side + name)] for name in ("HEE", "TOE"))
+        on_ground = ~np.isnan(heel[:, 0] + toe[:, 0])
+        assert on_ground.any()
+        assert (np.abs(x_mm - heel[:, 0])[on_ground] < 60).all()
+        assert (y_mm > heel[:, 1] - 60)[on_ground].all()
+        assert (y_mm < toe[:, 1] + 60)[on_ground].all()
+
+
+def test_nothing_names_the_computer_that_made_them() -> None:
+    hosts = {
+        decode(each.message).host for each in TakeReader(TAKE).messages() if each.key in {"take", "status"}
+    }
+    assert hosts == {"example"}
+
+
+def test_making_them_again_gives_the_same_content(made: Path) -> None:
+    def content(take: Take) -> dict[str, Any]:
+        source = take.sources["lab"]
+        [entry] = source.parameters
+        without_port = replace(entry.parameters, general=None)
+        found: dict[str, Any] = {"parameters": without_port}
+        for key in ("markers", "tools", "analog", "forces", "events"):
+            found[key] = getattr(source, key).items.tobytes()
+        return found
+
+    assert content(open_take(made / "walk.lcmlog")) == content(open_take(TAKE))
+    again, committed = read_ezc3d(made / "walk.c3d")["data"], read_ezc3d(C3D)["data"]
+    assert np.array_equal(again["points"], committed["points"], equal_nan=True)
+    assert np.array_equal(again["analogs"], committed["analogs"], equal_nan=True)
+
+
+def test_the_simulator_plays_the_c3d_file() -> None:
+    scene = C3dScene(C3D)
+    assert {component.key for component in scene.rates_hz} == {"3d", "analog", "force"}
+    assert scene.num_frames == 250
+
+
+def test_take_info_describes_the_take() -> None:
+    text = run("take", "info", str(TAKE))
+    for component in WIRE_ORDER:
+        assert re.search(rf"^ *{component.key} +\d+", text, re.MULTILINE)
+    assert "Foot strike (0x101)  9" in text
+
+
+@pytest.mark.parametrize("option", ["--take", "--c3d"])
+def test_the_simulator_serves_both(option: str) -> None:
+    file = TAKE if option == "--take" else C3D
+    text = run("simulate", option, str(file), "--port", "0", "--seconds", "0.5")
+    assert text.startswith("RTC3D server on 127.0.0.1:")
+
+
+@pytest.mark.parametrize("extension", ["c3d", "trc", "csv", "mcap"])
+def test_the_take_is_exported(extension: str, tmp_path: Path) -> None:
+    run("export", str(TAKE), str(tmp_path / f"walk.{extension}"))
+    assert list(tmp_path.glob(f"walk*.{extension}"))
