@@ -43,6 +43,8 @@ class LiveComponent:
         """The items of the newest message, shape (items,), in native byte order."""
         self.arrived_s: float | None = None
         """When the newest message arrived, on the monotonic clock; None before the first."""
+        self.newest_arrived_utime: int | None = None
+        """When the newest message arrived, before it waited for ``update``: µs since the Unix epoch."""
         self.num_skipped = 0
         """How many messages were not decoded, because too many waited."""
         self.num_malformed = 0
@@ -84,6 +86,7 @@ class LiveComponent:
         self._rate.add(self._num_messages, now_s)
         if len(rows.heads):
             self.arrived_s = now_s
+            self.newest_arrived_utime = arrived[-1][1]
             self._rate_before_stop_hz = self._rate.rate_hz
             self._take_newest(rows)
             if not rows.malformed:

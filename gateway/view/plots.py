@@ -1,0 +1,122 @@
+"""Scrolling plots of selected analog and force channels."""
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+import viser
+from viser import uplot
+
+from gateway.live.component import LiveComponent
+from gateway.live.live_data import LiveSource
+from gateway.view.channels import Channel, choices, component_of, samples
+from gateway.view.envelope import COLUMN_US, NUM_COLUMNS, Envelope
+
+MAX_PLOTS: Final = 8
+
+_CHOOSE: Final = "choose …"
+_ALL: Final = "all"
+_HEIGHT_PX: Final = 120
+_FONT: Final = "11px sans-serif"
+_LINE: Final = "#4dabf7"
+_FILL: Final = "rgba(77, 171, 247, 0.35)"
+
+_SECONDS: Final = np.arange(1 - NUM_COLUMNS, 1) * COLUMN_US / 1e6
+
+
+class _Plot:
+    """The plot of one channel."""
+
+    def __init__(self, server: viser.ViserServer, channel: Channel, title: str) -> None:
+        self.channel = channel
+        self._envelope = Envelope()
+        self._component: LiveComponent | None = None
+        line = uplot.Series(label="", stroke=_LINE, width=1, spanGaps=False, points={"show": False})
+        self.handle = server.gui.add_uplot(
+            (_SECONDS, *self._envelope.columns(0)),
+            (uplot.Series(label="s"), line, line),
+            title=title,
+            bands=(uplot.Band(series=(2, 1), fill=_FILL),),
+            scales={"x": uplot.Scale(time=False), "y": uplot.Scale()},
+            axes=(uplot.Axis(size=24, font=_FONT), uplot.Axis(size=52, font=_FONT)),
+            legend=uplot.Legend(show=False),
+            height=_HEIGHT_PX,
+        )
+
+    def take(self, component: LiveComponent | None) -> None:
+        """Take what came since the last call."""
+        self._component = component
+        if component is not None:
+            for utimes, values in samples(self.channel, component):
+                self._envelope.add(utimes, values)
+
+    def show(self) -> None:
+        """Send the plot to the browsers. It scrolls on when data have stopped."""
+        end_utime, component = self._envelope.newest_utime, self._component
+        if end_utime is not None:
+            if component is not None and component.is_stopped:
+                end_utime += round(1e6 * (component.age_s or 0.0))
+            self.handle.data = (_SECONDS, *self._envelope.columns(end_utime))
+
+
+class Plots:
+    """The tab in which a user chooses channels and sees their plots. All viewers see the same ones."""
+
+    def __init__(self, server: viser.ViserServer) -> None:
+        self._server = server
+        self._add = server.gui.add_dropdown("Plot", [_CHOOSE], hint=f"Up to {MAX_PLOTS} channels")
+        self._remove = server.gui.add_dropdown("Remove", [_CHOOSE], visible=False)
+        self._folder = server.gui.add_folder(None)
+        self._choices: dict[str, Channel] = {}
+        self._plots: dict[str, _Plot] = {}  # by their titles
+
+    def take(self, sources: Sequence[LiveSource]) -> None:
+        """Take what came since the last call."""
+        if self._plots:
+            by_name = {source.name: source for source in sources}
+            for plot in self._plots.values():
+                plot.take(component_of(plot.channel, by_name))
+
+    def show(self) -> None:
+        """Send the plots to the browsers."""
+        for plot in self._plots.values():
+            plot.show()
+
+    def follow_user(self) -> None:
+        """Add and remove the plots that the user chose."""
+        added, removed = self._add.value, self._remove.value
+        if added in self._choices and len(self._plots) < MAX_PLOTS and added not in self._plots:
+            with self._folder:
+                self._plots[added] = _Plot(self._server, self._choices[added], added)
+        for title in [*self._plots] if removed == _ALL else [removed]:
+            plot = self._plots.pop(title, None)
+            if plot is not None:
+                plot.handle.remove()
+        if added != _CHOOSE or removed != _CHOOSE:
+            self._add.value = _CHOOSE  # type: ignore[misc] # mypy does not find the setter
+            self._remove.value = _CHOOSE  # type: ignore[misc]
+            self._offer()
+
+    def offer(self, sources: Sequence[LiveSource]) -> None:
+        """Offer the channels that there are now."""
+        self._choices = choices(sources)
+        titles = {plot.channel: title for title, plot in self._plots.items()}
+        for text, channel in self._choices.items():
+            title = titles.get(channel, text)
+            if title != text:
+                plot = self._plots.pop(title)
+                plot.handle.title = text
+                self._plots[text] = plot
+        self._offer()
+
+    def _offer(self) -> None:
+        is_full = len(self._plots) == MAX_PLOTS
+        offered = (text for text in self._choices if text not in self._plots and not is_full)
+        _set_options(self._add, (_CHOOSE, *offered))
+        _set_options(self._remove, (_CHOOSE, *self._plots, *([_ALL] if len(self._plots) > 1 else [])))
+        self._add.visible, self._remove.visible = bool(self._choices), bool(self._plots)
+
+
+def _set_options(dropdown: viser.GuiDropdownHandle[str], options: tuple[str, ...]) -> None:
+    if dropdown.options != options:  # viser sends them in any case
+        dropdown.options = options

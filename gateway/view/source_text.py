@@ -1,0 +1,190 @@
+"""What the panel says about one source, as HTML: state, rates, latency, losses."""
+
+from collections.abc import Iterator, Mapping
+from typing import Final
+
+import rtc3d
+
+from gateway.live.component import LiveComponent
+from gateway.live.latency import Percentiles
+from gateway.live.live_data import LiveData, LiveSource
+from gateway.losses import counts_text
+from gateway.rtc3d.components import WIRE_ORDER
+from gateway.view.state_text import Level, gateway_states, states_html
+from gateway.view.texts import (
+    NONE,
+    age_text,
+    clock_text,
+    count_text,
+    counted,
+    html_text,
+    percentiles_text,
+    rate_text,
+    table,
+)
+
+_MAX_SENTENCE_CHARACTERS: Final = 300
+_MAX_LINES: Final = 20
+"""How many streams and outputs, each with its drops, are shown."""
+
+_CLOCKS_DIFFER_MS: Final = (-0.5, 1000.0)
+"""A median latency between computers outside of these says that their clocks differ."""
+
+_SLOW: Final = 0.95
+"""A rate below this share of the announced one is marked."""
+
+
+def source_html(source: LiveSource, shown: Mapping[str, Percentiles], *, is_take: bool) -> str:
+    """Return everything about a source but its markers, tools and events.
+
+    ``shown`` is the latency from the arrival here to the browsers, by component. A take has no gateway now,
+    so its latency to here is left out.
+    """
+    parts = [f"<h3>{html_text(source.name)}</h3>"]
+    if not (is_take and source.is_silent):
+        parts.append(states_html(gateway_states(source)))
+    parts += [f"<p class=dim>{line}</p>" for line in _origin(source)]
+    components = _components(source)
+    if components:
+        parts.append(_rates_table(source, components))
+        parts.append(_latency_table(components, shown, is_take=is_take))
+        parts += [f"<p class=waiting>{text}</p>" for text in clock_warning(components) if not is_take]
+    losses = [f"<p class={level.value}>{text}</p>" for level, text in _losses(source)]
+    parts += losses or ["<p class=good>nothing lost, dropped or skipped</p>"]
+    return f"<section>{''.join(parts)}</section>"
+
+
+def ignored_html(live: LiveData) -> str:
+    """Say what was received and belongs to no source."""
+    ignored = (
+        (live.num_foreign, "of another program"),
+        (live.num_beyond, "of more sources or keys than can be shown"),
+        (live.num_defects, "because of a defect in this program"),
+    )
+    texts = [f"{counted(number, 'message')} {why}" for number, why in ignored if number]
+    return f"<p class=waiting>left out: {', '.join(texts)}</p>" if texts else ""
+
+
+def clock_warning(components: Mapping[str, LiveComponent]) -> Iterator[str]:
+    """Say that the latency between the gateway and this program is none, because their clocks differ."""
+    medians = [each.latency.to_here.p50_ms for each in components.values() if each.latency.to_here]
+    low_ms, high_ms = _CLOCKS_DIFFER_MS
+    worst_ms = max(medians, key=abs, default=0.0)
+    if worst_ms < low_ms:
+        yield (
+            f"This computer’s clock is at least {age_text(-worst_ms / 1000)} behind that of the gateway’s "
+            "computer, so the latency from there to here is not known."
+        )
+    elif worst_ms > high_ms:
+        yield (
+            f"Messages seem to take {age_text(worst_ms / 1000)} from the gateway to here. Probably the "
+            "clocks of the two computers differ."
+        )
+
+
+def _components(source: LiveSource) -> dict[str, LiveComponent]:
+    keys = [component.key for component in WIRE_ORDER]
+    return {key: source.components[key] for key in keys if key in source.components}
+
+
+def _origin(source: LiveSource) -> Iterator[str]:
+    """Say where the data come from: server, gateway, clock."""
+    status = source.newest_status
+    if status is None:
+        return
+    on_host = f" on {html_text(status.host)}" if status.host else ""
+    yield f"server {html_text(status.server)} · gateway {html_text(status.gateway_version)}{on_host}"
+
+
+def _rates_table(source: LiveSource, components: Mapping[str, LiveComponent]) -> str:
+    rows = []
+    for key, component in components.items():
+        check = source.series_by_key[key].check
+        rows.append(
+            (
+                key,
+                count_text(len(component.newest_items)) if key != "event" else "",
+                _rate(component) if key != "event" else "",
+                count_text(source.series_by_key[key].num_messages),
+                f"<span class=bad>{count_text(check.num_lost)}</span>" if check.num_lost else "0",
+            )
+        )
+    return table(("", "items", "Hz", "messages", "lost"), rows)
+
+
+def _rate(component: LiveComponent) -> str:
+    """Return the rate, and the announced one if there is one."""
+    if component.is_stopped:
+        return f"<span class=bad>stopped {age_text(component.age_s or 0.0)} ago</span>"
+    announced_hz = component.announced_rate_hz
+    text = rate_text(component.rate_hz)
+    if announced_hz is None:
+        return text
+    if component.rate_hz < _SLOW * announced_hz:
+        text = f"<span class=waiting>{text}</span>"
+    return f"{text} <span class=dim>of {rate_text(announced_hz)}</span>"
+
+
+def _latency_table(
+    components: Mapping[str, LiveComponent], shown: Mapping[str, Percentiles], *, is_take: bool
+) -> str:
+    headings = ("ms, p50 / p99", "captured → gateway", "→ here", "→ browser")
+    rows = [
+        (
+            key,
+            percentiles_text(component.latency.to_gateway),
+            percentiles_text(component.latency.to_here),
+            percentiles_text(shown.get(key)),
+        )
+        for key, component in components.items()
+    ]
+    if is_take:
+        return table(headings[:2], [row[:2] for row in rows])
+    return table(headings, rows)
+
+
+def _losses(source: LiveSource) -> Iterator[tuple[Level, str]]:
+    """Say what is lost, skipped or wrong anywhere, by cause."""
+    for key, component in _components(source).items():
+        check = source.series_by_key[key].check
+        if check.num_lost:
+            gaps = counted(check.num_gaps, "gap")
+            yield Level.BAD, f"{key}: {counted(check.num_lost, 'message')} lost in {gaps}"
+        if check.num_restarts:
+            yield Level.WAITING, f"{key}: numbers restarted {counted(check.num_restarts, 'time')}"
+        if check.has_two_publishers:
+            yield Level.BAD, f"{key}: two gateways publish on the same key"
+        if component.num_malformed:
+            yield Level.BAD, f"{key}: {counted(component.num_malformed, 'malformed message')}"
+    if source.num_skipped:
+        yield Level.WAITING, f"skipped for display: {counted(source.num_skipped, 'message')}"
+    if source.num_unreadable:
+        unreadable = counted(source.num_unreadable, "message")
+        yield Level.BAD, f"parameters or status that cannot be read: {unreadable}"
+    if source.newest_status is not None:
+        yield from _status_losses(source.newest_status)
+
+
+def _status_losses(status: rtc3d.status_t) -> Iterator[tuple[Level, str]]:
+    """Say what the gateway has lost since its start, and what its streams and outputs lack."""
+    for stream in status.streams[:_MAX_LINES]:
+        name = html_text(stream.components)
+        if stream.drops:
+            yield Level.WAITING, f"dropped at {name}: {_drops(stream.drops)}"
+        for limitation in stream.limitations[:_MAX_LINES]:
+            yield Level.WAITING, f"{name}: {html_text(limitation, _MAX_SENTENCE_CHARACTERS)}"
+        if stream.last_error:
+            at = clock_text(stream.last_error_utime / 1e6)
+            error = html_text(stream.last_error, _MAX_SENTENCE_CHARACTERS)
+            yield Level.WAITING, f"last error of {name}, {at}: {error}"
+    for output in status.outputs[:_MAX_LINES]:
+        if not output.connected:
+            problem = html_text(output.problem or NONE, _MAX_SENTENCE_CHARACTERS)
+            yield Level.BAD, f"output {html_text(output.name)}: {problem}"
+        if output.drops:
+            yield Level.WAITING, f"dropped at output {html_text(output.name)}: {_drops(output.drops)}"
+
+
+def _drops(drops: list[rtc3d.loss_t]) -> str:
+    texts = counts_text((drop.cause, drop.messages, drop.frames) for drop in drops[:_MAX_LINES])
+    return html_text(texts, _MAX_SENTENCE_CHARACTERS)

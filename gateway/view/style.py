@@ -1,0 +1,31 @@
+"""The style sheet of the panel, for light and dark."""
+
+from typing import Final
+
+STYLE: Final = """<style>
+:root { --g-good: #2b8a3e; --g-waiting: #b35900; --g-bad: #c92a2a; --g-line: #0002; --g-on-bad: #fff }
+[data-mantine-color-scheme=dark] { --g-good: #69db7c; --g-waiting: #ffc078; --g-bad: #ff8787; --g-line: #fff2;
+  --g-on-bad: #2c0b0b }
+.gateway { font-size: 12.5px; line-height: 1.45; padding: 2px 12px 4px; overflow-wrap: anywhere }
+.gateway h3 { font-size: 13.5px; margin: 6px 0 2px }
+.gateway p { margin: 2px 0 }
+.gateway table { width: 100%; border-collapse: collapse; margin: 6px 0; font-variant-numeric: tabular-nums }
+.gateway th { font-weight: 500; opacity: .65; font-size: 11.5px; vertical-align: bottom }
+.gateway th, .gateway td { text-align: right; padding: 2px 0 2px 8px; white-space: nowrap }
+.gateway th:first-child, .gateway td:first-child { text-align: left; padding-left: 0; white-space: normal }
+.gateway td { border-top: 1px solid var(--g-line) }
+.gateway .good { color: var(--g-good) }
+.gateway .waiting { color: var(--g-waiting) }
+.gateway .bad { color: var(--g-bad) }
+.gateway .dim { opacity: .65 }
+.gateway .last { float: right; opacity: .65; font-variant-numeric: tabular-nums }
+.gateway .stopped { background: var(--g-bad); color: var(--g-on-bad); border-radius: 4px; padding: 5px 8px;
+  margin: 4px 0 }
+.gateway .bar { display: inline-block; width: 70px; height: 7px; margin-right: 6px;
+  background: var(--g-line) }
+.gateway .bar i { display: block; height: 100%; background: currentColor }
+.gateway .events td { text-align: left; white-space: normal }
+.gateway .frozen { max-height: 0; overflow: hidden; background: var(--g-bad); color: var(--g-on-bad);
+  border-radius: 4px; padding: 0 8px; animation: gateway-frozen 1ms 4s forwards }
+@keyframes gateway-frozen { to { max-height: 4em; padding: 5px 8px } }
+</style>"""
