@@ -11,6 +11,7 @@ import contextlib
 import time
 from collections import Counter
 from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -60,10 +61,19 @@ class _Received:
             self.late[component] += now_utime() - prefix_of(message).capture_utime > 1e6 * self.max_lag_s
 
 
-async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool) -> bool:
-    """Show rates and values for ``seconds``; return whether every message was received.
+async def run_demo(
+    scene: Scene,
+    stop: asyncio.Event,
+    console: Console,
+    *,
+    seconds: float | None = None,
+    udpm: bool = False,
+    view: Callable[[str], AbstractAsyncContextManager[None]] | None = None,
+) -> bool:
+    """Show rates and values for ``seconds``, or until ``stop``; return whether every message was received.
 
-    Raises OutputError if Zenoh or LCM does not open on this machine.
+    ``view`` starts a viewer that subscribes at a Zenoh endpoint, until the end of the demo. Raises
+    OutputError if Zenoh or LCM does not open on this machine.
     """
     sides = {name: kind.demo(udpm) for name, kind in OUTPUTS.items() if kind.demo is not None}
     async with contextlib.AsyncExitStack() as stack:
@@ -76,6 +86,8 @@ async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool
         for name, side in sides.items():
             await _until_open(name, side)
             stack.callback(side.subscribe(SOURCE, received[name].add).close)
+            if view is not None and side.endpoint is not None:
+                await stack.enter_async_context(view(side.endpoint))
         await _until(
             lambda: all(each.count["status"] for each in received.values()),
             _START_TIMEOUT_S,
@@ -88,7 +100,7 @@ async def run_demo(scene: Scene, seconds: float, console: Console, *, udpm: bool
             "the gateway did not request every component",
         )
         simulator.start_measurement()
-        await _show(received, seconds, console)
+        await _show(received, stop, seconds, console)
         simulator.stop_measurement()
         await _wait_for_missing(simulator, received)
         skipped = _num_skipped(gateway)
@@ -139,13 +151,19 @@ async def _until_open(name: str, side: DemoSide) -> None:
     await _until(lambda: side.output.health().connected, _START_TIMEOUT_S, f"{name} did not open")
 
 
-async def _show(received: dict[str, _Received], seconds: float, console: Console) -> None:
-    """Wait for ``seconds``, and show the live table if the output is a terminal."""
+async def _show(
+    received: dict[str, _Received], stop: asyncio.Event, seconds: float | None, console: Console
+) -> None:
+    """Wait for ``seconds``, or until ``stop``, and show the live table if the output is a terminal."""
+    end = "s; Ctrl-C ends it" if seconds is None else f"of {seconds:.0f} s"
     start_s = time.monotonic()
     previous: dict[str, Counter[str]] = {output: Counter() for output in received}
+    elapsed_s = 0.0
     with Live(console=console, auto_refresh=False, transient=True) as live:
-        while (elapsed_s := time.monotonic() - start_s) < seconds:
-            await asyncio.sleep(min(_REFRESH_S, seconds - elapsed_s))
+        while not stop.is_set() and (seconds is None or elapsed_s < seconds):
+            wait_s = _REFRESH_S if seconds is None else min(_REFRESH_S, seconds - elapsed_s)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(stop.wait(), wait_s)
             now_s = time.monotonic() - start_s
             rates = {
                 output: {
@@ -155,8 +173,10 @@ async def _show(received: dict[str, _Received], seconds: float, console: Console
                 for output, each in received.items()
             }
             previous = {output: Counter(each.count) for output, each in received.items()}
+            elapsed_s = now_s
             if console.is_terminal:
-                live.update(_table(received, rates, now_s, seconds), refresh=True)
+                title = f"RTC3D simulator → gateway → subscribers, {now_s:.0f} {end}"
+                live.update(_table(received, rates, title), refresh=True)
 
 
 async def _wait_for_missing(simulator: Simulator, received: dict[str, _Received]) -> None:
@@ -186,10 +206,8 @@ def _num_skipped(gateway: Gateway) -> int:
     )
 
 
-def _table(
-    received: dict[str, _Received], rates: dict[str, dict[str, float]], now_s: float, seconds: float
-) -> Table:
-    table = Table(title=f"RTC3D simulator → gateway → subscribers, {now_s:.0f} of {seconds:.0f} s")
+def _table(received: dict[str, _Received], rates: dict[str, dict[str, float]], title: str) -> Table:
+    table = Table(title=title)
     table.add_column("component")
     for output in received:
         table.add_column(f"{output} Hz", justify="right")

@@ -1,6 +1,9 @@
 """``rtc3d-gateway demo``: simulator, gateway and subscribers in one process."""
 
-from typing import Annotated
+import asyncio
+import signal
+from functools import partial
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -15,9 +18,22 @@ from gateway.cli.options import (
 )
 from gateway.service.log_format import LogLevel, set_up_log
 
+if TYPE_CHECKING:
+    from gateway.cli.demo_view import Viewer
+    from gateway.rtc3d_server.scene import Scene
+
 
 def demo(
-    seconds: Annotated[float, typer.Option(min=0.1, help="How many seconds to run.")] = 10.0,
+    seconds: Annotated[
+        float | None,
+        typer.Option(min=0.1, help="How many seconds to run; 10 by default, with --view until Ctrl-C."),
+    ] = None,
+    view: Annotated[
+        bool, typer.Option("--view", help="Open the 3D view in the browser, and run until Ctrl-C.")
+    ] = False,
+    no_browser: Annotated[
+        bool, typer.Option("--no-browser", help="With --view, only print the address of the 3D view.")
+    ] = False,
     udpm: Annotated[
         bool, typer.Option("--udpm", help="Use real multicast for LCM instead of LCM in memory.")
     ] = False,
@@ -29,12 +45,13 @@ def demo(
     analog_rate: AnalogRateOption = 2000.0,
     c3d: C3dOption = None,
 ) -> None:
-    """Run a self-contained demo: simulator, gateway and two subscribers. Counts lost messages."""
-    import uvloop
-    from rich.console import Console
+    """Run a self-contained demo: simulator, gateway and two subscribers. Counts lost messages.
 
-    from gateway.demo import run_demo
-    from gateway.rtc3d_server.scene import Scene
+    If the extra `view` is installed, the demo can be watched in a browser while it runs.
+    """
+    import uvloop
+
+    from gateway.cli.demo_view import viewer, viewer_is_installed
     from gateway.simulator.c3d_scene import C3dScene
     from gateway.simulator.synthetic import SyntheticScene
 
@@ -51,5 +68,25 @@ def demo(
             rate_hz=rate,
             analog_rate_hz=analog_rate,
         )
-    if not uvloop.run(run_demo(scene, seconds, Console(), udpm=udpm)):
+    run_s = seconds if seconds is not None or view else 10.0
+    watch = (
+        partial(viewer, is_required=view, opens_browser=not no_browser)
+        if view or viewer_is_installed()
+        else None
+    )
+    if not uvloop.run(_run(scene, run_s, udpm, watch)):
         raise typer.Exit(1)
+
+
+async def _run(scene: "Scene", seconds: float | None, udpm: bool, view: "Viewer | None") -> bool:
+    """Run the demo; without a time, Ctrl-C ends it."""
+    from rich.console import Console
+
+    from gateway.demo import run_demo
+
+    stop = asyncio.Event()
+    if seconds is None:
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGINT, signal.SIGTERM):
+            loop.add_signal_handler(number, stop.set)
+    return await run_demo(scene, stop, Console(), seconds=seconds, udpm=udpm, view=view)

@@ -5,6 +5,9 @@ import signal
 import sys
 import threading
 import webbrowser
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Final
 
@@ -20,7 +23,9 @@ from gateway.cli.options import (
 )
 
 if TYPE_CHECKING:
+    from gateway.subscriber.sides import Transport
     from gateway.view.server import ViewServer
+    from gateway.view.viewer import Viewer
 
 _CLOSE_S: Final = 0.5
 """How long to wait for Zenoh or LCM to close: a peer that does not read delays it."""
@@ -29,6 +34,12 @@ _INSTALL: Final = "pip install 'rtc3d-gateway[view]'"
 
 
 def view(
+    take: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="[TAKE]", help="Play this take (.lcmlog, or the folder of one) instead of live data."
+        ),
+    ] = None,
     source: SourcesOption = None,
     lcm: Annotated[bool, typer.Option("--lcm", help="Receive from LCM; the default is from Zenoh.")] = False,
     connect: ConnectOption = None,
@@ -43,29 +54,68 @@ def view(
     ] = 8080,
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Do not open the page.")] = False,
 ) -> None:
-    """Show markers, tools and forces in the browser as they arrive, until Ctrl-C."""
+    """Show markers, tools and forces in the browser as they arrive, or from a take, until Ctrl-C."""
     if lcm and (connect is not None or zenoh_config is not None):
         raise typer.BadParameter("--connect and --zenoh-config are for Zenoh")
     if url is not None and not lcm:
         raise typer.BadParameter("--url is for LCM; add --lcm")
-    from gateway.live.live_data import LiveData
-    from gateway.subscriber.sides import Transport, subscribe_all
+    from gateway.subscriber.sides import Transport
 
+    if take is not None and (lcm or connect is not None or zenoh_config is not None or prefix is not None):
+        raise typer.BadParameter(
+            "a take is read from its file; --lcm, --connect and --prefix are for live data"
+        )
     stop = _stop_signals()
     server = _open_server(host, port)
+    try:
+        if take is None:
+            transport = Transport(lcm, connect, zenoh_config, url, prefix)
+            show = _live_data(transport, source or (), server)
+        else:
+            show = _take(take, source or (), server)
+        with show as (viewer, tick):
+            _announce(host, server.get_port(), opens_browser=not no_browser)
+            viewer.run(stop, tick)
+    finally:
+        server.stop()
+
+
+@contextmanager
+def _live_data(
+    transport: "Transport", sources: Sequence[str], server: "ViewServer"
+) -> Iterator[tuple["Viewer", Callable[[], object]]]:
+    """Subscribe, and provide a viewer of what arrives."""
+    from gateway.live.live_data import LiveData
+    from gateway.subscriber.sides import subscribe_all
     from gateway.view.viewer import Viewer
 
     live = LiveData()
-    side = subscribe_all(Transport(lcm, connect, zenoh_config, url, prefix), source or (), None, live)
+    side = subscribe_all(transport, sources, None, live)
     try:
-        viewer = Viewer(server, live)
-        _announce(host, server.get_port(), opens_browser=not no_browser)
-        viewer.run(stop, side.tick)
+        yield Viewer(server, live), side.tick
     finally:
         closing = threading.Thread(target=side.close, name="view-close", daemon=True)
         closing.start()
-        server.stop()
         closing.join(_CLOSE_S)
+
+
+@contextmanager
+def _take(
+    path: Path, sources: Sequence[str], server: "ViewServer"
+) -> Iterator[tuple["Viewer", Callable[[], object]]]:
+    """Open a take, and provide a viewer that plays it."""
+    from gateway.live.live_data import LiveData
+    from gateway.view.playback import Playback
+    from gateway.view.viewer import Viewer
+
+    live = LiveData()
+    playback = Playback(path, sources, live)
+    viewer = Viewer(server, live, playback)
+    playback.start()
+    try:
+        yield viewer, lambda: None
+    finally:
+        playback.close()
 
 
 def _open_server(host: str, port: int) -> "ViewServer":

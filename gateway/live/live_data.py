@@ -152,6 +152,14 @@ class LiveData(Reception[LiveSource, Series]):
         else:
             self.receive(series, message)
 
+    def hold(self) -> None:
+        """Let nothing count as stopped until now: a recording pauses. Call it before each ``update``."""
+        now_s = time.monotonic()
+        for source in self.sources_now:
+            for component in [*source.components.values()]:
+                if component.arrived_s is not None:
+                    component.arrived_s = now_s
+
     def begin_again(self) -> None:
         """Forget everything, because a recording goes on at another place."""
         with self._lock:

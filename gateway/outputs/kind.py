@@ -49,6 +49,9 @@ class DemoSide(NamedTuple):
     subscribe: Callable[[str, Receive], Subscription]
     """Takes the source's name. Called after the output has opened. Raises OutputError."""
 
+    endpoint: str | None = None
+    """Where other programs on this computer can subscribe; None if nowhere."""
+
 
 @dataclass(frozen=True)
 class OutputKind:

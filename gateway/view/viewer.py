@@ -1,4 +1,4 @@
-"""The live view: what has arrived is shown about 30 times a second."""
+"""The view: what has arrived, live or from a take, is shown about 30 times a second."""
 
 import threading
 import time
@@ -7,6 +7,7 @@ from typing import Final
 
 from gateway.live.live_data import LiveData
 from gateway.view.panel import Panel
+from gateway.view.playback import Playback
 from gateway.view.scene import Scene
 from gateway.view.server import ViewServer
 
@@ -14,13 +15,16 @@ PERIOD_S: Final = 1 / 30
 
 
 class Viewer:
-    """Shows the data of all sources to every browser that is connected."""
+    """Shows the data of all sources, or of a take, to every browser that is connected."""
 
-    def __init__(self, server: ViewServer, live: LiveData) -> None:
+    def __init__(self, server: ViewServer, live: LiveData, playback: Playback | None = None) -> None:
         self._server = server
         self._live = live
+        self._playback = playback
+        if playback is not None:
+            playback.add_controls(server.gui)
         tabs = server.gui.add_tab_group()
-        self.panel = Panel(server, tabs, live)
+        self.panel = Panel(server, tabs, live, is_take=playback is not None)
         self.scene = Scene(server, tabs)
 
     def run(self, stop: threading.Event, tick: Callable[[], object]) -> None:
@@ -36,12 +40,17 @@ class Viewer:
             next_s += PERIOD_S * max(1, -(-(now_s - next_s) // PERIOD_S))
 
     def update(self) -> None:
-        """Decode what has arrived, and show it."""
+        """Decode what has arrived, and show it. Raises what ended the playback of a take."""
+        is_paused = self._playback is not None and self._playback.is_paused
+        if is_paused:
+            self._live.hold()
         sources = self._live.update()
         clients = self._server.get_clients()
-        with self._server.atomic():
-            if not clients:
-                self.scene.pause()
-                return
-            self.scene.update(sources, clients)
-            self.panel.update(sources)
+        if clients:
+            with self._server.atomic():
+                self.scene.update(sources, clients)
+        else:
+            self.scene.pause()
+        self.panel.update(sources, is_paused=is_paused)
+        if self._playback is not None:
+            self._playback.update()

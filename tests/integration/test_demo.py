@@ -40,7 +40,7 @@ class StallingScene(SyntheticScene):
 async def report(scene: SyntheticScene, seconds: float) -> tuple[bool, str]:
     """Run the demo; return its verdict and what it prints."""
     out = io.StringIO()
-    verdict = await demo.run_demo(scene, seconds, Console(file=out, width=200), udpm=False)
+    verdict = await demo.run_demo(scene, asyncio.Event(), Console(file=out, width=200), seconds=seconds)
     return verdict, out.getvalue()
 
 

@@ -230,7 +230,7 @@ async def test_the_demo_shows_it_and_counts_its_messages(monkeypatch: pytest.Mon
     monkeypatch.delitem(OUTPUTS, "zenoh")
     monkeypatch.delitem(OUTPUTS, "lcm")
     out = io.StringIO()
-    assert await run_demo(scene(), 0.2, Console(file=out, width=200), udpm=False)
+    assert await run_demo(scene(), asyncio.Event(), Console(file=out, width=200), seconds=0.2)
     assert "example" in out.getvalue()
     assert "Nothing was lost." in out.getvalue()
 

@@ -22,7 +22,7 @@ def _demo(_use_network: bool) -> DemoSide:
         keys = key_pattern(settings.prefix, source, None)
         return ZenohSubscriber(open_zenoh(endpoint), keys, receive, owns_session=True)
 
-    return DemoSide(settings, ZenohOutput(settings), subscribe_here)
+    return DemoSide(settings, ZenohOutput(settings), subscribe_here, endpoint)
 
 
 ZENOH: Final = OutputKind(
