@@ -291,7 +291,13 @@ async def test_faults_act_on_takes(take: Path) -> None:
         assert await ask_xml(client) == (XML, LABELS)
 
         frozen = simulator.faults.begin(FrozenTimestamps())
-        frames = await frames_after(client, bool, 3)
+        times_us: list[int] = []
+
+        def is_frozen(components: list[WireComponent]) -> bool:
+            times_us.append(components[0].timestamp_us)
+            return times_us[-1] in times_us[:-1]
+
+        frames = await frames_after(client, is_frozen, 3)
         assert len({components[0].timestamp_us for components in frames}) == 1
         assert frames[0][0].timestamp_us >= 7 * SECOND_US
         simulator.faults.end(frozen)

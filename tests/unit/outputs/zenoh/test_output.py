@@ -347,12 +347,15 @@ output.close()
 
 
 def test_a_session_that_opens_only_after_close_is_closed() -> None:
-    endpoint = free_endpoint()
-    keys = zenoh_keys("client", connect=endpoint)
-    keys["connect"]["timeout_ms"] = -1
-    output = ZenohOutput(ZenohSettings(config=keys))
-    output.start()
-    output.close()
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        endpoint = f"tcp/127.0.0.1:{silent.getsockname()[1]}"
+        keys = zenoh_keys("client", connect=endpoint)
+        keys["connect"]["timeout_ms"] = -1
+        output = ZenohOutput(ZenohSettings(config=keys))
+        output.start()
+        connection, _ = silent.accept()  # the session is opening
+        output.close()
+        connection.close()
     router = open_zenoh("router", listen=endpoint)
     events: list[zenoh.SampleKind] = []
     router.info.declare_transport_events_listener(lambda event: events.append(event.kind), history=True)
