@@ -81,8 +81,9 @@ async def test_recently_received_parameters_count_as_fresh() -> None:
 
 
 async def test_a_thousand_simultaneous_queries_cause_one_command() -> None:
-    timeouts_s = {"reply_timeout_s": 60.0, "query_timeout_s": 60.0}  # a busy computer needs seconds for them
-    async with gateway_with_server(**timeouts_s) as (server, _, gateway, peer):
+    # On a busy computer, it takes seconds until all of them have arrived.
+    lab = gateway_with_server(reply_timeout_s=60.0, query_timeout_s=60.0)
+    async with lab as (server, _, gateway, peer):
         before = server.count("SendParameters")
         server.may_answer.clear()
         payloads: list[bytes] = []

@@ -299,7 +299,7 @@ async def test_its_subscribers_keep_an_on_demand_stream_running(tmp_path: Path, 
         [status] = lab.source.statuses
         await wait_until_async(lambda: status.state is StreamState.IDLE and lab.source.streams[0].session)
         with closing(lab.subscribe()):
-            await lab.messages("frame" if whole_frames else "3d", 30)  # more than fit into idle_after_s
+            await lab.messages("frame" if whole_frames else "3d", 50)  # many more than fit into idle_after_s
         await wait_until_async(lambda: status.state is StreamState.IDLE)
 
 

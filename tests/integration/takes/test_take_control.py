@@ -119,13 +119,14 @@ async def test_a_take_is_started_listed_and_stopped(tmp_path: Path, side: str) -
 @sides
 async def test_errors_say_what_to_do(tmp_path: Path, side: str) -> None:
     async with lab(tmp_path / "takes") as at:
-        for arguments, text in (
-            (("stop",), "no take of source 'lab' is running"),
-            (("save",), "takes.keep_last_s is 0"),
-            (("start", "../x"), "'../x' cannot be the name of a take: expected 1 to 100 letters"),
-            (("start", "x;set=stop"), "cannot be the name of a take"),
-        ):
-            done = await take(*arguments, *at.options(side))
+        errors = {
+            ("stop",): "no take of source 'lab' is running",
+            ("save",): "takes.keep_last_s is 0",
+            ("start", "../x"): "'../x' cannot be the name of a take: expected 1 to 100 letters",
+            ("start", "x;set=stop"): "cannot be the name of a take",
+        }
+        results = await asyncio.gather(*(take(*arguments, *at.options(side)) for arguments in errors))
+        for done, text in zip(results, errors.values(), strict=True):
             assert (done.status, done.stdout) == (1, "")
             assert text in done.stderr
     async with lab(tmp_path / "takes", remote_control=False) as at:
@@ -134,8 +135,8 @@ async def test_errors_say_what_to_do(tmp_path: Path, side: str) -> None:
         assert "set remote_control: true" in done.stderr
         assert (await take("list", *at.options(side))).status == 0
     async with lab(tmp_path / "takes", {"enabled": False}) as at:
-        for command in ("start", "list"):
-            done = await take(command, *at.options(side))
+        results = await asyncio.gather(*(take(command, *at.options(side)) for command in ("start", "list")))
+        for done in results:
             assert (done.status, done.stdout.strip("{}\n")) == (1, "")
             assert "set takes.enabled: true" in done.stderr
 
