@@ -66,7 +66,7 @@ class GatewayProcess:
 
     def wait_for_clock(self) -> None:
         """Wait until the gateway knows the clock of the server."""
-        wait_until(lambda: self.statuses and self.statuses[-1].streams[0].clock.has_clock, 30)
+        wait_until(lambda: self.statuses and self.statuses[-1].streams[0].clock.has_clock, 60)
 
     def wait_for_frames(self, count: int) -> None:
         """Wait for ``count`` further frames."""
@@ -87,11 +87,13 @@ def program(*arguments: str, environ: Mapping[str, str] | None = None, **options
 
 
 @contextlib.contextmanager
-def simulator(*options: str) -> Iterator[tuple[int, subprocess.Popen[str]]]:
+def simulator(*options: str, log: Path = Path(os.devnull)) -> Iterator[tuple[int, subprocess.Popen[str]]]:
     """Run ``simulate`` with these options; yield its port and its process."""
-    with program(
-        "simulate", "--port", "0", *options, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
-    ) as process:
+    arguments = ("simulate", "--port", "0", *options)
+    with (
+        log.open("w") as stderr,
+        program(*arguments, stdout=subprocess.PIPE, stderr=stderr, text=True) as process,
+    ):
         line = process.stdout.readline()
         yield int(line.partition(";")[0].rpartition(":")[2]), process
 

@@ -2,10 +2,9 @@
 
 import struct
 import subprocess
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Final
-
-import pytest
 
 from tests.gateway_process import GatewayProcess, gaps, gateway_process, simulator
 from tests.waiting import wait_until
@@ -69,35 +68,45 @@ def capture_offsets_s(gateway: GatewayProcess, component: str) -> list[float]:
     ]
 
 
-@pytest.mark.parametrize("offset_s", [0.5, -0.5, 200 * 86_400.0])
-def test_a_step_changes_time_stamps_and_nothing_else(tmp_path: Path, offset_s: float) -> None:
-    clock = WallClock(tmp_path)
+def test_a_step_changes_time_stamps_and_nothing_else(tmp_path: Path) -> None:
     stream = {"components": ["3d", "6d"], "backlog": "latest", "adapt_rate": True}
     options = ("--rate", str(RATE_HZ), "--analog", "0", "--plates", "0")
-    with (
-        simulator(*options) as (port, _),
-        # Frames that are late on a busy machine must not be skipped; a step is larger than this.
-        gateway_process(tmp_path, port, clock.environ, streams=[stream], max_lag_ms=400) as gateway,
-    ):
-        gateway.wait_for_clock()
-        gateway.wait_for_frames(RATE_HZ // 2)
-        assert "set " not in gateway.log
-        clock.set(offset_s)
-        gateway.wait_for_frames(2 * RATE_HZ)
-        wait_until(lambda: "the clock of this computer was set" in gateway.log)
+    with ExitStack() as stack:
+        port, _ = stack.enter_context(simulator(*options))
+        runs = []  # at the same time, because each takes ten seconds
+        for number, offset_s in enumerate((0.5, -0.5, 200 * 86_400.0)):
+            folder = tmp_path / str(number)
+            folder.mkdir()
+            clock = WallClock(folder)
+            # Frames that are late on a busy machine must not be skipped; a step is larger than this.
+            process = gateway_process(folder, port, clock.environ, streams=[stream], max_lag_ms=400)
+            runs.append((stack.enter_context(process), clock, offset_s))
+        for gateway, _, _ in runs:
+            gateway.wait_for_clock()
+        for gateway, clock, offset_s in runs:
+            gateway.wait_for_frames(RATE_HZ // 2)
+            assert "set " not in gateway.log
+            clock.set(offset_s)
+        num_frames = [len(gateway.headers["3d"]) + 2 * RATE_HZ for gateway, _, _ in runs]
+        for (gateway, _, offset_s), count in zip(runs, num_frames, strict=True):
+            assert_step_changes_time_stamps_only(gateway, offset_s, count)
 
-        [stream_status] = gateway.statuses[-1].streams
-        assert (stream_status.rate, stream_status.restarts, stream_status.drops) == ("AllFrames", 0, [])
-        direction, size = ("forward", offset_s) if offset_s > 0 else ("back", -offset_s)
-        assert gateway.log.count("the clock of this computer was set") == 1
-        assert f"was set {direction} by {size:.1f}"[:-2] in gateway.log
-        for component in ("3d", "6d"):
-            headers = gateway.headers[component]
-            assert gaps([header.sequence for header in headers]) == []
-            assert gaps([header.frame_number for header in headers]) == []
-            assert all(header.capture_utime <= header.utime for header in headers)
-            offsets_s = capture_offsets_s(gateway, component)[RATE_HZ:]
-            followed = [abs(each - offset_s) < 0.1 for each in offsets_s]
-            assert followed == sorted(followed), "the capture time follows once, and for good"
-            assert followed.count(True) >= 2 * RATE_HZ - 10
-            assert all(abs(each) < 0.1 for each, has in zip(offsets_s, followed, strict=True) if not has)
+
+def assert_step_changes_time_stamps_only(gateway: GatewayProcess, offset_s: float, num_frames: int) -> None:
+    wait_until(lambda: len(gateway.headers["3d"]) >= num_frames, 40)
+    wait_until(lambda: "the clock of this computer was set" in gateway.log)
+    [stream_status] = gateway.statuses[-1].streams
+    assert (stream_status.rate, stream_status.restarts, stream_status.drops) == ("AllFrames", 0, [])
+    direction, size = ("forward", offset_s) if offset_s > 0 else ("back", -offset_s)
+    assert gateway.log.count("the clock of this computer was set") == 1
+    assert f"was set {direction} by {size:.1f}"[:-2] in gateway.log
+    for component in ("3d", "6d"):
+        headers = gateway.headers[component]
+        assert gaps([header.sequence for header in headers]) == []
+        assert gaps([header.frame_number for header in headers]) == []
+        assert all(header.capture_utime <= header.utime for header in headers)
+        offsets_s = capture_offsets_s(gateway, component)[RATE_HZ:]
+        followed = [abs(each - offset_s) < 0.1 for each in offsets_s]
+        assert followed == sorted(followed), "the capture time follows once, and for good"
+        assert followed.count(True) >= 2 * RATE_HZ - 10
+        assert all(abs(each) < 0.1 for each, has in zip(offsets_s, followed, strict=True) if not has)

@@ -11,6 +11,7 @@ from typing import Final
 import pytest
 
 from tests.gateway_process import GatewayProcess, gaps, gateway_process, simulator
+from tests.waiting import wait_until
 
 ROUNDS: Final = 5
 
@@ -61,13 +62,21 @@ ALL_200: Final = ("--rate", "200", "--analog-rate", "200")
 DENSE_1000: Final = ("--rate", "1000", "--analog-rate", "1000", "--markers", "50")
 
 
-def assert_nothing_is_lost(gateway: GatewayProcess) -> None:
+def lost_causes(gateway: GatewayProcess) -> set[str]:
+    return {loss.cause for loss in gateway.statuses[-1].streams[0].drops}
+
+
+def assert_nothing_is_lost(gateway: GatewayProcess, simulator_log: Path) -> None:
     assert set(gateway.headers) == {"3d", "6d", "analog", "force", "event"}
     for component in ("3d", "6d", "analog", "force"):
         headers = gateway.headers[component]
-        assert gaps([header.frame_number for header in headers]) == [], component
+        if gaps([header.frame_number for header in headers]):
+            # On a busy computer, the simulator leaves out frames for which it is a second too late itself.
+            wait_until(lambda: lost_causes(gateway) == {"not sent by the server"})
         assert gaps([header.sequence for header in headers]) == [], component
         assert {header.session for header in headers} == {1}, component
+    assert lost_causes(gateway) <= {"not sent by the server"}
+    assert "does not read" not in simulator_log.read_text()
     events = [header.sequence for header in gateway.headers["event"]]
     assert gaps(events) == []
     assert "connecting again" not in gateway.log
@@ -78,19 +87,23 @@ def assert_nothing_is_lost(gateway: GatewayProcess) -> None:
     ("scene", "rate_hz", "stops_s"),
     [
         pytest.param(ALL_200, 200, (0.3, 2.0), id="200 Hz"),
-        pytest.param(DENSE_1000, 1000, (0.3, 5.0), id="1000 Hz"),
+        pytest.param(DENSE_1000, 1000, (0.3, 3.0), id="1000 Hz"),
     ],
 )
 def test_stops_of_the_gateway_lose_nothing(
     tmp_path: Path, scene: tuple[str, ...], rate_hz: int, stops_s: tuple[float, ...]
 ) -> None:
-    with simulator(*scene) as (port, _), gateway_process(tmp_path, port, stall_timeout_s=STALL_S) as gateway:
+    log = tmp_path / "simulator.log"
+    with (
+        simulator(*scene, log=log) as (port, _),
+        gateway_process(tmp_path, port, stall_timeout_s=STALL_S) as gateway,
+    ):
         gateway.wait_for_clock()
         gateway.wait_for_frames(rate_hz // 4)
         for stop_s in stops_s:
             gateway.stop_for(stop_s)
             gateway.wait_for_frames(round(rate_hz * (stop_s + 1)))
-        assert_nothing_is_lost(gateway)
+        assert_nothing_is_lost(gateway, log)
 
 
 def test_a_stop_of_gateway_and_server_together_keeps_the_connection(tmp_path: Path) -> None:
