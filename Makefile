@@ -126,7 +126,7 @@ install:
 	systemd-tmpfiles --create rtc3d-gateway.conf
 	[ -e $(CONFIG)/gateway.yaml ] || install -m 644 config/gateway.yaml $(CONFIG)/gateway.yaml
 	install -m 644 config/gateway.schema.json $(CONFIG)/gateway.schema.json
-	$(PREFIX)/venv/bin/python -m gateway.cli.man_page >$(MAN)/rtc3d-gateway.1
+	$(PREFIX)/venv/bin/python -P -m gateway.cli.man_page >$(MAN)/rtc3d-gateway.1
 	chmod 644 $(MAN)/rtc3d-gateway.1
 	ln -sfn $(PREFIX)/venv/bin/rtc3d-gateway /usr/local/bin/rtc3d-gateway
 	[ ! -d /run/systemd/system ] || systemctl daemon-reload

@@ -34,7 +34,7 @@ async def test_the_program_runs_from_its_virtual_environment(machine: Machine) -
 
 async def test_the_man_page_describes_the_installed_program(machine: Machine) -> None:
     page = machine.path(MAN_PAGE).read_text()
-    assert page == (await machine.run(f"{VENV}/bin/python", "-m", "gateway.cli.man_page")).text
+    assert page == (await machine.run(f"{VENV}/bin/python", "-P", "-m", "gateway.cli.man_page")).text
     assert ".SS config check" in page
     assert machine.path(MAN_PAGE).stat().st_mode & 0o777 == 0o644
 
