@@ -17,7 +17,9 @@ def check(
         Path | None,
         typer.Argument(help=f"The configuration file to check; the default is {DEFAULT_CONFIG}."),
     ] = None,
-    config: Annotated[Path | None, typer.Option("--config", "-c", help="The same as FILE.")] = None,
+    config: Annotated[
+        Path | None, typer.Option("--config", "-c", metavar="FILE", help="The same as FILE.")
+    ] = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print nothing if the file is valid.")] = False,
 ) -> None:
     """Check a configuration file and print every mistake with its line. Starts nothing."""
@@ -27,7 +29,7 @@ def check(
 
     if file is not None and config is not None:
         raise typer.BadParameter("give the file once, as FILE or as --config FILE")
-    path = chosen_file(file or config, None)
+    path = chosen_file(file or config, None, wanted="FILE")
     names = [source.name for source in read(path, settings_type()).settings.sources]
     if not quiet:
         sources = f"{len(names)} source{'' if len(names) == 1 else 's'}: {', '.join(names)}"

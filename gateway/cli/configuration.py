@@ -12,23 +12,22 @@ from gateway.outputs.registry import settings_type
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT
 
 
-def chosen_file(config: Path | None, server: str | None) -> Path | None:
+def chosen_file(
+    config: Path | None, server: str | None, *, wanted: str = "either --config FILE or --server HOST[:PORT]"
+) -> Path | None:
     """Return the configuration file to read: that of ``--config``, or the default if there is neither option.
 
     None means ``--server``, or that environment variables alone are the configuration. Raises BadParameter if
-    both options are given, or if there is nothing to read.
+    both options are given, or if there is nothing to read; ``wanted`` is what should have been given.
     """
     if config is not None and server is not None:
-        raise typer.BadParameter("give either --config FILE or --server HOST[:PORT]")
+        raise typer.BadParameter(f"give {wanted}")
     if config is not None or server is not None:
         return config
     if DEFAULT_CONFIG.exists():
         return DEFAULT_CONFIG
     if not any(name.startswith(VARIABLE_PREFIX) for name in os.environ):
-        raise typer.BadParameter(
-            "give either --config FILE or --server HOST[:PORT]; "
-            f"the default, {DEFAULT_CONFIG}, does not exist"
-        )
+        raise typer.BadParameter(f"give {wanted}; the default, {DEFAULT_CONFIG}, does not exist")
     return None
 
 

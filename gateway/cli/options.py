@@ -28,18 +28,24 @@ ConfigOption = Annotated[
     typer.Option(
         "--config",
         "-c",
+        metavar="FILE",
         help=f"The configuration file (YAML); the default is {DEFAULT_CONFIG}. Environment variables "
         f"{VARIABLE_PREFIX}… override it or replace it.",
     ),
 ]
 ServerOption = Annotated[
     str | None,
-    typer.Option(help="HOST[:PORT] of an RT server, for a quick try without a configuration file."),
+    typer.Option(
+        metavar="HOST[:PORT]",
+        help="HOST[:PORT] of an RT server, for a quick try without a configuration file.",
+    ),
 ]
 
 LogLevelOption = Annotated[
     LogLevel,
-    typer.Option(case_sensitive=False, help="The lowest level to log: debug, info, warning or error."),
+    typer.Option(
+        case_sensitive=False, metavar="LEVEL", help="The lowest level to log: debug, info, warning or error."
+    ),
 ]
 VerboseOption = Annotated[
     bool, typer.Option("--verbose", "-v", help="Log everything; short for --log-level debug.")
@@ -51,7 +57,9 @@ NoProgressOption = Annotated[bool, typer.Option("--quiet", "-q", help="Show no p
 LogFormatOption = Annotated[
     LogFormat,
     typer.Option(
-        case_sensitive=False, help="text, json or journal; auto means journal under systemd, otherwise text."
+        case_sensitive=False,
+        metavar="FORMAT",
+        help="text, json or journal; auto means journal under systemd, otherwise text.",
     ),
 ]
 
