@@ -1,6 +1,6 @@
 """The program ``rtc3d-gateway``, also started by ``python -m gateway``.
 
-This module imports nothing of the gateway before ``main``: the imports take 0.5 s, and Ctrl-C must end the
+This module imports nothing of the gateway before ``main``: the imports take 0.1 s, and Ctrl-C must end the
 program quietly then, too.
 """
 
