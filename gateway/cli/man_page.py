@@ -47,7 +47,7 @@ def man_page() -> str:
     for name, command in _commands(group, ""):
         arguments = [f"\\fI{_value(each)}\\fR" for each in command.params if not _is_option(each)]
         lines.append(" ".join([".SS", _text(name), "[\\fIOPTIONS\\fR]", *arguments]))
-        for number, paragraph in enumerate(command.help.split("\n\n")):
+        for number, paragraph in enumerate((command.help or "").split("\n\n")):
             lines += [".PP"] * (number > 0) + [_text(" ".join(paragraph.split()))]
         lines += _parameters(command.params)
     lines.append(".SH EXIT STATUS")
@@ -88,17 +88,19 @@ def _value(parameter: Any) -> str:
 def _parameters(parameters: list[Any]) -> list[str]:
     lines = []
     for parameter in parameters:
+        if getattr(parameter, "hidden", False):
+            continue
         title = f"\\fI{_value(parameter)}\\fR"
         if _is_option(parameter):
             names = ", ".join(f"\\fB{_text(name)}\\fR" for name in sorted(parameter.opts, key=len))
             title = names if parameter.is_flag else f"{names} {title}"
         default = parameter.default
         if default is None or isinstance(default, bool):
-            lines += _entry(title, parameter.help)
+            lines += _entry(title, parameter.help or "")
         else:
             shown = default.value if isinstance(default, Enum) else default
             shown = f"{shown:g}" if isinstance(shown, float) else shown
-            lines += _entry(title, f"{parameter.help} The default is {shown}.")
+            lines += _entry(title, f"{parameter.help or ''} The default is {shown}.")
     return lines
 
 

@@ -3,7 +3,6 @@
 docs/design.md explains why Python's shutdown is avoided.
 """
 
-import asyncio
 import atexit
 import logging
 import os
@@ -15,7 +14,10 @@ import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from types import FrameType
-from typing import Final, NoReturn
+from typing import TYPE_CHECKING, Final, NoReturn
+
+if TYPE_CHECKING:
+    import asyncio
 
 STOP_S: Final = 1.5
 """How long an orderly stop may take. Systemd and users expect the end within 2 s."""
@@ -106,7 +108,9 @@ class Signals:
         )
 
 
-def named_tasks(loop: asyncio.AbstractEventLoop) -> list[str]:
+def named_tasks(loop: "asyncio.AbstractEventLoop") -> list[str]:
     """Return the names of the tasks that have one and are not done. It may be called in any thread."""
+    import asyncio  # noqa: PLC0415 - every command ends with this module, and few need asyncio
+
     names = {task.get_name() for task in asyncio.all_tasks(loop)}
     return sorted(name for name in names if not name.startswith("Task-"))
