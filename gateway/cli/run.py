@@ -1,6 +1,7 @@
 """``rtc3d-gateway run``: run the gateway."""
 
 import gc
+import logging
 import signal
 import sys
 from typing import Final
@@ -15,6 +16,8 @@ from gateway.cli.options import (
     chosen_log_level,
 )
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
+
+logger = logging.getLogger(__name__)
 
 SWITCH_INTERVAL_S: Final = 0.0005
 """How long a thread that runs Python keeps the event loop waiting for its lock. Every message to an output
@@ -48,5 +51,7 @@ def run(
     # them and stops the event loop for some 20 ms; many tiny packets cause one every second.
     gc.freeze()
     file = chosen_file(config, server)
+    if file is not None and config is None:
+        logger.info("the configuration is %s, because none was given", file)
     uvloop.run(serve(lambda: configuration_from_options(file, server).settings, limit.report))
     limit.report(at_once=True)

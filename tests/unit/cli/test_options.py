@@ -1,5 +1,7 @@
+import gc
 import logging
 import signal
+import sys
 from pathlib import Path
 
 import pytest
@@ -22,6 +24,14 @@ def default_config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = tmp_path / "default.yaml"
     monkeypatch.setattr(configuration, "DEFAULT_CONFIG", path)
     return path
+
+
+@pytest.fixture(autouse=True)
+def _process_unchanged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Keep run and simulate from changing the process of the tests."""
+    monkeypatch.setattr(signal, "signal", lambda *_: None)
+    monkeypatch.setattr(gc, "freeze", lambda: None)
+    monkeypatch.setattr(sys, "setswitchinterval", lambda _seconds: None)
 
 
 SOURCES = "RTC3D_GATEWAY__SOURCES"
@@ -111,11 +121,15 @@ def test_doctor_reads_the_default_file(default_config: Path) -> None:
     assert str(default_config) in result.output
 
 
-def test_run_reads_the_default_file(default_config: Path) -> None:
+def test_run_reads_the_default_file_and_says_so(
+    default_config: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
     default_config.write_text("sources: [{name: lab, host: a..b}]\n")
     result = CliRunner().invoke(app, ["run"])
     assert isinstance(result.exception, ConfigError)
     assert str(default_config) in str(result.exception)
+    assert caplog.messages == [f"the configuration is {default_config}, because none was given"]
 
 
 def test_check_takes_the_file_as_argument_or_option_and_can_be_quiet(tmp_path: Path) -> None:
@@ -145,7 +159,6 @@ def test_v_and_q_are_log_levels(
 ) -> None:
     levels: list[str] = []
     monkeypatch.setattr(logging, "basicConfig", lambda **settings: levels.append(settings["level"]))
-    monkeypatch.setattr(signal, "signal", lambda *_: None)
     CliRunner().invoke(app, [*command, "/nowhere", *arguments])
     assert levels == [level]
 
