@@ -1,6 +1,5 @@
 """``rtc3d-gateway demo``: simulator, gateway and subscribers in one process."""
 
-import asyncio
 import signal
 from functools import partial
 from typing import TYPE_CHECKING, Annotated
@@ -80,6 +79,8 @@ def demo(
 
 async def _run(scene: "Scene", seconds: float | None, udpm: bool, view: "Viewer | None") -> bool:
     """Run the demo; without a time, Ctrl-C ends it."""
+    import asyncio
+
     from rich.console import Console
 
     from gateway.demo import run_demo
