@@ -15,6 +15,7 @@ from gateway.cli.completion import one_of, source_names
 from gateway.config.environment import VARIABLE_PREFIX
 from gateway.config.files import DEFAULT_CONFIG
 from gateway.config.words import describe, join_or
+from gateway.messages.topics import MAX_LABEL_LENGTH
 from gateway.rtc3d.component_types import COMPONENTS_BY_KEY
 from gateway.service.log_format import LogFormat, LogLevel
 
@@ -22,6 +23,7 @@ _RECORDED: Final = (*COMPONENTS_BY_KEY, "status", "clock", "parameters")
 """What recordings have."""
 
 _COMPONENTS: Final = (*_RECORDED, "c3d")
+_POSE: Final = "6d/"
 
 ConfigOption = Annotated[
     Path | None,
@@ -135,6 +137,13 @@ def _one_of(components: Sequence[str]) -> Callable[[str | None], str | None]:
     return check
 
 
+def _checked_component(text: str | None) -> str | None:
+    label = (text or "").removeprefix(_POSE)
+    if label != text and text is not None and 0 < len(label) <= MAX_LABEL_LENGTH and label.isprintable():
+        return text
+    return _one_of(_COMPONENTS)(text)
+
+
 def _checked_each(
     check: Callable[[str | None], str | None],
 ) -> Callable[[list[str] | None], list[str] | None]:
@@ -165,9 +174,9 @@ SourceOption = Annotated[
 ComponentOption = Annotated[
     str | None,
     typer.Option(
-        callback=_one_of(_COMPONENTS),
+        callback=_checked_component,
         autocompletion=one_of(_COMPONENTS),
-        help=f"Only this: {join_or(_COMPONENTS)}.",
+        help=f"Only this: {join_or(_COMPONENTS)}; 6d/LABEL for the pose of one tool, 6d/* for each tool's.",
     ),
 ]
 SourcesOption = Annotated[

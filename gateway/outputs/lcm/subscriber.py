@@ -24,12 +24,19 @@ logger = logging.getLogger(__name__)
 
 
 def channel_pattern(prefix: str, source: str | None, component: str | None) -> str:
-    """Return the regular expression of the channels. None means all sources, or all components."""
-    if source is not None and component is not None:
-        return re.escape(lcm_channel(prefix, source, component))
+    """Return the regular expression of the channels. None means all sources, or all components.
+
+    The pose of one tool is 6d/LABEL, those of all tools are 6d/*.
+    """
+    takes_all = component is None or component.endswith("/*")
+    path = [] if component is None else component.removesuffix("/*").split("/", 1)
     if source is not None:
-        return re.escape(lcm_channel(prefix, source)) + "_.+"
-    return re.escape(prefix) + "_.+" + ("" if component is None else "_" + re.escape(component.upper()))
+        channels = re.escape(lcm_channel(prefix, source, *path))
+    elif path:
+        channels = f"{re.escape(prefix)}_.+{re.escape(lcm_channel('', *path))}"
+    else:
+        return f"{re.escape(prefix)}_.+"
+    return f"{channels}_.+" if takes_all else channels
 
 
 class LcmSubscriber:

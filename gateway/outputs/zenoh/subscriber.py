@@ -7,7 +7,7 @@ from pathlib import Path
 import zenoh
 
 from gateway.errors import OutputError
-from gateway.messages.topics import zenoh_key
+from gateway.messages.topics import escape_key_chunk, zenoh_key
 from gateway.outputs.absent import missing_source
 from gateway.outputs.kind import Receive, SubscriptionRequest
 from gateway.outputs.zenoh.command_session import command_config
@@ -16,8 +16,13 @@ from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
 
 
 def key_pattern(prefix: str, source: str | None, component: str | None) -> str:
-    """Return the key expression of the messages. None means all sources, or all components."""
-    return zenoh_key(prefix, source or "*") + "/" + (component or "**")
+    """Return the key expression of the messages. None means all sources, or all components.
+
+    The pose of one tool is 6d/LABEL, those of all tools are 6d/*.
+    """
+    group, _, label = (component or "**").partition("/")
+    path = (escape_key_chunk(label) if label != "*" else label,) if label else ()
+    return "/".join((zenoh_key(prefix, source or "*"), group, *path))
 
 
 def open_zenoh(connect: str | None, config_file: Path | None = None) -> zenoh.Session:

@@ -2,22 +2,41 @@
 
 import io
 import json
-import queue
 
 import pytest
 import rtc3d
 
-from gateway.cli.echo import Messages, print_messages
+from gateway.cli.echo_messages import MAX_WAITING, Limits, print_messages
+from gateway.cli.silence import Silence
+from gateway.outputs.kind import Receive, SubscriptionRequest
 from tests.spec_parameters import in_root, spec_xml
 
 MARKERS_BYTES = len(spec_xml("3d"))
 
 
+REQUEST = SubscriptionRequest()
+
+
+class Published:
+    """A subscription that has received these messages at once."""
+
+    def __init__(self, *messages: tuple[str, bytes]) -> None:
+        self._messages = messages
+
+    def __call__(self, _request: SubscriptionRequest, receive: Receive) -> "Published":
+        for name, message in self._messages:
+            receive(name, message)
+        return self
+
+    def close(self) -> None:
+        """Do nothing."""
+
+
 def printed(name: str, message: bytes, *, as_json: bool = False) -> str:
-    messages: Messages = queue.Queue()
-    messages.put((name, message))
     out = io.StringIO()
-    assert print_messages(messages, out, count=1, as_json=as_json, timeout_s=10) == 1
+    silence = Silence("example", REQUEST)
+    published = Published((name, message))
+    assert print_messages(published, REQUEST, Limits(1, 10), silence, out, as_json=as_json) == 1
     return out.getvalue().removesuffix("\n")
 
 
@@ -113,3 +132,19 @@ def test_json_has_the_fields_of_a_json_message() -> None:
 def test_json_has_the_fields_of_a_request() -> None:
     value = json.loads(printed("MOCAP_LAB_PARAMETERS_REQUEST", request(), as_json=True))
     assert (value["request_id"], value["requester"], value["sections"]) == (7, "viewer", ["3d", "6d"])
+
+
+def test_messages_that_come_faster_than_they_are_printed_are_counted(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    messages = [("mocap/lab/c3d", b'{"n": 1}')] * (MAX_WAITING + 5)
+    out = io.StringIO()
+    silence = Silence("example", REQUEST)
+    assert print_messages(Published(*messages), REQUEST, Limits(7, 10), silence, out, as_json=False) == 7
+    assert out.getvalue().count("\n") == 7
+    assert capsys.readouterr().err.startswith("5 messages were not printed, because they came faster than")
+
+
+def test_nothing_is_said_if_everything_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    printed("mocap/lab/c3d", b'{"n": 1}')
+    assert capsys.readouterr().err == ""

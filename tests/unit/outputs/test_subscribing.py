@@ -184,6 +184,10 @@ def test_an_endpoint_without_zenoh_is_named_with_what_to_check(received: list[tu
         ("lab", None, "mocap/lab/**", "MOCAP_LAB_.+"),
         (None, "3d", "mocap/*/3d", "MOCAP_.+_3D"),
         ("lab", "3d", "mocap/lab/3d", "MOCAP_LAB_3D"),
+        ("lab", "6d/Left hand", "mocap/lab/6d/Left%20hand", "MOCAP_LAB_6D_LEFT_HAND"),
+        (None, "6d/a/b*", "mocap/*/6d/a%2Fb%2A", "MOCAP_.+_6D_A_B"),
+        ("lab", "6d/*", "mocap/lab/6d/*", "MOCAP_LAB_6D_.+"),
+        (None, "6d/*", "mocap/*/6d/*", "MOCAP_.+_6D_.+"),
     ],
 )
 def test_no_source_and_no_component_select_all_of_them(
@@ -197,7 +201,7 @@ def test_characters_of_regular_expressions_in_a_prefix_are_taken_as_they_are() -
     assert channel_pattern("A.B", None, None) == r"A\.B_.+"
     assert channel_pattern("A.B", "lab", None) == r"A\.B_LAB_.+"
     assert channel_pattern("A.B", "lab", "3d") == r"A\.B_LAB_3D"
-    assert channel_pattern("A", None, "x.y") == r"A_.+_X\.Y"
+    assert channel_pattern("A.B", None, "6d/x.y") == r"A\.B_.+_6D_X_Y"
 
 
 @pytest.mark.parametrize(

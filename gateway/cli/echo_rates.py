@@ -1,0 +1,205 @@
+"""The table of rates that ``echo --hz`` prints: per key or channel, from the times of arrival."""
+
+import contextlib
+import json
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from contextlib import closing
+from functools import partial
+from typing import Any, Final, NamedTuple, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from gateway.cli.echo_messages import POLL_S, Limits, Subscribe
+from gateway.cli.silence import Silence
+from gateway.messages.host_time import now_utime
+from gateway.outputs.kind import SubscriptionRequest
+from gateway.safe_text import safe_json, safe_text
+
+WINDOW_S: Final = 10.0
+MIN_WINDOW: Final = 10
+"""The window: the messages of so many seconds, and at least so many messages."""
+
+MAX_KEYS: Final = 1000
+"""Names come from the network."""
+
+_EACH_S: Final = 1.0
+_STOPPED_S: Final = 2.0
+"""A key has stopped if nothing came for so long, and for three of its usual intervals."""
+
+_HEADINGS: Final = ("key", "rate", "min", "max", "std dev", "window")
+
+
+class Rate(NamedTuple):
+    """The rate of one key or channel.
+
+    The shortest and the longest interval between two messages, and the standard deviation of the intervals,
+    are those of the newest ``window`` messages; None if there is one only. ``age_s`` is the time since the
+    newest one; ``has_stopped`` says that no more seem to come.
+    """
+
+    key: str
+    rate_hz: float
+    min_s: float | None
+    max_s: float | None
+    std_dev_s: float | None
+    window: int
+    age_s: float
+    has_stopped: bool
+
+
+class Rates:
+    """Counts messages in the thread that receives them, until ``max_messages`` have come (None: no limit)."""
+
+    def __init__(
+        self, max_messages: int | None = None, monotonic: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._max_messages = max_messages
+        self._monotonic = monotonic
+        self._lock = threading.Lock()
+        self._arrivals: dict[str, deque[float]] = {}
+        self.is_complete = threading.Event()
+        """Set when ``max_messages`` have come."""
+        self.num_messages = 0
+        self.num_beyond = 0
+        """How many messages are in no row, because there are too many keys."""
+
+    def receive(self, key: str, _message: bytes) -> None:
+        """Note the arrival of a message."""
+        now_s = self._monotonic()
+        with self._lock:
+            if self.is_complete.is_set():
+                return
+            self.num_messages += 1
+            if self.num_messages == self._max_messages:
+                self.is_complete.set()
+            arrivals = self._arrivals.get(key)
+            if arrivals is None:
+                if len(self._arrivals) >= MAX_KEYS:
+                    self.num_beyond += 1
+                    return
+                arrivals = self._arrivals[key] = deque()
+            arrivals.append(now_s)
+            while len(arrivals) > MIN_WINDOW and arrivals[0] < now_s - WINDOW_S:
+                arrivals.popleft()
+
+    def rows(self) -> list[Rate]:
+        """Return the rates, sorted by key."""
+        with self._lock:
+            copies = {key: np.array(arrivals) for key, arrivals in self._arrivals.items()}
+        now_s = self._monotonic()
+        return [_rate(key, arrivals_s, now_s) for key, arrivals_s in sorted(copies.items())]
+
+
+def _rate(key: str, arrivals_s: NDArray[np.float64], now_s: float) -> Rate:
+    age_s = max(0.0, now_s - float(arrivals_s[-1]))
+    if len(arrivals_s) == 1:
+        return Rate(key, 0.0, None, None, None, 1, age_s, age_s > _STOPPED_S)
+    intervals_s = np.diff(arrivals_s)
+    mean_s = float(intervals_s.mean())
+    has_stopped = age_s > max(_STOPPED_S, 3 * mean_s)
+    # After a few messages at once, such as the first ones, the time since then counts, too.
+    span_s = float(now_s - arrivals_s[0]) if age_s > 2 * mean_s else mean_s * len(intervals_s)
+    rate_hz = 0.0 if has_stopped or span_s <= 0 else len(intervals_s) / span_s
+    spread = (float(intervals_s.min()), float(intervals_s.max()), float(intervals_s.std()))
+    return Rate(key, rate_hz, *spread, len(arrivals_s), age_s, has_stopped)
+
+
+def print_rates(
+    subscribe: Subscribe,
+    request: SubscriptionRequest,
+    limits: Limits,
+    silence: Silence,
+    out: TextIO,
+    *,
+    as_json: bool,
+) -> int:
+    """Print the rates every second until ``limits`` are reached; return how many messages came.
+
+    On a terminal, the table is refreshed in place. Raises OutputError and QueryError as ``print_messages``.
+    """
+    rates = Rates(limits.count)
+    console = Console(file=out)
+    with closing(subscribe(request, rates.receive)), contextlib.ExitStack() as stack:
+        if as_json or not console.is_terminal:
+            show: Callable[[list[Rate]], object] = partial(_print_block, out, as_json=as_json)
+        else:
+            live = stack.enter_context(Live(console=console, auto_refresh=False))
+            show = partial(_refresh, live)
+        stack.callback(_report_beyond, rates)
+        try:
+            _run(rates, limits, silence, show)
+        finally:
+            if rates.num_messages:
+                show(rates.rows())
+    return rates.num_messages
+
+
+def _run(rates: Rates, limits: Limits, silence: Silence, show: Callable[[list[Rate]], object]) -> None:
+    """Show the rates every second, but for the last time, until ``limits`` are reached."""
+    shown_s = time.monotonic()
+    while not rates.is_complete.wait(limits.wait_s(_EACH_S if rates.num_messages else POLL_S)):
+        if limits.is_over:
+            return
+        if not rates.num_messages:
+            silence.check()
+        elif time.monotonic() - shown_s >= _EACH_S:
+            shown_s = time.monotonic()
+            show(rates.rows())
+
+
+def _refresh(live: Live, rows: Sequence[Rate]) -> None:
+    table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    table.add_column(_HEADINGS[0], overflow="fold")
+    for heading in _HEADINGS[1:]:
+        table.add_column(heading, justify="right", no_wrap=True)
+    for row in rows:
+        key, *cells = _cells(row)
+        table.add_row(Text(key), *cells, style="yellow" if row.has_stopped else "")
+    live.update(table, refresh=True)
+
+
+def _print_block(out: TextIO, rows: Sequence[Rate], *, as_json: bool) -> None:
+    utime = now_utime()
+    if as_json:
+        for row in rows:
+            print(safe_json(json.dumps({"utime": utime} | _rounded(row), ensure_ascii=False)), file=out)
+    else:
+        width = max(len(_HEADINGS[0]), *(len(_cells(row)[0]) for row in rows))
+        for key, *cells in (_HEADINGS, *map(_cells, rows)):
+            print(f"{key:{width}}", *(f"{cell:>12}" for cell in cells), file=out)
+        print(file=out)
+    out.flush()
+
+
+def _cells(row: Rate) -> tuple[str, ...]:
+    rate = f"none for {row.age_s:.0f} s" if row.has_stopped else f"{row.rate_hz:.1f} Hz"
+    if row.window == 1 and not row.has_stopped:
+        rate = "-"
+    times = (_milliseconds(time_s) for time_s in (row.min_s, row.max_s, row.std_dev_s))
+    return safe_text(row.key), rate, *times, str(row.window)
+
+
+def _rounded(row: Rate) -> dict[str, Any]:
+    fields = row._asdict()
+    return {name: round(value, 6) if isinstance(value, float) else value for name, value in fields.items()}
+
+
+def _milliseconds(time_s: float | None) -> str:
+    return "-" if time_s is None else f"{1e3 * time_s:.1f} ms"
+
+
+def _report_beyond(rates: Rates) -> None:
+    if rates.num_beyond:
+        print(
+            f"{rates.num_beyond} messages are in no row, because there are more than {MAX_KEYS} keys",
+            file=sys.stderr,
+        )
