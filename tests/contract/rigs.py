@@ -168,7 +168,9 @@ class TakesRig:
         self.names = LCM_CHANNELS
         self._parent = tempfile.TemporaryDirectory()
         self._folder = Path(self._parent.name) / "takes"
-        self._folder.mkdir()
+        self._disk = Path(self._parent.name) / "disk"
+        self._disk.mkdir()
+        self.restore()
         settings = TakesSettings(enabled=True, directory=str(self._folder))
         self.output = TakesOutput(settings, max_queued_bytes=100_000)
         for topic in self.names:
@@ -186,12 +188,14 @@ class TakesRig:
             asyncio.run(self.output.takes.start(source, "take"))
 
     def cut(self) -> None:
-        self._folder.rename(self._folder.with_name("gone"))
-        self._folder.write_text("no folder")
+        file = self._folder.with_name("file")
+        file.write_text("no folder")
+        file.replace(self._folder)
 
     def restore(self) -> None:
-        self._folder.unlink()
-        self._folder.with_name("gone").rename(self._folder)
+        link = self._folder.with_name("link")
+        link.symlink_to(self._disk)
+        link.replace(self._folder)  # in one step, because the output creates a folder that is missing
 
     def close(self) -> None:
         self._parent.cleanup()
