@@ -5,7 +5,7 @@ from typing import Final
 
 import zenoh
 
-from gateway.cli.found_sources import MAX_SOURCES, FoundSources
+from gateway.cli.found_sources import FoundSources
 from gateway.cli.gateway_queries import DISCOVERY_S, RETRY_S
 from gateway.messages.topics import zenoh_key
 from gateway.outputs.zenoh.subscriber import served_sources
@@ -21,16 +21,15 @@ def find_on_zenoh(session: zenoh.Session, prefix: str, source: str | None = None
     found = FoundSources()
     for name in served:
         found.hear(name)
-    found.num_left_out = max(0, len(wanted) - MAX_SOURCES)
-    wanted = wanted[:MAX_SOURCES]
     received: set[tuple[str, str]] = set()
     end_s = time.monotonic() + _ANSWER_S
     while wanted:
         _query(session, zenoh_key(prefix, source or "*", "status"), prefix, found, received)
-        if not set(wanted).difference(name for name, _ in received) or time.monotonic() >= end_s:
+        silent = set(wanted).difference(name for name, _ in received)
+        if not silent or time.monotonic() >= end_s:
+            found.add_silent(sorted(silent))
             break
         time.sleep(RETRY_S)
-    found.add_silent(wanted)
     return found
 
 
@@ -38,12 +37,13 @@ def _served(session: zenoh.Session, prefix: str) -> list[str]:
     """Return the sources that are served; gateways are found one after the other."""
     end_s = time.monotonic() + DISCOVERY_S
     served: list[str] = []
-    while (found := served_sources(session, prefix)) != served or not served:
-        if time.monotonic() >= end_s:
+    while True:
+        left_s = end_s - time.monotonic()
+        found = sorted({*served, *served_sources(session, prefix, max(1.0, left_s))})
+        if found == served != [] or left_s <= 0:
             return found
         served = found
         time.sleep(RETRY_S)
-    return served
 
 
 def _query(

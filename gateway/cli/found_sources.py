@@ -71,11 +71,6 @@ class FoundSources:
         """The sources by name, server and computer."""
         return sorted(self._sources.values())
 
-    @property
-    def names(self) -> list[str]:
-        """The names of the sources, each once."""
-        return sorted({source.name for source in self._sources.values()})
-
     def add_status(self, message: bytes, name: str = "", gateway: str = "") -> None:
         """Add the source of a ``status_t``: see ``read_status``."""
         if self.takes(message):
@@ -93,11 +88,9 @@ class FoundSources:
             self.heard.add(safe_text(name))
 
     def add_silent(self, names: Iterable[str]) -> None:
-        """Add those of the sources ``names`` of which no status was found."""
-        known = set(self.names)
+        """Add sources whose gateways do not answer."""
         for name in names:
-            if name not in known:
-                self.add(FoundSource(safe_text(name), problem=NO_ANSWER))
+            self.add(FoundSource(safe_text(name), problem=NO_ANSWER))
 
     def add(self, source: FoundSource) -> None:
         """Add a source, or replace what an earlier status said about it."""

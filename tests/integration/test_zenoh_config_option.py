@@ -52,13 +52,22 @@ def test_connect_replaces_the_address_in_the_file(router: SecureRouter, tmp_path
     file.write_text(router.client("viewer", (f"tls/127.0.0.1:{router.port}", "tls/127.0.0.1:9")))
     arguments = ("params", "3d", "--zenoh-config", str(file), "--timeout", "2")
     assert run_command(*arguments).returncode == 3
-    assert run_command(*arguments, "--connect", f"tls/127.0.0.1:{router.port}").returncode == 0
+    connect = ("--connect", f"tls/127.0.0.1:{router.port}")
+    assert run_command(*arguments, *connect).returncode == 0
+    assert run_command("list", "--zenoh-config", str(file), *connect).stdout.startswith("lab\t")
+    echo = ("echo", "--zenoh-config", str(file), "--component", "3d", "--count", "1", "--seconds", "20")
+    assert run_command(*echo, *connect).returncode == 0
+    unknown = run_command(*echo, *connect, "--source", "hall")
+    assert (unknown.returncode, unknown.stderr) == (
+        3,
+        "no gateway serves source 'hall'; sources found: lab\n",
+    )
 
 
 def test_a_file_that_zenoh_rejects_is_named(tmp_path: Path) -> None:
     file = tmp_path / "viewer.json5"
     file.write_text("{ mode: 7 }")
-    for command in ("echo", "params"):
+    for command in ("echo", "params", "list"):
         result = run_command(command, "--zenoh-config", str(file))
         assert result.returncode == 2
         assert f"Zenoh does not accept the file {file}" in result.stderr
@@ -70,7 +79,7 @@ def test_a_file_that_zenoh_rejects_is_named(tmp_path: Path) -> None:
     assert (link["result"], link["remedy"]) == ("red", "Correct this file.")
 
 
-@pytest.mark.parametrize("command", ["echo", "params"])
+@pytest.mark.parametrize("command", ["echo", "params", "list"])
 def test_a_zenoh_file_is_not_for_lcm(command: str, tmp_path: Path) -> None:
     result = run_command(command, "--lcm", "--zenoh-config", str(tmp_path))
     assert result.returncode == 2

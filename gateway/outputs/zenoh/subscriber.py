@@ -73,9 +73,9 @@ def subscribe(request: SubscriptionRequest, receive: Receive) -> ZenohSubscriber
     return ZenohSubscriber(open_zenoh(request.address, request.config), keys, receive, owns_session=True)
 
 
-def served_sources(session: zenoh.Session, prefix: str) -> list[str]:
-    """Return the sources that gateways serve, by their liveliness tokens. It takes 1 s at most."""
-    tokens = session.liveliness().get(zenoh_key(prefix, "*", "alive"), timeout=1.0)
+def served_sources(session: zenoh.Session, prefix: str, timeout_s: float = 1.0) -> list[str]:
+    """Return the sources that gateways serve, by their liveliness tokens. It takes ``timeout_s`` at most."""
+    tokens = session.liveliness().get(zenoh_key(prefix, "*", "alive"), timeout=timeout_s)
     keys = [str(reply.ok.key_expr) for reply in tokens if reply.ok is not None]
     return sorted({key.removeprefix(f"{prefix}/").partition("/")[0] for key in keys})
 

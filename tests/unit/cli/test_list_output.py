@@ -80,7 +80,7 @@ def test_without_a_terminal_there_is_one_line_for_each_source() -> None:
 
 def test_json_has_the_fields_of_the_reference() -> None:
     found = found_of(status())
-    found.add_silent(["lab", "hall"])
+    found.add_silent(["hall"])
     assert json.loads(sources_json(found)) == {
         "sources": [
             {
