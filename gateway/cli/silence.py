@@ -78,6 +78,8 @@ class Silence:
             self._error = error
         except OutputError as error:
             self._reason = str(error)
+        except Exception as error:  # noqa: BLE001 - what comes later is printed, whatever this is
+            self._reason = f"nothing heard, and the search for gateways failed: {error}"
 
     def _why_silent(self, found: FoundSources) -> str:
         """Return what the sources do; raise QueryError if they do not have the component."""
