@@ -15,7 +15,12 @@ import pytest
 
 from tests.documents import ROOT, Block, blocks
 
-LONG_RUNNING: Final = ("rtc3d-gateway simulate", "rtc3d-gateway run")
+LONG_RUNNING: Final = (
+    "rtc3d-gateway simulate",
+    "rtc3d-gateway run",
+    "rtc3d-gateway replay examples/walk.lcmlog --loop",
+    "python router.py",
+)
 """Commands that run until Ctrl-C."""
 
 TIMEOUT_S: Final = 60
@@ -112,7 +117,7 @@ def folder(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def terminals(folder: Path) -> Iterator[dict[str, Terminal]]:
-    terminals = {name: Terminal(folder) for name in ("terminal 1", "terminal 2", "terminal 3")}
+    terminals = {name: Terminal(folder) for name in ("terminal 1", "terminal 2", "terminal 3", "terminal 4")}
     yield terminals
     for terminal in terminals.values():
         if terminal.is_busy:
@@ -149,7 +154,8 @@ def follow(document: str, folder: Path, terminals: dict[str, Terminal]) -> int:
             if command.startswith(LONG_RUNNING):
                 terminal.wait_for(output)
             else:
-                assert terminal.end() == 0, f"{block.place}:\n{terminal.text}"
+                status = 1 if any(line.startswith("  FAIL ") for line in output) else 0
+                assert terminal.end() == status, f"{block.place}:\n{terminal.text}"
                 assert terminal.shows(output), f"{block.place} printed:\n{terminal.text}"
     for terminal in reversed(terminals.values()):
         if terminal.is_busy:

@@ -54,6 +54,9 @@ class ReplayRun:
         for number in _STOP_SIGNALS:
             asyncio.get_running_loop().add_signal_handler(number, stop.set)
         async with open_publication(destinations, are_required=are_required, warn=self._note) as publication:
+            opened = [each for each in destinations if each.output.health().connected]
+            places = [f"on {each.kind.name} under {each.request.prefix}" for each in opened]
+            self._note(f"publishing {' and '.join(places)}")
             if not stop.is_set():
                 await self._play(publication, stop)
         if not publication.num_messages:
