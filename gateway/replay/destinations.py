@@ -57,8 +57,7 @@ def zenoh_destination(prefix: str, address: ZenohAddress) -> Destination:
             "scouting": {"multicast": {"enabled": False}},
         }
     elif address.listen is not None:
-        # Only subscribers that name this address; multicast would leave the computer.
-        keys = {"listen": {"endpoints": [address.listen]}, "scouting": {"multicast": {"enabled": False}}}
+        keys = {"listen": {"endpoints": [address.listen]}}
     settings = ZenohSettings(prefix=prefix, config=keys)
     config = None if address.config is None else command_config(address.config)
     if config is not None and address.connect is not None:
