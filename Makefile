@@ -164,10 +164,11 @@ define timed
 @set -e; echo '$(1) (about $(2)) …'; start=$$(date +%s); $(3); echo "Done in $$(($$(date +%s) - start)) s."
 endef
 
-# What running needs, in the versions of requirements.txt; .venv/installed adds the development tools.
-.venv/runtime: pyproject.toml requirements.txt
-	$(call timed,Installing the gateway into .venv,30 s,$(PYTHON) -m venv .venv; \
-	    $(BIN)/pip install --quiet --require-hashes --requirement requirements.txt; \
+# What running needs, with the live view, in the versions of requirements-view.txt; .venv/installed adds the
+# development tools.
+.venv/runtime: pyproject.toml requirements-view.txt
+	$(call timed,Installing the gateway into .venv,40 s,$(PYTHON) -m venv .venv; \
+	    $(BIN)/pip install --quiet --require-hashes --requirement requirements-view.txt; \
 	    $(BIN)/pip install --quiet --no-deps --editable .)
 	@touch $@
 
@@ -176,12 +177,17 @@ endef
 	    $(BIN)/pip install --quiet --editable . --group dev)
 	@touch $@
 
-# Renew requirements.txt: the versions of all dependencies and extras for every supported Python and platform.
+# Renew the versions of all dependencies for every supported Python and platform: requirements-view.txt has those of all
+# extras, and requirements.txt the same without the live view, which a service does not need.
+UV_COMPILE := build/lock-venv/bin/uv pip compile --quiet --universal --python-version 3.11 --upgrade --generate-hashes \
+    --no-annotate --no-header --no-emit-index-url
+
 lock:
 	$(PYTHON) -m venv build/lock-venv
 	build/lock-venv/bin/pip install --quiet uv
-	build/lock-venv/bin/uv pip compile --quiet --universal --python-version 3.11 --all-extras --upgrade --generate-hashes \
-	    --no-annotate --no-header --no-emit-index-url --output-file requirements.txt pyproject.toml
+	$(UV_COMPILE) --all-extras --output-file requirements-view.txt pyproject.toml
+	$(UV_COMPILE) --extra c3d --extra foxglove --extra systemd --constraint requirements-view.txt \
+	    --output-file requirements.txt pyproject.toml
 
 # Coverage-guided fuzzing, FUZZ_SECONDS for each target; not part of the check.
 FUZZ_SECONDS ?= 60

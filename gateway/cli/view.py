@@ -21,15 +21,21 @@ from gateway.cli.options import (
     ZenohConfigOption,
     checked_host,
 )
+from gateway.safe_text import safe_text
 
 if TYPE_CHECKING:
-    from gateway.subscriber.sides import Transport
+    from gateway.live.live_data import LiveData
+    from gateway.subscriber.sides import SubscriberSide, Transport
     from gateway.view.server import ViewServer
     from gateway.view.viewer import Viewer
 
 _CLOSE_S: Final = 0.5
 """How long to wait for Zenoh or LCM to close: a peer that does not read delays it."""
 
+VISER: Final = "viser>=1.1,<2"
+"""What the extra ``view`` installs; a test compares it with pyproject.toml."""
+
+_SILENCE_S: Final = 2.0
 _INSTALL: Final = "pip install 'rtc3d-gateway[view]'"
 
 
@@ -91,6 +97,9 @@ def _live_data(
 
     live = LiveData()
     side = subscribe_all(transport, sources, None, live)
+    silence = threading.Timer(_SILENCE_S, _explain_silence, (live, side))
+    silence.daemon = True
+    silence.start()
     try:
         yield Viewer(server, live), side.tick
     finally:
@@ -127,7 +136,10 @@ def _open_server(host: str, port: int) -> "ViewServer":
             raise
         from gateway.errors import ViewError
 
-        raise ViewError(f"the view needs viser, which is not installed; install it: {_INSTALL}") from error
+        raise ViewError(
+            f"the view needs viser, which is not installed; install it: {_INSTALL}, "
+            f"or only viser for this program: {sys.executable} -m pip install '{VISER}'"
+        ) from error
     return open_server(host, port)
 
 
@@ -139,8 +151,19 @@ def _announce(host: str, port: int, *, opens_browser: bool) -> None:
     print(f"{address} shows the data; press Ctrl-C to stop", flush=True)
     if not is_loopback(host):
         print(f"note: everybody who reaches {host}:{port} can watch; there is no password", file=sys.stderr)
-    if opens_browser:
+    if opens_browser and _has_display():
         threading.Thread(target=webbrowser.open, args=(address,), name="open-browser", daemon=True).start()
+
+
+def _has_display() -> bool:
+    """Whether a browser can open a window: in a terminal, one would take the terminal."""
+    return sys.platform != "linux" or any(name in os.environ for name in ("DISPLAY", "WAYLAND_DISPLAY"))
+
+
+def _explain_silence(live: "LiveData", side: "SubscriberSide") -> None:
+    """Say why nothing has arrived, if so. The page waits on."""
+    if live.first_heard_s is None:
+        print(safe_text(side.silence()), file=sys.stderr, flush=True)
 
 
 def _stop_signals() -> threading.Event:

@@ -12,8 +12,9 @@ from gateway.view.positions import is_shown
 MAX_LABELS: Final = 300
 """How many items of one kind have labels."""
 
-_PER_UPDATE: Final = 20
-"""How many labels are moved in each picture, because each one costs as much as all markers."""
+_PERIOD_S: Final = 1 / 15
+_PER_PERIOD: Final = 40
+"""How many labels are moved at a time, because each one costs as much as all markers."""
 _MOVED_M: Final = 0.002
 
 
@@ -27,9 +28,13 @@ class Labels:
         self._positions = np.empty((0, 3), np.float32)  # as they are shown; NaN is hidden
         self._texts: Sequence[str] = ()
         self._next = 0
+        self._moved_s = 0.0
 
-    def update(self, positions: Array, texts: Sequence[str]) -> None:
+    def update(self, positions: Array, texts: Sequence[str], now_s: float) -> None:
         """Show the labels at ``positions``, shape (items, 3), not all at a time; NaN hides one."""
+        if now_s - self._moved_s < _PERIOD_S:
+            return
+        self._moved_s = now_s
         self._parent.visible = True
         count = min(MAX_LABELS, len(positions), len(texts))
         self._add_nodes(count)
@@ -43,7 +48,7 @@ class Labels:
         differs |= (abs(wanted - self._positions) > _MOVED_M).any(axis=1)
         (indices,) = np.nonzero(differs)
         first = int(np.searchsorted(indices, self._next))
-        for index in [*indices[first:], *indices[:first]][:_PER_UPDATE]:
+        for index in [*indices[first:], *indices[:first]][:_PER_PERIOD]:
             self._move(int(index), wanted[index])
 
     def hide(self) -> None:
@@ -52,7 +57,7 @@ class Labels:
 
     def _add_nodes(self, count: int) -> None:
         first = len(self._nodes)
-        for index in range(first, min(count, first + _PER_UPDATE)):
+        for index in range(first, min(count, first + _PER_PERIOD)):
             text = self._texts[index] if index < len(self._texts) else ""
             name = f"{self._parent.name}/{index}"
             self._nodes.append(self._scene.add_label(name, text, visible=False, anchor="bottom-left"))

@@ -33,6 +33,8 @@ class Markers:
         self._names: tuple[str, ...] = ()
         self._seen = _NOTHING
         self._seen_s = np.empty(0)
+        self._is_missing = self._is_ghost = np.empty(0, bool)
+        self._is_stopped = False
         self.positions: Array = _NOTHING
         """The positions in the newest frame, shape (markers, 3), in metres; NaN is missing."""
 
@@ -41,18 +43,27 @@ class Markers:
         if component.newest_head is not self._head:
             self._head = component.newest_head
             self._take(component, now_s)
-        stopped = component.is_stopped
-        self._points.colors = np.array(GREY if stopped else self._color.rgb, np.uint8)
-        missing_s = np.where(is_shown(self.positions), np.inf, now_s - self._seen_s)
-        self._ghosts.points = self._seen[(missing_s < GHOST_S) & (not stopped)]
+        self._show_stopped(component.is_stopped)
+        self._show_ghosts(now_s)
         if labels:
-            self._labels.update(self.positions, self._names)
+            self._labels.update(self.positions, self._names, now_s)
         else:
             self._labels.hide()
-        if trails:
+        if trails and not self._is_stopped:
             self._trails.update(self.positions, now_s)
         else:
             self._trails.clear()
+
+    def _show_stopped(self, stopped: bool) -> None:
+        if stopped != self._is_stopped:
+            self._is_stopped = stopped
+            self._points.colors = np.array(GREY if stopped else self._color.rgb, np.uint8)
+
+    def _show_ghosts(self, now_s: float) -> None:
+        is_ghost = self._is_missing & (now_s - self._seen_s < GHOST_S) & (not self._is_stopped)
+        if not np.array_equal(is_ghost, self._is_ghost):
+            self._is_ghost = is_ghost
+            self._ghosts.points = self._seen[is_ghost]
 
     def _take(self, component: LiveComponent, now_s: float) -> None:
         names, unit = component.description.labels, component.description.unit
@@ -63,6 +74,7 @@ class Markers:
             self._seen_s = np.full(len(visible), -np.inf)
             self._trails.clear()
         self._names = names
+        self._is_missing = ~visible
         self._seen[visible] = self.positions[visible]
         self._seen_s[visible] = now_s
         self._points.points = self.positions[visible]

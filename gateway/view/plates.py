@@ -55,20 +55,23 @@ class Plates:
         self._known: tuple[Parameters, int, UpAxis] | None = None
         self._plates: list[PlacedPlate] = []
         self._names: tuple[str, ...] = ()
+        self._centres = np.empty((0, 3), np.float32)
         self._head: Any = None
         self.corners: Array = np.empty((0, 3), np.float32)
         """The corners of all plates, shape (corners, 3), in metres."""
 
-    def update(self, component: LiveComponent | None, parameters: Parameters, up: UpAxis) -> None:
+    def update(
+        self, component: LiveComponent | None, parameters: Parameters, up: UpAxis, now_s: float
+    ) -> None:
         """Show the plates, and the forces of the newest frame."""
         num_items = 0 if component is None else len(component.newest_items)
         known = self._known
         if known is None or known[0] is not parameters or known[1:] != (num_items, up):
             self._known = (parameters, num_items, up)
             self._place(parameters, component, up)
-        centres = np.array([plate.centre for plate in self._plates], np.float32).reshape(-1, 3)
-        self._labels.update(centres, self._names)
+        self._labels.update(self._centres, self._names, now_s)
         if component is None or component.is_stopped:
+            self._head = None
             self._arrows.points = _NOTHING
         elif component.newest_head is not self._head:
             self._head = component.newest_head
@@ -89,6 +92,7 @@ class Plates:
             else:
                 self._plates.append(plate)
         self._names = tuple(plate.label for plate in self._plates)
+        self._centres = np.array([plate.centre for plate in self._plates], np.float32).reshape(-1, 3)
         corners = np.array([plate.corners for plate in self._plates], np.float32).reshape(-1, 4, 3)
         self.corners = corners.reshape(-1, 3)
         self._outlines.points = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 3)

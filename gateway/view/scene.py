@@ -6,6 +6,7 @@ from typing import Final
 import viser
 
 from gateway.live.live_data import LiveSource
+from gateway.rtc3d.parameters import Parameters
 from gateway.view.axes import up_axis_of
 from gateway.view.camera import fit, sphere_around
 from gateway.view.colors import color_of
@@ -24,6 +25,7 @@ class Scene:
         self._server = server
         self._world = World(server)
         self._sources: dict[str, SourceScene] = {}  # by the beginning of their channels
+        self._parameters: list[Parameters] = []
         self._first_s: float | None = None
         """When the first data were shown."""
         self._fitted: set[int] = set()
@@ -52,9 +54,12 @@ class Scene:
 
     def _turn(self, sources: list[LiveSource]) -> None:
         """Turn the picture as chosen, or as the plates lie."""
-        found = up_axis_of([source.newest_parameters for source in sources])
-        if found is not None:
-            self._switches.suggest_up(found)
+        parameters = [source.newest_parameters for source in sources]
+        if [*map(id, parameters)] != [*map(id, self._parameters)]:
+            self._parameters = parameters
+            found = up_axis_of(parameters)
+            if found is not None:
+                self._switches.suggest_up(found)
         if self._world.up != self._switches.up:
             self._world.set_up(self._switches.up)
             self._fitted.clear()

@@ -14,7 +14,7 @@ from gateway.view.camera import Sphere, sphere_around
 from gateway.view.colors import SourceColor
 from gateway.view.markers import Markers
 from gateway.view.plates import Plates
-from gateway.view.switches import Switches
+from gateway.view.switches import Switches, switch_text
 from gateway.view.tools import Tools
 
 _NAMES: Final = {"3d": "markers", "6d": "tools", "force": "forces", "analog": "analog data"}
@@ -31,6 +31,7 @@ class SourceScene:
         switch: viser.GuiCheckboxHandle,
     ) -> None:
         self._color = color
+        self._name = source.name
         self._switch = switch
         scene = server.scene
         path = f"/sources/{quote(source.channels, safe='')}"
@@ -44,7 +45,9 @@ class SourceScene:
 
     def update(self, source: LiveSource, up: UpAxis, switches: Switches, now_s: float) -> None:
         """Show the newest data of the source."""
-        self._switch.label = f"{self._color.sign} {source.name}"
+        if source.name != self._name:  # on LCM, a status says the name
+            self._name = source.name
+            self._switch.label = switch_text(source.name, self._color)
         self._group.visible = self._switch.value
         if not self._group.visible:
             return
@@ -54,8 +57,8 @@ class SourceScene:
                 components["3d"], now_s, labels=switches.marker_labels, trails=switches.trails
             )
         if "6d" in components:
-            self._tools.update(components["6d"], labels=switches.tool_labels)
-        self._plates.update(components.get("force"), source.newest_parameters, up)
+            self._tools.update(components["6d"], now_s, labels=switches.tool_labels)
+        self._plates.update(components.get("force"), source.newest_parameters, up, now_s)
         self._say_stopped(source.name, components)
 
     def hide(self) -> None:

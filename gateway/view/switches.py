@@ -80,4 +80,9 @@ class Switches:
     def add_source(self, name: str, color: SourceColor) -> viser.GuiCheckboxHandle:
         """Add the switch of a source."""
         with self._group:
-            return self._server.gui.add_checkbox(f"{color.sign} {name}", initial_value=True)
+            return self._server.gui.add_checkbox(switch_text(name, color), initial_value=True)
+
+
+def switch_text(source: str, color: SourceColor) -> str:
+    """Return the text beside the switch of a source."""
+    return f"{color.sign} {source}"

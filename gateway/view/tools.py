@@ -12,7 +12,7 @@ from gateway.view.positions import is_shown, positions_in_metres
 
 _AXES_M: Final = 0.12
 _RADIUS_M: Final = 0.004
-_STOPPED_SCALE: Final = 0.3
+_STOPPED_SIZE: Final = 0.3
 _MIN_NORM: Final = 1e-3
 """A quaternion that is shorter says nothing about the orientation."""
 
@@ -29,21 +29,27 @@ class Tools:
         self._labels = Labels(scene, f"{path}/tool labels")
         self._head: Any = None
         self._names: tuple[str, ...] = ()
+        self._sizes = np.empty(0, np.float32)
         self.positions: Array = _NOTHING
         """The positions in the newest frame, shape (tools, 3), in metres; NaN is missing."""
 
-    def update(self, component: LiveComponent, *, labels: bool) -> None:
+    def update(self, component: LiveComponent, now_s: float, *, labels: bool) -> None:
         """Show the newest frame."""
         if component.newest_head is not self._head:
             self._head = component.newest_head
             self._take(component)
-        if self._axes is not None:
-            size = _STOPPED_SCALE if component.is_stopped else 1.0
-            self._axes.batched_scales = np.where(is_shown(self.positions), size, 0.0).astype(np.float32)
+        self._show_sizes(_STOPPED_SIZE if component.is_stopped else 1.0)
         if labels:
-            self._labels.update(self.positions, self._names)
+            self._labels.update(self.positions, self._names, now_s)
         else:
             self._labels.hide()
+
+    def _show_sizes(self, size: float) -> None:
+        """Hide missing tools: their size is 0."""
+        sizes = is_shown(self.positions) * np.float32(size)
+        if self._axes is not None and not np.array_equal(sizes, self._sizes):
+            self._sizes = sizes
+            self._axes.batched_scales = sizes
 
     def _take(self, component: LiveComponent) -> None:
         items = component.newest_items
@@ -67,11 +73,12 @@ class Tools:
 
     def _add_axes(self, quaternions: Array, positions: Array) -> viser.BatchedAxesHandle:
         """Replace the axes, because the number of tools is another one."""
+        self._sizes = np.zeros(len(positions), np.float32)
         return self._scene.add_batched_axes(
             self._name,
             quaternions,
             positions,
-            np.zeros(len(positions), np.float32),
+            self._sizes,
             axes_length=_AXES_M,
             axes_radius=_RADIUS_M,
             visible=len(positions) > 0,
