@@ -9,10 +9,9 @@ GREY: Final[Rgb] = (128, 128, 128)
 
 
 class SourceColor(NamedTuple):
-    """The colour of a source, and a sign of the same colour for texts."""
+    """The colour of a source."""
 
     rgb: Rgb
-    sign: str
 
     @property
     def faint(self) -> Rgb:
@@ -22,12 +21,12 @@ class SourceColor(NamedTuple):
 
 
 _COLORS: Final = (
-    SourceColor((34, 139, 230), "🔵"),
-    SourceColor((240, 125, 20), "🟠"),
-    SourceColor((55, 165, 70), "🟢"),
-    SourceColor((150, 90, 220), "🟣"),
-    SourceColor((225, 60, 60), "🔴"),
-    SourceColor((150, 100, 60), "🟤"),
+    SourceColor((34, 139, 230)),
+    SourceColor((240, 125, 20)),
+    SourceColor((55, 165, 70)),
+    SourceColor((150, 90, 220)),
+    SourceColor((225, 60, 60)),
+    SourceColor((150, 100, 60)),
 )
 
 

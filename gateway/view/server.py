@@ -25,6 +25,7 @@ def open_server(host: str, port: int) -> ViewServer:
         server.stop()
         raise ViewError(_in_use(host, port))
     set_theme(server.gui, dark=True)
+    server.gui.main_panel.dock_right()  # a floating one would cover the picture
     return server
 
 

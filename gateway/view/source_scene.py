@@ -14,7 +14,7 @@ from gateway.view.camera import Sphere, sphere_around
 from gateway.view.colors import SourceColor
 from gateway.view.markers import Markers
 from gateway.view.plates import Plates
-from gateway.view.switches import Switches, switch_text
+from gateway.view.switches import Switches
 from gateway.view.tools import Tools
 
 _NAMES: Final = {"3d": "markers", "6d": "tools", "force": "forces", "analog": "analog data"}
@@ -30,7 +30,6 @@ class SourceScene:
         color: SourceColor,
         switch: viser.GuiCheckboxHandle,
     ) -> None:
-        self._color = color
         self._name = source.name
         self._switch = switch
         scene = server.scene
@@ -47,7 +46,7 @@ class SourceScene:
         """Show the newest data of the source."""
         if source.name != self._name:  # on LCM, a status says the name
             self._name = source.name
-            self._switch.label = switch_text(source.name, self._color)
+            self._switch.label = source.name
         self._group.visible = self._switch.value
         if not self._group.visible:
             return

@@ -78,11 +78,10 @@ class Switches:
             dropdown.value = up
 
     def add_source(self, name: str, color: SourceColor) -> viser.GuiCheckboxHandle:
-        """Add the switch of a source."""
+        """Add the switch of a source, with a stripe in its colour."""
         with self._group:
-            return self._server.gui.add_checkbox(switch_text(name, color), initial_value=True)
-
-
-def switch_text(source: str, color: SourceColor) -> str:
-    """Return the text beside the switch of a source."""
-    return f"{color.sign} {source}"
+            red, green, blue = color.rgb
+            self._server.gui.add_html(
+                f'<div style="margin: 0 0.8em; height: 3px; background: rgb({red}, {green}, {blue})"></div>'
+            )
+            return self._server.gui.add_checkbox(name, initial_value=True)

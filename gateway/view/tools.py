@@ -10,8 +10,8 @@ from gateway.takes.component_rows import Array
 from gateway.view.labels import Labels
 from gateway.view.positions import is_shown, positions_in_metres
 
-_AXES_M: Final = 0.12
-_RADIUS_M: Final = 0.004
+_AXES_M: Final = 0.15
+_RADIUS_M: Final = 0.005
 _STOPPED_SIZE: Final = 0.3
 _MIN_NORM: Final = 1e-3
 """A quaternion that is shorter says nothing about the orientation."""

@@ -48,7 +48,7 @@ class World:
             _GRID_M,
             _GRID_M,
             plane=PLANES[axis],
-            cell_size=0.1,
+            cell_size=0.25,
             cell_color=GREY,
             cell_thickness=0.4,
             section_size=1.0,
