@@ -84,4 +84,4 @@ def events_html(source: LiveSource) -> str:
         for event in reversed([*source.events])
     ]
     events = table(("captured", "event", ""), rows) if rows else "<p class=dim>no events yet</p>"
-    return f"<section><h3>{html_text(source.name)}</h3>{events}</section>"
+    return f"<section class=events><h3>{html_text(source.name)}</h3>{events}</section>"

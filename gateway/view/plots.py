@@ -1,5 +1,6 @@
 """Scrolling plots of selected analog and force channels."""
 
+import time
 from collections.abc import Sequence
 from typing import Final
 
@@ -9,6 +10,7 @@ from viser import uplot
 
 from gateway.live.component import LiveComponent
 from gateway.live.live_data import LiveSource
+from gateway.takes.component_rows import Array
 from gateway.view.channels import Channel, choices, component_of, samples
 from gateway.view.envelope import COLUMN_US, NUM_COLUMNS, Envelope
 
@@ -21,7 +23,7 @@ _FONT: Final = "11px sans-serif"
 _LINE: Final = "#4dabf7"
 _FILL: Final = "rgba(77, 171, 247, 0.35)"
 
-_SECONDS: Final = np.arange(1 - NUM_COLUMNS, 1) * COLUMN_US / 1e6
+_COLUMNS: Final = np.arange(1 - NUM_COLUMNS, 1)
 
 
 class _Plot:
@@ -32,15 +34,20 @@ class _Plot:
         self._envelope = Envelope()
         self._component: LiveComponent | None = None
         line = uplot.Series(label="", stroke=_LINE, width=1, spanGaps=False, points={"show": False})
+        no_ticks = uplot.Axis_Ticks(show=False)
         self.handle = server.gui.add_uplot(
-            (_SECONDS, *self._envelope.columns(0)),
-            (uplot.Series(label="s"), line, line),
+            self._data(time.time_ns() // 1000),
+            (uplot.Series(label="time"), line, line),
             title=title,
             bands=(uplot.Band(series=(2, 1), fill=_FILL),),
-            scales={"x": uplot.Scale(time=False), "y": uplot.Scale()},
-            axes=(uplot.Axis(size=24, font=_FONT), uplot.Axis(size=52, font=_FONT)),
+            scales={"x": uplot.Scale(time=True), "y": uplot.Scale()},
+            axes=(
+                uplot.Axis(size=24, font=_FONT, ticks=no_ticks, values="{HH}:{mm}:{ss}", space=70),
+                uplot.Axis(size=52, font=_FONT, ticks=no_ticks),
+            ),
             legend=uplot.Legend(show=False),
             height=_HEIGHT_PX,
+            padding=(8, 8, 0, 0),
         )
 
     def take(self, component: LiveComponent | None) -> None:
@@ -56,7 +63,16 @@ class _Plot:
         if end_utime is not None:
             if component is not None and component.is_stopped:
                 end_utime += round(1e6 * (component.age_s or 0.0))
-            self.handle.data = (_SECONDS, *self._envelope.columns(end_utime))
+            self.handle.data = self._data(end_utime)
+
+    def _data(self, end_utime: int) -> tuple[Array, Array, Array]:
+        """Return the times of the columns in seconds since the Unix epoch, and the envelope.
+
+        The y axis follows the values because the times change: viser fits a plot only then.
+        """
+        lowest, highest = self._envelope.columns(end_utime)
+        times_s = (end_utime // COLUMN_US + _COLUMNS) * (COLUMN_US / 1e6)
+        return times_s, lowest, highest
 
 
 class Plots:

@@ -24,7 +24,7 @@ STYLE: Final = """<style>
 .gateway .bar { display: inline-block; width: 70px; height: 7px; margin-right: 6px;
   background: var(--g-line) }
 .gateway .bar i { display: block; height: 100%; background: currentColor }
-.gateway .events td { text-align: left; white-space: normal }
+.gateway .events :is(td, th) { text-align: left; white-space: normal }
 .gateway .frozen { max-height: 0; overflow: hidden; background: var(--g-bad); color: var(--g-on-bad);
   border-radius: 4px; padding: 0 8px; animation: gateway-frozen 1ms 4s forwards }
 @keyframes gateway-frozen { to { max-height: 4em; padding: 5px 8px } }
