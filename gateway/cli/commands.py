@@ -15,6 +15,7 @@ COMMANDS: Final = {
     "list": "gateway.cli.list_gateways:list_gateways",
     "view": "gateway.cli.view:view",
     "echo": "gateway.cli.echo:echo",
+    "top": "gateway.cli.top:top",
     "params": "gateway.cli.params:params",
     "record": "gateway.cli.record:record",
     "replay": "gateway.cli.replay:replay",

@@ -5,7 +5,6 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Final
@@ -28,8 +27,6 @@ if TYPE_CHECKING:
     from gateway.subscriber.sides import SubscriberSide
 
 _TICK_S: Final = 0.1
-_CLOSE_S: Final = 0.5
-"""How long to wait for Zenoh or LCM to close: a peer that does not read delays it."""
 
 
 def record(
@@ -69,7 +66,7 @@ def record(
     from gateway.recorder.take_recording import TakeRecording
     from gateway.recorder.target import Target
     from gateway.subscriber.lcm_side import START_S
-    from gateway.subscriber.sides import Transport, subscribe_all
+    from gateway.subscriber.sides import Transport, close_in_time, subscribe_all
 
     stop = _stop_signals()
     target = Target(file)
@@ -86,7 +83,7 @@ def record(
             _end(recording, progress)
         finally:
             progress.close()
-            _close(side.close)
+            close_in_time(side)
         is_complete = print_summary(recording, sys.stdout)
     finally:
         target.discard_empty()
@@ -137,9 +134,3 @@ def _end(recording: "TakeRecording", progress: "RecordProgress") -> None:
         recording.sink.give_up()
     while not recording.close(_TICK_S):
         progress.tick()
-
-
-def _close(close: Callable[[], None]) -> None:
-    thread = threading.Thread(target=close, name="record-close", daemon=True)
-    thread.start()
-    thread.join(_CLOSE_S)

@@ -10,7 +10,6 @@ from typing import Final
 from rich.console import Console
 from rich.text import Text
 
-from gateway.cli.keyboard import keys
 from gateway.cli.replay_report import Progress, jump_text, print_report
 from gateway.replay.destinations import Destination
 from gateway.replay.play_list import Selection
@@ -20,6 +19,7 @@ from gateway.replay.replay import open_publication, playing
 from gateway.replay.take_length import take_length_us
 from gateway.replay.timeline import Jump
 from gateway.takes.reader import TakeReader
+from gateway.terminal.keyboard import keys
 
 _SEEK_US: Final = 10_000_000
 _SHOW_S: Final = 0.25

@@ -1,8 +1,9 @@
 """Subscribing to everything that gateways publish, on Zenoh or on LCM."""
 
+import threading
 from collections.abc import Collection
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple, Protocol
 
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
@@ -10,6 +11,8 @@ from gateway.outputs.zenoh.subscriber import open_zenoh
 from gateway.subscriber.lcm_side import LcmSide
 from gateway.subscriber.reception import Reception
 from gateway.subscriber.zenoh_side import ZenohSide
+
+_CLOSE_S: Final = 0.5
 
 
 class SubscriberSide(Protocol):
@@ -50,3 +53,10 @@ def subscribe_all(
         return LcmSide(url, transport.prefix or DEFAULT_LCM_PREFIX, sources, components, reception)
     session = open_zenoh(transport.connect, transport.zenoh_config)
     return ZenohSide(session, transport.prefix or DEFAULT_ZENOH_PREFIX, sources, components, reception)
+
+
+def close_in_time(side: SubscriberSide) -> None:
+    """Close a subscriber, but do not wait longer than 0.5 s: a peer that does not read delays it."""
+    thread = threading.Thread(target=side.close, name="subscriber-close", daemon=True)
+    thread.start()
+    thread.join(_CLOSE_S)

@@ -1,84 +1,28 @@
 """The keys of ``rtc3d-gateway replay`` on a terminal, whose settings are restored in every way it ends."""
 
-import contextlib
 import os
-import pty
 import re
-import select
 import signal
-import subprocess
-import termios
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import pytest
 
 from gateway.rtc3d.components import ComponentType
-from tests.gateway_process import PROGRAM
 from tests.networks import lcm_url
+from tests.pseudo_terminals import PseudoTerminal, in_terminal
 from tests.takes import START_UTIME, description, frame, markers, parameters, write_take
 
 pytestmark = pytest.mark.netns
 
 XML: Final = b"<Parameters></Parameters>"
 SOME_MESSAGES: Final = re.compile(r"[1-9]\d* messages/s")
-_TIMEOUT_S: Final = 20.0
 
 
-class Terminal:
-    """A terminal with a replay in front. ``text`` is what it has shown since the last ``wait_for``."""
-
-    def __init__(self, master: int, process: "subprocess.Popen[bytes]") -> None:
-        self._master = master
-        self.process = process
-        self.text = ""
-
-    def press(self, keys: str) -> None:
-        os.write(self._master, keys.encode())
-
-    def read(self) -> None:
-        if select.select([self._master], [], [], 0.1)[0]:
-            with contextlib.suppress(OSError):  # EIO: the process has ended
-                self.text += os.read(self._master, 65536).decode()
-
-    def wait_for(self, condition: Callable[[str], Any]) -> None:
-        """Wait until ``condition`` holds for what is shown next."""
-        deadline_s = time.monotonic() + _TIMEOUT_S
-        self.text = ""
-        while not condition(self.text):
-            assert time.monotonic() < deadline_s, self.text
-            self.read()
-
-    def wait_for_end(self) -> int:
-        deadline_s = time.monotonic() + _TIMEOUT_S
-        while self.process.poll() is None:
-            assert time.monotonic() < deadline_s
-            self.read()
-        self.read()
-        return self.process.returncode
-
-    def shows_keys(self) -> bool:
-        """Whether the terminal waits for Enter and shows what is typed."""
-        flags = termios.tcgetattr(self._master)[3]
-        return bool(flags & termios.ICANON and flags & termios.ECHO)
-
-
-@contextlib.contextmanager
-def replay_in_terminal(take: Path, *options: str) -> Iterator[Terminal]:
-    master, end = pty.openpty()
-    # The terminal controls the program, as when a shell starts it.
-    command = ["setsid", "--ctty", *PROGRAM, "replay", str(take), "--lcm", "--url", lcm_url(), *options]
-    environ = {**os.environ, "TERM": "xterm", "COLUMNS": "150"}
-
-    with subprocess.Popen(command, stdin=end, stdout=end, stderr=end, env=environ) as process:
-        try:
-            yield Terminal(master, process)
-        finally:
-            process.kill()
-            os.close(master)
-            os.close(end)
+def replay_in_terminal(take: Path, *options: str) -> AbstractContextManager[PseudoTerminal]:
+    return in_terminal("replay", str(take), "--lcm", "--url", lcm_url(), *options)
 
 
 @pytest.fixture
@@ -90,7 +34,7 @@ def take(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def terminal(take: Path) -> Iterator[Terminal]:
+def terminal(take: Path) -> Iterator[PseudoTerminal]:
     """A terminal in which some messages have been replayed."""
     with replay_in_terminal(take) as terminal:
         terminal.wait_for(SOME_MESSAGES.search)
@@ -98,7 +42,7 @@ def terminal(take: Path) -> Iterator[Terminal]:
         yield terminal
 
 
-def test_space_pauses_and_continues_and_q_quits(terminal: Terminal) -> None:
+def test_space_pauses_and_continues_and_q_quits(terminal: PseudoTerminal) -> None:
     terminal.press(" ")
     terminal.wait_for(lambda text: "paused" in text)
     terminal.press(" ")
@@ -109,7 +53,7 @@ def test_space_pauses_and_continues_and_q_quits(terminal: Terminal) -> None:
     assert terminal.shows_keys()
 
 
-def test_arrows_go_back_and_forth(terminal: Terminal) -> None:
+def test_arrows_go_back_and_forth(terminal: PseudoTerminal) -> None:
     terminal.press("\x1b[C" * 3)
     terminal.wait_for(lambda text: "0:00:3" in text)
     terminal.press("\x1b[D")
@@ -149,7 +93,7 @@ def test_a_replay_that_ends_before_the_first_message_says_so(
         assert terminal.shows_keys()
 
 
-def test_an_error_restores_the_terminal(terminal: Terminal, take: Path) -> None:
+def test_an_error_restores_the_terminal(terminal: PseudoTerminal, take: Path) -> None:
     take.unlink()
     take.mkdir()
     terminal.press("\x1b[D")  # reads the file again
@@ -158,7 +102,7 @@ def test_an_error_restores_the_terminal(terminal: Terminal, take: Path) -> None:
     assert terminal.shows_keys()
 
 
-def test_while_it_is_stopped_the_terminal_has_its_own_settings(terminal: Terminal) -> None:
+def test_while_it_is_stopped_the_terminal_has_its_own_settings(terminal: PseudoTerminal) -> None:
     os.kill(terminal.process.pid, signal.SIGTSTP)
     os.waitid(os.P_PID, terminal.process.pid, os.WSTOPPED)
     assert terminal.shows_keys()

@@ -1,0 +1,128 @@
+"""``rtc3d-gateway top``: what gateways publish, as tables that change."""
+
+import contextlib
+import logging
+import os
+import shutil
+import signal
+import sys
+from collections import deque
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Final, TextIO
+
+import typer
+
+from gateway.cli.gateway_queries import exit_with
+from gateway.cli.options import ConnectOption, PrefixOption, SourceOption, UrlOption, ZenohConfigOption
+from gateway.errors import QueryError
+from gateway.safe_text import safe_lines
+from gateway.service.log_format import LogLevel, set_up_log
+
+if TYPE_CHECKING:
+    from gateway.live.live_data import LiveData
+    from gateway.subscriber.sides import SubscriberSide, Transport
+
+_MAX_WIDTH: Final = 10_000
+"""How wide tables may be in files and pipes."""
+
+
+def top(
+    source: SourceOption = None,
+    once: Annotated[
+        bool, typer.Option("--once", help="Print all tables once, as without a terminal, and end.")
+    ] = False,
+    as_json: Annotated[
+        bool,
+        typer.Option(
+            "--json", help="Print one JSON object per second, until Ctrl-C; with --once, only one object."
+        ),
+    ] = False,
+    lcm: Annotated[bool, typer.Option("--lcm", help="Receive on LCM; the default is Zenoh.")] = False,
+    connect: ConnectOption = None,
+    zenoh_config: ZenohConfigOption = None,
+    url: UrlOption = None,
+    prefix: PrefixOption = None,
+) -> None:
+    """Watch what gateways publish: rates, gaps, latencies, visibility, clocks, drops, outputs, queries.
+
+    With --once, exit status 3 if no gateway is found.
+    """
+    if lcm and (connect is not None or zenoh_config is not None):
+        raise typer.BadParameter("--connect and --zenoh-config are for Zenoh")
+    if url is not None and not lcm:
+        raise typer.BadParameter("--url is for LCM; add --lcm")
+    from gateway.subscriber.sides import Transport
+
+    transport = Transport(lcm, connect, zenoh_config, url, prefix)
+    _run(transport, source, is_once=once, as_json=as_json)
+
+
+def _run(transport: "Transport", source: str | None, *, is_once: bool, as_json: bool) -> None:
+    from gateway.live.live_data import LiveData
+    from gateway.subscriber.sides import close_in_time, subscribe_all
+
+    is_shown = not (is_once or as_json) and has_screen(sys.stdout, os.environ)
+    notices: deque[str] = deque(maxlen=1)
+    if is_shown:
+        logging.basicConfig(level=logging.WARNING, handlers=[_Notices(notices)])
+    else:
+        set_up_log(LogLevel.WARNING)
+    live = LiveData()
+    side = subscribe_all(transport, [source] if source else [], None, live)
+    try:
+        if is_shown:
+            _show(live, side, notices, "LCM" if transport.is_lcm else "Zenoh")
+        else:
+            _print(live, side, is_once=is_once or not as_json, as_json=as_json)
+    finally:
+        close_in_time(side)
+
+
+def has_screen(out: TextIO, environ: Mapping[str, str]) -> bool:
+    """Return whether ``out`` is a terminal on which texts can be placed."""
+    return out.isatty() and environ.get("TERM", "dumb") not in {"", "dumb", "unknown"}
+
+
+class _Notices(logging.Handler):
+    """Keeps what is logged: it must not be written into the tables."""
+
+    def __init__(self, notices: "deque[str]") -> None:
+        super().__init__()
+        self._notices = notices
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._notices.append(record.getMessage())
+
+
+def _show(live: "LiveData", side: "SubscriberSide", notices: "deque[str]", title: str) -> None:
+    from gateway.terminal.keyboard import Keyboard
+    from gateway.terminal.screen import Screen
+    from gateway.top.app import App
+
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # ignored by nohup
+        signal.signal(signal.SIGHUP, signal.default_int_handler)
+    screen = Screen(sys.stdout.fileno(), sys.stdout.encoding)
+    with contextlib.suppress(KeyboardInterrupt):
+        App(live, side, screen, Keyboard.of_stdin(), notices, title).run()
+
+
+def _print(live: "LiveData", side: "SubscriberSide", *, is_once: bool, as_json: bool) -> None:
+    from gateway.terminal.screen import has_colours
+    from gateway.top.reports import json_line, print_json_lines, print_tables, wait_for_picture
+
+    if not is_once:
+        with contextlib.suppress(KeyboardInterrupt):
+            print_json_lines(live, side, sys.stdout, lambda text: print(safe_lines(text), file=sys.stderr))
+        return
+    try:
+        sources = wait_for_picture(live, side)
+    except QueryError as error:
+        exit_with([error])
+        return
+    if as_json:
+        print(json_line(live, sources), flush=True)
+    else:
+        size = shutil.get_terminal_size() if sys.stdout.isatty() else None
+        is_coloured = size is not None and has_screen(sys.stdout, os.environ) and has_colours(os.environ)
+        width = _MAX_WIDTH if size is None else size.columns
+        print_tables(sources, sys.stdout, width, is_coloured=is_coloured)

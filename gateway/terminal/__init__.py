@@ -1,0 +1,1 @@
+"""Terminals: keys without Enter, and drawing on the whole screen."""

@@ -1,0 +1,99 @@
+"""What ``top --once`` and ``top --json`` print: everything that is known, once or every second."""
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any, Final, TextIO
+
+from gateway.errors import QueryError
+from gateway.live.live_data import LiveData, LiveSource
+from gateway.messages.host_time import now_utime
+from gateway.messages.json_text import json_text
+from gateway.safe_text import safe_json
+from gateway.subscriber.sides import SubscriberSide
+from gateway.terminal.screen import Line, Style, encoded, line_text
+from gateway.top.facts import source_facts
+from gateway.top.pages import PAGES
+from gateway.top.table import laid_out, sorted_by
+
+DISCOVERY_S: Final = 2.5
+"""How long it may take to find a gateway: Zenoh needs time to connect; LCM carries one status a second."""
+
+_PICTURE_S: Final = 2.5
+"""How long after the first message a picture is complete: rates are over 2 s, statuses come every second."""
+
+_UPDATE_S: Final = 0.1
+_LINE_S: Final = 1.0
+
+
+def wait_for_picture(live: LiveData, side: SubscriberSide) -> list[LiveSource]:
+    """Receive until the picture is complete; raises QueryError ("no-gateway") if nothing is heard."""
+    start_s = time.monotonic()
+    while True:
+        sources = receive_once(live, side)
+        now_s = time.monotonic()
+        first_s = live.first_heard_s
+        if first_s is not None and now_s - first_s >= _PICTURE_S:
+            return sources
+        if first_s is None and now_s - start_s >= DISCOVERY_S:
+            problem = side.silence() or silence_text(sources)
+            if live.first_heard_s is None:
+                raise QueryError(problem, code="no-gateway")
+
+
+def receive_once(live: LiveData, side: SubscriberSide) -> list[LiveSource]:
+    """Wait for a moment, and return the sources with what has come meanwhile."""
+    time.sleep(_UPDATE_S)
+    side.tick()
+    return live.update()
+
+
+def silence_text(sources: Sequence[LiveSource]) -> str:
+    """Return what to say if gateways can be found but nothing of them arrives."""
+    names = ", ".join(source.name for source in sources)
+    return f"a gateway serves {names or 'this source'}, but nothing arrives from it; try again"
+
+
+def print_tables(sources: Sequence[LiveSource], out: TextIO, width: int, *, is_coloured: bool) -> None:
+    """Print every page, one below the other."""
+    encoding = out.encoding or "ascii"
+    for page in PAGES:
+        table = page.table(sources)
+        lines = laid_out(sorted_by(table, table.order), width, table.order)
+        shown: list[Line] = [[(page.name, Style.MARKED)]]
+        shown += (
+            [lines.titles, *lines.body] if any(section.rows for section in table.sections) else lines.body
+        )
+        for line in [*shown, []]:
+            text = line_text(line if is_coloured else _plain(line), width, has_colours=is_coloured)
+            print(encoded(text.rstrip(), encoding).decode(encoding, "replace"), file=out)
+    out.flush()
+
+
+def _plain(line: Line) -> Line:
+    return [(text, Style.PLAIN) for text, _ in line]
+
+
+def json_line(live: LiveData, sources: Sequence[LiveSource]) -> str:
+    """Return one JSON object, in one line, with everything about the sources."""
+    facts: dict[str, Any] = {
+        "utime": now_utime(),
+        "sources": [source_facts(source) for source in sources],
+        "num_foreign": live.num_foreign,
+        "num_beyond": live.num_beyond,
+    }
+    return safe_json(json_text(facts))
+
+
+def print_json_lines(live: LiveData, side: SubscriberSide, out: TextIO, warn: Callable[[str], None]) -> None:
+    """Print a JSON object every second until an interrupt; ``warn`` once if nothing is heard."""
+    start_s = next_s = time.monotonic()
+    has_warned = False
+    while True:
+        sources = receive_once(live, side)
+        now_s = time.monotonic()
+        if now_s - next_s >= _LINE_S:
+            next_s += _LINE_S * ((now_s - next_s) // _LINE_S)
+            print(json_line(live, sources), file=out, flush=True)
+        if not has_warned and live.first_heard_s is None and now_s - start_s >= DISCOVERY_S:
+            has_warned = True
+            warn(side.silence() or silence_text(sources))
