@@ -1,5 +1,6 @@
 """The keys of ``rtc3d-gateway replay`` on a terminal, whose settings are restored in every way it ends."""
 
+import contextlib
 import os
 import re
 import signal
