@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 import typer
 
 from gateway.cli.gateway_queries import exit_with
-from gateway.cli.options import ConnectOption, PrefixOption, SourceOption, UrlOption, ZenohConfigOption
+from gateway.cli.options import ConnectOption, PrefixOption, SourcesOption, UrlOption, ZenohConfigOption
 from gateway.errors import QueryError
 from gateway.safe_text import safe_lines
 from gateway.service.log_format import LogLevel, set_up_log
@@ -27,7 +27,7 @@ _MAX_WIDTH: Final = 10_000
 
 
 def top(
-    source: SourceOption = None,
+    source: SourcesOption = None,
     once: Annotated[
         bool, typer.Option("--once", help="Print all tables once, as without a terminal, and end.")
     ] = False,
@@ -45,7 +45,7 @@ def top(
 ) -> None:
     """Watch what gateways publish: rates, gaps, latencies, visibility, clocks, drops, outputs, queries.
 
-    With --once, exit status 3 if no gateway is found.
+    With --once, exit status 3 if no gateway is found, or none that serves a source.
     """
     if lcm and (connect is not None or zenoh_config is not None):
         raise typer.BadParameter("--connect and --zenoh-config are for Zenoh")
@@ -54,10 +54,10 @@ def top(
     from gateway.subscriber.sides import Transport
 
     transport = Transport(lcm, connect, zenoh_config, url, prefix)
-    _run(transport, source, is_once=once, as_json=as_json)
+    _run(transport, list(dict.fromkeys(source or ())), is_once=once, as_json=as_json)
 
 
-def _run(transport: "Transport", source: str | None, *, is_once: bool, as_json: bool) -> None:
+def _run(transport: "Transport", wanted: list[str], *, is_once: bool, as_json: bool) -> None:
     from gateway.live.live_data import LiveData
     from gateway.subscriber.sides import close_in_time, subscribe_all
 
@@ -68,12 +68,12 @@ def _run(transport: "Transport", source: str | None, *, is_once: bool, as_json: 
     else:
         set_up_log(LogLevel.WARNING)
     live = LiveData()
-    side = subscribe_all(transport, [source] if source else [], None, live)
+    side = subscribe_all(transport, wanted, None, live)
     try:
         if is_shown:
             _show(live, side, notices, "LCM" if transport.is_lcm else "Zenoh")
         else:
-            _print(live, side, is_once=is_once or not as_json, as_json=as_json)
+            _print(live, side, wanted, is_once=is_once or not as_json, as_json=as_json)
     finally:
         close_in_time(side)
 
@@ -106,9 +106,17 @@ def _show(live: "LiveData", side: "SubscriberSide", notices: "deque[str]", title
         App(live, side, screen, Keyboard.of_stdin(), notices, title).run()
 
 
-def _print(live: "LiveData", side: "SubscriberSide", *, is_once: bool, as_json: bool) -> None:
+def _print(
+    live: "LiveData", side: "SubscriberSide", wanted: list[str], *, is_once: bool, as_json: bool
+) -> None:
     from gateway.terminal.screen import has_colours
-    from gateway.top.reports import json_line, print_json_lines, print_tables, wait_for_picture
+    from gateway.top.reports import (
+        json_line,
+        missing_sources,
+        print_json_lines,
+        print_tables,
+        wait_for_picture,
+    )
 
     if not is_once:
         with contextlib.suppress(KeyboardInterrupt):
@@ -126,3 +134,4 @@ def _print(live: "LiveData", side: "SubscriberSide", *, is_once: bool, as_json: 
         is_coloured = size is not None and has_screen(sys.stdout, os.environ) and has_colours(os.environ)
         width = _MAX_WIDTH if size is None else size.columns
         print_tables(sources, sys.stdout, width, is_coloured=is_coloured)
+    exit_with(missing_sources(sources, wanted))

@@ -40,6 +40,16 @@ def wait_for_picture(live: LiveData, side: SubscriberSide) -> list[LiveSource]:
                 raise QueryError(problem, code="no-gateway")
 
 
+def missing_sources(sources: Sequence[LiveSource], wanted: Sequence[str]) -> list[QueryError]:
+    """Return an error for each of the ``wanted`` sources that is not found."""
+    found = sorted(source.name for source in sources if source.heard_s is not None)
+    return [
+        QueryError(f"no gateway serves source {name!r}; sources found: {', '.join(found)}", code="no-gateway")
+        for name in wanted
+        if name not in found
+    ]
+
+
 def receive_once(live: LiveData, side: SubscriberSide) -> list[LiveSource]:
     """Wait for a moment, and return the sources with what has come meanwhile."""
     time.sleep(_UPDATE_S)

@@ -151,6 +151,15 @@ def test_a_source_that_nobody_serves_is_said_with_those_that_there_are(lab: Lab)
     ended = top("--once", *lab.zenoh, "--source", "stage")
     assert ended.returncode == STATUS_3
     assert ended.stderr == "no gateway serves source 'stage'; sources found: Lab-1\n"
+    assert ended.stdout == ""
+
+
+@pytest.mark.parametrize("side", ["zenoh", "lcm"])
+def test_one_of_two_sources_is_shown_and_the_other_one_is_said_to_be_missing(lab: Lab, side: str) -> None:
+    ended = top("--once", *lab.options(side), "--source", "stage", "--source", "Lab-1")
+    assert ended.returncode == STATUS_3
+    assert "Marker 12" in ended.stdout
+    assert ended.stderr == "no gateway serves source 'stage'; sources found: Lab-1\n"
 
 
 def test_wrong_options_are_status_2() -> None:
