@@ -74,8 +74,7 @@ class Screen:
         if self.is_open:
             self.is_open = False
             with contextlib.suppress(OSError, termios.error):  # the terminal is gone
-                termios.tcflow(self.descriptor, termios.TCOON)  # after Ctrl-S, writing would wait
-                self._write(_LEAVE)
+                self._write_anyway(_LEAVE)
 
     def redraw(self) -> None:
         """Draw everything at the next call of ``draw``."""
@@ -100,6 +99,14 @@ class Screen:
         ]
         self._drawn = texts
         self._write("".join(parts))
+
+    def _write_anyway(self, text: str) -> None:
+        """Write, also after Ctrl-S: without IXON, the terminal goes on."""
+        settings = termios.tcgetattr(self.descriptor)
+        flags = settings[0]
+        termios.tcsetattr(self.descriptor, termios.TCSANOW, [flags & ~termios.IXON, *settings[1:]])
+        self._write(text)
+        termios.tcsetattr(self.descriptor, termios.TCSANOW, [flags, *settings[1:]])
 
     def _write(self, text: str) -> None:
         data = encoded(text, self._encoding)

@@ -216,6 +216,16 @@ def test_every_signal_restores_the_terminal(lab: Lab, number: signal.Signals) ->
         assert terminal.output.endswith(b"\x1b[?1049l")
 
 
+def test_a_terminal_whose_output_is_held_is_restored(lab: Lab) -> None:
+    with in_terminal("top", *lab.lcm) as terminal:
+        terminal.wait_for_screen(is_streaming)
+        terminal.press("\x13")  # Ctrl-S
+        terminal.process.terminate()
+        assert terminal.wait_for_end() == 0
+        assert terminal.shows_keys()
+        assert terminal.output.endswith(b"\x1b[?1049l")
+
+
 def test_while_it_is_stopped_the_terminal_is_as_before(lab: Lab) -> None:
     with in_terminal("top", *lab.lcm) as terminal:
         terminal.wait_for_screen(is_streaming)
