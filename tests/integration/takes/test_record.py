@@ -88,6 +88,11 @@ def size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
 
 
+def num_recorded(path: Path, channel: str) -> int:
+    """Return how many messages of a channel a recording has so far."""
+    return path.read_bytes().count(channel.encode()) if path.exists() else 0
+
+
 def events(path: Path) -> list[tuple[str, bytes]]:
     """Return the channels and messages of a file, which must not be damaged."""
     reader = EventLogReader(path)
@@ -300,26 +305,21 @@ def test_the_first_messages_are_recorded_with_the_seconds_given(tmp_path: Path) 
     recorded = by_channel(path)
     assert recorded.keys() == {"MOCAP_LAB_1_TAKE", "MOCAP_LAB_1_PARAMETERS", "MOCAP_LAB_1_3D"}
     utimes = [prefix_of(message).utime for message in recorded["MOCAP_LAB_1_3D"]]
-    assert 1.5e6 < utimes[-1] - utimes[0] < 2.5e6
+    assert 1.5e6 < utimes[-1] - utimes[0] < 10e6  # on a busy computer, the end comes late
 
 
 def test_a_restart_of_the_gateway_is_told_from_loss(tmp_path: Path) -> None:
     path = tmp_path / "walk.lcmlog"
     with lab(tmp_path, "lcm") as gateway, recording(tmp_path, str(path), *gateway.options) as record:
-        wait_until(lambda: num_statuses(path) >= 1, 30)
+        wait_until(lambda: num_recorded(path, "MOCAP_LAB_1_STATUS") >= 1, 30)
         gateway.stop()
         wait_until(lambda: "Lab-1: nothing has arrived for 2 s" in record.stderr, 30)
-        before = num_statuses(path)
+        before = num_recorded(path, "MOCAP_LAB_1_STATUS")
         gateway.start()
-        wait_until(lambda: num_statuses(path) >= before + 2, 30)
+        wait_until(lambda: num_recorded(path, "MOCAP_LAB_1_STATUS") >= before + 2, 30)
         ended = record.end()
     assert ended.status == 0, ended
     assert "Lab-1: its gateway was started again (once)" in ended.stdout
-
-
-def num_statuses(path: Path) -> int:
-    """Return how many statuses a recording has so far."""
-    return path.read_bytes().count(b"MOCAP_LAB_1_STATUS") if path.exists() else 0
 
 
 # A publisher of the test, which can do what a gateway does not -----------------------------
@@ -362,6 +362,7 @@ def test_gaps_are_counted_and_shown(tmp_path: Path, publisher: Publisher) -> Non
     with recording_of(publisher, tmp_path) as record:
         publisher.publish("lab", *range(500, 600), *range(605, 700), *range(703, 720))
         wait_until(lambda: "8 messages were lost on the way" in record.stderr, 30)
+        wait_until(lambda: num_recorded(tmp_path / "walk.lcmlog", "MOCAP_LAB_3D") == 212, 30)
         ended = record.end()
     assert ended.status == 1
     assert re.search(r"^lab +3d +212 .* 2 +8 +-$", ended.stdout, re.MULTILINE)
@@ -427,7 +428,7 @@ def test_a_terminal_shows_the_progress_on_one_line(tmp_path: Path, publisher: Pu
         publisher.wait_for_subscriber()
         publisher.publish("lab", *range(10), *range(12, 20))
         shown = ""
-        while not re.search(r"\r.*0:0\d  2 kB  .* messages/s  .*/s  2 lost  0 kB to be written", shown):
+        while not re.search(r"\r.*\d:\d\d  2 kB  .* messages/s  .*/s  2 lost  0 kB to be written", shown):
             shown += os.read(reading, 65536).decode()
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 1
@@ -469,19 +470,34 @@ def test_an_endpoint_where_nobody_listens_is_an_error_and_leaves_no_file(tmp_pat
     assert {path.name for path in tmp_path.iterdir()} == {"stderr"}
 
 
+HANGING: Final = """
+import sys, threading
+from gateway.cli.main import main
+from gateway.recorder.take_recording import TakeRecording
+from gateway.takes.recording import LogFile
+
+def hang(*_):
+    print("the disk hangs", file=sys.stderr, flush=True)
+    threading.Event().wait()
+
+def stop(recording, stop=TakeRecording.stop):
+    print("it ends", file=sys.stderr, flush=True)
+    stop(recording)
+
+LogFile.append, TakeRecording.stop = hang, stop
+main()
+"""
+
+
 def test_a_second_ctrl_c_ends_at_once_although_the_disk_hangs(tmp_path: Path, publisher: Publisher) -> None:
-    hanging = (
-        "import threading; from gateway.takes.recording import LogFile; from gateway.cli.main import main; "
-        "LogFile.append = lambda *_: threading.Event().wait(); main()"
-    )
-    command = (sys.executable, "-c", hanging)
+    command = (sys.executable, "-c", HANGING)
     options = (str(tmp_path / "walk"), "--connect", publisher.endpoint)
     with recording(tmp_path, *options, command=command) as record:
         publisher.wait_for_subscriber()
         publisher.publish("lab", *range(10))
-        time.sleep(2)
+        wait_until(lambda: "the disk hangs" in record.stderr, 30)
         record.process.send_signal(signal.SIGINT)
-        time.sleep(1)
+        wait_until(lambda: "it ends" in record.stderr, 30)
         assert record.process.poll() is None
         assert record.end().status == 130
 
