@@ -148,3 +148,21 @@ def test_messages_that_come_faster_than_they_are_printed_are_counted(
 def test_nothing_is_said_if_everything_is_printed(capsys: pytest.CaptureFixture[str]) -> None:
     printed("mocap/lab/c3d", b'{"n": 1}')
     assert capsys.readouterr().err == ""
+
+
+def test_what_was_not_printed_is_said_at_ctrl_c_too(capsys: pytest.CaptureFixture[str]) -> None:
+    class Interrupted(io.StringIO):
+        def write(self, _text: str) -> int:
+            raise KeyboardInterrupt
+
+    messages = [("mocap/lab/c3d", b'{"n": 1}')] * (MAX_WAITING + 5)
+    with pytest.raises(KeyboardInterrupt):
+        print_messages(
+            Published(*messages),
+            REQUEST,
+            Limits(None, None),
+            Silence("example", REQUEST),
+            Interrupted(),
+            as_json=False,
+        )
+    assert capsys.readouterr().err.startswith("5 messages were not printed")
