@@ -16,15 +16,15 @@ from gateway.stream.state import StreamState
 from gateway.stream.status_text import source_text
 
 _GOOD: Final = StreamState.STREAMING.value
-_STATE_WIDTH: Final = len("streaming 2000.0 Hz")
-_WIDE: Final = 80
-"""How wide a terminal must be for the state to have this width in one line."""
+_NARROW: Final = range(80, 110)
+_NARROW_WIDTHS: Final = {"state": len("streaming 2000.0 Hz"), "components": len("analog force")}
+"""The widths of these columns on a terminal of so many columns, so that the others stay in one line."""
 
 
 def write_sources(found: FoundSources, console: Console) -> None:
     """Write a table on a terminal; otherwise, a line for each source with tabs between the columns."""
     if console.is_terminal:
-        console.print(_table(found.sources, _STATE_WIDTH if console.width >= _WIDE else None))
+        console.print(_table(found.sources, is_narrow=console.width in _NARROW))
         return
     for source in found.sources:
         print(_line(source), file=console.file)  # rich would expand the tabs
@@ -53,10 +53,11 @@ def notes(found: FoundSources) -> list[str]:
     return texts
 
 
-def _table(sources: Sequence[FoundSource], state_width: int | None) -> Table:
+def _table(sources: Sequence[FoundSource], *, is_narrow: bool) -> Table:
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for heading in ("source", "state", "components", "server", "host", "version"):
-        table.add_column(heading, overflow="fold", min_width=state_width if heading == "state" else None)
+        width = _NARROW_WIDTHS.get(heading) if is_narrow else None
+        table.add_column(heading, overflow="fold", width=width)
     for source in sources:
         rows = [(_state(stream), stream.components) for stream in source.streams]
         if source.problem or not rows:

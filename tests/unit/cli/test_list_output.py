@@ -69,6 +69,14 @@ def test_a_table_fits_the_terminal_and_loses_nothing(columns: int) -> None:
     assert set("撮影室のコンピューター[2001:db8::1234:5678:9abc:def0]:3020") <= set(text)
 
 
+def test_on_80_columns_each_stream_that_streams_has_one_line() -> None:
+    message = two_streams()
+    message.streams[1].state, message.streams[1].frame_rate_hz = "streaming", 2000.0
+    lines = printed(found_of(message)).splitlines()
+    assert [line.split("  ")[0].strip() for line in lines] == ["source", "lab", ""]
+    assert lines[1].rstrip().endswith("192.0.2.20:3020  mocap-pc  1.2.3")
+
+
 def test_without_a_terminal_there_is_one_line_for_each_source() -> None:
     found = found_of(two_streams(source="b"), status(source="a"))
     assert printed(found, columns=10, is_terminal=False).splitlines() == [
