@@ -18,6 +18,7 @@ from tests.documents import ROOT, Block, blocks
 LONG_RUNNING: Final = (
     "rtc3d-gateway simulate",
     "rtc3d-gateway run",
+    "rtc3d-gateway view",
     "rtc3d-gateway replay examples/walk.lcmlog --loop",
     "python router.py",
 )
