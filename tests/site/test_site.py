@@ -16,6 +16,8 @@ pytestmark = pytest.mark.chromium
 
 __all__ = ["chromium", "new_page"]
 
+expect.set_options(timeout=30_000)  # busy machines need longer than the default of 5 s
+
 PHONE: Final = {"viewport": {"width": 390, "height": 844}, "is_mobile": True, "has_touch": True}
 
 TOO_WIDE: Final = """() => [...document.querySelectorAll("pre code")].filter(code => {
