@@ -10,15 +10,18 @@ NUM_COLUMNS: Final = 320
 COLUMN_US: Final = 31_250
 """320 columns of 31.25 ms are 10 s."""
 
-_MAX_LATE_COLUMNS: Final = 32
-"""Samples may be late by up to a second. If times go back by more, they begin anew there."""
+_MAX_STEP_COLUMNS: Final = 32
+"""If times go back, or forward, by more than a second, the envelope begins anew there.
+
+A plot would connect the values before and after a gap, as if there had been some between them.
+"""
 
 
 class Envelope:
     """The smallest and the largest value of a channel in each column of a plot.
 
-    Every sample of the last NUM_COLUMNS columns is within them. Values that are not finite are missing.
-    Times are µs since the Unix epoch.
+    Every sample of the last NUM_COLUMNS columns, and since the last gap, is within them. Values that are not
+    finite are missing. Times are µs since the Unix epoch.
     """
 
     def __init__(self) -> None:
@@ -63,7 +66,7 @@ class Envelope:
 
     def _make_room(self, column: int) -> None:
         newest = self._newest
-        if newest is None or column < newest - _MAX_LATE_COLUMNS or column >= newest + NUM_COLUMNS:
+        if newest is None or abs(column - newest) > _MAX_STEP_COLUMNS:
             self._clear(slice(None))
             self._newest = column
         elif column > newest:

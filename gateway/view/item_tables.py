@@ -26,7 +26,7 @@ def items_html(source: LiveSource) -> str:
         parts.append(_visibility_html(markers, "marker"))
     if markers is None and tools is None:
         parts.append("<p class=dim>no markers and no tools</p>")
-    return f"<section>{''.join(parts)}</section>"
+    return f"<section class=items>{''.join(parts)}</section>"
 
 
 def worst_first(shares: Array) -> list[int]:

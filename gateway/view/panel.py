@@ -18,6 +18,9 @@ _PLOT_INTERVAL_S: Final = 0.1
 _BANNER_INTERVAL_S: Final = 0.25
 _TEXT_INTERVAL_S: Final = 0.5
 
+_WIDTH_PX: Final = 410
+"""The tables need it."""
+
 
 class Panel:
     """The tabs of the panel, and above them a banner that says whether the picture is live.
@@ -39,6 +42,7 @@ class Panel:
         self._is_paused = False
         self._shown_latency = ShownLatency()
         self._stopped: tuple[bool, ...] = ()
+        server.gui.main_panel.set_width(_WIDTH_PX)
         server.gui.add_html(STYLE, order=-2)
         self._banner = server.gui.add_html("", order=-1)
         with tabs.add_tab("Sources"):

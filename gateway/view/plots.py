@@ -16,6 +16,11 @@ from gateway.view.envelope import COLUMN_US, NUM_COLUMNS, Envelope
 
 MAX_PLOTS: Final = 8
 
+_NOTE: Final = (
+    f"<div class=gateway>Up to {MAX_PLOTS} channels, from the smallest to the largest value of all frames. "
+    "All viewers see the same plots.</div>"
+)
+_NO_CHANNELS: Final = "<div class=gateway>No analog or force channels have come yet.</div>"
 _CHOOSE: Final = "choose …"
 _ALL: Final = "all"
 _HEIGHT_PX: Final = 120
@@ -68,11 +73,13 @@ class _Plot:
     def _data(self, end_utime: int) -> tuple[Array, Array, Array]:
         """Return the times of the columns in seconds since the Unix epoch, and the envelope.
 
-        The y axis follows the values because the times change: viser fits a plot only then.
+        The y axis follows the values because the times change: viser fits a plot only then. It cannot fit
+        a plot that begins with NaN, so the columns before the first value are left out.
         """
         lowest, highest = self._envelope.columns(end_utime)
         times_s = (end_utime // COLUMN_US + _COLUMNS) * (COLUMN_US / 1e6)
-        return times_s, lowest, highest
+        first = int(np.argmax(np.isfinite(lowest)))
+        return times_s[first:], lowest[first:], highest[first:]
 
 
 class Plots:
@@ -80,7 +87,8 @@ class Plots:
 
     def __init__(self, server: viser.ViserServer) -> None:
         self._server = server
-        self._add = server.gui.add_dropdown("Plot", [_CHOOSE], hint=f"Up to {MAX_PLOTS} channels")
+        self._note = server.gui.add_html(_NO_CHANNELS)
+        self._add = server.gui.add_dropdown("Plot", [_CHOOSE], visible=False)
         self._remove = server.gui.add_dropdown("Remove", [_CHOOSE], visible=False)
         self._folder = server.gui.add_folder(None)
         self._choices: dict[str, Channel] = {}
@@ -130,6 +138,7 @@ class Plots:
         offered = (text for text in self._choices if text not in self._plots and not is_full)
         _set_options(self._add, (_CHOOSE, *offered))
         _set_options(self._remove, (_CHOOSE, *self._plots, *([_ALL] if len(self._plots) > 1 else [])))
+        self._note.content = _NOTE if self._choices else _NO_CHANNELS
         self._add.visible, self._remove.visible = bool(self._choices), bool(self._plots)
 
 

@@ -11,8 +11,10 @@ STYLE: Final = """<style>
 .gateway p { margin: 2px 0 }
 .gateway table { width: 100%; border-collapse: collapse; margin: 6px 0; font-variant-numeric: tabular-nums }
 .gateway th { font-weight: 500; opacity: .65; font-size: 11.5px; vertical-align: bottom }
-.gateway th, .gateway td { text-align: right; padding: 2px 0 2px 8px; white-space: nowrap }
-.gateway th:first-child, .gateway td:first-child { text-align: left; padding-left: 0; white-space: normal }
+.gateway th, .gateway td { text-align: right; padding: 2px 0 2px 8px; overflow-wrap: normal }
+.gateway td { white-space: nowrap }
+.gateway th:first-child, .gateway td:first-child { text-align: left; padding-left: 0 }
+.gateway .items td:first-child { white-space: normal; overflow-wrap: anywhere }
 .gateway td { border-top: 1px solid var(--g-line) }
 .gateway .good { color: var(--g-good) }
 .gateway .waiting { color: var(--g-waiting) }
@@ -24,7 +26,8 @@ STYLE: Final = """<style>
 .gateway .bar { display: inline-block; width: 70px; height: 7px; margin-right: 6px;
   background: var(--g-line) }
 .gateway .bar i { display: block; height: 100%; background: currentColor }
-.gateway .events :is(td, th) { text-align: left; white-space: normal }
+.gateway .events :is(td, th) { text-align: left }
+.gateway .events td:not(:first-child) { white-space: normal; overflow-wrap: anywhere }
 .gateway .frozen { max-height: 0; overflow: hidden; background: var(--g-bad); color: var(--g-on-bad);
   border-radius: 4px; padding: 0 8px; animation: gateway-frozen 1ms 4s forwards }
 @keyframes gateway-frozen { to { max-height: 4em; padding: 5px 8px } }

@@ -20,7 +20,7 @@ class Lab:
     def __init__(self, name: str = "lab") -> None:
         self.name = name
         self.live = LiveData()
-        self._sequence = 0
+        self._sequences: dict[ComponentType, int] = {}
 
     @property
     def source(self) -> LiveSource:
@@ -30,8 +30,8 @@ class Lab:
 
     def send(self, component: ComponentType, items: Sequence[Any], **options: Any) -> None:
         """Send a message, by default captured now, with the next sequence number."""
-        sequence = options.pop("sequence", self._sequence)
-        self._sequence = sequence + 1
+        sequence = options.pop("sequence", self._sequences.get(component, 0))
+        self._sequences[component] = sequence + 1
         _, message = frame(component, items, sequence, **{"utime": now_utime(), **options})
         self.live.publish(self.name, component.key, message)
 

@@ -1,0 +1,145 @@
+"""The panel of ``view`` in a real browser."""
+
+import html
+import itertools
+import threading
+from collections.abc import Iterator
+from typing import Final
+
+import pytest
+from playwright.sync_api import Page, expect
+
+from gateway.rtc3d.components import ComponentType
+from gateway.view.panel import Panel
+from gateway.view.server import ViewServer, open_server
+from gateway.view.viewer import PERIOD_S
+from tests.browser import NewPage, chromium, new_page
+from tests.unit.view.live_lab import Lab, stream
+
+pytestmark = pytest.mark.chromium
+
+__all__ = ["chromium", "new_page"]
+
+HOSTILE: Final = ("<img src=x onerror=alert(1)>", "[x](http://192.0.2.1)")
+SPIKE: Final = 500.0
+
+TIMEOUT_MS: Final = 40_000
+"""Chromium that renders in software takes a while on a busy computer."""
+
+_PLOTS: Final = "Object.values(window.__viserTestpoints?.uplots ?? {}).map(plot => plot.chart)"
+
+
+class Shown:
+    """A panel without a scene, in a thread, and a source that sends 50 frames a second in another one."""
+
+    def __init__(self, server: ViewServer) -> None:
+        self.lab = Lab()
+        self.address = f"http://127.0.0.1:{server.get_port()}"
+        self.is_sending = True
+        self.value = 1.0
+        """Of the second analog channel."""
+        self._panel = Panel(server, server.gui.add_tab_group(), self.lab.live)
+        self._ends = [threading.Event(), threading.Event()]
+        self._threads = [
+            threading.Thread(target=self._show),
+            threading.Thread(target=self._send),
+        ]
+        labels = "".join(f"<Marker><Label>{html.escape(label)}</Label></Marker>" for label in HOSTILE)
+        channel = f"<Channel><Label>{html.escape(HOSTILE[0])}</Label></Channel>"
+        self.lab.send_parameters(
+            f"<The_3D><Markers>2</Markers>{labels}</The_3D><Analog><Channels>1</Channels>{channel}</Analog>"
+        )
+        for thread in self._threads:
+            thread.start()
+
+    def stop_panel(self) -> None:
+        """Show nothing new any more."""
+        self._ends[0].set()
+        self._threads[0].join()
+
+    def stop(self) -> None:
+        """End both threads."""
+        self._ends[1].set()
+        self._threads[1].join()
+        self.stop_panel()
+
+    def _show(self) -> None:
+        while not self._ends[0].wait(PERIOD_S):
+            self._panel.update(self.lab.live.update())
+
+    def _send(self) -> None:
+        for number in itertools.count():
+            if self._ends[1].wait(0.02):
+                return
+            if number % 50 == 0:
+                self.lab.send_status(stream(state="streaming" if self.is_sending else "no measurement"))
+            if self.is_sending:
+                self.lab.send_markers(True, number % 2 == 0)
+                self.lab.send(ComponentType.ANALOG, [0.5, self.value])
+
+
+@pytest.fixture
+def server() -> Iterator[ViewServer]:
+    server = open_server("127.0.0.1", 0)
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def shown(server: ViewServer) -> Iterator[Shown]:
+    shown = Shown(server)
+    yield shown
+    shown.stop()
+
+
+@pytest.fixture
+def page(shown: Shown, new_page: NewPage) -> Page:
+    page = new_page(viewport={"width": 600, "height": 400})
+    page.set_default_timeout(TIMEOUT_MS)
+    page.goto(shown.address)
+    return page
+
+
+def choose(page: Page, channel: str) -> None:
+    """Plot a channel."""
+    page.get_by_text("Plots", exact=True).click()
+    field = page.get_by_label("Plot", exact=True)
+    field.click()
+    field.fill(channel)
+    page.get_by_role("option", name=channel).click()
+
+
+def test_labels_are_text_wherever_they_are_shown(page: Page) -> None:
+    page.get_by_text("Markers", exact=True).click()
+    for label in HOSTILE:
+        expect(page.get_by_text(label, exact=True)).to_be_visible(timeout=TIMEOUT_MS)
+    choose(page, f"lab analog 1: {HOSTILE[0]} (mV)")
+    expect(page.locator(".u-title")).to_have_text(f"lab analog 1: {HOSTILE[0]} (mV)", timeout=TIMEOUT_MS)
+    assert not page.locator("img[src=x], a[href*='192.0.2.1']").count()
+
+
+def test_a_stop_is_said_with_its_reason_until_data_come_again(page: Page, shown: Shown) -> None:
+    banner, stopped = page.locator(".gateway").first, page.locator(".gateway .stopped")
+    expect(banner).to_contain_text("● live lab", timeout=TIMEOUT_MS)
+    shown.is_sending = False
+    expect(stopped).to_contain_text("lab: no data for", timeout=TIMEOUT_MS)
+    expect(stopped).to_contain_text("no measurement running", timeout=TIMEOUT_MS)
+    shown.is_sending = True
+    expect(banner).to_contain_text("● live lab", timeout=TIMEOUT_MS)
+    expect(stopped).to_have_count(0)
+
+
+def test_the_page_says_that_it_gets_nothing_any_more(page: Page, shown: Shown) -> None:
+    expect(page.locator(".gateway").first).to_contain_text("● live lab", timeout=TIMEOUT_MS)
+    page.wait_for_function("document.querySelector('.gateway .frozen').clientHeight == 0")
+    shown.stop_panel()
+    page.wait_for_function("document.querySelector('.gateway .frozen').clientHeight > 10")
+
+
+def test_a_spike_is_within_its_plot(page: Page, shown: Shown) -> None:
+    choose(page, "lab analog 2: channel 2 (mV)")
+    page.wait_for_function(f"{_PLOTS}.some(plot => plot.scales.y.max > 1)")
+    shown.value = SPIKE
+    page.wait_for_function(f"{_PLOTS}.some(plot => plot.scales.y.max >= {SPIKE})")
+    shown.value = 1.0
+    page.wait_for_function(f"{_PLOTS}.some(plot => plot.scales.y.max < {SPIKE})")
