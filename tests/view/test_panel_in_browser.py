@@ -94,7 +94,7 @@ def shown(server: ViewServer) -> Iterator[Shown]:
 
 @pytest.fixture
 def page(shown: Shown, new_page: NewPage) -> Page:
-    page = new_page(viewport={"width": 600, "height": 400})
+    page = new_page(viewport={"width": 800, "height": 400})
     page.set_default_timeout(TIMEOUT_MS)
     page.goto(shown.address)
     return page
