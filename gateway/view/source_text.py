@@ -46,7 +46,7 @@ def source_html(source: LiveSource, shown: Mapping[str, Percentiles], *, is_take
     parts += [f"<p class=dim>{line}</p>" for line in _origin(source)]
     components = _components(source)
     if components:
-        parts.append(_rates_table(source, components))
+        parts.append(_rates_table(source, components, is_take=is_take))
         parts.append(_latency_table(components, shown, is_take=is_take))
         parts += [f"<p class=waiting>{text}</p>" for text in clock_warning(components) if not is_take]
     losses = [f"<p class={level.value}>{text}</p>" for level, text in _losses(source)]
@@ -96,7 +96,7 @@ def _origin(source: LiveSource) -> Iterator[str]:
     yield f"server {html_text(status.server)} · gateway {html_text(status.gateway_version)}{on_host}"
 
 
-def _rates_table(source: LiveSource, components: Mapping[str, LiveComponent]) -> str:
+def _rates_table(source: LiveSource, components: Mapping[str, LiveComponent], *, is_take: bool) -> str:
     rows = []
     for key, component in components.items():
         check = source.series_by_key[key].check
@@ -104,7 +104,7 @@ def _rates_table(source: LiveSource, components: Mapping[str, LiveComponent]) ->
             (
                 key,
                 count_text(len(component.newest_items)) if key != "event" else "",
-                _rate(component) if key != "event" else "",
+                _rate(component, is_take=is_take) if key != "event" else "",
                 count_text(source.series_by_key[key].num_messages),
                 f"<span class=bad>{count_text(check.num_lost)}</span>" if check.num_lost else "0",
             )
@@ -112,15 +112,15 @@ def _rates_table(source: LiveSource, components: Mapping[str, LiveComponent]) ->
     return table(("", "items", "Hz", "messages", "lost"), rows)
 
 
-def _rate(component: LiveComponent) -> str:
-    """Return the rate, and the announced one if there is one."""
+def _rate(component: LiveComponent, *, is_take: bool) -> str:
+    """Return the rate, and the announced one if there is one. That of a take depends on its speed."""
     if component.is_stopped:
         return f"<span class=bad>stopped {age_text(component.age_s or 0.0)} ago</span>"
     announced_hz = component.announced_rate_hz
     text = rate_text(component.rate_hz)
     if announced_hz is None:
         return text
-    if component.rate_hz < _SLOW * announced_hz:
+    if component.rate_hz < _SLOW * announced_hz and not is_take:
         text = f"<span class=waiting>{text}</span>"
     return f"{text} <span class=dim>of {rate_text(announced_hz)}</span>"
 

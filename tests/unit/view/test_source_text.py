@@ -38,6 +38,8 @@ def test_rates_and_announced_rates(lab: Lab) -> None:
     lab.send_parameters("<The_3D><Markers>2</Markers><Frequency>200</Frequency></The_3D>")
     lab.send_markers(True, True)
     assert "|3d|2|0.0|of 200.0|1|0|" in shown_text(lab)
+    assert "<span class=waiting>0.0</span>" in source_html(lab.source, {}, is_take=False)
+    assert "waiting" not in source_html(lab.source, {}, is_take=True)
 
 
 def test_latency_by_stage(lab: Lab) -> None:
