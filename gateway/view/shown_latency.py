@@ -25,7 +25,7 @@ class ShownLatency:
         now = now_utime()
         for source in sources:
             samples_ms = self._samples_ms.setdefault(source.name, {})
-            for key, component in source.components.items():
+            for key, component in [*source.components.items()]:
                 arrived_utime = component.newest_arrived_utime
                 if len(component.batch.heads) and arrived_utime is not None:
                     of_component = samples_ms.setdefault(key, deque(maxlen=_NUM_SAMPLES))

@@ -83,8 +83,9 @@ def clock_warning(components: Mapping[str, LiveComponent]) -> Iterator[str]:
 
 
 def _components(source: LiveSource) -> dict[str, LiveComponent]:
-    keys = [component.key for component in WIRE_ORDER]
-    return {key: source.components[key] for key in keys if key in source.components}
+    # Threads that receive add components, and after each the series of its messages.
+    keys = [each.key for each in WIRE_ORDER if each.key in source.series_by_key]
+    return {key: source.components[key] for key in keys}
 
 
 def _origin(source: LiveSource) -> Iterator[str]:

@@ -42,7 +42,7 @@ def data_state(source: LiveSource) -> State:
     age_s = source.age_s
     if age_s is None:
         return State(Level.WAITING, "no data yet")
-    components = {key: each for key, each in sorted(source.components.items()) if key != "event"}
+    components = {key: each for key, each in sorted([*source.components.items()]) if key != "event"}
     stopped = {key: each for key, each in components.items() if each.is_stopped}
     if not stopped:
         return State(Level.GOOD, "live")

@@ -5,6 +5,7 @@ import re
 import pytest
 import rtc3d
 
+from gateway.live.component import LiveComponent
 from gateway.live.latency import Percentiles
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import ComponentType
@@ -161,3 +162,10 @@ def test_parameters_and_status_that_cannot_be_read() -> None:
     broken = rtc3d.status_t().encode()[:60]
     lab.live.publish("lab", "status", broken)
     assert "parameters or status that cannot be read: 1 message" in shown_text(lab)
+
+
+def test_a_component_that_a_thread_adds_at_this_moment(lab: Lab) -> None:
+    lab.send_markers(True)
+    source = lab.source
+    source.components["analog"] = LiveComponent(ComponentType.ANALOG)
+    assert "analog" not in source_html(source, {}, is_take=False)
