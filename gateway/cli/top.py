@@ -15,13 +15,14 @@ import typer
 from gateway.cli.gateway_queries import exit_with
 from gateway.cli.options import ConnectOption, PrefixOption, SourcesOption, UrlOption, ZenohConfigOption
 from gateway.errors import QueryError
-from gateway.safe_text import safe_lines
+from gateway.safe_text import safe_lines, safe_text
 from gateway.service.log_format import LogLevel, set_up_log
 
 if TYPE_CHECKING:
     from gateway.live.live_data import LiveData
     from gateway.subscriber.sides import SubscriberSide, Transport
 
+_MAX_TITLE: Final = 60
 _MAX_WIDTH: Final = 10_000
 """How wide tables may be in files and pipes."""
 
@@ -71,7 +72,7 @@ def _run(transport: "Transport", wanted: list[str], *, is_once: bool, as_json: b
     side = subscribe_all(transport, wanted, None, live)
     try:
         if is_shown:
-            _show(live, side, notices, "LCM" if transport.is_lcm else "Zenoh")
+            _show(live, side, notices, _title(transport))
         else:
             _print(live, side, wanted, is_once=is_once or not as_json, as_json=as_json)
     finally:
@@ -81,6 +82,11 @@ def _run(transport: "Transport", wanted: list[str], *, is_once: bool, as_json: b
 def has_screen(out: TextIO, environ: Mapping[str, str]) -> bool:
     """Return whether ``out`` is a terminal on which texts can be placed."""
     return out.isatty() and environ.get("TERM", "dumb") not in {"", "dumb", "unknown"}
+
+
+def _title(transport: "Transport") -> str:
+    words = ("LCM", transport.url) if transport.is_lcm else ("Zenoh", transport.connect)
+    return safe_text(" ".join(filter(None, words)), _MAX_TITLE)
 
 
 class _Notices(logging.Handler):

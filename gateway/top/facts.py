@@ -155,13 +155,18 @@ def state(source: LiveSource) -> StateFacts:
     if status is None:
         return StateFacts("waiting for the status of its gateway", "warning")
     text = _sentence(source_text(message_texts(status))) or "its gateway reports no stream"
-    stopped = [key for key, component in [*source.components.items()] if component.is_stopped]
+    stopped = [each.key for each in WIRE_ORDER if _is_stopped(source, each)]
     states = {stream.state for stream in status.streams}
     if any(stream.problem for stream in status.streams) or states & _BAD_STATES:
         return StateFacts(text, "error")
     if stopped:
         return StateFacts(f"{text}; stopped: {' '.join(stopped)}", "error")
     return StateFacts(text, "ok" if states == {StreamState.STREAMING.value} else "warning")
+
+
+def _is_stopped(source: LiveSource, kind: ComponentType) -> bool:
+    component = source.components.get(kind.key)
+    return component is not None and component.is_stopped
 
 
 def components(source: LiveSource) -> list[ComponentFacts]:
@@ -178,7 +183,8 @@ def _component(source: LiveSource, kind: ComponentType) -> ComponentFacts:
     series = source.series_by_key.get(kind.key)
     has_come = component.newest_head is not None
     announced = describe(kind, source.newest_parameters, len(component.newest_items)).rate_hz
-    can_be_missing = kind in {ComponentType.MARKERS, ComponentType.TOOLS} and has_come
+    can_be_seen = kind in {ComponentType.MARKERS, ComponentType.TOOLS} and has_come
+    num_visible = 0 if component.is_stopped else int(is_visible(component.newest_items).sum())
     to_gateway, to_here = component.latency.to_gateway, component.latency.to_here
     return ComponentFacts(
         component=kind.key,
@@ -194,7 +200,7 @@ def _component(source: LiveSource, kind: ComponentType) -> ComponentFacts:
         gateway_to_here_p50_ms=_p50_ms(to_here),
         gateway_to_here_p99_ms=_p99_ms(to_here),
         num_items=len(component.newest_items) if has_come else None,
-        num_visible=int(is_visible(component.newest_items).sum()) if can_be_missing else None,
+        num_visible=num_visible if can_be_seen else None,
         age_s=component.age_s,
         is_stopped=component.is_stopped,
         num_skipped=component.num_skipped,

@@ -34,7 +34,7 @@ def overview(sources: Sequence[LiveSource]) -> Table:
     """Each source with its state, and a line for each of its components."""
     columns = (
         Column("component"),
-        Column("Hz", is_number=True),
+        Column("Hz", is_number=True, width=6),
         Column("announced", is_number=True, rank=1),
         Column("lost", is_number=True),
         Column("gaps", is_number=True, rank=4),
@@ -66,6 +66,7 @@ def _component_row(component: facts.ComponentFacts) -> Row:
         and component.num_messages > 0
         and component.rate_hz < _LITTLE * component.announced_rate_hz
     )
+    is_missing = component.num_visible is not None and component.num_visible < (component.num_items or 0)
     lost_style = Style.BAD if component.num_lost else Style.PLAIN
     return (
         text_cell(component.component),
@@ -77,7 +78,7 @@ def _component_row(component: facts.ComponentFacts) -> Row:
         _latency_cell(component.capture_to_gateway_p50_ms, component.capture_to_gateway_p99_ms),
         _latency_cell(component.gateway_to_here_p50_ms, component.gateway_to_here_p99_ms),
         number_cell(component.num_items),
-        number_cell(component.num_visible),
+        number_cell(component.num_visible, 0, _warning_if(is_missing)),
         number_cell(component.age_s, 1, style if style is Style.BAD else Style.PLAIN),
         text_cell(note, style),
     )
@@ -138,7 +139,7 @@ def tools(sources: Sequence[LiveSource]) -> Table:
 
 
 def _position_columns() -> list[Column]:
-    return [*(Column(axis, is_number=True, rank=2) for axis in "xyz"), Column("unit", rank=3)]
+    return [*(Column(axis, is_number=True, rank=2, width=7) for axis in "xyz"), Column("unit", rank=3)]
 
 
 def _item_cells(item: facts.ItemFacts) -> list[Cell]:
@@ -170,7 +171,7 @@ def server(sources: Sequence[LiveSource]) -> Table:
     columns = (
         Column("stream"),
         Column("state"),
-        Column("Hz", is_number=True),
+        Column("Hz", is_number=True, width=6),
         Column("session", is_number=True, rank=4),
         Column("reconnects", is_number=True, rank=3),
         Column("restarts", is_number=True, rank=6),

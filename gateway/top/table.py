@@ -18,11 +18,15 @@ _INDENT: Final = "  "
 
 
 class Column(NamedTuple):
-    """A column. Those with the highest ``rank`` are left out first where the width does not suffice."""
+    """A column, at least ``width`` wide, so that the others stay in place while its numbers change.
+
+    Those with the highest ``rank`` are left out first where the screen is too narrow.
+    """
 
     title: str
     is_number: bool = False
     rank: int = 0
+    width: int = 0
 
 
 class Cell(NamedTuple):
@@ -166,7 +170,7 @@ def _title(column: Column, order: Order | None) -> str:
 
 
 def _widths(table: Table, titles: Iterable[str]) -> list[int]:
-    widths = [cell_len(title) for title in titles]
+    widths = [max(cell_len(title), column.width) for title, column in zip(titles, table.columns, strict=True)]
     for section in table.sections:
         for row in section.rows:
             for number, cell in enumerate(row):

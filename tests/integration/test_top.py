@@ -134,6 +134,16 @@ def test_json_prints_a_line_every_second_until_it_is_interrupted(lab: Lab) -> No
     assert 2_500_000 < times[-1] - times[0] < 30_000_000
 
 
+def test_json_says_once_that_there_is_no_gateway_and_goes_on() -> None:
+    pipes: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with program("top", "--json", "--lcm", "--url", lcm_url(), **pipes) as process:
+        assert process.stderr.readline().startswith("no gateway found on LCM (")
+        assert [json.loads(process.stdout.readline())["sources"] for _ in range(4)] == [[]] * 4
+        process.send_signal(signal.SIGTERM)
+        _, rest = process.communicate(timeout=20)
+    assert (process.returncode, rest) == (0, "")
+
+
 @pytest.mark.parametrize("side", ["zenoh", "lcm"])
 @pytest.mark.parametrize("options", [["--once"], ["--once", "--json"], []], ids=["once", "json", "piped"])
 def test_without_a_gateway_it_says_so_with_status_3(side: str, options: list[str]) -> None:

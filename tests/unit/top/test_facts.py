@@ -36,7 +36,7 @@ def test_data_that_stop_are_stopped_at_once(monkeypatch: pytest.MonkeyPatch) -> 
     source = lab.source()
     [component] = facts.components(source)
     assert component.is_stopped
-    assert component.rate_hz == 0
+    assert (component.rate_hz, component.num_visible) == (0, 0)
     assert facts.state(source) == facts.StateFacts("streaming 200.0 Hz; stopped: 3d", "error")
     [marker] = facts.markers(source)
     assert not marker.is_visible
