@@ -21,7 +21,7 @@ from gateway.stream.status_text import message_texts, source_text
 from gateway.subscriber.series import POSE
 from gateway.takes.labels import describe
 
-_MAX_ENTRIES: Final = 200
+_MAX_ENTRIES: Final = 50
 """How many streams, outputs, causes and results of a status are taken, of each kind."""
 
 _MAX_LABEL: Final = 64

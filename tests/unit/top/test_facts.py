@@ -156,7 +156,7 @@ def test_texts_from_networks_are_cut_and_escaped() -> None:
 def test_a_status_with_very_many_entries_is_cut() -> None:
     lab = LiveLab()
     lab.status(*[stream(str(number)) for number in range(1000)])
-    assert len(facts.streams(lab.source())) == 200
+    assert len(facts.streams(lab.source())) == 50
 
 
 def test_everything_about_a_source_is_json() -> None:
