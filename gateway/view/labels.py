@@ -60,7 +60,9 @@ class Labels:
         for index in range(first, min(count, first + _PER_PERIOD)):
             text = self._texts[index] if index < len(self._texts) else ""
             name = f"{self._parent.name}/{index}"
-            self._nodes.append(self._scene.add_label(name, text, visible=False, anchor="bottom-left"))
+            self._nodes.append(
+                self._scene.add_label(name, text, visible=False, font_screen_scale=0.8, anchor="bottom-left")
+            )
         added = np.full((len(self._nodes) - first, 3), np.nan, np.float32)
         self._positions = np.concatenate([self._positions, added])
 

@@ -1,0 +1,59 @@
+"""The server of the page: its address, and what it does not do."""
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from gateway.errors import ViewError
+from gateway.view.server import ViewServer, address_of, is_loopback, open_server
+
+
+@pytest.fixture
+def server() -> Iterator[ViewServer]:
+    server = open_server("127.0.0.1", 0)
+    yield server
+    server.stop()
+
+
+def test_a_port_in_use_is_one_sentence_with_the_port_and_the_option() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(ViewError, match=rf"^port {port} of 127\.0\.0\.1 is in use .* --port$"):
+            open_server("127.0.0.1", port)
+
+
+def test_a_port_that_was_used_a_moment_ago_can_be_used_again(server: ViewServer) -> None:
+    with socket.create_connection(("127.0.0.1", server.get_port())):
+        server.stop()
+    open_server("127.0.0.1", server.get_port()).stop()
+
+
+@pytest.mark.parametrize("host", ["192.0.2.1", "no-such-host.invalid"])
+def test_an_address_of_another_computer_is_one_sentence_with_the_option(host: str) -> None:
+    with pytest.raises(ViewError, match=f"{host}.*--host"):
+        open_server(host, 0)
+
+
+def test_it_prints_nothing_and_shares_nothing(capfd: pytest.CaptureFixture[str], server: ViewServer) -> None:
+    assert server.request_share_url() is None  # type: ignore[func-returns-value]
+    server.stop()
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("host", "address"),
+    [
+        ("127.0.0.1", "http://127.0.0.1:8080"),
+        ("0.0.0.0", "http://localhost:8080"),  # noqa: S104
+        ("::1", "http://[::1]:8080"),
+        ("lab-pc", "http://lab-pc:8080"),
+    ],
+)
+def test_the_address_can_be_opened_on_this_computer(host: str, address: str) -> None:
+    assert address_of(host, 8080) == address
+
+
+def test_who_can_reach_an_address() -> None:
+    assert all(map(is_loopback, ("127.0.0.1", "127.1.2.3", "::1", "localhost")))
+    assert not any(map(is_loopback, ("192.0.2.1", "lab-pc", "::")))

@@ -1,0 +1,131 @@
+"""The viewer with pages that are connected, but are no browsers."""
+
+import contextlib
+import threading
+from collections.abc import Iterator
+
+import pytest
+
+from gateway.rtc3d.components import ComponentType
+from gateway.view.server import ViewServer, open_server
+from gateway.view.viewer import Viewer
+from tests.unit.view.live_lab import Lab
+from tests.unit.view.page_client import PageClient, page_client
+from tests.waiting import wait_until
+
+POINTS = "/sources/MOCAP_LAB/markers"
+
+
+@pytest.fixture
+def server() -> Iterator[ViewServer]:
+    server = open_server("127.0.0.1", 0)
+    yield server
+    server.stop()
+
+
+@pytest.fixture
+def lab() -> Lab:
+    return Lab()
+
+
+@pytest.fixture
+def viewer(server: ViewServer, lab: Lab) -> Viewer:
+    return Viewer(server, lab.live)
+
+
+def num_sent(server: ViewServer) -> int:
+    return server._connection.get_message_buffer().message_counter
+
+
+def show(viewer: Viewer, lab: Lab, times: int, num_markers: int = 1) -> None:
+    """Show frames that differ."""
+    for number in range(times):
+        markers = [(number % 1000, each, 0, 0.1) for each in range(num_markers)]
+        lab.send(ComponentType.MARKERS, markers)
+        viewer.update()
+
+
+def test_nothing_is_sent_while_no_page_is_connected(viewer: Viewer, lab: Lab, server: ViewServer) -> None:
+    show(viewer, lab, times=1)
+    before = num_sent(server)
+    show(viewer, lab, times=50)
+    assert num_sent(server) == before
+
+
+def test_each_of_three_pages_sees_the_data(viewer: Viewer, lab: Lab, server: ViewServer) -> None:
+    with contextlib.ExitStack() as stack:
+        pages = [stack.enter_context(page_client(server)) for _ in range(3)]
+        wait_until(lambda: len(server.get_clients()) == 3)
+        with _running(viewer, lab):
+            for page in pages:
+                page.wait_for(POINTS, "points")
+    wait_until(lambda: not server.get_clients())
+
+
+def test_the_view_of_a_page_is_fitted_once_and_when_it_wants(
+    viewer: Viewer, lab: Lab, server: ViewServer
+) -> None:
+    with page_client(server) as page:
+        wait_until(lambda: bool(server.get_clients()))
+        with _running(viewer, lab):
+            _wait_for_camera(page)
+            [number] = server.get_clients()
+            assert number in viewer.scene._fitted
+            viewer.scene._fitted.discard(number)  # as its button does
+            wait_until(lambda: number in viewer.scene._fitted)
+
+
+def test_a_page_that_does_not_read_costs_no_memory_and_does_not_delay_others(
+    viewer: Viewer, lab: Lab, server: ViewServer
+) -> None:
+    with page_client(server), page_client(server) as reader:
+        wait_until(lambda: len(server.get_clients()) == 2)
+        waiting = server._connection.get_message_buffer().message_from_id
+        with _running(viewer, lab):
+            reader.wait_for(POINTS, "points")
+        show(viewer, lab, times=10)
+        before = len(waiting)
+        show(viewer, lab, times=300, num_markers=1000)  # 12 kB each: more than its socket takes
+        assert len(waiting) <= before + 10
+        with _running(viewer, lab):
+            reader.wait_for(POINTS, "points")
+
+
+def test_a_page_that_comes_and_goes_leaves_nothing(viewer: Viewer, lab: Lab, server: ViewServer) -> None:
+    waiting = server._connection.get_message_buffer().message_from_id
+    sizes = []
+    for _ in range(4):
+        with page_client(server) as page:
+            wait_until(lambda: bool(server.get_clients()))
+            with _running(viewer, lab):
+                page.wait_for(POINTS, "points")
+        wait_until(lambda: not server.get_clients())
+        viewer.update()
+        sizes.append(len(waiting))
+    assert sizes[-1] <= sizes[1]
+    assert viewer.scene._fitted == set() or len(viewer.scene._fitted) == 1
+
+
+def _wait_for_camera(page: PageClient) -> None:
+    while not any(message["type"] == "SetCameraLookAtMessage" for message in page.receive()):
+        pass
+
+
+@contextlib.contextmanager
+def _running(viewer: Viewer, lab: Lab) -> Iterator[None]:
+    """Run the viewer in a thread, with a frame for each picture."""
+    stop = threading.Event()
+    number = 0
+
+    def send() -> None:
+        nonlocal number
+        number += 1
+        lab.send(ComponentType.MARKERS, [(number % 1000, 0, 0, 0.1)])
+
+    thread = threading.Thread(target=viewer.run, args=(stop, send))
+    thread.start()
+    try:
+        yield
+    finally:
+        stop.set()
+        thread.join()
