@@ -1,5 +1,6 @@
 """Where the camera of a browser stands, so that it sees all data."""
 
+import math
 from collections.abc import Sequence
 from typing import Final, NamedTuple
 
@@ -40,10 +41,14 @@ def sphere_around(parts: Sequence[Array]) -> Sphere | None:
 
 
 def fit(client: viser.ClientHandle, sphere: Sphere, up: UpAxis) -> None:
-    """Turn the camera of one browser so that it sees the sphere."""
+    """Turn the camera of one browser so that it sees the sphere.
+
+    Raises ValueError if the browser has said that its camera is at no place.
+    """
     camera = client.camera
-    angle = min(camera.fov, 2 * float(np.arctan(np.tan(camera.fov / 2) * max(0.1, camera.aspect))))
-    distance = _MARGIN * sphere.radius / float(np.sin(max(0.1, angle) / 2))
+    aspect = camera.image_width / max(1, camera.image_height)  # the height of a page can be 0
+    angle = min(camera.fov, 2 * math.atan(math.tan(camera.fov / 2) * max(0.1, aspect)))
+    distance = _MARGIN * sphere.radius / math.sin(min(max(0.1, angle), math.pi) / 2)
     direction = np.array(on_floor(up, *_FROM))
     position = np.array(sphere.centre) + distance * direction / np.linalg.norm(direction)
     with client.atomic():

@@ -1,6 +1,7 @@
 """The picture: the world, and a group for each source."""
 
 import time
+from contextlib import suppress
 from typing import Final
 
 import viser
@@ -79,5 +80,6 @@ class Scene:
         if now_s - self._first_s < _SETTLE_S:
             return
         for client in waiting:
-            fit(client, sphere, self._world.up)
             self._fitted.add(client.client_id)
+            with suppress(ValueError):
+                fit(client, sphere, self._world.up)

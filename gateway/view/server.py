@@ -1,7 +1,9 @@
 """The web server of the live view."""
 
+import errno
 import ipaddress
 import socket
+import warnings
 
 import rich
 import viser
@@ -20,6 +22,7 @@ def open_server(host: str, port: int) -> ViewServer:
     """Serve the page at this address; port 0 picks a free one. Raises ViewError if that is not possible."""
     _check_address(host, port)
     rich.get_console().quiet = True  # viser prints there, also when a browser connects
+    warnings.filterwarnings("ignore", "Queued a ")  # to a browser that has left a moment ago
     server = ViewServer(host, port, label="rtc3d-gateway", verbose=False)
     if port not in {0, server.get_port()}:  # taken since; viser chose another port
         server.stop()
@@ -57,7 +60,7 @@ def _check_address(host: str, port: int) -> None:
     except OSError as error:
         if isinstance(error, socket.gaierror):
             raise ViewError(f"no address {host}: {error.strerror}; choose another one with --host") from None
-        if port and error.errno in {98, 48}:
+        if port and error.errno == errno.EADDRINUSE:
             raise ViewError(_in_use(host, port)) from None
         raise ViewError(
             f"cannot serve the page on {host}:{port}: {error.strerror}; choose with --host and --port"

@@ -68,8 +68,9 @@ class Switches:
 
     @property
     def up(self) -> UpAxis:
-        """The axis that points up."""
-        return self._up.value
+        """The axis that points up; z if a page has sent anything else."""
+        chosen = self._up.value
+        return chosen if chosen in UP_AXES else "z"
 
     def suggest_up(self, up: UpAxis) -> None:
         """Choose the axis that points up, unless somebody has chosen it."""

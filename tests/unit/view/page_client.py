@@ -27,9 +27,9 @@ _CAMERA: Final = {
 class PageClient:
     """A page that is connected; viser counts it after its first camera message."""
 
-    def __init__(self, connection: Connection) -> None:
+    def __init__(self, connection: Connection, camera: dict[str, Any]) -> None:
         self._connection = connection
-        connection.send(msgspec.msgpack.encode(_CAMERA))
+        connection.send(msgspec.msgpack.encode({**_CAMERA, **camera}))
 
     def receive(self) -> list[dict[str, Any]]:
         """Return the messages of the next window; arrays are placeholders. Wait at most 10 s."""
@@ -49,9 +49,9 @@ class PageClient:
 
 
 @contextmanager
-def page_client(server: viser.ViserServer) -> Iterator[PageClient]:
-    """Connect a page, and provide it."""
+def page_client(server: viser.ViserServer, **camera: Any) -> Iterator[PageClient]:
+    """Connect a page, and provide it. ``camera`` replaces fields of its camera message."""
     url = f"ws://127.0.0.1:{server.get_port()}"
     protocol: Any = f"viser-v{viser.__version__}"
     with connect(url, subprotocols=[protocol], max_size=None, close_timeout=0.1) as connection:
-        yield PageClient(connection)
+        yield PageClient(connection, camera)

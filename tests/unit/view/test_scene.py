@@ -257,6 +257,9 @@ def test_the_up_axis_is_that_of_the_plates_until_somebody_chooses(picture: Pictu
     picture.switch("up", "x")
     picture.show()
     assert picture.up == "x"
+    picture.switch("up", "no axis")  # no page of ours sends this
+    picture.show()
+    assert picture.up == "z"
 
 
 def test_plates_without_a_known_place_stand_at_the_origin_and_say_so(picture: Picture) -> None:

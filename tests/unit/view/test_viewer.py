@@ -1,8 +1,10 @@
 """The viewer with pages that are connected, but are no browsers."""
 
 import contextlib
+import math
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -73,6 +75,20 @@ def test_the_view_of_a_page_is_fitted_once_and_when_it_wants(
             assert number in viewer.scene._fitted
             viewer.scene._fitted.discard(number)  # as its button does
             wait_until(lambda: number in viewer.scene._fitted)
+
+
+@pytest.mark.parametrize(
+    "camera",
+    [{"image_height": 0}, {"image_width": 0}, {"position": (math.nan,) * 3}, {"fov": 0.0}, {"fov": 9.0}],
+)
+def test_a_page_with_an_odd_camera_sees_the_data(
+    viewer: Viewer, lab: Lab, server: ViewServer, camera: dict[str, Any]
+) -> None:
+    with page_client(server, **camera) as page:
+        wait_until(lambda: bool(server.get_clients()))
+        with _running(viewer, lab):
+            wait_until(lambda: viewer.scene._fitted)
+            page.wait_for(POINTS, "points")
 
 
 def test_a_page_that_does_not_read_costs_no_memory_and_does_not_delay_others(
