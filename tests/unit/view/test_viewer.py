@@ -110,7 +110,7 @@ def test_a_page_that_does_not_read_costs_no_memory_and_does_not_delay_others(
 def test_a_page_that_comes_and_goes_leaves_nothing(viewer: Viewer, lab: Lab, server: ViewServer) -> None:
     waiting = server._connection.get_message_buffer().message_from_id
     sizes = []
-    for _ in range(4):
+    for _ in range(8):
         with page_client(server) as page:
             wait_until(lambda: bool(server.get_clients()))
             with _running(viewer, lab):
@@ -118,7 +118,7 @@ def test_a_page_that_comes_and_goes_leaves_nothing(viewer: Viewer, lab: Lab, ser
         wait_until(lambda: not server.get_clients())
         viewer.update()
         sizes.append(len(waiting))
-    assert sizes[-1] <= sizes[1]
+    assert sizes[-1] <= sizes[1] + 2  # the panel's banner may be among them or not
     assert viewer.scene._fitted == set() or len(viewer.scene._fitted) == 1
 
 
