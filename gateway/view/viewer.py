@@ -1,11 +1,14 @@
 """The view: what has arrived, live or from a take, is shown about 30 times a second."""
 
+import sys
 import threading
 import time
 from collections.abc import Callable
 from typing import Final
 
+from gateway.errors import GatewayError
 from gateway.live.live_data import LiveData
+from gateway.safe_text import safe_text
 from gateway.view.panel import Panel
 from gateway.view.playback import Playback
 from gateway.view.scene import Scene
@@ -26,6 +29,8 @@ class Viewer:
         tabs = server.gui.add_tab_group()
         self.panel = Panel(server, tabs, live, is_take=playback is not None)
         self.scene = Scene(server, tabs)
+        self.num_defects = 0
+        """How many pictures were not complete, because of a defect in this program."""
 
     def run(self, stop: threading.Event, tick: Callable[[], object]) -> None:
         """Show what arrives until ``stop``; call ``tick`` before each picture.
@@ -35,9 +40,21 @@ class Viewer:
         next_s = time.monotonic()
         while not stop.wait(max(0.0, next_s - time.monotonic())):
             tick()
-            self.update()
+            self._update_or_report()
             now_s = time.monotonic()
             next_s += PERIOD_S * max(1, -(-(now_s - next_s) // PERIOD_S))
+
+    def _update_or_report(self) -> None:
+        """Show what has arrived. A defect, or what a page should not send, does not end the view."""
+        try:
+            self.update()
+        except GatewayError:
+            raise
+        except Exception as defect:  # noqa: BLE001 - the next picture may be whole
+            if self.num_defects == 0:
+                text = f"defect in rtc3d-gateway view: {type(defect).__name__}: {defect}; report this"
+                print(safe_text(text), file=sys.stderr, flush=True)
+            self.num_defects += 1
 
     def update(self) -> None:
         """Decode what has arrived, and show it. Raises what ended the playback of a take."""

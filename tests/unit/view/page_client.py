@@ -29,7 +29,11 @@ class PageClient:
 
     def __init__(self, connection: Connection, camera: dict[str, Any]) -> None:
         self._connection = connection
-        connection.send(msgspec.msgpack.encode({**_CAMERA, **camera}))
+        self.send({**_CAMERA, **camera})
+
+    def send(self, message: dict[str, Any]) -> None:
+        """Send a message."""
+        self._connection.send(msgspec.msgpack.encode(message))
 
     def receive(self) -> list[dict[str, Any]]:
         """Return the messages of the next window; arrays are placeholders. Wait at most 10 s."""
