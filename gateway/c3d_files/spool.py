@@ -127,12 +127,12 @@ class Spool:
     def delete_abandoned(self) -> None:
         """Delete unfinished files that nobody writes, because a gateway was killed."""
         with self._creating, contextlib.suppress(OSError):
-            for entry in os.scandir(self.directory):
+            for entry in [*os.scandir(self.directory)]:
                 if entry.name.endswith(_UNFINISHED) and entry.is_file(follow_symlinks=False):
                     _delete_if_abandoned(Path(entry.path))
 
     def _files(self, source: str) -> Iterator[_File]:
-        for entry in os.scandir(self.directory):
+        for entry in [*os.scandir(self.directory)]:
             name = _NAME.fullmatch(entry.name)
             if name is None or name["source"] != source or not entry.is_file(follow_symlinks=False):
                 continue

@@ -160,7 +160,7 @@ class TakesFolder:
         entries: list[TakeEntry] = []
         if source is not None:
             return _source_entries(self.directory / source)
-        for folder in os.scandir(self.directory):
+        for folder in [*os.scandir(self.directory)]:
             if folder.is_dir(follow_symlinks=False) and not folder.name.startswith("."):
                 entries += _source_entries(Path(folder.path))
         return entries
@@ -252,7 +252,7 @@ class TakesFolder:
     def _rolling_sizes(self) -> dict[FileId, int]:
         sizes: dict[FileId, int] = {}
         with contextlib.suppress(FileNotFoundError):
-            for folder in os.scandir(self.directory / ROLLING):
+            for folder in [*os.scandir(self.directory / ROLLING)]:
                 for _, status in _files(Path(folder.path)):
                     sizes[status.st_dev, status.st_ino] = status.st_size
         return sizes
@@ -321,7 +321,7 @@ def _source_entries(folder: Path, only: str = "") -> list[TakeEntry]:
 
 def _files(folder: Path) -> list[tuple[Path, os.stat_result]]:
     files = []
-    for entry in os.scandir(folder):
+    for entry in [*os.scandir(folder)]:
         with contextlib.suppress(FileNotFoundError):
             if entry.is_file(follow_symlinks=False):
                 files.append((Path(entry.path), entry.stat(follow_symlinks=False)))
