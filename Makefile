@@ -16,7 +16,7 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 # What a wheel is built from.
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-integration test-takes test-hostile test-others test-compiled check lint types contracts generated docs lcm-types samples fuzz soak stops \
+.PHONY: demo lock test test-integration test-takes test-hostile test-others test-compiled check lint types contracts generated docs lcm-types samples screenshots fuzz soak stops \
     mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
 
 demo: .venv/runtime
@@ -77,6 +77,10 @@ lcm-types: .venv/installed
 # Record the sample take and the sample C3D file again.
 samples: .venv/installed
 	$(BIN)/python examples/make_samples.py
+
+# Make the pictures of the live view in docs/ again, in Debian's Chromium. Look at them before you commit them.
+screenshots: .venv/installed
+	tests/with-netns $(BIN)/python -m tests.screenshots
 
 # Print what the compilation for a Python lacks: the C compiler that it would call, or its headers.
 MISSING = import os, shutil, sysconfig; \

@@ -6,6 +6,7 @@ running.
 """
 
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
@@ -38,9 +39,16 @@ def chromium() -> Iterator[Browser]:
 
 @pytest.fixture
 def new_page(chromium: Browser) -> Iterator[NewPage]:
-    """Open pages, each with a profile of its own.
+    """Open pages, each with a profile of its own; see ``pages``."""
+    with pages(chromium) as open_page:
+        yield open_page
 
-    At the end, the test fails if a page has logged an error, raised one, or contacted another host.
+
+@contextmanager
+def pages(chromium: Browser) -> Iterator[NewPage]:
+    """Open pages, each with a profile of its own, until the end of the block.
+
+    Then the test fails if a page has logged an error, raised one, or contacted another host.
     """
     problems: list[str] = []
 

@@ -39,8 +39,10 @@ class Header(NamedTuple):
 class GatewayProcess:
     """A running gateway with the source lab. ``headers`` are those received so far, by component."""
 
-    def __init__(self, process: subprocess.Popen[bytes], log: Path) -> None:
+    def __init__(self, process: subprocess.Popen[bytes], log: Path, endpoint: str) -> None:
         self.process = process
+        self.endpoint = endpoint
+        """Where its Zenoh session, and other subscribers, connect to."""
         self._log = log
         self.headers: defaultdict[str, list[Header]] = defaultdict(list)
         self.statuses: list[Any] = []
@@ -100,9 +102,12 @@ def simulator(*options: str, log: Path = Path(os.devnull)) -> Iterator[tuple[int
 
 @contextlib.contextmanager
 def gateway_process(
-    folder: Path, port: int, environ: Mapping[str, str] | None = None, **source: Any
+    folder: Path, port: int, environ: Mapping[str, str] | None = None, hub: str = "peer", **source: Any
 ) -> Iterator[GatewayProcess]:
-    """Run a gateway on Zenoh, with default settings except for those of the ``source``."""
+    """Run a gateway on Zenoh, with default settings except for those of the ``source``.
+
+    Its subscriber is a peer; with "router" as the ``hub``, other programs can connect to it, too.
+    """
     endpoint = free_endpoint()
     configuration = {
         "sources": [{"name": "lab", "host": "127.0.0.1", "port": port, **source}],
@@ -113,13 +118,13 @@ def gateway_process(
     (folder / "gateway.yaml").write_text(yaml.safe_dump(configuration))
     log = folder / "gateway.log"
     with contextlib.ExitStack() as stack:
-        session = open_zenoh("peer", listen=endpoint)
+        session = open_zenoh(hub, listen=endpoint)
         stack.callback(session.close)
         file = stack.enter_context(log.open("wb"))
         process = stack.enter_context(
             program("run", "--config", str(folder / "gateway.yaml"), environ=environ, stderr=file)
         )
-        gateway = GatewayProcess(process, log)
+        gateway = GatewayProcess(process, log, endpoint)
         session.declare_subscriber("mocap/lab/*", gateway.receive)
         yield gateway
 

@@ -51,7 +51,7 @@ class Terminal:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
-        self._environ = {"PYTHONUNBUFFERED": "1", "XDG_STATE_HOME": str(folder / "state")}
+        self._environ = {"PYTHONUNBUFFERED": "1", "BROWSER": "true", "XDG_STATE_HOME": str(folder / "state")}
         self._process: subprocess.Popen[bytes] | None = None
         self.text = ""
 

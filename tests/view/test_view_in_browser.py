@@ -1,0 +1,163 @@
+"""``rtc3d-gateway view`` in a real browser, fed by scenes that the tests choose."""
+
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Final
+
+import pytest
+from playwright.sync_api import Browser
+
+from gateway.takes.component_rows import Array
+from tests.browser import NewPage, chromium, new_page, pages
+from tests.gateway_process import gateway_process, simulator
+from tests.networks import free_port
+from tests.view.picture import Picture, Position
+from tests.view.published_scene import MISSING, PublishedScene, published_scene
+from tests.view.view_process import ViewProcess, view_process
+
+pytestmark = [pytest.mark.netns, pytest.mark.chromium, pytest.mark.timeout(240)]
+
+__all__ = ["chromium", "new_page"]
+
+WINDOW: Final = {"width": 800, "height": 320}
+
+LEFT: Final = (-500.0, 0.0, 200.0)
+RIGHT: Final = (500.0, 0.0, 200.0)
+TOP: Final = (0.0, 0.0, 1200.0)
+FREE: Final = (0.0, 0.0, 700.0)
+
+MARKERS: Final = "/sources/MOCAP_LAB/markers"
+LAST_PLACES: Final = "/sources/MOCAP_LAB/missing markers"
+
+
+@pytest.fixture(scope="module")
+def shared_scene() -> Iterator[PublishedScene]:
+    with published_scene([LEFT, RIGHT, TOP]) as scene:
+        yield scene
+
+
+@pytest.fixture(scope="module")
+def view(shared_scene: PublishedScene) -> Iterator[ViewProcess]:
+    with view_process("--connect", shared_scene.endpoint) as process:
+        yield process
+
+
+@pytest.fixture(scope="module")
+def picture(view: ViewProcess, chromium: Browser) -> Iterator[Picture]:
+    """A page that all tests share, because opening one takes seconds."""
+    with pages(chromium) as new_page:
+        picture = Picture(new_page(viewport=WINDOW), view.address)
+        see(picture, LEFT, RIGHT, TOP)
+        yield picture
+
+
+@pytest.fixture
+def scene(shared_scene: PublishedScene, picture: Picture) -> PublishedScene:
+    """The scene as every test begins, seen in the picture."""
+    shared_scene.markers = [LEFT, RIGHT, TOP]
+    shared_scene.is_sending = True
+    picture.wait_for_points(MARKERS, [LEFT, RIGHT, TOP])
+    return shared_scene
+
+
+def see(picture: Picture, *positions: Position) -> None:
+    """Wait until just these markers are shown, and the view is fitted to them."""
+    picture.wait_for_points(MARKERS, positions)
+    picture.wait_for_view_of(MARKERS, positions)
+
+
+def is_blue(color: Array) -> bool:
+    """Whether it is the colour of the first source."""
+    red, _, blue = color
+    return bool(blue - red > 100)
+
+
+def is_grey(color: Array) -> bool:
+    """Whether it is the colour of what is not live."""
+    return bool(color.max() - color.min() < 30 and 90 < color.mean() < 170)
+
+
+def is_background(color: Array) -> bool:
+    return bool(color.mean() < 60)
+
+
+def test_markers_are_drawn_where_they_are(scene: PublishedScene, picture: Picture) -> None:
+    for position in (LEFT, RIGHT, TOP):
+        picture.wait_for_drawn(MARKERS, position, is_blue)
+    picture.wait_for_drawn(MARKERS, FREE, is_background)
+    scene.markers = [LEFT, RIGHT, FREE]
+    picture.wait_for_drawn(MARKERS, FREE, is_blue)
+    picture.wait_for_drawn(MARKERS, TOP, is_background)
+
+
+def test_a_missing_marker_is_absent_and_its_last_place_fades(scene: PublishedScene, picture: Picture) -> None:
+    picture.wait_for_drawn(MARKERS, TOP, is_blue)
+    scene.markers = [LEFT, RIGHT, MISSING]
+    picture.wait_for_points(LAST_PLACES, [TOP])
+    picture.wait_for_points(MARKERS, [LEFT, RIGHT])
+    picture.wait_for_points(LAST_PLACES, [])
+    picture.wait_for_drawn(MARKERS, TOP, is_background)
+    scene.markers = [LEFT, RIGHT, TOP]
+    picture.wait_for_drawn(MARKERS, TOP, is_blue)
+
+
+def test_a_scene_without_any_visible_marker_is_empty(scene: PublishedScene, picture: Picture) -> None:
+    scene.markers = [MISSING] * 3
+    picture.wait_for_points(MARKERS, [])
+    scene.markers = []
+    picture.wait_for_points(LAST_PLACES, [])
+    scene.markers = [LEFT]
+    picture.wait_for_points(MARKERS, [LEFT])
+
+
+def test_labels_follow_the_parameters(scene: PublishedScene, picture: Picture) -> None:
+    scene.name_markers("LASI", "RASI", "SACR")
+    picture.page.get_by_role("tab", name="Scene").click()
+    picture.page.get_by_label("Marker labels").check()
+    picture.wait_for_labels({"LASI": LEFT, "RASI": RIGHT, "SACR": TOP})
+    scene.name_markers("L.ASI", "R.ASI", "SACRUM")
+    picture.wait_for_labels({"L.ASI": LEFT, "R.ASI": RIGHT, "SACRUM": TOP})
+    picture.page.get_by_label("Marker labels").uncheck()
+    picture.wait_for_labels({})
+
+
+def test_the_picture_says_that_data_have_stopped_and_dims(scene: PublishedScene, picture: Picture) -> None:
+    picture.wait_for_drawn(MARKERS, LEFT, is_blue)
+    scene.is_sending = False
+    picture.wait_for_text("^lab: no data for ")
+    picture.wait_for_drawn(MARKERS, LEFT, is_grey)
+    scene.is_sending = True
+    picture.wait_for_no_text("no data")
+    picture.wait_for_drawn(MARKERS, LEFT, is_blue)
+
+
+def test_several_browsers_see_the_same_until_they_go_away(
+    scene: PublishedScene, picture: Picture, view: ViewProcess, new_page: NewPage
+) -> None:
+    others = [Picture(new_page(viewport={"width": 400, "height": 200}), view.address) for _ in range(2)]
+    for other in others:
+        other.wait_for_points(MARKERS, [LEFT, RIGHT, TOP])
+    others.pop().page.close()
+    scene.markers = [LEFT, FREE]
+    for each in (picture, *others):
+        each.wait_for_points(MARKERS, [LEFT, FREE])
+
+
+def test_a_source_that_is_lost_and_comes_back(tmp_path: Path, new_page: NewPage) -> None:
+    port = free_port()
+    with ExitStack() as stack:
+        gateway = stack.enter_context(gateway_process(tmp_path, port, hub="router"))
+        view = stack.enter_context(view_process("--connect", gateway.endpoint))
+        picture = Picture(new_page(viewport=WINDOW), view.address)
+        with simulator("--port", str(port)):
+            picture.wait_for_banner("live lab")
+            picture.wait_for_number_of_points(MARKERS, 10)
+        picture.wait_for_banner("lab: no data for")
+        picture.wait_for_banner(f"waiting for 127.0.0.1:{port}")
+        picture.wait_for_text("^lab: no data for ")
+        with simulator("--port", str(port)):
+            picture.wait_for_banner("live lab")
+            picture.wait_for_no_text("no data")
+        assert view.end() == 0
+        assert "\n" not in view.output.strip()  # nothing but the address
