@@ -80,7 +80,7 @@ samples: .venv/installed
 
 # Make the pictures of the live view in docs/ again, in Debian's Chromium. Look at them before you commit them.
 screenshots: .venv/installed
-	tests/with-netns $(BIN)/python -m tests.screenshots
+	tests/with-netns unshare --uts sh -c 'echo mocap-pc >/proc/sys/kernel/hostname && exec $(BIN)/python -m tests.screenshots'
 
 # Print what the compilation for a Python lacks: the C compiler that it would call, or its headers.
 MISSING = import os, shutil, sysconfig; \

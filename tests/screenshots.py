@@ -18,6 +18,9 @@ from tests.view.view_process import view_process
 _SIZE: Final[ViewportSize] = {"width": 1200, "height": 700}
 _TIMEOUT_MS: Final = 120_000
 
+_MOMENT: Final = (0.7, 0.95)
+"""The places, in metres, between which the person stands on a plate and no label hides another one."""
+
 _NO_NOTICE: Final = ".mantine-Notifications-root { display: none }"
 """Software rendering is what this computer lacks, not what users see."""
 
@@ -35,7 +38,7 @@ def _picture(page: Page, theme: str, file: Path) -> None:
     page.get_by_role("tab", name="Scene").click()
     page.get_by_role("button", name=theme).click()
     page.get_by_role("tab", name="Sources").click()
-    page.wait_for_function(_ON_PLATES, arg=[0.35, 0.8])
+    page.wait_for_function(_ON_PLATES, arg=[*_MOMENT])
     page.screenshot(path=file, style=_NO_NOTICE)
     print(f"{file.relative_to(ROOT)}: {file.stat().st_size / 1000:.0f} kB")
 
@@ -55,7 +58,7 @@ def main() -> None:
         page.goto(view.address)
         page.get_by_role("tab", name="Scene").click()
         page.get_by_label("Marker trails").check()
-        page.wait_for_function(_ON_PLATES, arg=[0.35, 0.8])
+        page.wait_for_function(_ON_PLATES, arg=[*_MOMENT])
         page.get_by_role("button", name="Fit view").click()
         for theme in ("light", "dark"):
             _picture(page, theme, ROOT / f"docs/view-{theme}.png")
