@@ -16,7 +16,7 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 # What a wheel is built from.
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-integration test-takes test-hostile test-others test-compiled check lint types contracts generated docs lcm-types samples screenshots fuzz soak stops \
+.PHONY: demo lock test test-integration test-commands test-takes test-hostile test-browser test-others test-compiled check lint types contracts generated docs lcm-types samples screenshots fuzz soak stops \
     mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
 
 demo: .venv/runtime
@@ -26,12 +26,15 @@ demo: .venv/runtime
 test: .venv/installed
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) tests/with-netns $(BIN)/pytest $(ARGS)
 
-# `make test` in four parts, of which `make check` runs two at the same time.
-test-integration: ARGS := 'tests/integration --ignore=tests/integration/takes'
+# `make test` in parts, of which `make check` runs several at the same time.
+BROWSER_TESTS := tests/view tests/site
+test-integration: ARGS := 'tests/integration --ignore=tests/integration/takes --ignore=tests/integration/commands'
+test-commands: ARGS := tests/integration/commands
 test-takes: ARGS := tests/integration/takes
 test-hostile: ARGS := tests/hostile
-test-others: ARGS := '--ignore=tests/integration --ignore=tests/hostile'
-test-integration test-takes test-hostile test-others: .venv/installed
+test-browser: ARGS := '$(BROWSER_TESTS)'
+test-others: ARGS := '$(addprefix --ignore=,tests/integration tests/hostile $(BROWSER_TESTS))'
+test-integration test-commands test-takes test-hostile test-browser test-others: .venv/installed
 	$(MAKE) --no-print-directory test ARGS=$(ARGS)
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
@@ -44,10 +47,14 @@ COMPILED_TESTS := tests/packaging/test_compiled.py tests/contract tests/property
 test-compiled: build/compiled/complete
 	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 tests/with-netns $(BIN)/pytest -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
 
-# Two parts at a time. Each run of pytest has a network namespace of its own, so they do not disturb each other.
+# Each run of pytest has a network namespace of its own, so they do not disturb each other. Most of them wait for most of
+# their time, so four run on two cores. Those of the last line measure delays, or need a core for themselves.
+PARTS_AT_ONCE = $(MAKE) --keep-going --output-sync=target --no-print-directory
+
 check: .venv/installed
-	$(MAKE) --jobs=2 --output-sync=target --no-print-directory lint types contracts generated docs wheelhouse compiled
-	$(MAKE) --jobs=2 --keep-going --output-sync=target --no-print-directory test-integration test-takes test-hostile test-others test-compiled
+	$(PARTS_AT_ONCE) --jobs=3 lint types contracts generated docs wheelhouse compiled
+	$(PARTS_AT_ONCE) --jobs=4 test-others test-integration test-commands test-takes
+	$(PARTS_AT_ONCE) --jobs=2 test-hostile test-browser test-compiled
 
 lint: .venv/installed
 	$(BIN)/ruff format --check

@@ -51,7 +51,7 @@ TESTS: Final = {
         "tests/integration/test_zenoh_queries_keys.py",
         "tests/integration/test_zenoh_selectors.py",
         "tests/integration/test_lcm_queries.py",
-        "tests/integration/test_doctor_outputs.py",
+        "tests/integration/commands/test_doctor_outputs.py",
     ),
 }
 """The packages that are mutated, and the tests that should notice."""

@@ -1,6 +1,6 @@
 """Checks of the documents: links, commands, configurations, tables of bytes, causes of drops.
 
-The tutorial's commands are run as well, in tests/integration/test_tutorial.py; those of other pages are
+The commands of some pages are run as well, in tests/integration/commands and takes; those of other pages are
 parsed by the program, because they name servers that nobody has.
 """
 

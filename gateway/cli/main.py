@@ -45,7 +45,6 @@ def main() -> NoReturn:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # for locales other than UTF-8
-    _handle_interrupts(signal.default_int_handler)
     try:
         status = _run()
     except KeyboardInterrupt:
@@ -64,7 +63,7 @@ def _run() -> int:
     """Run the command, and return the exit status. Errors are printed to stderr."""
     stdout = sys.stdout
     try:
-        app(prog_name="rtc3d-gateway")
+        app(prog_name="rtc3d-gateway", obj=lambda: _handle_interrupts(signal.default_int_handler))
     except SystemExit as end:
         if sys.stdout is not stdout:  # typer replaces it if its reader is gone
             return 0
@@ -107,9 +106,15 @@ def _print_version(context: typer.Context, wanted: bool) -> None:
 
 @app.callback()
 def _options(
-    version: Annotated[
+    context: typer.Context,
+    _version: Annotated[
         bool,
         typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit."),
     ] = False,
 ) -> None:
-    pass
+    """Set what holds for all commands. The module of the command is imported before.
+
+    Until here, a signal ends the process at once.
+    """
+    if context.obj is not None:
+        context.obj()

@@ -23,7 +23,7 @@ from gateway.rtc3d.parameters_xml import encode_parameters
 from gateway.takes.event_log import encode_event
 from tests.command_in_process import run_in_process
 from tests.gateway_process import PROGRAM
-from tests.integration.test_command_line import Ended, end_of, run
+from tests.integration.commands.test_command_line import Ended, end_of, run
 from tests.lcm_tools import lcm_logger, lcm_tool
 from tests.networks import free_endpoint, lcm_url, open_zenoh
 from tests.takes import START_UTIME, Message, description, frame, log_bytes, markers, parameters, write_take

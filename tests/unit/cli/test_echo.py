@@ -1,4 +1,4 @@
-"""What ``echo`` prints for a message; tests/integration/test_params_command.py runs the command."""
+"""What ``echo`` prints for a message; tests/integration/commands/test_params_command.py runs the command."""
 
 import io
 import json

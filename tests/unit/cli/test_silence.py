@@ -1,4 +1,4 @@
-"""What ``echo`` says while it hears nothing; tests/integration/test_echo_command.py runs the command."""
+"""What ``echo`` says while it hears nothing; tests/integration/commands has the tests of the command."""
 
 import pytest
 

@@ -12,7 +12,7 @@ import pytest
 from gateway.cli.commands import COMMANDS
 from tests.gateway_process import PROGRAM
 
-ROOT: Final = Path(__file__).parents[2]
+ROOT: Final = Path(__file__).parents[3]
 CONFIG: Final = str(ROOT / "config/gateway.yaml")
 _ASCII: Final = {"LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "PYTHONIOENCODING": "ascii"}
 _NARROW: Final = {"TERM": "dumb", "COLUMNS": "20"}
