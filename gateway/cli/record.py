@@ -24,7 +24,7 @@ from gateway.cli.options import (
 if TYPE_CHECKING:
     from gateway.cli.record_progress import RecordProgress
     from gateway.recorder.take_recording import TakeRecording
-    from gateway.subscriber.sides import SubscriberSide
+    from gateway.subscriber.subscribe import GatewaySubscriber
 
 _TICK_S: Final = 0.1
 
@@ -65,8 +65,8 @@ def record(
     from gateway.recorder.file_sink import FileSink
     from gateway.recorder.take_recording import TakeRecording
     from gateway.recorder.target import Target
-    from gateway.subscriber.lcm_side import START_S
-    from gateway.subscriber.sides import Transport, close_in_time, subscribe_all
+    from gateway.subscriber.lcm_subscriber import START_S
+    from gateway.subscriber.subscribe import Transport, close_in_time, subscribe_all
 
     stop = _stop_signals()
     target = Target(file)
@@ -76,14 +76,14 @@ def record(
     sources = list(dict.fromkeys(source or ()))
     try:
         transport = Transport(lcm, connect, zenoh_config, url, prefix)
-        side = subscribe_all(transport, sources, component, recording)
-        progress = RecordProgress(recording, side, sources, quiet=quiet)
+        subscriber = subscribe_all(transport, sources, component, recording)
+        progress = RecordProgress(recording, subscriber, sources, quiet=quiet)
         try:
-            _run(recording, side, progress, stop, seconds)
+            _run(recording, subscriber, progress, stop, seconds)
             _end(recording, progress)
         finally:
             progress.close()
-            close_in_time(side)
+            close_in_time(subscriber)
         is_complete = print_summary(recording, sys.stdout)
     finally:
         target.discard_empty()
@@ -110,7 +110,7 @@ def _stop_signals() -> threading.Event:
 
 def _run(
     recording: "TakeRecording",
-    side: "SubscriberSide",
+    subscriber: "GatewaySubscriber",
     progress: "RecordProgress",
     stop: threading.Event,
     seconds: float | None,
@@ -119,7 +119,7 @@ def _run(
     start_s = time.monotonic()
     first_s: float | None = None
     while not stop.wait(_TICK_S):
-        side.tick()
+        subscriber.tick()
         recording.tick()
         progress.tick()
         first_s = recording.first_heard_s if first_s is None else first_s

@@ -12,7 +12,7 @@ from rich.text import Text
 from gateway.recorder.series import RecordedSource
 from gateway.recorder.take_recording import TakeRecording
 from gateway.safe_text import safe_text
-from gateway.subscriber.sides import SubscriberSide
+from gateway.subscriber.subscribe import GatewaySubscriber
 
 SILENCE_S: Final = 2.0
 _NO_DATA_S: Final = 3.0
@@ -32,10 +32,10 @@ class RecordProgress:
     """
 
     def __init__(
-        self, recording: TakeRecording, side: SubscriberSide, wanted: list[str], *, quiet: bool
+        self, recording: TakeRecording, subscriber: GatewaySubscriber, wanted: list[str], *, quiet: bool
     ) -> None:
         self._recording = recording
-        self._side = side
+        self._subscriber = subscriber
         self._wanted = wanted
         self._quiet = quiet
         self._start_s = self._rate_s = time.monotonic()
@@ -139,7 +139,7 @@ class RecordProgress:
 
     def _report_missing(self) -> None:
         if "missing" not in self._reported:
-            problem = self._side.silence()
+            problem = self._subscriber.silence()
             if problem:
                 self._reported.add("missing")
                 self._print(problem)

@@ -20,7 +20,7 @@ from gateway.service.log_format import LogLevel, set_up_log
 
 if TYPE_CHECKING:
     from gateway.live.live_data import LiveData
-    from gateway.subscriber.sides import SubscriberSide, Transport
+    from gateway.subscriber.subscribe import GatewaySubscriber, Transport
 
 _MAX_TITLE: Final = 60
 _MAX_WIDTH: Final = 10_000
@@ -52,7 +52,7 @@ def top(
         raise typer.BadParameter("--connect and --zenoh-config are for Zenoh")
     if url is not None and not lcm:
         raise typer.BadParameter("--url is for LCM; add --lcm")
-    from gateway.subscriber.sides import Transport
+    from gateway.subscriber.subscribe import Transport
 
     transport = Transport(lcm, connect, zenoh_config, url, prefix)
     _run(transport, list(dict.fromkeys(source or ())), is_once=once, as_json=as_json)
@@ -60,7 +60,7 @@ def top(
 
 def _run(transport: "Transport", wanted: list[str], *, is_once: bool, as_json: bool) -> None:
     from gateway.live.live_data import LiveData
-    from gateway.subscriber.sides import close_in_time, subscribe_all
+    from gateway.subscriber.subscribe import close_in_time, subscribe_all
 
     is_shown = not (is_once or as_json) and has_screen(sys.stdout, os.environ)
     notices: deque[str] = deque(maxlen=1)
@@ -69,14 +69,14 @@ def _run(transport: "Transport", wanted: list[str], *, is_once: bool, as_json: b
     else:
         set_up_log(LogLevel.WARNING)
     live = LiveData()
-    side = subscribe_all(transport, wanted, None, live)
+    subscriber = subscribe_all(transport, wanted, None, live)
     try:
         if is_shown:
-            _show(live, side, notices, _title(transport))
+            _show(live, subscriber, notices, _title(transport))
         else:
-            _print(live, side, wanted, is_once=is_once or not as_json, as_json=as_json)
+            _print(live, subscriber, wanted, is_once=is_once or not as_json, as_json=as_json)
     finally:
-        close_in_time(side)
+        close_in_time(subscriber)
 
 
 def has_screen(out: TextIO, environ: Mapping[str, str]) -> bool:
@@ -100,7 +100,7 @@ class _Notices(logging.Handler):
         self._notices.append(record.getMessage())
 
 
-def _show(live: "LiveData", side: "SubscriberSide", notices: "deque[str]", title: str) -> None:
+def _show(live: "LiveData", subscriber: "GatewaySubscriber", notices: "deque[str]", title: str) -> None:
     from gateway.terminal.keyboard import Keyboard
     from gateway.terminal.screen import Screen
     from gateway.top.app import App
@@ -109,11 +109,11 @@ def _show(live: "LiveData", side: "SubscriberSide", notices: "deque[str]", title
         signal.signal(signal.SIGHUP, signal.default_int_handler)
     screen = Screen(sys.stdout.fileno(), sys.stdout.encoding)
     with contextlib.suppress(KeyboardInterrupt):
-        App(live, side, screen, Keyboard.of_stdin(), notices, title).run()
+        App(live, subscriber, screen, Keyboard.of_stdin(), notices, title).run()
 
 
 def _print(
-    live: "LiveData", side: "SubscriberSide", wanted: list[str], *, is_once: bool, as_json: bool
+    live: "LiveData", subscriber: "GatewaySubscriber", wanted: list[str], *, is_once: bool, as_json: bool
 ) -> None:
     from gateway.terminal.screen import has_colours
     from gateway.top.reports import (
@@ -126,10 +126,12 @@ def _print(
 
     if not is_once:
         with contextlib.suppress(KeyboardInterrupt):
-            print_json_lines(live, side, sys.stdout, lambda text: print(safe_lines(text), file=sys.stderr))
+            print_json_lines(
+                live, subscriber, sys.stdout, lambda text: print(safe_lines(text), file=sys.stderr)
+            )
         return
     try:
-        sources = wait_for_picture(live, side)
+        sources = wait_for_picture(live, subscriber)
     except QueryError as error:
         exit_with([error])
         return

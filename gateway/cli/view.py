@@ -25,7 +25,7 @@ from gateway.safe_text import safe_text
 
 if TYPE_CHECKING:
     from gateway.live.live_data import LiveData
-    from gateway.subscriber.sides import SubscriberSide, Transport
+    from gateway.subscriber.subscribe import GatewaySubscriber, Transport
     from gateway.view.server import ViewServer
     from gateway.view.viewer import Viewer
 
@@ -65,7 +65,7 @@ def view(
         raise typer.BadParameter("--connect and --zenoh-config are for Zenoh")
     if url is not None and not lcm:
         raise typer.BadParameter("--url is for LCM; add --lcm")
-    from gateway.subscriber.sides import Transport
+    from gateway.subscriber.subscribe import Transport
 
     if take is not None and (lcm or connect is not None or zenoh_config is not None or prefix is not None):
         raise typer.BadParameter(
@@ -92,18 +92,18 @@ def _live_data(
 ) -> Iterator[tuple["Viewer", Callable[[], object]]]:
     """Subscribe, and provide a viewer of what arrives."""
     from gateway.live.live_data import LiveData
-    from gateway.subscriber.sides import subscribe_all
+    from gateway.subscriber.subscribe import subscribe_all
     from gateway.view.viewer import Viewer
 
     live = LiveData()
-    side = subscribe_all(transport, sources, None, live)
-    silence = threading.Timer(_SILENCE_S, _explain_silence, (live, side))
+    subscriber = subscribe_all(transport, sources, None, live)
+    silence = threading.Timer(_SILENCE_S, _explain_silence, (live, subscriber))
     silence.daemon = True
     silence.start()
     try:
-        yield Viewer(server, live), side.tick
+        yield Viewer(server, live), subscriber.tick
     finally:
-        closing = threading.Thread(target=side.close, name="view-close", daemon=True)
+        closing = threading.Thread(target=subscriber.close, name="view-close", daemon=True)
         closing.start()
         closing.join(_CLOSE_S)
 
@@ -160,10 +160,10 @@ def _has_display() -> bool:
     return sys.platform != "linux" or any(name in os.environ for name in ("DISPLAY", "WAYLAND_DISPLAY"))
 
 
-def _explain_silence(live: "LiveData", side: "SubscriberSide") -> None:
+def _explain_silence(live: "LiveData", subscriber: "GatewaySubscriber") -> None:
     """Say why nothing has arrived, if so. The page waits on."""
     if live.first_heard_s is None:
-        print(safe_text(side.silence()), file=sys.stderr, flush=True)
+        print(safe_text(subscriber.silence()), file=sys.stderr, flush=True)
 
 
 def _stop_signals() -> threading.Event:

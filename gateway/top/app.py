@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
 from gateway.live.live_data import LiveData, LiveSource
-from gateway.subscriber.sides import SubscriberSide
+from gateway.subscriber.subscribe import GatewaySubscriber
 from gateway.terminal.keyboard import Keyboard, is_in_front
 from gateway.terminal.screen import Screen
 from gateway.top.reports import DISCOVERY_S, silence_text
@@ -30,14 +30,14 @@ class App:
     def __init__(
         self,
         live: LiveData,
-        side: SubscriberSide,
+        subscriber: GatewaySubscriber,
         screen: Screen,
         keyboard: Keyboard | None,
         notices: deque[str],
         title: str,
     ) -> None:
         self._live = live
-        self._side = side
+        self._subscriber = subscriber
         self._screen = screen
         self._keyboard = keyboard
         self._notices = notices
@@ -59,7 +59,7 @@ class App:
                     if self._is_suspending:
                         self._stop_process()
                         has_changed = True
-                    self._side.tick()
+                    self._subscriber.tick()
                     self._sources = self._live.update()
                     self._check_silence()
                     has_changed |= size != self._screen.size
@@ -123,7 +123,7 @@ class App:
             self._asking.start()
 
     def _ask(self) -> None:
-        self._silence = self._side.silence() or silence_text(self._sources)
+        self._silence = self._subscriber.silence() or silence_text(self._sources)
 
     def _draw(self) -> None:
         if not self._screen.is_open:

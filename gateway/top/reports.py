@@ -9,7 +9,7 @@ from gateway.live.live_data import LiveData, LiveSource
 from gateway.messages.host_time import now_utime
 from gateway.messages.json_text import json_text
 from gateway.safe_text import safe_json
-from gateway.subscriber.sides import SubscriberSide
+from gateway.subscriber.subscribe import GatewaySubscriber
 from gateway.terminal.screen import Line, Style, encoded, line_text
 from gateway.top.facts import source_facts
 from gateway.top.pages import PAGES
@@ -25,17 +25,17 @@ _UPDATE_S: Final = 0.1
 _LINE_S: Final = 1.0
 
 
-def wait_for_picture(live: LiveData, side: SubscriberSide) -> list[LiveSource]:
+def wait_for_picture(live: LiveData, subscriber: GatewaySubscriber) -> list[LiveSource]:
     """Receive until the picture is complete; raises QueryError ("no-gateway") if nothing is heard."""
     start_s = time.monotonic()
     while True:
-        sources = receive_once(live, side)
+        sources = receive_once(live, subscriber)
         now_s = time.monotonic()
         first_s = live.first_heard_s
         if first_s is not None and now_s - first_s >= _PICTURE_S:
             return sources
         if first_s is None and now_s - start_s >= DISCOVERY_S:
-            problem = side.silence() or silence_text(sources)
+            problem = subscriber.silence() or silence_text(sources)
             if live.first_heard_s is None:
                 raise QueryError(problem, code="no-gateway")
 
@@ -50,10 +50,10 @@ def missing_sources(sources: Sequence[LiveSource], wanted: Sequence[str]) -> lis
     ]
 
 
-def receive_once(live: LiveData, side: SubscriberSide) -> list[LiveSource]:
+def receive_once(live: LiveData, subscriber: GatewaySubscriber) -> list[LiveSource]:
     """Wait for a moment, and return the sources with what has come meanwhile."""
     time.sleep(_UPDATE_S)
-    side.tick()
+    subscriber.tick()
     return live.update()
 
 
@@ -94,16 +94,18 @@ def json_line(live: LiveData, sources: Sequence[LiveSource]) -> str:
     return safe_json(json_text(facts))
 
 
-def print_json_lines(live: LiveData, side: SubscriberSide, out: TextIO, warn: Callable[[str], None]) -> None:
+def print_json_lines(
+    live: LiveData, subscriber: GatewaySubscriber, out: TextIO, warn: Callable[[str], None]
+) -> None:
     """Print a JSON object every second until an interrupt; ``warn`` once if nothing is heard."""
     start_s = next_s = time.monotonic()
     has_warned = False
     while True:
-        sources = receive_once(live, side)
+        sources = receive_once(live, subscriber)
         now_s = time.monotonic()
         if now_s - next_s >= _LINE_S:
             next_s += _LINE_S * ((now_s - next_s) // _LINE_S)
             print(json_line(live, sources), file=out, flush=True)
         if not has_warned and live.first_heard_s is None and now_s - start_s >= DISCOVERY_S:
             has_warned = True
-            warn(side.silence() or silence_text(sources))
+            warn(subscriber.silence() or silence_text(sources))

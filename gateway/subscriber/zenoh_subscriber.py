@@ -1,4 +1,4 @@
-"""Receiving from gateways on Zenoh ."""
+"""Receiving what gateways publish on Zenoh."""
 
 import json
 import math
@@ -23,13 +23,13 @@ _AGAIN_S: Final = 0.3
 
 _SOURCE_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,24}")
 _NO_KEYS: Final = {"c3d", "recording", "take"}
-"""Keys of a source that are no messages: nothing of them is recorded."""
+"""Keys of a source that are not messages: they are ignored."""
 
 _PLAIN_KEYS: Final = {*COMPONENTS_BY_KEY, "status", "clock", "parameters"}
 _INT32: Final = range(-(1 << 31), 1 << 31)
 
 
-class ZenohSide:
+class ZenohGatewaySubscriber:
     """Subscribes on an open session, which ``close`` closes.
 
     Each subscription calls ``_receive`` in a thread of its own.
@@ -70,11 +70,11 @@ class ZenohSide:
 
     def _receive(self, sample: zenoh.Sample) -> None:
         try:
-            self._record(sample)
-        except Exception as defect:  # noqa: BLE001 - the other messages are recorded
+            self._sort(sample)
+        except Exception as defect:  # noqa: BLE001 - the other messages are received
             self._reception.failed(defect)
 
-    def _record(self, sample: zenoh.Sample) -> None:
+    def _sort(self, sample: zenoh.Sample) -> None:
         key = str(sample.key_expr)
         series = self._series.get(key) or self._find_series(key)
         if series is None:
@@ -159,11 +159,11 @@ class ZenohSide:
             )
 
     def silence(self) -> str:
-        """See SubscriberSide."""
+        """See GatewaySubscriber."""
         return no_gateway(self._prefix, self._sources, served_sources(self._session, self._prefix))
 
     def close(self) -> None:
-        """See SubscriberSide."""
+        """See GatewaySubscriber."""
         self._session.close()
 
 

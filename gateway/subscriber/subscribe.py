@@ -8,14 +8,14 @@ from typing import Any, Final, NamedTuple, Protocol
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
 from gateway.outputs.zenoh.subscriber import open_zenoh
-from gateway.subscriber.lcm_side import LcmSide
+from gateway.subscriber.lcm_subscriber import LcmGatewaySubscriber
 from gateway.subscriber.reception import Reception
-from gateway.subscriber.zenoh_side import ZenohSide
+from gateway.subscriber.zenoh_subscriber import ZenohGatewaySubscriber
 
 _CLOSE_S: Final = 0.5
 
 
-class SubscriberSide(Protocol):
+class GatewaySubscriber(Protocol):
     """A subscriber that hands what it receives to a Reception."""
 
     def tick(self) -> None:
@@ -43,20 +43,24 @@ def subscribe_all(
     sources: Collection[str],
     components: Collection[str] | None,
     reception: Reception[Any, Any],
-) -> SubscriberSide:
+) -> GatewaySubscriber:
     """Subscribe to these sources (all, if empty) and components (None: all).
 
     Raises OutputError if Zenoh or LCM does not open, and ConfigError if Zenoh rejects the configuration file.
     """
     if transport.is_lcm:
         url = effective_lcm_url(transport.url)
-        return LcmSide(url, transport.prefix or DEFAULT_LCM_PREFIX, sources, components, reception)
+        return LcmGatewaySubscriber(
+            url, transport.prefix or DEFAULT_LCM_PREFIX, sources, components, reception
+        )
     session = open_zenoh(transport.connect, transport.zenoh_config)
-    return ZenohSide(session, transport.prefix or DEFAULT_ZENOH_PREFIX, sources, components, reception)
+    return ZenohGatewaySubscriber(
+        session, transport.prefix or DEFAULT_ZENOH_PREFIX, sources, components, reception
+    )
 
 
-def close_in_time(side: SubscriberSide) -> None:
+def close_in_time(subscriber: GatewaySubscriber) -> None:
     """Close a subscriber, but do not wait longer than 0.5 s: a peer that does not read delays it."""
-    thread = threading.Thread(target=side.close, name="subscriber-close", daemon=True)
+    thread = threading.Thread(target=subscriber.close, name="subscriber-close", daemon=True)
     thread.start()
     thread.join(_CLOSE_S)

@@ -1,4 +1,4 @@
-"""Receiving from gateways on LCM ."""
+"""Receiving what gateways publish on LCM."""
 
 import logging
 import math
@@ -31,7 +31,7 @@ _KEYS_BY_FINGERPRINT: Final = {fingerprint: key for key, fingerprint in FINGERPR
 logger = logging.getLogger(__name__)
 
 
-class LcmSide:
+class LcmGatewaySubscriber:
     """Subscribes on an LCM URL, and asks on the URL of requests that belongs to it. Raises OutputError.
 
     Messages are received in one thread, answers in another.
@@ -51,7 +51,7 @@ class LcmSide:
         self._reception = reception
         self._series: dict[str, Series | None] = {}  # by channel; None: left out
         self._asked_s: dict[str, float] = {}  # when a source was asked, by its channels
-        self._requester = f"rtc3d-gateway record {uuid.uuid4()}"
+        self._requester = f"rtc3d-gateway {uuid.uuid4()}"
         self._by_request_id: dict[int, Source] = {}
         self._subscribers = [
             LcmSubscriber(
@@ -70,11 +70,11 @@ class LcmSide:
 
     def _receive(self, channel: str, message: bytes) -> None:
         try:
-            self._record(channel, message)
-        except Exception as defect:  # noqa: BLE001 - the other messages are recorded
+            self._sort(channel, message)
+        except Exception as defect:  # noqa: BLE001 - the other messages are received
             self._reception.failed(defect)
 
-    def _record(self, channel: str, message: bytes) -> None:
+    def _sort(self, channel: str, message: bytes) -> None:
         series = self._series.get(channel) or self._find_series(channel, message)
         if series is None:
             return
@@ -166,11 +166,11 @@ class LcmSide:
             logger.debug("asking for the parameters of %s: %s", source.name, error)
 
     def silence(self) -> str:
-        """See SubscriberSide."""
+        """See GatewaySubscriber."""
         return no_gateway(" ".join(self._names) or self._prefix, self._url)
 
     def close(self) -> None:
-        """See SubscriberSide."""
+        """See GatewaySubscriber."""
         for subscriber in self._subscribers:
             subscriber.close()
 

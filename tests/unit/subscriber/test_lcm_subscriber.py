@@ -1,4 +1,4 @@
-"""Recording from LCM, whatever is sent there."""
+"""Receiving from LCM, whatever is sent there."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,7 +11,7 @@ from gateway.outputs.lcm.connection import open_lcm
 from gateway.recorder.file_sink import FileSink
 from gateway.recorder.take_recording import TakeRecording
 from gateway.recorder.target import Target
-from gateway.subscriber.lcm_side import LcmSide
+from gateway.subscriber.lcm_subscriber import LcmGatewaySubscriber
 from gateway.subscriber.reception import MAX_SOURCES
 from gateway.subscriber.series import FINGERPRINTS
 from gateway.takes.event_log import EventLogReader
@@ -30,7 +30,7 @@ class Lab:
         self.path = folder / "walk.lcmlog"
         self.lcm = open_lcm(url)
         self.recording = TakeRecording(lambda names: FileSink(target.open(names)))
-        self.side = LcmSide(url, "MOCAP", sources, None, self.recording)
+        self.subscriber = LcmGatewaySubscriber(url, "MOCAP", sources, None, self.recording)
 
     def markers(self, sequence: int) -> bytes:
         return FINGERPRINTS["3d"] + PREFIX.pack(1_000_000, 1_000_000, sequence, 1, 1) + bytes(16)
@@ -53,7 +53,7 @@ class Lab:
 def lab(tmp_path: Path) -> Iterator[Lab]:
     lab = Lab(tmp_path)
     yield lab
-    lab.side.close()
+    lab.subscriber.close()
 
 
 def names(lab: Lab) -> set[str]:
@@ -108,4 +108,4 @@ def test_only_the_chosen_sources_are_received(tmp_path: Path) -> None:
     wait_until(lambda: lab.recording.num_messages == 2)
     assert names(lab) == {"Lab-1"}
     assert lab.channels() == ["MOCAP_LAB_1_TAKE", "MOCAP_LAB_1_3D", "MOCAP_LAB_1_STATUS"]
-    lab.side.close()
+    lab.subscriber.close()
