@@ -29,9 +29,6 @@ if TYPE_CHECKING:
     from gateway.view.server import ViewServer
     from gateway.view.viewer import Viewer
 
-_CLOSE_S: Final = 0.5
-"""How long to wait for Zenoh or LCM to close: a peer that does not read delays it."""
-
 VISER: Final = "viser>=1.1,<2"
 """What the extra ``view`` installs; a test compares it with pyproject.toml."""
 
@@ -92,7 +89,7 @@ def _live_data(
 ) -> Iterator[tuple["Viewer", Callable[[], object]]]:
     """Subscribe, and provide a viewer of what arrives."""
     from gateway.live.live_data import LiveData
-    from gateway.subscriber.subscribe import subscribe_all
+    from gateway.subscriber.subscribe import close_in_time, subscribe_all
     from gateway.view.viewer import Viewer
 
     live = LiveData()
@@ -103,9 +100,7 @@ def _live_data(
     try:
         yield Viewer(server, live), subscriber.tick
     finally:
-        closing = threading.Thread(target=subscriber.close, name="view-close", daemon=True)
-        closing.start()
-        closing.join(_CLOSE_S)
+        close_in_time(subscriber)
 
 
 @contextmanager
@@ -161,9 +156,14 @@ def _has_display() -> bool:
 
 
 def _explain_silence(live: "LiveData", subscriber: "GatewaySubscriber") -> None:
-    """Say why nothing has arrived, if so. The page waits on."""
+    """Print why nothing has arrived, if that is so. The page goes on waiting."""
+    from gateway.subscriber.subscribe import silence_text
+
+    if live.first_heard_s is not None:
+        return
+    text = silence_text(subscriber, live)
     if live.first_heard_s is None:
-        print(safe_text(subscriber.silence()), file=sys.stderr, flush=True)
+        print(safe_text(text), file=sys.stderr, flush=True)
 
 
 def _stop_signals() -> threading.Event:

@@ -22,7 +22,7 @@ class GatewaySubscriber(Protocol):
         """Query what is not known yet of new sources. Called often, in one thread."""
 
     def silence(self) -> str:
-        """Return why nothing may have arrived: no gateway, or none with these sources. It may take 1 s."""
+        """Return that no gateway is found, or none with these sources; "" if one is. It may take 1 s."""
 
     def close(self) -> None:
         """Unsubscribe. It may block while a peer does not read."""
@@ -57,6 +57,13 @@ def subscribe_all(
     return ZenohGatewaySubscriber(
         session, transport.prefix or DEFAULT_ZENOH_PREFIX, sources, components, reception
     )
+
+
+def silence_text(subscriber: GatewaySubscriber, reception: Reception[Any, Any]) -> str:
+    """Return why nothing has arrived so far. It may take 1 s."""
+    names = ", ".join(source.name for source in reception.sources_now)
+    found = f"a gateway serves {names or 'this source'}, but nothing arrives from it; try again"
+    return subscriber.silence() or found
 
 
 def close_in_time(subscriber: GatewaySubscriber) -> None:

@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
 from gateway.live.live_data import LiveData, LiveSource
-from gateway.subscriber.subscribe import GatewaySubscriber
+from gateway.subscriber.subscribe import GatewaySubscriber, silence_text
 from gateway.terminal.keyboard import Keyboard, is_in_front
 from gateway.terminal.screen import Screen
-from gateway.top.reports import DISCOVERY_S, silence_text
+from gateway.top.reports import DISCOVERY_S
 from gateway.top.view import View
 
 _UPDATE_S: Final = 0.1
@@ -45,7 +45,7 @@ class App:
         self._sources: Sequence[LiveSource] = ()
         self._is_suspending = False
         self._silence = ""
-        self._asked_s = time.monotonic() - _ASK_AGAIN_S + DISCOVERY_S
+        self._next_ask_s = time.monotonic() + DISCOVERY_S
         self._asking: threading.Thread | None = None
 
     def run(self) -> None:
@@ -115,15 +115,13 @@ class App:
         """If nothing is heard, find out why, in another thread: it may take a second."""
         if self._live.first_heard_s is not None:
             self._silence = ""
-        elif time.monotonic() - self._asked_s >= _ASK_AGAIN_S and not (
-            self._asking is not None and self._asking.is_alive()
-        ):
-            self._asked_s = time.monotonic()
+        elif time.monotonic() >= self._next_ask_s and not (self._asking and self._asking.is_alive()):
+            self._next_ask_s = time.monotonic() + _ASK_AGAIN_S
             self._asking = threading.Thread(target=self._ask, name="top-silence", daemon=True)
             self._asking.start()
 
     def _ask(self) -> None:
-        self._silence = self._subscriber.silence() or silence_text(self._sources)
+        self._silence = silence_text(self._subscriber, self._live)
 
     def _draw(self) -> None:
         if not self._screen.is_open:

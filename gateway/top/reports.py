@@ -9,7 +9,7 @@ from gateway.live.live_data import LiveData, LiveSource
 from gateway.messages.host_time import now_utime
 from gateway.messages.json_text import json_text
 from gateway.safe_text import safe_json
-from gateway.subscriber.subscribe import GatewaySubscriber
+from gateway.subscriber.subscribe import GatewaySubscriber, silence_text
 from gateway.terminal.screen import Line, Style, encoded, line_text
 from gateway.top.facts import source_facts
 from gateway.top.pages import PAGES
@@ -35,7 +35,7 @@ def wait_for_picture(live: LiveData, subscriber: GatewaySubscriber) -> list[Live
         if first_s is not None and now_s - first_s >= _PICTURE_S:
             return sources
         if first_s is None and now_s - start_s >= DISCOVERY_S:
-            problem = subscriber.silence() or silence_text(sources)
+            problem = silence_text(subscriber, live)
             if live.first_heard_s is None:
                 raise QueryError(problem, code="no-gateway")
 
@@ -55,12 +55,6 @@ def receive_once(live: LiveData, subscriber: GatewaySubscriber) -> list[LiveSour
     time.sleep(_UPDATE_S)
     subscriber.tick()
     return live.update()
-
-
-def silence_text(sources: Sequence[LiveSource]) -> str:
-    """Return what to say if gateways can be found but nothing of them arrives."""
-    names = ", ".join(source.name for source in sources)
-    return f"a gateway serves {names or 'this source'}, but nothing arrives from it; try again"
 
 
 def print_tables(sources: Sequence[LiveSource], out: TextIO, width: int, *, is_coloured: bool) -> None:
@@ -108,4 +102,4 @@ def print_json_lines(
             print(json_line(live, sources), file=out, flush=True)
         if not has_warned and live.first_heard_s is None and now_s - start_s >= DISCOVERY_S:
             has_warned = True
-            warn(subscriber.silence() or silence_text(sources))
+            warn(silence_text(subscriber, live))
