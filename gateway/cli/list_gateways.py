@@ -5,7 +5,14 @@ from typing import Annotated
 
 import typer
 
-from gateway.cli.options import ConnectOption, PrefixOption, SourceOption, UrlOption, ZenohConfigOption
+from gateway.cli.options import (
+    ConnectOption,
+    PrefixOption,
+    SourceOption,
+    UrlOption,
+    ZenohConfigOption,
+    check_transport,
+)
 
 
 def list_gateways(
@@ -24,8 +31,7 @@ def list_gateways(
     """
     if zenoh and lcm:
         raise typer.BadParameter("give either --zenoh or --lcm")
-    if zenoh_config is not None and lcm:
-        raise typer.BadParameter("--zenoh-config is for looking on Zenoh")
+    check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url)
 
     from rich.console import Console
 

@@ -241,6 +241,22 @@ QueriesUrlOption = Annotated[
 ]
 
 
+def check_transport(
+    *,
+    lcm: bool,
+    connect: str | None,
+    zenoh_config: Path | None,
+    url: str | None,
+    queries_url: str | None = None,
+) -> None:
+    """Raise BadParameter if there are options for Zenoh with ``--lcm``, or options for LCM without it."""
+    if lcm and (connect is not None or zenoh_config is not None):
+        raise typer.BadParameter("--connect and --zenoh-config are for Zenoh, not for --lcm")
+    for name, value in (("--url", url), ("--queries-url", queries_url)):
+        if value is not None and not lcm:
+            raise typer.BadParameter(f"{name} is for LCM; add --lcm")
+
+
 def chosen_log_level(level: LogLevel, *, verbose: bool, quiet: bool) -> LogLevel:
     """Return the level to log; raises BadParameter if the three options contradict each other."""
     if verbose + quiet + (level is not LogLevel.INFO) > 1:

@@ -1,12 +1,10 @@
 """``rtc3d-gateway record``: write what gateways publish to an LCM event log."""
 
 import os
-import signal
 import sys
 import threading
 import time
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -19,7 +17,9 @@ from gateway.cli.options import (
     SourcesOption,
     UrlOption,
     ZenohConfigOption,
+    check_transport,
 )
+from gateway.cli.stop_signals import stop_at_signals
 
 if TYPE_CHECKING:
     from gateway.cli.record_progress import RecordProgress
@@ -56,10 +56,7 @@ def record(
 
     A second Ctrl-C ends at once, without what waits for the disk.
     """
-    if lcm and (connect is not None or zenoh_config is not None):
-        raise typer.BadParameter("--connect and --zenoh-config are for recording from Zenoh")
-    if url is not None and not lcm:
-        raise typer.BadParameter("--url is for recording from LCM; add --lcm")
+    check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url)
     from gateway.cli.record_progress import RecordProgress
     from gateway.cli.record_summary import print_summary
     from gateway.recorder.file_sink import FileSink
@@ -68,7 +65,7 @@ def record(
     from gateway.subscriber.lcm_subscriber import START_S
     from gateway.subscriber.subscribe import Transport, close_in_time, subscribe_all
 
-    stop = _stop_signals()
+    stop = stop_at_signals(_end_at_once)
     target = Target(file)
     recording = TakeRecording(
         lambda sources: FileSink(target.open(sources)), component, START_S if lcm else 0.0
@@ -91,21 +88,10 @@ def record(
         raise typer.Exit(1)
 
 
-def _stop_signals() -> threading.Event:
-    """Return an event that the first signal sets. The second one ends the process at once."""
-    stop = threading.Event()
-
-    def handle(number: int, _frame: FrameType | None) -> None:
-        if stop.is_set():
-            if sys.stderr.isatty():
-                os.write(2, b"\x1b[?25h\n")  # the progress line has hidden the cursor
-            os._exit(128 + number)
-        stop.set()
-
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # nohup, and shells for `&`
-            signal.signal(number, handle)
-    return stop
+def _end_at_once(signal_number: int) -> None:
+    if sys.stderr.isatty():
+        os.write(2, b"\x1b[?25h\n")  # the progress line has hidden the cursor
+    os._exit(128 + signal_number)
 
 
 def _run(

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import typer
 from rich.console import Console
 
 from gateway.cli.gateway_queries import exit_with
+from gateway.cli.options import check_transport
 from gateway.cli.take_fetch import fetch_take
 from gateway.cli.take_gateway import GatewayAddress, TakeReplies
 from gateway.cli.take_list import ListedTake, write_list
@@ -29,10 +29,7 @@ def gateway_address(
     timeout_s: float,
 ) -> GatewayAddress:
     """Return where to ask, from the options of a command. Raises BadParameter if they contradict."""
-    if lcm and (zenoh_config is not None or connect is not None):
-        raise typer.BadParameter("--connect and --zenoh-config are for Zenoh, not for --lcm")
-    if not lcm and (url is not None or queries_url is not None):
-        raise typer.BadParameter("--url and --queries-url are for LCM; give --lcm, too")
+    check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url, queries_url=queries_url)
     return GatewayAddress(source, lcm, connect, zenoh_config, url, queries_url, prefix, timeout_s)
 
 

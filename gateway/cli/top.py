@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Annotated, Final, TextIO
 import typer
 
 from gateway.cli.gateway_queries import exit_with
-from gateway.cli.options import ConnectOption, PrefixOption, SourcesOption, UrlOption, ZenohConfigOption
+from gateway.cli.options import (
+    ConnectOption,
+    PrefixOption,
+    SourcesOption,
+    UrlOption,
+    ZenohConfigOption,
+    check_transport,
+)
 from gateway.errors import QueryError
 from gateway.safe_text import safe_lines, safe_text
 from gateway.service.log_format import LogLevel, set_up_log
@@ -48,10 +55,7 @@ def top(
 
     With --once, exit status 3 if no gateway is found, or none that serves a source.
     """
-    if lcm and (connect is not None or zenoh_config is not None):
-        raise typer.BadParameter("--connect and --zenoh-config are for Zenoh")
-    if url is not None and not lcm:
-        raise typer.BadParameter("--url is for LCM; add --lcm")
+    check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url)
     from gateway.subscriber.subscribe import Transport
 
     transport = Transport(lcm, connect, zenoh_config, url, prefix)

@@ -1,14 +1,12 @@
 """``rtc3d-gateway view``: a live 3D view in the browser."""
 
 import os
-import signal
 import sys
 import threading
 import webbrowser
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import FrameType
 from typing import TYPE_CHECKING, Annotated, Final
 
 import typer
@@ -19,8 +17,10 @@ from gateway.cli.options import (
     SourcesOption,
     UrlOption,
     ZenohConfigOption,
+    check_transport,
     checked_host,
 )
+from gateway.cli.stop_signals import stop_at_signals
 from gateway.safe_text import safe_text
 
 if TYPE_CHECKING:
@@ -58,17 +58,14 @@ def view(
     no_browser: Annotated[bool, typer.Option("--no-browser", help="Do not open the page.")] = False,
 ) -> None:
     """Show markers, tools and forces in the browser as they arrive, or from a take, until Ctrl-C."""
-    if lcm and (connect is not None or zenoh_config is not None):
-        raise typer.BadParameter("--connect and --zenoh-config are for Zenoh")
-    if url is not None and not lcm:
-        raise typer.BadParameter("--url is for LCM; add --lcm")
-    from gateway.subscriber.subscribe import Transport
-
+    check_transport(lcm=lcm, connect=connect, zenoh_config=zenoh_config, url=url)
     if take is not None and (lcm or connect is not None or zenoh_config is not None or prefix is not None):
         raise typer.BadParameter(
             "a take is read from its file; --lcm, --connect and --prefix are for live data"
         )
-    stop = _stop_signals()
+    from gateway.subscriber.subscribe import Transport
+
+    stop = stop_at_signals(lambda _: os._exit(0))
     server = _open_server(host, port)
     try:
         if take is None:
@@ -164,18 +161,3 @@ def _explain_silence(live: "LiveData", subscriber: "GatewaySubscriber") -> None:
     text = silence_text(subscriber, live)
     if live.first_heard_s is None:
         print(safe_text(text), file=sys.stderr, flush=True)
-
-
-def _stop_signals() -> threading.Event:
-    """Return an event that the first signal sets. The second one ends the process at once."""
-    stop = threading.Event()
-
-    def handle(_number: int, _frame: FrameType | None) -> None:
-        if stop.is_set():
-            os._exit(0)
-        stop.set()
-
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-        if signal.getsignal(number) is not signal.SIG_IGN:  # nohup, and shells for `&`
-            signal.signal(number, handle)
-    return stop

@@ -114,6 +114,25 @@ def test_the_default_file_is_read_and_environment_variables_override_it(
     assert printed("config", "check") == f"{default_config}: valid; 1 source: hall\n"
 
 
+@pytest.mark.parametrize(
+    "command", [("record", "walk"), ("view",), ("top",), ("list",), ("take", "list")], ids=" ".join
+)
+@pytest.mark.parametrize(
+    ("options", "text"),
+    [
+        (("--lcm", "--connect", "tcp/127.0.0.1:1"), "--connect and --zenoh-config are for Zenoh"),
+        (("--lcm", "--zenoh-config", "viewer.json5"), "--connect and --zenoh-config are for Zenoh"),
+        (("--url", "memq://"), "--url is for LCM; add --lcm"),
+    ],
+)
+def test_options_for_another_transport_end_with_status_2(
+    command: tuple[str, ...], options: tuple[str, ...], text: str
+) -> None:
+    result = CliRunner().invoke(app, [*command, *options], env={"COLUMNS": "300"})
+    assert result.exit_code == 2
+    assert text in result.output
+
+
 def test_doctor_reads_the_default_file(default_config: Path) -> None:
     default_config.write_text("sources: [{name: lab, host: a..b}]\n")
     result = CliRunner().invoke(app, ["doctor"])
