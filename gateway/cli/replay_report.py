@@ -11,6 +11,7 @@ from rich.text import Text
 
 from gateway.replay.player import Player
 from gateway.replay.publication import MAX_SOURCES, MAX_TOPICS, Publication
+from gateway.replay.time_text import time_text
 from gateway.replay.timeline import Jump
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.safe_text import safe_text
@@ -21,13 +22,6 @@ LINE_S: Final = 5.0
 
 _MAX_LISTED: Final = 10
 _ORDER: Final = (*(component.key for component in WIRE_ORDER), "6d/tool", "status", "clock", "parameters")
-
-
-def time_text(us: int) -> str:
-    """Return a duration as hours, minutes and seconds, such as 0:01:30.2."""
-    tenths = abs(us) // 100_000
-    minutes, rest = divmod(tenths, 600)
-    return f"{'-' if us < 0 else ''}{minutes // 60}:{minutes % 60:02}:{rest // 10:02}.{rest % 10}"
 
 
 def jump_text(jump: Jump) -> str:

@@ -11,6 +11,7 @@ from gateway.live.live_data import LiveData
 from gateway.replay.play_list import Selection
 from gateway.replay.player import Player
 from gateway.replay.take_length import take_length_us
+from gateway.replay.time_text import time_text
 from gateway.safe_text import safe_text
 from gateway.takes.reader import TakeReader
 
@@ -114,14 +115,6 @@ class Playback:
 
     def _repeat(self, is_repeated: bool) -> None:
         self._player.is_repeated = is_repeated
-
-
-def time_text(duration_us: int) -> str:
-    """Return a duration as minutes, seconds and tenths, or with hours: "1:02.5", "2:01:02.5"."""
-    minutes, tenths = divmod(duration_us // 100_000, 600)
-    hours, minutes = divmod(minutes, 60)
-    seconds = f"{tenths // 10:02}.{tenths % 10}"
-    return f"{hours}:{minutes:02}:{seconds}" if hours else f"{minutes}:{seconds}"
 
 
 def _length_by_reading_us(reader: TakeReader) -> int:
