@@ -7,8 +7,8 @@ from contextlib import suppress
 from typing import Final
 
 from gateway.cli.found_sources import FoundSources, read_status
-from gateway.cli.gateway_queries import DISCOVERY_S
 from gateway.messages.topics import lcm_channel
+from gateway.outputs.discovery import DISCOVERY_S
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.safe_text import safe_text

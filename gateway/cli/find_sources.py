@@ -5,7 +5,7 @@ from gateway.cli.find_zenoh import find_on_zenoh
 from gateway.cli.found_sources import FoundSources
 from gateway.errors import OutputError
 from gateway.messages.topics import lcm_channel
-from gateway.outputs.absent import missing_source
+from gateway.outputs.discovery import missing_source
 from gateway.outputs.kind import SubscriptionRequest
 from gateway.outputs.lcm import subscriber as lcm
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX, effective_lcm_url

@@ -6,8 +6,9 @@ from typing import Final
 import zenoh
 
 from gateway.cli.found_sources import FoundSources
-from gateway.cli.gateway_queries import DISCOVERY_S, RETRY_S
+from gateway.cli.gateway_queries import RETRY_S
 from gateway.messages.topics import zenoh_key
+from gateway.outputs.discovery import DISCOVERY_S
 from gateway.outputs.zenoh.subscriber import served_sources
 
 _ANSWER_S: Final = 2.0

@@ -8,6 +8,7 @@ from typing import Final
 import typer
 
 from gateway.errors import QueryError
+from gateway.outputs.discovery import DISCOVERY_S
 from gateway.safe_text import safe_lines
 
 EXIT_STATUSES: Final = {"no-gateway": 3, "no-connection": 4, "timeout": 5}
@@ -18,9 +19,6 @@ RETRY_S: Final = 0.5
 
 BUSY_CODES: Final = frozenset({"busy", "rate"})
 """The codes of a gateway that gets too many queries. They count as no reply as long as there is time."""
-
-DISCOVERY_S: Final = 2.5
-"""How long it may take to find a gateway: Zenoh needs time to connect; LCM carries one status a second."""
 
 
 class TimeLimits:

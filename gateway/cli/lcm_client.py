@@ -8,10 +8,11 @@ from typing import Any, NamedTuple
 
 import rtc3d
 
-from gateway.cli.gateway_queries import BUSY_CODES, DISCOVERY_S, RETRY_S, TimeLimits
+from gateway.cli.gateway_queries import BUSY_CODES, RETRY_S, TimeLimits
 from gateway.errors import OutputError, ProtocolError, QueryError
 from gateway.messages.decode import decode
 from gateway.messages.topics import lcm_channel
+from gateway.outputs.discovery import DISCOVERY_S
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber, no_gateway

@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, Final
 
 from gateway.live.live_data import LiveData, LiveSource
+from gateway.outputs.discovery import DISCOVERY_S
 from gateway.subscriber.subscribe import GatewaySubscriber, silence_text
 from gateway.terminal.keyboard import Keyboard, is_in_front
 from gateway.terminal.screen import Screen
-from gateway.top.reports import DISCOVERY_S
 from gateway.top.view import View
 
 _UPDATE_S: Final = 0.1

@@ -8,15 +8,13 @@ from gateway.errors import QueryError
 from gateway.live.live_data import LiveData, LiveSource
 from gateway.messages.host_time import now_utime
 from gateway.messages.json_text import json_text
+from gateway.outputs.discovery import DISCOVERY_S, missing_source
 from gateway.safe_text import safe_json
 from gateway.subscriber.subscribe import GatewaySubscriber, silence_text
 from gateway.terminal.screen import Line, Style, encoded, line_text
 from gateway.top.facts import source_facts
 from gateway.top.pages import PAGES
 from gateway.top.table import laid_out, sorted_by
-
-DISCOVERY_S: Final = 2.5
-"""How long it may take to find a gateway: Zenoh needs time to connect; LCM carries one status a second."""
 
 _PICTURE_S: Final = 2.5
 """How long after the first message a picture is complete: rates are over 2 s, statuses come every second."""
@@ -42,11 +40,9 @@ def wait_for_picture(live: LiveData, subscriber: GatewaySubscriber) -> list[Live
 
 def missing_sources(sources: Sequence[LiveSource], wanted: Sequence[str]) -> list[QueryError]:
     """Return an error for each of the ``wanted`` sources that is not found."""
-    found = sorted(source.name for source in sources if source.heard_s is not None)
+    found = [source.name for source in sources if source.heard_s is not None]
     return [
-        QueryError(f"no gateway serves source {name!r}; sources found: {', '.join(found)}", code="no-gateway")
-        for name in wanted
-        if name not in found
+        QueryError(missing_source([name], found), code="no-gateway") for name in wanted if name not in found
     ]
 
 

@@ -8,7 +8,7 @@ import zenoh
 
 from gateway.errors import OutputError
 from gateway.messages.topics import escape_key_chunk, zenoh_key
-from gateway.outputs.absent import missing_source
+from gateway.outputs.discovery import missing_source
 from gateway.outputs.kind import Receive, SubscriptionRequest
 from gateway.outputs.zenoh.command_session import command_config
 from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason

@@ -1,12 +1,16 @@
-"""Sentences about sources that no gateway serves, for every output."""
+"""Finding gateways on any output: how long it may take, and what to say of sources that none serves."""
 
 from collections.abc import Collection
+from typing import Final
 
-_MAX_NAMED = 20
+DISCOVERY_S: Final = 2.5
+"""How long it may take to find a gateway: Zenoh needs time to connect; LCM carries one status a second."""
+
+_MAX_NAMED: Final = 20
 
 
 def missing_source(wanted: Collection[str], served: Collection[str]) -> str:
-    """Return that one of the ``wanted`` sources is not served, and which are; "" if all are."""
+    """Return which of the ``wanted`` sources is not served, and which sources are; "" if all are."""
     missing = [source for source in wanted if source not in served]
     if not missing:
         return ""
