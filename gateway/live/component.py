@@ -50,9 +50,9 @@ class LiveComponent:
         self.num_malformed = 0
         """How many messages could not be decoded."""
         self.latency = Latency()
-        self.visibility = Visibility()
         self.description: Description = describe(component, None, 0)
         """The labels, units and announced rate of the newest items."""
+        self._visibility = Visibility()
         self._rate = MessageRate()
         self._rate_before_stop_hz = 0.0
         self._num_messages = 0
@@ -94,7 +94,7 @@ class LiveComponent:
                 self.latency.add(rows.heads["capture_utime"], rows.heads["utime"], times)
             for items in rows.items.values():
                 if self.type in _CAN_BE_MISSING:
-                    self.visibility.add(is_visible(items), now_s)
+                    self._visibility.add(_is_visible(items), now_s)
         wanted = (parameters, len(self.newest_items))
         if self._described is None or self._described[0] is not parameters or self._described[1] != wanted[1]:
             self._described = wanted
@@ -115,6 +115,20 @@ class LiveComponent:
         return self.description.rate_hz
 
     @property
+    def is_visible(self) -> Array:
+        """Whether each marker or tool is visible now, shape (items,): none is if data have stopped."""
+        return _is_visible(self.newest_items) & (not self.is_stopped)
+
+    @property
+    def visible_shares(self) -> Array:
+        """In which share of the frames of the last 10 s each marker or tool was visible, from 0 to 1.
+
+        The shape is (items,); it is (0,) if no frame came in this time.
+        """
+        shares = self._visibility.shares(time.monotonic())
+        return shares if len(shares) == len(self.newest_items) else shares[:0]
+
+    @property
     def age_s(self) -> float | None:
         """How long ago the newest message arrived; None before the first."""
         return None if self.arrived_s is None else time.monotonic() - self.arrived_s
@@ -128,7 +142,7 @@ class LiveComponent:
         return time.monotonic() - self.arrived_s > max(_STOPPED_S, frames_s)
 
 
-def is_visible(items: Array) -> Array:
+def _is_visible(items: Array) -> Array:
     """Return for each marker or tool of an array whether it is visible, in the shape of ``items``.
 
     Any NaN in a position or orientation means missing (§7.3, field note 7).

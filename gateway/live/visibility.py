@@ -11,6 +11,11 @@ WINDOW_S: Final = 10.0
 _STEP_S: Final = 0.5
 
 
+def visible_percent(share: float) -> float:
+    """Return a share from 0 to 1 in %, for one decimal: only 0 and 1 themselves become 0.0 and 100.0."""
+    return 100 * share if share in {0, 1} else min(max(100 * share, 0.1), 99.9)
+
+
 class Visibility:
     """Counts in steps of half a second, over WINDOW_S, in how many frames each item was visible."""
 

@@ -5,13 +5,12 @@ limit to how many entries of a status are taken.
 """
 
 import math
-import time
 from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final, NamedTuple, TypeVar
 
-from gateway.live.component import LiveComponent, is_visible
+from gateway.live.component import LiveComponent
 from gateway.live.latency import Percentiles
 from gateway.live.live_data import LiveSource
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
@@ -33,7 +32,7 @@ _Entry = TypeVar("_Entry")
 
 @dataclass(frozen=True, slots=True)
 class StateFacts:
-    """How a source is. ``level`` is ok, warning or error."""
+    """The state of a source. ``level`` is ok, warning or error."""
 
     text: str
     level: str
@@ -146,7 +145,7 @@ def source_names(source: LiveSource) -> Names:
 
 
 def state(source: LiveSource) -> StateFacts:
-    """Return how a source is, in the words of the status line."""
+    """Return the state of a source, in the words of the status line."""
     if source.is_silent:
         age_s = source.status_age_s
         since = "yet" if age_s is None else f"for {age_s:.0f} s"
@@ -184,7 +183,6 @@ def _component(source: LiveSource, kind: ComponentType) -> ComponentFacts:
     has_come = component.newest_head is not None
     announced = describe(kind, source.newest_parameters, len(component.newest_items)).rate_hz
     can_be_seen = kind in {ComponentType.MARKERS, ComponentType.TOOLS} and has_come
-    num_visible = 0 if component.is_stopped else int(is_visible(component.newest_items).sum())
     to_gateway, to_here = component.latency.to_gateway, component.latency.to_here
     return ComponentFacts(
         component=kind.key,
@@ -200,7 +198,7 @@ def _component(source: LiveSource, kind: ComponentType) -> ComponentFacts:
         gateway_to_here_p50_ms=_p50_ms(to_here),
         gateway_to_here_p99_ms=_p99_ms(to_here),
         num_items=len(component.newest_items) if has_come else None,
-        num_visible=num_visible if can_be_seen else None,
+        num_visible=int(component.is_visible.sum()) if can_be_seen else None,
         age_s=component.age_s,
         is_stopped=component.is_stopped,
         num_skipped=component.num_skipped,
@@ -252,16 +250,13 @@ def _items(component: LiveComponent | None) -> list[ItemFacts]:
     if component is None:
         return []
     items = component.newest_items
-    shares = component.visibility.shares(time.monotonic()).tolist()
-    if len(shares) != len(items):
-        shares = [None] * len(items)
-    visible = (is_visible(items) & (not component.is_stopped)).tolist()
+    shares = component.visible_shares.tolist() or [None] * len(items)
     errors = items["error"].tolist() if "error" in (items.dtype.names or ()) else [None] * len(items)
     columns = zip(
         component.description.labels,
         component.description.units,
         shares,
-        visible,
+        component.is_visible.tolist(),
         *(items[name].tolist() for name in "xyz"),
         errors,
         strict=True,

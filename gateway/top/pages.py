@@ -1,11 +1,11 @@
 """The pages of ``top``: a table each, made from the facts about all sources."""
 
-import math
 from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Final, NamedTuple
 
 from gateway.live.live_data import LiveSource
+from gateway.live.visibility import visible_percent
 from gateway.safe_text import safe_text
 from gateway.terminal.screen import Style
 from gateway.top import facts
@@ -133,7 +133,7 @@ def tools(sources: Sequence[LiveSource]) -> Table:
     for source in sources:
         for item in facts.tools(source):
             name, share, now, *position = _item_cells(item)
-            error = number_cell(_finite(item.error), 3)
+            error = number_cell(item.error, 3)
             rows.append((name, share, now, error, *position, text_cell(_name(source))))
     return Table(columns, [Section(rows)] if rows else [], "no tools so far", Order("visible in 10 s"))
 
@@ -147,17 +147,11 @@ def _item_cells(item: facts.ItemFacts) -> list[Cell]:
     style = Style.FAINT if share is None else _share_style(share)
     return [
         text_cell(item.label, Style.PLAIN if item.is_visible else Style.BAD),
-        Cell("") if share is None else Cell(_percent(share), style, share),
+        Cell("") if share is None else Cell(f"{visible_percent(share):.1f} %", style, share),
         text_cell("visible") if item.is_visible else text_cell("missing", Style.BAD),
-        *(number_cell(_finite(value), 1) for value in (item.x, item.y, item.z)),
+        *(number_cell(value, 1) for value in (item.x, item.y, item.z)),
         text_cell(item.unit, Style.FAINT),
     ]
-
-
-def _percent(share: float) -> str:
-    """Return a share in percent; 100 % and 0 % only if nothing, or everything, was missing."""
-    percent = min(max(100 * share, 0.1 if share else 0.0), 99.9 if share < 1 else 100.0)
-    return f"{percent:.1f} %"
 
 
 def _share_style(share: float) -> Style:
@@ -197,15 +191,15 @@ def _server_of(source: LiveSource) -> Section:
             (
                 text_cell(stream.components),
                 text_cell(stream.state, Style.GOOD if stream.state == "streaming" else Style.WARNING),
-                number_cell(_finite(stream.frame_rate_hz), 1),
+                number_cell(stream.frame_rate_hz, 1),
                 number_cell(stream.session),
                 number_cell(stream.num_reconnects),
                 number_cell(stream.num_restarts),
                 text_cell(stream.byte_order),
                 text_cell(stream.rate),
-                number_cell(_finite(stream.lag_ms), 1),
-                number_cell(_finite(drift_ppm), 2),
-                number_cell(_finite(uncertainty_us), 1),
+                number_cell(stream.lag_ms, 1),
+                number_cell(drift_ppm, 2),
+                number_cell(uncertainty_us, 1),
             )
         )
         problem = [f"{stream.components}: {stream.problem}"] if stream.problem else []
@@ -343,7 +337,3 @@ def _name(source: LiveSource) -> str:
 
 def _warning_if(is_true: bool) -> Style:
     return Style.WARNING if is_true else Style.PLAIN
-
-
-def _finite(value: float | None) -> float | None:
-    return value if value is not None and math.isfinite(value) else None

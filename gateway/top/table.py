@@ -1,5 +1,6 @@
 """Tables of texts: sorted, filtered, and laid out for a certain width."""
 
+import math
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -78,8 +79,8 @@ def text_cell(text: str, style: Style = Style.PLAIN) -> Cell:
 
 
 def number_cell(value: float | None, digits: int = 0, style: Style = Style.PLAIN) -> Cell:
-    """Return a cell with a number, or nothing for None and NaN; very large ones are written as 1.2e+15."""
-    if value is None or value != value:  # noqa: PLR0124 - NaN
+    """Return a cell with a number, empty for None, NaN and infinity; 1e12 and more is as in 1.2e+15."""
+    if value is None or not math.isfinite(value):
         return Cell("")
     text = f"{value:.{digits}f}" if -1e12 < value < 1e12 else f"{value:.2g}"
     return Cell(text, style, value)

@@ -1,11 +1,10 @@
 """Tables of markers and tools by visibility, and of the newest events, as HTML."""
 
-import time
 from typing import Final
 
 import numpy as np
 
-from gateway.live.component import LiveComponent, is_visible
+from gateway.live.component import LiveComponent
 from gateway.live.live_data import LiveSource
 from gateway.takes.component_rows import Array
 from gateway.view.texts import NONE, counted, event_time_text, html_text, share_text, table, value_text
@@ -36,23 +35,22 @@ def worst_first(shares: Array) -> list[int]:
 
 
 def _visibility_html(component: LiveComponent, noun: str) -> str:
-    shares = component.visibility.shares(time.monotonic())
-    num_items = len(component.newest_items)
-    if len(shares) != num_items or not num_items:
+    shares, num_items = component.visible_shares, len(component.newest_items)
+    if not len(shares):
         return f"<p class=dim>{counted(num_items, noun)}, no frames in the last 10 s</p>"
-    now_visible = is_visible(component.newest_items)
+    is_visible = component.is_visible
     units, labels = component.description.units, component.description.labels
     rows = []
     for index in worst_first(shares)[:MAX_ROWS]:
         name = html_text(labels[index])
         if component.is_stopped:
             name = f"<span class=dim>{name}</span>"
-        elif not now_visible[index]:
+        elif not is_visible[index]:
             name = f"<span class=bad>{name}</span>"
         cells = [name, _bar(float(shares[index]))]
         if noun == "tool":
             error = float(component.newest_items["error"][index])
-            cells.append(f"{value_text(error)} {html_text(units[index])}" if now_visible[index] else NONE)
+            cells.append(f"{value_text(error)} {html_text(units[index])}" if is_visible[index] else NONE)
         rows.append(tuple(cells))
     headings = (f"{counted(num_items, noun)}", "visible, last 10 s", *(("error",) if noun == "tool" else ()))
     return table(headings, rows) + _rest(shares, noun)

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from typing import Final
 
 from gateway.live.latency import Percentiles
+from gateway.live.visibility import visible_percent
 from gateway.safe_text import safe_text
 
 NONE: Final = "–"
@@ -64,9 +65,7 @@ def percentiles_text(percentiles: Percentiles | None) -> str:
 
 def share_text(share: float) -> str:
     """Return a share from 0 to 1 in %. Only a share of exactly 0 or 1 is "0 %" or "100 %"."""
-    if share in {0, 1}:
-        return f"{100 * share:.0f} %"
-    return f"{min(max(100 * share, 0.1), 99.9):.1f} %"
+    return f"{visible_percent(share):.{0 if share in {0, 1} else 1}f} %"
 
 
 def age_text(age_s: float) -> str:

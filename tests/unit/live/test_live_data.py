@@ -91,7 +91,7 @@ def test_the_share_of_frames_in_which_a_marker_is_visible() -> None:
     for number in range(4):
         x = float(MISSING) if number else 1.0
         live.publish("lab", "3d", message("3d", number, markers((x, 2, 3), (4, 5, 6))))
-    shares = only(live).components["3d"].visibility.shares(time.monotonic())
+    shares = only(live).components["3d"].visible_shares
     assert shares.tolist() == [0.25, 1.0]
 
 
