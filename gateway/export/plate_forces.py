@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 from gateway.export.force_plates import geometry_of
 from gateway.messages.tool_pose import metres_per_unit
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters import Parameters, Plate
 from gateway.takes.labels import describe
 
 METRES_PER_NEWTON: Final = 1e-3
@@ -53,25 +53,24 @@ def placed_plates(parameters: Parameters) -> list[PlacedPlate | None]:
         if geometry is None:
             found.append(None)
             continue
-        units = [channel.unit for channel in plate.channels]
-        newtons = unit_in_newtons(units[0] if units else "")
         x, y, z = geometry.corners.mean(axis=0).tolist()
         nx, ny, nz = geometry.rotation[:, 2].tolist()
-        newton_metres = unit_in_newton_metres(units[3] if len(units) > 3 else "")
-        found.append(
-            PlacedPlate(label, geometry.corners.tolist(), (x, y, z), (nx, ny, nz), newtons, newton_metres)
-        )
+        found.append(PlacedPlate(label, geometry.corners.tolist(), (x, y, z), (nx, ny, nz), *units_of(plate)))
     return found
 
 
-def unit_in_newtons(unit: str) -> float:
-    """Return a unit of force in N; an unknown one counts as N."""
+def units_of(plate: Plate) -> tuple[float, float]:
+    """Return the units of a plate's forces and moments, in N and in Nm; unknown ones count as N and Nm."""
+    units = [channel.unit for channel in plate.channels]
+    return _in_newtons(units[0] if units else ""), _in_newton_metres(units[3] if len(units) > 3 else "")
+
+
+def _in_newtons(unit: str) -> float:
     match = _UNIT_OF_FORCE.fullmatch(unit)
     return 1000.0 if match and match[1] else 1.0
 
 
-def unit_in_newton_metres(unit: str) -> float:
-    """Return a unit of moments in Nm; an unknown one counts as Nm."""
+def _in_newton_metres(unit: str) -> float:
     match = _UNIT_OF_MOMENT.fullmatch(unit)
     if match is None:
         return 1.0

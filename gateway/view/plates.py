@@ -10,8 +10,7 @@ from gateway.export.plate_forces import (
     PlacedPlate,
     force_on,
     placed_plates,
-    unit_in_newton_metres,
-    unit_in_newtons,
+    units_of,
 )
 from gateway.live.component import LiveComponent
 from gateway.rtc3d.parameters import Parameters
@@ -114,7 +113,7 @@ class Plates:
 def _nominal_plate(label: str, place: int, parameters: Parameters, number: int, up: UpAxis) -> PlacedPlate:
     """Return a plate whose place is not known, at a place of its own on the floor."""
     plates = parameters.force.plates if parameters.force else ()
-    units = [channel.unit for channel in plates[number].channels] if number < len(plates) else []
+    units = units_of(plates[number]) if number < len(plates) else (1.0, 1.0)
     x = place * (_WIDTH_M + _GAP_M)
     corners = [
         on_floor(up, x + sx * _WIDTH_M / 2, sy * _DEPTH_M / 2)
@@ -125,6 +124,5 @@ def _nominal_plate(label: str, place: int, parameters: Parameters, number: int, 
         [list(corner) for corner in corners],
         on_floor(up, x, 0.0),
         on_floor(up, 0.0, 0.0, 1.0),
-        unit_in_newtons(units[0] if units else ""),
-        unit_in_newton_metres(units[3] if len(units) > 3 else ""),
+        *units,
     )
