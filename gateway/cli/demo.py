@@ -18,7 +18,7 @@ from gateway.cli.options import (
 from gateway.service.log_format import LogLevel, set_up_log
 
 if TYPE_CHECKING:
-    from gateway.cli.demo_view import Viewer
+    from gateway.cli.demo_view import ViewProcess
     from gateway.rtc3d_server.scene import Scene
 
 
@@ -50,7 +50,7 @@ def demo(
     """
     import uvloop
 
-    from gateway.cli.demo_view import viewer, viewer_is_installed
+    from gateway.cli.demo_view import view_is_installed, view_process
     from gateway.simulator.c3d_scene import C3dScene
     from gateway.simulator.synthetic import SyntheticScene
 
@@ -69,15 +69,15 @@ def demo(
         )
     run_s = seconds if seconds is not None or view else 10.0
     watch = (
-        partial(viewer, is_required=view, opens_browser=not no_browser)
-        if view or viewer_is_installed()
+        partial(view_process, is_required=view, opens_browser=not no_browser)
+        if view or view_is_installed()
         else None
     )
     if not uvloop.run(_run(scene, run_s, udpm, watch)):
         raise typer.Exit(1)
 
 
-async def _run(scene: "Scene", seconds: float | None, udpm: bool, view: "Viewer | None") -> bool:
+async def _run(scene: "Scene", seconds: float | None, udpm: bool, view: "ViewProcess | None") -> bool:
     """Run the demo; without a time, Ctrl-C ends it."""
     import asyncio
 

@@ -11,7 +11,8 @@ from typing import Final, TypeAlias
 
 from gateway.errors import ViewError
 
-Viewer: TypeAlias = Callable[[str], AbstractAsyncContextManager[None]]
+ViewProcess: TypeAlias = Callable[[str], AbstractAsyncContextManager[None]]
+"""Runs the view on a Zenoh endpoint, while the context is open."""
 
 _HOST: Final = "127.0.0.1"
 _PORT: Final = 8080
@@ -19,13 +20,13 @@ _READY_S: Final = 15.0
 _STOP_S: Final = 5.0
 
 
-def viewer_is_installed() -> bool:
+def view_is_installed() -> bool:
     """Whether the extra ``view`` is installed."""
     return importlib.util.find_spec("viser") is not None
 
 
 @asynccontextmanager
-async def viewer(endpoint: str, *, is_required: bool, opens_browser: bool) -> AsyncIterator[None]:
+async def view_process(endpoint: str, *, is_required: bool, opens_browser: bool) -> AsyncIterator[None]:
     """Run ``rtc3d-gateway view`` on a Zenoh endpoint, and print its address when it serves the page.
 
     If it ``is_required``, raise ViewError if it does not start, and open a browser if ``opens_browser``.

@@ -14,7 +14,7 @@ from gateway.outputs.discovery import DISCOVERY_S
 from gateway.subscriber.subscribe import GatewaySubscriber, silence_text
 from gateway.terminal.keyboard import Keyboard, is_in_front
 from gateway.terminal.screen import Screen
-from gateway.top.view import View
+from gateway.top.display import Display
 
 _UPDATE_S: Final = 0.1
 _DRAW_S: Final = 0.5
@@ -41,7 +41,7 @@ class App:
         self._screen = screen
         self._keyboard = keyboard
         self._notices = notices
-        self._view = View(title, has_keys=keyboard is not None)
+        self._display = Display(title, has_keys=keyboard is not None)
         self._sources: Sequence[LiveSource] = ()
         self._is_suspending = False
         self._silence = ""
@@ -54,7 +54,7 @@ class App:
         size = self._screen.size
         with _suspending(self._suspend):
             try:
-                while not self._view.is_over:
+                while not self._display.is_over:
                     has_changed = self._read_keys()
                     if self._is_suspending:
                         self._stop_process()
@@ -83,11 +83,11 @@ class App:
             return False
         names = keyboard.read()
         if names is None:
-            self._view.is_over = True
+            self._display.is_over = True
         for name in names or ():
             if name == "ctrl-l":
                 self._screen.redraw()
-            self._view.press(name)
+            self._display.press(name)
         return True
 
     def _take(self) -> None:
@@ -131,7 +131,7 @@ class App:
             notices.append(f"a defect in this program: {self._live.defect!r}")
         notices += [*self._notices][-1:]
         size = self._screen.size
-        self._screen.draw(self._view.lines(self._sources, notices, size.columns, size.lines))
+        self._screen.draw(self._display.lines(self._sources, notices, size.columns, size.lines))
 
 
 @contextlib.contextmanager

@@ -2,16 +2,16 @@ import pytest
 from rich.cells import cell_len
 
 from gateway.terminal.screen import Line
+from gateway.top.display import Display
 from gateway.top.pages import PAGES
-from gateway.top.view import View
 from tests.unit.top.live_lab import LiveLab, stream
 
 
 class Shown:
-    """A view of a source with 30 markers, of which the second one is missing."""
+    """The display of a source with 30 markers, of which the second one is missing."""
 
     def __init__(self, width: int = 100, height: int = 20) -> None:
-        self.view = View("Zenoh", has_keys=True)
+        self.display = Display("Zenoh", has_keys=True)
         self.width, self.height = width, height
         lab = LiveLab()
         lab.status(stream("3d"))
@@ -20,7 +20,7 @@ class Shown:
         self.notices: list[str] = []
 
     def lines(self) -> list[Line]:
-        return self.view.lines(self.sources, self.notices, self.width, self.height)
+        return self.display.lines(self.sources, self.notices, self.width, self.height)
 
     def texts(self) -> list[str]:
         return ["".join(text for text, _ in line).rstrip() for line in self.lines()]
@@ -28,7 +28,7 @@ class Shown:
     def press(self, *keys: str) -> list[str]:
         self.lines()
         for key in keys:
-            self.view.press(key)
+            self.display.press(key)
         return self.texts()
 
     def body(self) -> list[str]:
@@ -86,7 +86,7 @@ def test_the_filter_is_typed_and_cleared() -> None:
     assert shown.texts()[-1] == "filter: MARKER 3"
     assert [line.split()[1] for line in shown.body()] == ["3", "30"]
     assert shown.press("q", "backspace", "enter")[-1].startswith("filter: MARKER 3  Esc clear")
-    assert not shown.view.is_over
+    assert not shown.display.is_over
     shown.press("escape")
     assert len(shown.body()) == 16
     shown.press("/", *"xyz", "ctrl-u", "a", "escape")
@@ -98,7 +98,7 @@ def test_the_filter_is_typed_and_cleared() -> None:
 def test_q_ends() -> None:
     shown = Shown()
     shown.press("q")
-    assert shown.view.is_over
+    assert shown.display.is_over
 
 
 def test_notices_are_shown_above_the_table_and_escaped() -> None:
@@ -108,5 +108,5 @@ def test_notices_are_shown_above_the_table_and_escaped() -> None:
 
 
 def test_without_a_keyboard_no_key_is_named() -> None:
-    view = View("LCM", has_keys=False)
-    assert "quit" not in "".join(text for line in view.lines([], [], 100, 20) for text, _ in line)
+    display = Display("LCM", has_keys=False)
+    assert "quit" not in "".join(text for line in display.lines([], [], 100, 20) for text, _ in line)

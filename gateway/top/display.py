@@ -27,8 +27,8 @@ _PAGE_STEPS: Final = {"tab": 1, "right": 1, "l": 1, "shift-tab": -1, "left": -1,
 _PAGES_BY_KEY: Final = {str(number): number - 1 for number in range(1, len(PAGES) + 1)}
 
 
-class View:
-    """The state of the screen, which ``press`` changes and ``lines`` shows."""
+class Display:
+    """The page that is shown, which ``press`` changes and ``lines`` returns as text."""
 
     def __init__(self, title: str, *, has_keys: bool) -> None:
         self._title = title
