@@ -1,9 +1,7 @@
 """Receiving what gateways publish on LCM."""
 
 import logging
-import math
 import re
-import time
 import uuid
 from collections.abc import Collection
 from typing import Any, Final
@@ -23,7 +21,6 @@ from gateway.subscriber.series import FINGERPRINTS, POSE, Series, Source
 START_S: Final = 1.2
 """Each source is heard within this time, because it sends a status once a second."""
 
-_AGAIN_S: Final = 0.3
 _POSE_MARK: Final = "_6D_"
 
 _KEYS_BY_FINGERPRINT: Final = {fingerprint: key for key, fingerprint in FINGERPRINTS.items()}
@@ -50,7 +47,6 @@ class LcmGatewaySubscriber:
         self._names = {lcm_channel(prefix, name): name for name in sources}
         self._reception = reception
         self._series: dict[str, Series | None] = {}  # by channel; None: left out
-        self._asked_s: dict[str, float] = {}  # when a source was asked, by its channels
         self._requester = f"rtc3d-gateway {uuid.uuid4()}"
         self._by_request_id: dict[int, Source] = {}
         self._subscribers = [
@@ -146,16 +142,12 @@ class LcmGatewaySubscriber:
     # In the thread of the command.
 
     def tick(self) -> None:
-        """Ask for the parameters of sources that wait for their description."""
-        now_s = time.monotonic()
+        """Query the parameters of sources that wait for their description."""
         for source in self._reception.sources_now:
-            if source.has_answer or not source.is_waiting:
-                continue
-            if now_s - self._asked_s.get(source.channels, -math.inf) > _AGAIN_S:
-                self._asked_s[source.channels] = now_s
-                self._ask(source)
+            if source.is_waiting and not source.has_answer and source.begin_query():
+                self._query(source)
 
-    def _ask(self, source: Source) -> None:
+    def _query(self, source: Source) -> None:
         request = rtc3d.parameters_request_t()
         request.requester = self._requester
         request.request_id = len(self._by_request_id)

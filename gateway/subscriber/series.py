@@ -1,5 +1,6 @@
 """What was received: the sources, and the messages of each of their keys."""
 
+import math
 import time
 from typing import Any, Final
 
@@ -10,6 +11,11 @@ from gateway.messages.decode import decode
 from gateway.messages.encode import MESSAGE_TYPES
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.subscriber.sequence_check import PREFIX_END, SequenceCheck
+
+_AGAIN_S: Final = 0.3
+"""When a query is repeated that got no answer, as may happen while Zenoh connects."""
+
+_MAX_AGAIN_S: Final = 10.0
 
 POSE: Final = "6d/"
 """What the keys of tool poses begin with."""
@@ -83,11 +89,24 @@ class Source:
         """Whether a gateway has answered the query for the parameters, or published them."""
         self.series_by_key: dict[str, Any] = {}
         self.found_s = time.monotonic()
+        self._queried_s = -math.inf
 
     @property
     def is_waiting(self) -> bool:
         """Whether a query for the parameters or the status is still to be answered."""
         return self.status is None or not self.has_answer
+
+    def begin_query(self) -> bool:
+        """Return whether it is time for a query about the source, and note that it is made.
+
+        If a gateway does not reply, the queries become rarer: from every 0.3 s to every 10 s.
+        """
+        now_s = time.monotonic()
+        again_s = min(max(_AGAIN_S, (now_s - self.found_s) / 10), _MAX_AGAIN_S)
+        if now_s - self._queried_s < again_s:
+            return False
+        self._queried_s = now_s
+        return True
 
     @property
     def series(self) -> list[Any]:

@@ -1,9 +1,7 @@
 """Receiving what gateways publish on Zenoh."""
 
 import json
-import math
 import re
-import time
 from collections.abc import Collection
 from typing import Any, Final
 from urllib.parse import unquote
@@ -18,8 +16,6 @@ from gateway.subscriber.reception import MAX_SERIES, MAX_XML_BYTES, Reception
 from gateway.subscriber.series import POSE, Series, Source
 
 _QUERY_S: Final = 1.0
-_AGAIN_S: Final = 0.3
-"""When a query is repeated that got no answer, as may happen while Zenoh connects."""
 
 _SOURCE_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,24}")
 _NO_KEYS: Final = {"c3d", "recording", "take"}
@@ -48,7 +44,6 @@ class ZenohGatewaySubscriber:
         self._sources = sources
         self._reception = reception
         self._series: dict[str, Series | None] = {}  # by key; None: left out
-        self._asked_s: dict[str, float] = {}  # when the description of a source was queried, by its name
         for name in self._served():
             self._source(name)
         wanted = ["**"] if components is None else [*components, "status", "parameters"]
@@ -139,13 +134,11 @@ class ZenohGatewaySubscriber:
 
     def tick(self) -> None:
         """Query the parameters and the status of sources that wait for their description."""
-        now_s = time.monotonic()
         for source in self._reception.sources_now:
-            if source.is_waiting and now_s - self._asked_s.get(source.name, -math.inf) > _AGAIN_S:
-                self._asked_s[source.name] = now_s
-                self._ask(source)
+            if source.is_waiting and source.begin_query():
+                self._query(source)
 
-    def _ask(self, source: Source) -> None:
+    def _query(self, source: Source) -> None:
         key = zenoh_key(self._prefix, source.name)
         if not source.has_answer:
             self._session.get(
