@@ -14,7 +14,8 @@ from gateway.view.panel import Panel
 from gateway.view.server import ViewServer, open_server
 from gateway.view.viewer import PERIOD_S
 from tests.browser import NewPage, chromium, new_page
-from tests.unit.view.live_lab import Lab, stream
+from tests.statuses import stream
+from tests.unit.view.live_lab import Lab
 
 pytestmark = pytest.mark.chromium
 

@@ -60,34 +60,3 @@ class LiveLab:
     def source(self) -> LiveSource:
         """Return the source as it is now."""
         return next(source for source in self.live.update() if source.name == self.name)
-
-
-def stream(components: str = "3d 6d", state: str = "streaming", **fields: Any) -> Any:
-    message = rtc3d.stream_status_t()
-    message.components, message.state, message.frame_rate_hz = components, state, 200.0
-    for name, value in fields.items():
-        setattr(message, name, value)
-    message.num_drops, message.num_limitations = len(message.drops), len(message.limitations)
-    return message
-
-
-def output(name: str = "zenoh", **fields: Any) -> Any:
-    message = rtc3d.output_status_t()
-    message.name, message.connected = name, True
-    for field, value in fields.items():
-        setattr(message, field, value)
-    message.num_messages, message.num_drops = len(message.messages), len(message.drops)
-    message.num_queries = len(message.queries)
-    return message
-
-
-def count(name: str, number: int) -> Any:
-    message = rtc3d.count_t()
-    message.name, message.count = name, number
-    return message
-
-
-def loss(cause: str, messages: int, frames: int) -> Any:
-    message = rtc3d.loss_t()
-    message.cause, message.messages, message.frames = cause, messages, frames
-    return message

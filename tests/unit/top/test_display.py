@@ -4,7 +4,8 @@ from rich.cells import cell_len
 from gateway.terminal.screen import Line
 from gateway.top.display import Display
 from gateway.top.pages import PAGES
-from tests.unit.top.live_lab import LiveLab, stream
+from tests.statuses import stream
+from tests.unit.top.live_lab import LiveLab
 
 
 class Shown:

@@ -6,7 +6,8 @@ import pytest
 from gateway.live.live_data import LiveData
 from gateway.messages.json_text import json_text
 from gateway.top import facts
-from tests.unit.top.live_lab import LiveLab, count, loss, output, stream
+from tests.statuses import count, loss, output, stream
+from tests.unit.top.live_lab import LiveLab
 
 HOSTILE = "\x1b[31mred\u202e\n" + "x" * 5000
 

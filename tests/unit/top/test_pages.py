@@ -4,7 +4,8 @@ from gateway.live.live_data import LiveData, LiveSource
 from gateway.top import facts, pages
 from gateway.top.pages import PAGES, TWO_GATEWAYS, Page, event_time
 from gateway.top.table import laid_out, sorted_by
-from tests.unit.top.live_lab import LiveLab, count, loss, output, stream
+from tests.statuses import count, loss, output, stream
+from tests.unit.top.live_lab import LiveLab
 
 
 def shown(page: str, *sources: LiveSource) -> list[str]:

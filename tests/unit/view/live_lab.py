@@ -54,30 +54,3 @@ class Lab:
         status.streams, status.num_streams = list(streams), len(streams)
         status.num_outputs = len(status.outputs)
         self.live.publish(self.name, "status", status.encode())
-
-
-def stream(components: str = "3d 6d", state: str = "streaming", **fields: Any) -> rtc3d.stream_status_t:
-    """Return the status of a stream."""
-    status = rtc3d.stream_status_t()
-    status.components, status.state, status.frame_rate_hz = components, state, 200.0
-    for name, value in fields.items():
-        setattr(status, name, value)
-    status.num_drops, status.num_limitations = len(status.drops), len(status.limitations)
-    return status
-
-
-def output(name: str, **fields: Any) -> rtc3d.output_status_t:
-    """Return the status of an output."""
-    status = rtc3d.output_status_t()
-    status.name, status.connected = name, True
-    for field, value in fields.items():
-        setattr(status, field, value)
-    status.num_drops = len(status.drops)
-    return status
-
-
-def drop(cause: str, messages: int, frames: int) -> rtc3d.loss_t:
-    """Return what was lost for one cause."""
-    loss = rtc3d.loss_t()
-    loss.cause, loss.messages, loss.frames = cause, messages, frames
-    return loss

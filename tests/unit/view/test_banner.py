@@ -7,7 +7,8 @@ import pytest
 from gateway.live.live_data import LiveSource
 from gateway.view.banner import MAX_SOURCES, banner_html
 from gateway.view.texts import clock_text
-from tests.unit.view.live_lab import Lab, stream
+from tests.statuses import stream
+from tests.unit.view.live_lab import Lab
 from tests.unit.view.test_source_text import text_of
 from tests.unit.view.test_state_text import wait
 

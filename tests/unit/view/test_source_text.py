@@ -10,7 +10,8 @@ from gateway.live.latency import Percentiles
 from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import ComponentType
 from gateway.view.source_text import ignored_html, source_html
-from tests.unit.view.live_lab import Lab, drop, output, stream
+from tests.statuses import loss, output, stream
+from tests.unit.view.live_lab import Lab
 
 HOSTILE = "<img src=x onerror=alert(1)>"
 
@@ -94,9 +95,9 @@ def test_messages_that_are_lost_on_the_way(lab: Lab) -> None:
 
 def test_drops_by_cause_of_streams_and_outputs(lab: Lab) -> None:
     lab.send_status(
-        stream("3d 6d", drops=[drop("skipped while behind", 12, 6)]),
+        stream("3d 6d", drops=[loss("skipped while behind", 12, 6)]),
         outputs=[
-            output("zenoh", drops=[drop("queue full", 3, 3), drop("closed", 1, 0)]),
+            output("zenoh", drops=[loss("queue full", 3, 3), loss("closed", 1, 0)]),
             output("lcm", connected=False, problem="no route to 239.255.76.67"),
         ],
     )
@@ -129,12 +130,12 @@ def test_nothing_of_a_gateway_is_html() -> None:
             problem=HOSTILE,
             limitations=[HOSTILE],
             last_error=HOSTILE,
-            drops=[drop(HOSTILE, 1, 1)],
+            drops=[loss(HOSTILE, 1, 1)],
         ),
         server=HOSTILE,
         host=HOSTILE,
         gateway_version=HOSTILE,
-        outputs=[output(HOSTILE, connected=False, problem=HOSTILE, drops=[drop(HOSTILE, 1, 1)])],
+        outputs=[output(HOSTILE, connected=False, problem=HOSTILE, drops=[loss(HOSTILE, 1, 1)])],
     )
     html = source_html(lab.source, {}, is_take=False)
     assert "<img" not in html
@@ -143,7 +144,7 @@ def test_nothing_of_a_gateway_is_html() -> None:
 
 def test_a_status_of_any_size_is_cut() -> None:
     lab = Lab()
-    many = [stream("3d" * 1000, limitations=["x" * 1000] * 50, drops=[drop("y" * 1000, 1, 1)] * 50)] * 500
+    many = [stream("3d" * 1000, limitations=["x" * 1000] * 50, drops=[loss("y" * 1000, 1, 1)] * 50)] * 500
     lab.send_status(*many, outputs=[output("z" * 1000, connected=False, problem="p" * 1000)] * 500)
     assert len(source_html(lab.source, {}, is_take=False)) < 300_000
 

@@ -6,7 +6,8 @@ import pytest
 
 from gateway.rtc3d.components import ComponentType
 from gateway.view.state_text import Level, State, data_state, gateway_states, states_html
-from tests.unit.view.live_lab import Lab, stream
+from tests.statuses import stream
+from tests.unit.view.live_lab import Lab
 
 
 def wait(monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
