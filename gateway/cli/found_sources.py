@@ -11,7 +11,7 @@ from gateway.safe_text import safe_text
 from gateway.stream.status_text import message_texts
 
 MAX_SOURCES: Final = 1000
-"""Of how many sources a status is read. Anybody on the network can send some."""
+"""How many sources are kept. Anybody on the network can send some."""
 
 MAX_STATUS_BYTES: Final = 256 * 1024
 _MAX_TOTAL_BYTES: Final = 4 * 1024 * 1024

@@ -20,7 +20,7 @@ from gateway.rtc3d.component_types import COMPONENTS_BY_KEY
 from gateway.service.log_format import LogFormat, LogLevel
 
 _RECORDED: Final = (*COMPONENTS_BY_KEY, "status", "clock", "parameters")
-"""What recordings have."""
+"""The values of ``--component`` for commands that read or write recordings."""
 
 _COMPONENTS: Final = (*_RECORDED, "c3d")
 _POSE: Final = "6d/"

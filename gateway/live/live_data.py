@@ -153,7 +153,7 @@ class LiveData(Reception[LiveSource, Series]):
             self.receive(series, message)
 
     def hold(self) -> None:
-        """Let nothing count as stopped until now: a recording pauses. Call it before each ``update``."""
+        """Count no time until now as a stop: a recording pauses. Call it before each ``update``."""
         now_s = time.monotonic()
         for source in self.sources_now:
             for component in [*source.components.values()]:
@@ -161,7 +161,7 @@ class LiveData(Reception[LiveSource, Series]):
                     component.arrived_s = now_s
 
     def begin_again(self) -> None:
-        """Forget everything, because a recording goes on at another place."""
+        """Forget everything, because a recording continues at another place."""
         with self._lock:
             self.sources.clear()
             self._num_series = 0

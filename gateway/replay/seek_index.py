@@ -7,7 +7,7 @@ from gateway.replay.timeline import TimelineState
 from gateway.takes.reader import Place
 
 STEP_US: Final = 2_000_000
-"""Reading on from a place takes 2 s of the take at most."""
+"""How far apart places are; a seek reads at most this much of the take before its target."""
 
 
 class SeekPoint(NamedTuple):
@@ -26,7 +26,7 @@ class SeekIndex:
 
     @property
     def next_us(self) -> int:
-        """The position from which on another place is to be added."""
+        """The earliest position at which the next place is to be added."""
         return self._points[-1].timeline.position_us + STEP_US if self._points else 0
 
     def add(self, point: SeekPoint) -> None:

@@ -20,7 +20,7 @@ MAX_XML_BYTES: Final = 16 * 1024 * 1024
 
 _MIN_UTIME: Final = -(1 << 63)
 _VERSION: Final = slice(VERSION_OFFSET, None)
-"""The part of a ``parameters_t`` by which it is known: its version and its XML."""
+"""The part of a ``parameters_t`` that shows whether it is new: its version and its XML."""
 
 SourceT = TypeVar("SourceT", bound=Source)
 SeriesT = TypeVar("SeriesT", bound=Series)
@@ -37,7 +37,7 @@ class Reception(ABC, Generic[SourceT, SeriesT]):
         self.sources: dict[str, SourceT] = {}
         """By the beginning of their channels."""
         self.num_foreign = 0
-        """How many messages were left out, because they are none of a gateway."""
+        """How many messages were left out, because no gateway of this version sends such messages."""
         self.num_beyond = 0
         """How many messages were left out, because there are too many sources or keys."""
         self.defect: Exception | None = None

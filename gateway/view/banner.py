@@ -1,4 +1,4 @@
-"""The top of the panel, as HTML: is what is shown live, and when did data last come?"""
+"""The top of the panel, as HTML: whether the picture is live, and when data last came."""
 
 from collections.abc import Sequence
 from typing import Final

@@ -52,7 +52,7 @@ def _channels(source: LiveSource) -> Iterator[tuple[Channel, str]]:
         labels, units = (map(_cut, texts[:MAX_CHOICES]) for texts in (description.labels, description.units))
         moment_unit = _cut(description.moment_unit)
         for position, (label, unit) in enumerate(zip(labels, units, strict=True)):
-            # The number keeps names apart that are cut.
+            # Labels that are cut may be equal; the number distinguishes them.
             name = f"{_cut(source.name)} {key} {position + 1}: {label}"
             for field in _FIELDS if key == ComponentType.FORCE.key else ("",):
                 of_field = moment_unit if field.startswith("m") else unit

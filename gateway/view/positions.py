@@ -8,7 +8,7 @@ from gateway.messages.tool_pose import metres_per_unit
 from gateway.takes.component_rows import Array
 
 MAX_M: Final = 1000.0
-"""What is farther from the origin is not shown: no laboratory is that large."""
+"""Positions farther from the origin are not shown: no laboratory is that large."""
 
 
 def positions_in_metres(items: Array, unit: str) -> Array:
@@ -23,6 +23,6 @@ def positions_in_metres(items: Array, unit: str) -> Array:
 
 
 def is_shown(positions: Array) -> Array:
-    """Return for each position whether it is one: shape (items,)."""
+    """Return for each position whether it is shown, shape (items,): NaN is not."""
     shown: Array = ~np.isnan(positions[:, 0])
     return shown

@@ -66,7 +66,7 @@ def ignored_html(live: LiveData) -> str:
 
 
 def clock_warning(components: Mapping[str, LiveComponent]) -> Iterator[str]:
-    """Say that the latency between the gateway and this program is none, because their clocks differ."""
+    """Say that latencies from the gateway to this program are wrong, if the clocks seem to differ."""
     medians = [each.latency.to_here.p50_ms for each in components.values() if each.latency.to_here]
     low_ms, high_ms = _CLOCKS_DIFFER_MS
     worst_ms = max(medians, key=abs, default=0.0)

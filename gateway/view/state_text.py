@@ -1,4 +1,4 @@
-"""The state of a source in words: do data come, and what does its gateway say?"""
+"""The state of a source in words: whether data come, and what its gateway reports."""
 
 from collections.abc import Iterable
 from enum import Enum
