@@ -2,7 +2,6 @@
 
 import os
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final
@@ -19,7 +18,7 @@ from gateway.cli.options import (
     ZenohConfigOption,
     check_transport,
 )
-from gateway.cli.stop_signals import stop_at_signals
+from gateway.cli.stop_signals import StopSignals
 
 if TYPE_CHECKING:
     from gateway.cli.record_progress import RecordProgress
@@ -65,7 +64,7 @@ def record(
     from gateway.subscriber.lcm_subscriber import START_S
     from gateway.subscriber.subscribe import Transport, close_in_time, subscribe_all
 
-    stop = stop_at_signals(_end_at_once)
+    stop = StopSignals(_end_at_once)
     target = Target(file)
     recording = TakeRecording(
         lambda sources: FileSink(target.open(sources)), component, START_S if lcm else 0.0
@@ -98,7 +97,7 @@ def _run(
     recording: "TakeRecording",
     subscriber: "GatewaySubscriber",
     progress: "RecordProgress",
-    stop: threading.Event,
+    stop: StopSignals,
     seconds: float | None,
 ) -> None:
     """Record until ``stop``, or for ``seconds`` after the first message, or without any."""

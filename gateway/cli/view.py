@@ -20,7 +20,7 @@ from gateway.cli.options import (
     check_transport,
     checked_host,
 )
-from gateway.cli.stop_signals import stop_at_signals
+from gateway.cli.stop_signals import StopSignals
 from gateway.safe_text import safe_text
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def view(
         )
     from gateway.subscriber.subscribe import Transport
 
-    stop = stop_at_signals(lambda _: os._exit(0))
+    stop = StopSignals(lambda _: os._exit(0))
     server = _open_server(host, port)
     try:
         if take is None:
@@ -75,7 +75,7 @@ def view(
             show = _take(take, source or (), server)
         with show as (viewer, tick):
             _announce(host, server.get_port(), opens_browser=not no_browser)
-            viewer.run(stop, tick)
+            viewer.run(stop.wait, tick)
     finally:
         server.stop()
 

@@ -1,7 +1,6 @@
 """The view: what has arrived, live or from a take, is shown about 30 times a second."""
 
 import sys
-import threading
 import time
 from collections.abc import Callable
 from typing import Final
@@ -32,13 +31,14 @@ class Viewer:
         self.num_defects = 0
         """How many pictures were not complete, because of a defect in this program."""
 
-    def run(self, stop: threading.Event, tick: Callable[[], object]) -> None:
-        """Show what arrives until ``stop``; call ``tick`` before each picture.
+    def run(self, stops_within: Callable[[float], bool], tick: Callable[[], object]) -> None:
+        """Show what arrives until ``stops_within``, which waits for some seconds, returns True.
 
-        The schedule is absolute, and pictures that are late are dropped. Without a browser, nothing is sent.
+        ``tick`` is called before each picture. The schedule is absolute, and pictures that are late are
+        dropped. Without a browser, nothing is sent.
         """
         next_s = time.monotonic()
-        while not stop.wait(max(0.0, next_s - time.monotonic())):
+        while not stops_within(max(0.0, next_s - time.monotonic())):
             tick()
             self._update_or_report()
             now_s = time.monotonic()

@@ -168,7 +168,7 @@ def _running(viewer: Viewer, lab: Lab) -> Iterator[None]:
         number += 1
         lab.send(ComponentType.MARKERS, [(number % 1000, 0, 0, 0.1)])
 
-    thread = threading.Thread(target=viewer.run, args=(stop, send))
+    thread = threading.Thread(target=viewer.run, args=(stop.wait, send))
     thread.start()
     try:
         yield
