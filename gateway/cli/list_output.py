@@ -12,10 +12,9 @@ from rich.text import Text
 
 from gateway.cli.found_sources import FoundSource, FoundSources, FoundStream
 from gateway.safe_text import safe_json
-from gateway.stream.state import StreamState
-from gateway.stream.status_text import source_text
+from gateway.stream.status_text import Level, source_text, stream_level
 
-_GOOD: Final = StreamState.STREAMING.value
+_COLOURS: Final = {Level.GOOD: "green", Level.WAITING: "yellow", Level.BAD: "red"}
 _NARROW: Final = range(80, 110)
 _NARROW_WIDTHS: Final = {"state": len("streaming 2000.0 Hz"), "components": len("analog force")}
 """The widths of these columns on a terminal of so many columns, so that the others stay in one line."""
@@ -71,8 +70,7 @@ def _table(sources: Sequence[FoundSource], *, is_narrow: bool) -> Table:
 
 
 def _state(stream: FoundStream) -> Text:
-    is_good = stream.state == _GOOD and not stream.problem
-    return Text(stream.text, "green" if is_good else "yellow")
+    return Text(stream.text, _COLOURS[stream_level(stream.state, stream.problem)])
 
 
 def _line(source: FoundSource) -> str:

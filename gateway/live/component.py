@@ -24,6 +24,9 @@ _STOPPED_S: Final = 0.5
 """Data that do not come for this long, and for STOPPED_FRAMES frames, have stopped."""
 _STOPPED_FRAMES: Final = 4
 
+SLOW_SHARE: Final = 0.95
+"""A rate below this share of the announced one is slow."""
+
 _CAN_BE_MISSING: Final = (ComponentType.MARKERS, ComponentType.TOOLS)
 
 
@@ -127,6 +130,12 @@ class LiveComponent:
         """
         shares = self._visibility.shares(time.monotonic())
         return shares if len(shares) == len(self.newest_items) else shares[:0]
+
+    @property
+    def is_slow(self) -> bool:
+        """Whether fewer messages come than the server has announced."""
+        announced_hz = self.announced_rate_hz
+        return announced_hz is not None and self.rate_hz < SLOW_SHARE * announced_hz
 
     @property
     def age_s(self) -> float | None:

@@ -1,13 +1,36 @@
 """Texts about the state of a source's streams, for the status line and for commands that show the same."""
 
 from collections.abc import Sequence
-from typing import Any
+from enum import Enum
+from typing import Any, Final
 
 from gateway.rtc3d.components import ComponentType
 from gateway.safe_text import safe_text
 from gateway.stream.running_clock import running_clock
 from gateway.stream.state import StreamState
 from gateway.stream.status import FRAME_REJECTED, StreamStatus
+
+
+class Level(Enum):
+    """How well something works."""
+
+    GOOD = "good"
+    WAITING = "waiting"
+    BAD = "bad"
+
+
+_LEVELS: Final = {
+    StreamState.STREAMING.value: Level.GOOD,
+    StreamState.STALLED.value: Level.BAD,
+    StreamState.WAITING.value: Level.BAD,
+    StreamState.CONNECTING.value: Level.BAD,
+}
+"""The others, and states of other versions of the gateway, are between these."""
+
+
+def stream_level(state: str, problem: str) -> Level:
+    """Return how well a stream works, by two fields of its ``stream_status_t``."""
+    return Level.BAD if problem else _LEVELS.get(state, Level.WAITING)
 
 
 def source_text(streams: Sequence[tuple[str, str]]) -> str:

@@ -15,8 +15,7 @@ from gateway.live.latency import Percentiles
 from gateway.live.live_data import LiveSource
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.safe_text import safe_text
-from gateway.stream.state import StreamState
-from gateway.stream.status_text import message_texts, source_text
+from gateway.stream.status_text import Level, message_texts, source_text, stream_level
 from gateway.subscriber.series import POSE
 from gateway.takes.labels import describe
 
@@ -25,7 +24,6 @@ _MAX_ENTRIES: Final = 50
 
 _MAX_LABEL: Final = 64
 _MAX_SENTENCE: Final = 500
-_BAD_STATES: Final = {StreamState.WAITING.value, StreamState.STALLED.value, StreamState.CONNECTING.value}
 
 _Entry = TypeVar("_Entry")
 
@@ -155,12 +153,12 @@ def state(source: LiveSource) -> StateFacts:
         return StateFacts("waiting for the status of its gateway", "warning")
     text = _sentence(source_text(message_texts(status))) or "its gateway reports no stream"
     stopped = [each.key for each in WIRE_ORDER if _is_stopped(source, each)]
-    states = {stream.state for stream in status.streams}
-    if any(stream.problem for stream in status.streams) or states & _BAD_STATES:
+    levels = {stream_level(stream.state, stream.problem) for stream in status.streams}
+    if Level.BAD in levels:
         return StateFacts(text, "error")
     if stopped:
         return StateFacts(f"{text}; stopped: {' '.join(stopped)}", "error")
-    return StateFacts(text, "ok" if states == {StreamState.STREAMING.value} else "warning")
+    return StateFacts(text, "ok" if levels == {Level.GOOD} else "warning")
 
 
 def _is_stopped(source: LiveSource, kind: ComponentType) -> bool:

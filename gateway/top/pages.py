@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from datetime import UTC, datetime, timedelta
 from typing import Final, NamedTuple
 
+from gateway.live.component import SLOW_SHARE
 from gateway.live.live_data import LiveSource
 from gateway.live.visibility import visible_percent
 from gateway.safe_text import safe_text
@@ -17,8 +18,8 @@ TWO_GATEWAYS: Final = (
 )
 _LEVEL_STYLES: Final = {"ok": Style.GOOD, "warning": Style.WARNING, "error": Style.BAD}
 _MAX_NAME: Final = 40
-_LITTLE: Final = 0.9
-"""A rate, or a share of visible frames, below this is worth a look."""
+_SELDOM_SHARE: Final = 0.9
+"""A marker or tool that is visible in a smaller share of the frames is worth a look."""
 
 _EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
 
@@ -64,7 +65,7 @@ def _component_row(component: facts.ComponentFacts) -> Row:
         component.rate_hz is not None
         and component.announced_rate_hz is not None
         and component.num_messages > 0
-        and component.rate_hz < _LITTLE * component.announced_rate_hz
+        and component.rate_hz < SLOW_SHARE * component.announced_rate_hz
     )
     is_missing = component.num_visible is not None and component.num_visible < (component.num_items or 0)
     lost_style = Style.BAD if component.num_lost else Style.PLAIN
@@ -155,7 +156,7 @@ def _item_cells(item: facts.ItemFacts) -> list[Cell]:
 
 
 def _share_style(share: float) -> Style:
-    if share < _LITTLE:
+    if share < _SELDOM_SHARE:
         return Style.BAD
     return Style.WARNING if share < 1 else Style.PLAIN
 

@@ -4,7 +4,8 @@ from collections.abc import Sequence
 from typing import Final
 
 from gateway.live.live_data import LiveSource
-from gateway.view.state_text import Level, State, data_state, gateway_states
+from gateway.stream.status_text import Level
+from gateway.view.state_text import State, data_state, gateway_states
 from gateway.view.texts import clock_text, counted, html_text
 
 MAX_SOURCES: Final = 16

@@ -10,7 +10,8 @@ from gateway.live.latency import Percentiles
 from gateway.live.live_data import LiveData, LiveSource
 from gateway.losses import counts_text
 from gateway.rtc3d.components import WIRE_ORDER
-from gateway.view.state_text import Level, gateway_states, states_html
+from gateway.stream.status_text import Level
+from gateway.view.state_text import gateway_states, states_html
 from gateway.view.texts import (
     NONE,
     age_text,
@@ -29,9 +30,6 @@ _MAX_LINES: Final = 20
 
 _CLOCKS_DIFFER_MS: Final = (-0.5, 1000.0)
 """A median latency between computers outside of these says that their clocks differ."""
-
-_SLOW: Final = 0.95
-"""A rate below this share of the announced one is marked."""
 
 
 def source_html(source: LiveSource, shown: Mapping[str, Percentiles], *, is_take: bool) -> str:
@@ -121,7 +119,7 @@ def _rate(component: LiveComponent, *, is_take: bool) -> str:
     text = rate_text(component.rate_hz)
     if announced_hz is None:
         return text
-    if component.rate_hz < _SLOW * announced_hz and not is_take:
+    if component.is_slow and not is_take:
         text = f"<span class=waiting>{text}</span>"
     return f"{text} <span class=dim>of {rate_text(announced_hz)}</span>"
 

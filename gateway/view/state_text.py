@@ -1,24 +1,14 @@
 """The state of a source in words: whether data come, and what its gateway reports."""
 
 from collections.abc import Iterable
-from enum import Enum
 from typing import Final, NamedTuple
 
 from gateway.live.live_data import LiveSource
-from gateway.stream.state import StreamState
-from gateway.stream.status_text import message_texts
+from gateway.stream.status_text import Level, message_texts, stream_level
 from gateway.view.texts import age_text, html_text
 
 _MAX_CHARACTERS: Final = 300
 _MAX_STREAMS: Final = 8
-
-
-class Level(Enum):
-    """How well something works. The values are classes of the style sheet."""
-
-    GOOD = "good"
-    WAITING = "waiting"
-    BAD = "bad"
 
 
 class State(NamedTuple):
@@ -26,15 +16,6 @@ class State(NamedTuple):
 
     level: Level
     text: str
-
-
-_LEVELS: Final = {
-    StreamState.STREAMING.value: Level.GOOD,
-    StreamState.IDLE.value: Level.WAITING,
-    StreamState.NO_MEASUREMENT.value: Level.WAITING,
-    StreamState.HANDSHAKING.value: Level.WAITING,
-}
-"""The others are bad."""
 
 
 def data_state(source: LiveSource) -> State:
@@ -65,9 +46,7 @@ def gateway_states(source: LiveSource) -> list[State]:
     if status is None:
         return []
     texts = message_texts(status)[:_MAX_STREAMS]
-    levels = [
-        Level.BAD if stream.problem else _LEVELS.get(stream.state, Level.BAD) for stream in status.streams
-    ]
+    levels = [stream_level(stream.state, stream.problem) for stream in status.streams]
     if len({text for _, text in texts}) == 1:
         return [State(levels[0], texts[0][1])]
     return [
@@ -78,6 +57,6 @@ def gateway_states(source: LiveSource) -> list[State]:
 
 def states_html(states: Iterable[State]) -> str:
     """Return states as lines in their colours."""
-    return "".join(
+    return "".join(  # the values of levels are classes of the style sheet
         f"<p class={state.level.value}>{html_text(state.text, _MAX_CHARACTERS)}</p>" for state in states
     )
