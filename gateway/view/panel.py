@@ -16,7 +16,7 @@ from gateway.view.style import STYLE
 
 _PLOT_INTERVAL_S: Final = 0.1
 _BANNER_INTERVAL_S: Final = 0.25
-_TEXT_INTERVAL_S: Final = 0.5
+_TEXT_INTERVAL_S: Final = 1.0
 
 _WIDTH_PX: Final = 410
 """The tables need it."""
