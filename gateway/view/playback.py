@@ -7,12 +7,13 @@ from typing import Any, Final
 
 import viser
 
+from gateway.errors import TakeError
 from gateway.live.live_data import LiveData
 from gateway.replay.play_list import Selection
 from gateway.replay.player import Player
 from gateway.replay.take_length import take_length_us
 from gateway.replay.time_text import time_text
-from gateway.safe_text import safe_text
+from gateway.safe_text import quoted, safe_text
 from gateway.takes.reader import TakeReader
 
 RATES: Final = {"0.1 ×": 0.1, "0.25 ×": 0.25, "0.5 ×": 0.5, "1 ×": 1.0, "2 ×": 2.0, "5 ×": 5.0, "10 ×": 10.0}
@@ -29,13 +30,15 @@ _STOP_S: Final = 2.0
 
 
 class Playback:
-    """A take that plays into ``live``, and its controls. Raises TakeError if there is no take.
+    """A take that plays into ``live``, and its controls.
 
-    ``sources`` are the sources to play; empty means all.
+    ``sources`` are the sources to play; empty means all. Raises TakeError if there is no take, or if it has
+    none of these sources.
     """
 
     def __init__(self, path: Path, sources: Collection[str], live: LiveData) -> None:
         self._reader = TakeReader(path)
+        _check_sources(self._reader, sources)
         self._live = live
         self._length_us = take_length_us(self._reader) or _length_by_reading_us(self._reader)
         self._player = Player(
@@ -115,6 +118,14 @@ class Playback:
 
     def _repeat(self, is_repeated: bool) -> None:
         self._player.is_repeated = is_repeated
+
+
+def _check_sources(reader: TakeReader, sources: Collection[str]) -> None:
+    """Raise TakeError if the take has no message of these sources. This reads up to their first message."""
+    if sources and not any(message.source in sources for message in reader.messages()):
+        shown = ", ".join(map(quoted, sources))
+        existing = ", ".join(reader.source_names)
+        raise TakeError(f"{reader.path} has no messages of {shown}; sources of the take: {existing}")
 
 
 def _length_by_reading_us(reader: TakeReader) -> int:

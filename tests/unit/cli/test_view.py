@@ -51,6 +51,12 @@ def test_options_that_contradict_each_other_are_an_error(arguments: tuple[str, .
     assert view(*arguments).returncode == 2
 
 
+def test_a_source_that_the_take_does_not_have_is_one_sentence_and_no_page() -> None:
+    run = view("examples/walk.lcmlog", "--port", "0", "--source", "nosuch")
+    assert (run.returncode, run.stdout) == (1, "")
+    assert run.stderr == "examples/walk.lcmlog has no messages of 'nosuch'; sources of the take: lab\n"
+
+
 def test_a_browser_is_opened_only_where_it_has_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "platform", "linux")
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):
