@@ -6,11 +6,15 @@ from typing import Final
 import numpy as np
 import viser
 
+from gateway.safe_text import safe_text
 from gateway.takes.component_rows import Array
 from gateway.view.positions import is_shown
 
 MAX_LABELS: Final = 300
 """How many items of one kind have labels."""
+
+_MAX_CHARACTERS: Final = 100
+"""How much of a label is drawn. Labels come from the network."""
 
 _PERIOD_S: Final = 1 / 15
 _PER_PERIOD: Final = 40
@@ -41,7 +45,7 @@ class Labels:
         if texts is not self._texts:
             self._texts = texts
             for node, text in zip(self._nodes, texts, strict=False):
-                node.text = text
+                node.text = safe_text(text, _MAX_CHARACTERS)
         wanted = np.full_like(self._positions, np.nan)
         wanted[:count] = positions[: len(wanted)][:count]
         differs = is_shown(wanted) != is_shown(self._positions)
@@ -58,7 +62,7 @@ class Labels:
     def _add_nodes(self, count: int) -> None:
         first = len(self._nodes)
         for index in range(first, min(count, first + _PER_PERIOD)):
-            text = self._texts[index] if index < len(self._texts) else ""
+            text = safe_text(self._texts[index], _MAX_CHARACTERS) if index < len(self._texts) else ""
             name = f"{self._parent.name}/{index}"
             self._nodes.append(
                 self._scene.add_label(name, text, visible=False, font_screen_scale=0.8, anchor="bottom-left")
