@@ -61,7 +61,7 @@ class Playback:
         self._state = gui.add_markdown("")
         self._button = gui.add_button("Pause")
         self._button.on_click(self._toggle)
-        length_s = max(self._length_us / 1e6, _STEP_S)
+        length_s = max(round(self._length_us / 1e6, 2), _STEP_S)
         self._slider = gui.add_slider("Time (s)", 0.0, length_s, _STEP_S, 0.0)
         self._slider.on_update(self._seek)
         self._rate = gui.add_dropdown("Speed", [*RATES], initial_value="1 ×")

@@ -2,6 +2,7 @@
 
 import errno
 import ipaddress
+import logging
 import socket
 import warnings
 
@@ -22,6 +23,8 @@ def open_server(host: str, port: int) -> ViewServer:
     """Serve the page at this address; port 0 picks a free one. Raises ViewError if that is not possible."""
     _check_address(host, port)
     rich.get_console().quiet = True  # viser prints there, also when a browser connects
+    # It would log a traceback for each connection that is no browser's, as of a port scan.
+    logging.getLogger("websockets.server").setLevel(logging.CRITICAL)
     warnings.filterwarnings("ignore", "Queued a ")  # to a browser that has left a moment ago
     server = ViewServer(host, port, label="rtc3d-gateway", verbose=False)
     if port not in {0, server.get_port()}:  # taken since; viser chose another port

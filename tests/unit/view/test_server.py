@@ -35,6 +35,18 @@ def test_an_address_of_another_computer_is_one_sentence_with_the_option(host: st
         open_server(host, 0)
 
 
+def test_a_connection_that_is_no_browser_logs_nothing(
+    server: ViewServer, caplog: pytest.LogCaptureFixture
+) -> None:
+    for request in (b"", b"\x16\x03\x01 no HTTP\r\n\r\n"):
+        with socket.create_connection(("127.0.0.1", server.get_port())) as connection:
+            connection.sendall(request)
+            connection.shutdown(socket.SHUT_WR)
+            while connection.recv(1000):
+                pass
+    assert not caplog.records
+
+
 def test_it_prints_nothing_and_shares_nothing(capfd: pytest.CaptureFixture[str], server: ViewServer) -> None:
     assert server.request_share_url() is None  # type: ignore[func-returns-value]
     server.stop()
