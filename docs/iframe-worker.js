@@ -1,6 +1,6 @@
 /*!
  * iframe-worker 1.0.4 (shim/index.js of the npm package, unchanged below): browsers start no Worker on pages from a
- * folder (file:), so the site's search runs in an iframe there. mkdocs' plugin `offline` would load this from unpkg.com.
+ * folder (file:), so the site's search runs in an iframe there. mkdocs' plugin `offline` would load this from the internet.
  *
  * Copyright (c) 2020-2022 Martin Donath <martin.donath@squidfunk.com>
  *

@@ -81,6 +81,7 @@ class TakesFolder:
         self.directory = directory
         self._was_open = False
         self._lock: int | None = None
+        self._is_closed = False
         self._opening = threading.Lock()
         self._times: dict[tuple[Path, int, int], tuple[int, float]] = {}  # of takes, by path, size and time
 
@@ -96,7 +97,8 @@ class TakesFolder:
             check_directory(self.directory)
             self._was_open = True
             with self._opening:
-                return self._take_lock()
+                # A check that is late must not lock the folder again: nobody would unlock it.
+                return f"{self.directory} is closed" if self._is_closed else self._take_lock()
         except OSError as error:
             return disk_problem(self.directory, error)
 
@@ -121,8 +123,9 @@ class TakesFolder:
         return ""
 
     def close(self) -> None:
-        """Let another gateway use the folder."""
+        """Let another gateway use the folder; this object cannot be used any more."""
         with self._opening:
+            self._is_closed = True
             lock, self._lock = self._lock, None
             if lock is not None:
                 os.close(lock)

@@ -15,7 +15,8 @@ _SILENT_S: Final = 5.0
 """How long a check of the folder may take; after that, the disk does not respond."""
 
 _REST: Final = 50
-"""After a check, the next one waits for this many times the duration of the check."""
+"""After a check, the next one waits for this many times the duration of the check. After a problem, it does
+not wait: the former gateway with this folder may just be ending."""
 
 _DAY_S: Final = 86_400.0
 
@@ -66,7 +67,7 @@ class FolderWatch:
                 problem = disk_problem(self.folder.directory, error)
         self._problem, self.excess_bytes, self.is_checked = problem, excess_bytes, True
         ended_s = time.monotonic()  # with thousands of takes, every second would keep a disk busy
-        self._next_check_s = ended_s + _REST * (ended_s - began_s)
+        self._next_check_s = ended_s if problem else ended_s + _REST * (ended_s - began_s)
 
     def close(self) -> None:
         """Let another gateway use the folder, once no check is in progress."""

@@ -125,16 +125,16 @@ async def test_errors_say_what_to_do(tmp_path: Path, side: str) -> None:
             ("start", "../x"): "'../x' cannot be the name of a take: expected 1 to 100 letters",
             ("start", "x;set=stop"): "cannot be the name of a take",
         }
-        results = await asyncio.gather(*(take(*arguments, *at.options(side)) for arguments in errors))
-        for done, text in zip(results, errors.values(), strict=True):
+        for arguments, text in errors.items():
+            done = await take(*arguments, *at.options(side))
             assert (done.status, done.stdout) == (1, "")
             assert text in done.stderr
-    async with lab(tmp_path / "takes", remote_control=False) as at:
+    async with lab(tmp_path / "others", remote_control=False) as at:
         done = await take("start", *at.options(side))
         assert (done.status, done.stdout) == (1, "")
         assert "set remote_control: true" in done.stderr
         assert (await take("list", *at.options(side))).status == 0
-    async with lab(tmp_path / "takes", {"enabled": False}) as at:
+    async with lab(tmp_path / "none", {"enabled": False}) as at:
         results = await asyncio.gather(*(take(command, *at.options(side)) for command in ("start", "list")))
         for done in results:
             assert (done.status, done.stdout.strip("{}\n")) == (1, "")
