@@ -23,7 +23,10 @@ class Visibility:
         self._steps: deque[tuple[float, int, Array]] = deque()  # begin, number of frames, visible frames
 
     def add(self, is_visible: Array, now_s: float) -> None:
-        """Take frames; ``is_visible`` has the shape (frames, items). Another number of items begins anew."""
+        """Take frames; ``is_visible`` has the shape (frames, items).
+
+        If the number of items changes, counting starts again.
+        """
         self._forget(now_s)
         num_frames, num_items = is_visible.shape
         if self._steps and len(self._steps[-1][2]) != num_items:

@@ -11,7 +11,7 @@ COLUMN_US: Final = 31_250
 """320 columns of 31.25 ms are 10 s."""
 
 _MAX_STEP_COLUMNS: Final = 32
-"""If times go back, or forward, by more than a second, the envelope begins anew there.
+"""If times go back, or forward, by more than a second, the envelope starts again there.
 
 A plot would connect the values before and after a gap, as if there had been some between them.
 """

@@ -128,6 +128,8 @@ class TakesFolder:
             self._is_closed = True
             lock, self._lock = self._lock, None
             if lock is not None:
+                with contextlib.suppress(OSError):
+                    fcntl.flock(lock, fcntl.LOCK_UN)  # a process that was just forked may still have it open
                 os.close(lock)
 
     def recover(self) -> None:
