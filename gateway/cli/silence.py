@@ -12,6 +12,7 @@ from gateway.cli.params_lcm import query_lcm
 from gateway.cli.params_query import Replies
 from gateway.cli.params_zenoh import query_zenoh
 from gateway.config.words import join_or
+from gateway.descriptions.labels import describe
 from gateway.errors import OutputError, ParametersError, QueryError
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.kind import SubscriptionRequest
@@ -22,7 +23,6 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.safe_text import quoted, safe_lines, safe_text
 from gateway.stream.status_text import source_text
-from gateway.takes.labels import describe
 
 LOOK_S: Final = 0.4
 """How long nothing is heard before this looks for what exists."""

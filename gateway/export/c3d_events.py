@@ -4,10 +4,10 @@ from typing import Final
 
 import numpy as np
 
+from gateway.descriptions.event_texts import MAX_EVENT_AGE_US, event_text
+from gateway.descriptions.fitting_labels import printable
 from gateway.export.c3d_format import MAX_LIST, Parameter
-from gateway.export.event_texts import MAX_EVENT_AGE_US, event_text
 from gateway.export.job import ExportJob
-from gateway.export.labels import printable
 from gateway.export.measurements import Measurement
 from gateway.takes.component_rows import Array
 from gateway.takes.series import Series

@@ -3,6 +3,7 @@
 from typing import Final
 
 from gateway import version_text
+from gateway.descriptions.fitting_labels import fitting_labels, printable
 from gateway.errors import TakeError
 from gateway.export.c3d_content import C3dContent
 from gateway.export.c3d_events import event_group
@@ -17,7 +18,6 @@ from gateway.export.c3d_format import (
 )
 from gateway.export.c3d_plates import plate_group
 from gateway.export.job import ExportJob
-from gateway.export.labels import fitting_labels, printable
 
 _TEXT_SIZES: Final = (MAX_TEXT_BYTES, 64, 32, 24, 16, 12, 8)
 """How long labels may be, in bytes; the parameters of a file have 130 kB at most."""

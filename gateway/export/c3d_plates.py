@@ -4,8 +4,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from gateway.export.c3d_format import MAX_LIST, Parameter
-from gateway.export.force_plates import (
+from gateway.descriptions.force_plates import (
     ADDED_LABELS,
     CALIBRATED,
     FORCES_AND_MOMENTS,
@@ -19,6 +18,7 @@ from gateway.export.force_plates import (
     own_channels,
     possible_types,
 )
+from gateway.export.c3d_format import MAX_LIST, Parameter
 from gateway.export.job import ExportJob
 from gateway.export.measurements import Placed
 from gateway.rtc3d.parameters import Parameters, Plate

@@ -6,8 +6,8 @@ import math
 from collections.abc import Iterator
 from typing import IO, Final
 
+from gateway.descriptions.event_texts import event_text
 from gateway.errors import TakeError
-from gateway.export.event_texts import event_text
 from gateway.export.job import ExportJob, nothing_to_export
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.takes.component_rows import decode_rows

@@ -11,11 +11,11 @@ from typing import Final
 import numpy as np
 
 from gateway.errors import ProtocolError
-from gateway.export.float_topics import MAX_FIELDS, FloatTopics
-from gateway.export.foxglove_messages import FoxgloveSource
-from gateway.export.foxglove_topics import MAX_UTIME
 from gateway.export.job import ExportJob, nothing_to_export
 from gateway.export.mcap_file import McapFile
+from gateway.foxglove_schemas.float_topics import MAX_FIELDS, FloatTopics
+from gateway.foxglove_schemas.messages import FoxgloveSource
+from gateway.foxglove_schemas.topics import MAX_UTIME
 from gateway.messages.decode import decode
 from gateway.messages.encode import ITEMS_OFFSET
 from gateway.messages.parameters_text import xml_bytes

@@ -10,7 +10,7 @@ import foxglove
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 
 from gateway.errors import TakeError
-from gateway.export.foxglove_topics import FoxgloveMessage, Topic
+from gateway.foxglove_schemas.topics import FoxgloveMessage, Topic
 
 _MAX_CHANNELS: Final = 1000
 """More can only come from labels that change all the time."""

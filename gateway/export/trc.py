@@ -6,8 +6,8 @@ from typing import IO, Final
 
 import numpy as np
 
+from gateway.descriptions.fitting_labels import fitting_labels
 from gateway.export.job import ExportJob
-from gateway.export.labels import fitting_labels
 from gateway.export.measurements import Measurement, named_measurements
 from gateway.takes.component_rows import Array
 

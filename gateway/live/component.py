@@ -6,6 +6,7 @@ from typing import Any, Final
 
 import numpy as np
 
+from gateway.descriptions.labels import Description, describe
 from gateway.live.latency import Latency
 from gateway.live.rate import MessageRate
 from gateway.live.visibility import Visibility
@@ -13,7 +14,6 @@ from gateway.messages.host_time import now_utime
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.component_rows import NATIVE_ITEM_DTYPES, Array, Rows, decode_rows
-from gateway.takes.labels import Description, describe
 
 MAX_WAITING: Final = 20_000
 """How many messages of one component may wait for ``update``; older ones are skipped."""

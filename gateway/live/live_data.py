@@ -7,8 +7,8 @@ from typing import Any, Final, NamedTuple
 
 import rtc3d
 
+from gateway.descriptions.event_texts import EventText, event_text
 from gateway.errors import ParametersError, ProtocolError
-from gateway.export.event_texts import EventText, event_text
 from gateway.live.component import LiveComponent
 from gateway.messages.decode import decode
 from gateway.messages.parameters_text import xml_bytes

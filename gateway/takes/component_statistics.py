@@ -4,10 +4,10 @@ from typing import Final
 
 import numpy as np
 
+from gateway.descriptions.labels import describe
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.component_rows import Array, Rows
-from gateway.takes.labels import describe
 from gateway.takes.restarts import find_restarts
 from gateway.takes.sequence_gaps import SequenceGaps
 

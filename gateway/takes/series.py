@@ -7,12 +7,12 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from gateway.descriptions.labels import Description, common, describe, event_labels
 from gateway.errors import TakeError
 from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.takes.component_rows import HEAD, NATIVE_ITEM_DTYPES, Array, Rows
 from gateway.takes.growing_array import GrowingArray
-from gateway.takes.labels import Description, common, describe, event_labels
 from gateway.takes.restarts import find_restarts
 
 _COLUMNS: Final = tuple(name for name in HEAD.names or () if name != "fingerprint")

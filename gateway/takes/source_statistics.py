@@ -4,6 +4,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
+from gateway.descriptions.labels import describe, event_labels
 from gateway.errors import ParametersError, ProtocolError
 from gateway.messages.decode import decode
 from gateway.messages.encode import FINGERPRINT_BYTES
@@ -16,7 +17,6 @@ from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.takes.clock_steps import ClockSteps
 from gateway.takes.component_rows import decode_rows
 from gateway.takes.component_statistics import ComponentStatistics, MessageStatistics
-from gateway.takes.labels import describe, event_labels
 
 MAX_LISTED_CHANGES: Final = 100
 """How many changes of the parameters are listed; all are counted."""

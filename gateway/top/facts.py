@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from itertools import islice
 from typing import Any, Final, NamedTuple, TypeVar
 
+from gateway.descriptions.labels import describe
 from gateway.live.component import LiveComponent
 from gateway.live.latency import Percentiles
 from gateway.live.live_data import LiveSource
@@ -17,7 +18,6 @@ from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.safe_text import safe_text
 from gateway.stream.status_text import Level, message_texts, source_text, stream_level
 from gateway.subscriber.series import POSE
-from gateway.takes.labels import describe
 
 _MAX_ENTRIES: Final = 50
 """How many streams, outputs, causes and results of a status are taken, of each kind."""

@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from typing import Final, Literal
 
-from gateway.export.plate_forces import placed_plates
+from gateway.descriptions.plate_forces import placed_plates
 from gateway.rtc3d.parameters import Parameters
 
 UpAxis = Literal["x", "y", "z"]

@@ -5,7 +5,7 @@ from typing import Any, Final
 import numpy as np
 import viser
 
-from gateway.export.plate_forces import (
+from gateway.descriptions.plate_forces import (
     METRES_PER_NEWTON,
     PlacedPlate,
     force_on,

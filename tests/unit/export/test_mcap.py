@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from gateway.errors import TakeError
-from gateway.export.foxglove_topics import FoxgloveMessage, Topic
 from gateway.export.mcap_file import McapFile
+from gateway.foxglove_schemas.topics import FoxgloveMessage, Topic
 from gateway.messages.topics import lcm_channel
 from gateway.rtc3d.components import MISSING, ComponentType
 from gateway.rtc3d.parameters import (
@@ -397,7 +397,7 @@ def test_without_foxglove_sdk_the_error_says_how_to_install_it(
 ) -> None:
     for module in [name for name in sys.modules if name.startswith("gateway.export.mcap")]:
         monkeypatch.delitem(sys.modules, module)
-    monkeypatch.setitem(sys.modules, "gateway.export.float_topics", None)
+    monkeypatch.setitem(sys.modules, "gateway.foxglove_schemas.float_topics", None)
     with pytest.raises(TakeError, match=r"pip install 'rtc3d-gateway\[foxglove\]'"):
         export_messages(tmp_path, [markers(1)], "walk.mcap")
     assert [path.name for path in tmp_path.iterdir()] == ["take.lcmlog"]

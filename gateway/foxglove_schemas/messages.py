@@ -20,14 +20,14 @@ from foxglove.messages import (
     Vector3,
 )
 
-from gateway.export.event_texts import MAX_EVENT_AGE_US, event_text
-from gateway.export.float_topics import FloatRecord, FloatTopics, field_names
-from gateway.export.foxglove_forces import ForceScene
-from gateway.export.foxglove_topics import MAX_UTIME, FoxgloveMessage, json_topic, timestamp, topic_of
+from gateway.descriptions.event_texts import MAX_EVENT_AGE_US, event_text
+from gateway.descriptions.labels import describe, event_labels
+from gateway.foxglove_schemas.float_topics import FloatRecord, FloatTopics, field_names
+from gateway.foxglove_schemas.forces import ForceScene
+from gateway.foxglove_schemas.topics import MAX_UTIME, FoxgloveMessage, json_topic, timestamp, topic_of
 from gateway.messages.tool_pose import metres_per_unit
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType, Items
 from gateway.rtc3d.parameters import Parameters
-from gateway.takes.labels import describe, event_labels
 
 _POINT: Final = np.dtype(
     [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("reliability", "<f4"), ("marker", "<u4")]

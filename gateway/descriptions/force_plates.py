@@ -6,12 +6,14 @@ the plate refers to the server's own channels. Otherwise six channels are added,
 """
 
 import re
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from gateway.rtc3d.parameters import ParametersAnalog, Plate, Point
-from gateway.takes.component_rows import Array
+
+Array: TypeAlias = npt.NDArray[Any]
 
 FORCES_AND_MOMENTS: Final = 2
 """The type of plates whose six channels are Fx, Fy, Fz, Mx, My, Mz at the transducer's origin."""

@@ -4,11 +4,11 @@ import math
 import re
 from typing import Final, NamedTuple
 
-from gateway.export.force_plates import geometry_of
+from gateway.descriptions.force_plates import geometry_of
+from gateway.descriptions.labels import describe
 from gateway.messages.tool_pose import metres_per_unit
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters, Plate
-from gateway.takes.labels import describe
 
 METRES_PER_NEWTON: Final = 1e-3
 """The length of arrows: 1 m for 1000 N, so a person's weight is about as long as a leg."""

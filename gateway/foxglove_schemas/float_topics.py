@@ -15,9 +15,9 @@ from google.protobuf.descriptor_pb2 import (
     FileDescriptorSet,
 )
 
-from gateway.export.foxglove_topics import Topic
-from gateway.export.labels import fitting_labels
-from gateway.takes.component_rows import Array
+from gateway.descriptions.fitting_labels import fitting_labels
+from gateway.foxglove_schemas.topics import Topic
+from gateway.rtc3d.components import Items
 
 _MAX_NAME_BYTES: Final = 100
 
@@ -70,7 +70,7 @@ class FloatRecord:
         self._template = np.frombuffer(bytes(data), np.uint8)
         self._places = np.array(places, np.intp)[:, np.newaxis] + np.arange(4)
 
-    def encode(self, values: Array) -> bytes:
+    def encode(self, values: Items) -> bytes:
         """Return the message with these values, one per field, in the order of the names."""
         data = self._template.copy()
         data[self._places] = values.astype("<f4").view(np.uint8).reshape(-1, 4)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from gateway.export.force_plates import (
+from gateway.descriptions.force_plates import (
     CALIBRATED,
     EIGHT_FORCES,
     FORCES_AND_MOMENTS,

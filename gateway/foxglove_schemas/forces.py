@@ -20,8 +20,8 @@ from foxglove.messages import (
     Vector3,
 )
 
-from gateway.export.foxglove_topics import FoxgloveMessage, timestamp, topic_of
-from gateway.export.plate_forces import METRES_PER_NEWTON, PlacedPlate, force_on, placed_plates
+from gateway.descriptions.plate_forces import METRES_PER_NEWTON, PlacedPlate, force_on, placed_plates
+from gateway.foxglove_schemas.topics import FoxgloveMessage, timestamp, topic_of
 from gateway.rtc3d.components import Items
 from gateway.rtc3d.parameters import Parameters
 

@@ -3,6 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateway.descriptions.labels import describe, event_labels
 from gateway.messages.topics import MAX_LABEL_LENGTH, unique_name
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import (
@@ -18,7 +19,6 @@ from gateway.rtc3d.parameters import (
     Plate,
     Tool,
 )
-from gateway.takes.labels import describe, event_labels
 
 
 @given(st.lists(st.sampled_from(["", "a", " a ", "a_2", "tool 3", "x" * 300, "x" * 299 + "y"]), max_size=8))

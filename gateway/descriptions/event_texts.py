@@ -3,8 +3,8 @@
 import struct
 from typing import Any, Final, NamedTuple
 
+from gateway.descriptions.labels import event_number
 from gateway.rtc3d.parameters import EventDefinition, EventParameter, Parameters
-from gateway.takes.labels import event_number
 
 UNUSED: Final = -1
 """An event's parameter that is not used (0xFFFFFFFF)."""

@@ -1,0 +1,1 @@
+"""What the parameters say about the items of components: labels, units, force plates, events."""

@@ -1,0 +1,1 @@
+"""Messages with Foxglove's types, for MCAP files and for live subscribers."""
