@@ -10,11 +10,12 @@ from gateway.c3d_files.spool import Spool
 from gateway.config.settings import Settings, SourceSettings, SpoolSettings
 from gateway.log import defect_text, log_fields
 from gateway.messages.host_time import host_clock
-from gateway.outputs.contract import Command, Output, ServerFile, ServerParameters
+from gateway.outputs.contract import Answer, Command, Output, ServerFile, ServerParameters
 from gateway.outputs.guard import guarded, health, log_defect
 from gateway.outputs.registry import build_outputs
 from gateway.publish.fan_out import FanOut
 from gateway.publish.routes import OPENING_S
+from gateway.queries.frame_answer import FRAME_KEY, frame_answer
 from gateway.queries.service import SourceQueryService
 from gateway.queries.source_queries import SourceQueries
 from gateway.source import Source
@@ -69,7 +70,14 @@ class Gateway:
         return {name: source.queries for name, source in self._sources.items()}
 
     def _commands(self) -> Mapping[str, Command]:
-        return {name: command for output in self._outputs for name, command in output.commands.items()}
+        of_outputs = {name: command for output in self._outputs for name, command in output.commands.items()}
+        return {FRAME_KEY: self._answer_frame, **of_outputs}
+
+    async def _answer_frame(self, source: str, options: Mapping[str, str]) -> Answer:
+        names: dict[str, Mapping[str, Mapping[str, str]]] = {}
+        for output in self._outputs:
+            names[output.name] = guarded(output, partial(output.topic_names, source), {})
+        return frame_answer(self._sources[source].queries.frame, names, options)
 
     # Running.
 
@@ -194,10 +202,9 @@ class Gateway:
 
     def _publish_known_parameters(self, output: Output) -> None:
         for name, source in self._sources.items():
-            known = source.queries.parameters.known
-            if known.version:
-                xml = b"" if known.newest is None else known.newest.xml
-                output.publish_parameters(name, ServerParameters(xml, source.queries.session, known.version))
+            parameters = source.known_parameters
+            if parameters.version:
+                output.publish_parameters(name, parameters)
 
     async def _change_sources(self, wanted_sources: Sequence[SourceSettings]) -> list[str]:
         wanted = {settings.name: settings for settings in wanted_sources}

@@ -208,6 +208,7 @@ class Source:
                 for output, status in self.fan_out.outputs
             ],
             stall_timeout_s=self.settings.stall_timeout_s,
+            frame=self.queries.frame,
         )
         return encode_within_limits(message)
 
@@ -245,15 +246,24 @@ class Source:
 
     # Parameters.
 
+    @property
+    def known_parameters(self) -> ServerParameters:
+        """The newest parameters as the outputs get them; empty ones if the server gives none."""
+        known = self.queries.parameters.known
+        xml, parsed = (b"", Parameters())
+        if known.newest is not None:
+            xml, parsed = known.newest.xml, known.newest.parsed.parameters
+        return ServerParameters(
+            xml, self.queries.session, known.version, parsed=parsed, frame=self.queries.frame
+        )
+
     def _read_parameters(self, connection: Connection) -> Awaitable[ParsedParameters]:
         return self.queries.parameters.read_for_handshake(connection)
 
     async def _announce_parameters(self, answer: ServerAnswer | None, version: int) -> None:
         """Publish parameters, empty ones if the former are void; then mark the frames with their version."""
-        parameters = Parameters() if answer is None else answer.parsed.parameters
-        xml = b"" if answer is None else answer.xml
         try:
-            await self._publish_parameters(self.name, ServerParameters(xml, self.queries.session, version))
+            await self._publish_parameters(self.name, self.known_parameters)
         finally:
             if version != self.parameters_version:
                 self.parameters_version = version
@@ -261,8 +271,8 @@ class Source:
                     stream.status.parameters_changed(version)
                     if answer is not None:
                         stream.status.replace_limitation(UNANSWERED, "")
-                self._streams.parameters_changed(parameters)
-            self.fan_out.set_parameters(parameters)
+                self._streams.parameters_changed(self.known_parameters.parsed)
+            self.fan_out.set_parameters(self.known_parameters)
 
     # C3D files and recordings.
 

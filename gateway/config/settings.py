@@ -23,12 +23,14 @@ from pydantic import (
 )
 
 from gateway.config.section import Effective, Section, expects, validation_error
+from gateway.config.transform import TransformSettings
 from gateway.config.values import (
     AbsoluteDirectory,
     Backlog,
     ByteLimit,
     Components,
     FileLimit,
+    FrameId,
     Host,
     IntervalSeconds,
     Milliseconds,
@@ -131,6 +133,12 @@ class SourceSettings(Section):
     byte_order: ServerByteOrder = "big"
     """The byte order to request. The published messages are the same in both."""
 
+    frame_id: FrameId | None = None
+    """The name of the coordinate frame of poses, which sources can share. null means the source's name."""
+
+    transform: TransformSettings = TransformSettings()
+    """From the server's units and axes to the frame of poses. Component messages are never transformed."""
+
     streams: Streams = "auto"
     """The TCP sessions with the server: auto for one per rate, or a list with components and rates."""
 
@@ -166,6 +174,11 @@ class SourceSettings(Section):
 
     remote_control: Switch = False
     """Whether peers may start and stop recordings on the server, and takes."""
+
+    @property
+    def effective(self) -> dict[str, Effective]:
+        """See Section."""
+        return {} if self.frame_id is not None else {"frame_id": Effective(self.name)}
 
     @field_validator("streams")
     @classmethod

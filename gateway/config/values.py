@@ -117,6 +117,13 @@ SourceName = Annotated[
 ]
 
 
+FrameId = Annotated[
+    str,
+    Field(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_./-]{0,63}$"),
+    expects("1 to 64 of the letters A to Z and a to z, digits, '_', '.', '-' and, except first, '/'"),
+]
+
+
 class FrequencyRate(Section):
     """``rate: {frequency_hz: 60}``."""
 

@@ -1,4 +1,4 @@
-"""Pose messages of single tools, in SI units, from a 6D component."""
+"""Pose messages of single tools, in metres and in the frame of the source, from a 6D component."""
 
 import math
 import struct
@@ -7,12 +7,14 @@ from typing import Final
 
 import rtc3d
 
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.stamp import Stamp
 from gateway.rtc3d.components import Component
 
 _FINGERPRINT: Final[bytes] = rtc3d.tool_pose_t._get_packed_fingerprint()  # noqa: SLF001 - lcm-gen offers no other way
 # Frame number, time stamp, visible, position, orientation, error.
 _CONTENT: Final = struct.Struct(">iq?8f")
+_NO_POSE: Final = (math.nan,) * 8
 _METRES: Final = {"m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "in": 0.0254}
 
 
@@ -22,25 +24,17 @@ def metres_per_unit(unit: str) -> float | None:
 
 
 def tool_poses(
-    component: Component, stamp: Stamp, sequences: Sequence[int], unit_m: float = 1e-3
+    component: Component, stamp: Stamp, sequences: Sequence[int], frame: CoordinateFrame
 ) -> list[bytes]:
-    """Return one ``tool_pose_t`` message per tool of a 6D component.
+    """Return one ``tool_pose_t`` message per tool of a 6D component, with poses in ``frame``.
 
     Positions and errors are in metres; quaternions have the order x, y, z, w. ``sequences`` has one sequence
-    number per tool. ``unit_m`` is the length of the component's unit in metres.
+    number per tool. The unit of ``frame`` must be known.
     """
+    head = (component.frame_number, component.timestamp_us)
     return [
-        _FINGERPRINT + stamp.prefix(sequence) + _content(component, tool, unit_m)
-        for tool, sequence in zip(component.items().tolist(), sequences, strict=True)
+        _FINGERPRINT
+        + stamp.prefix(sequence)
+        + (_CONTENT.pack(*head, False, *_NO_POSE) if pose is None else _CONTENT.pack(*head, True, *pose))
+        for pose, sequence in zip(frame.poses(component.items(), accept_zeros=True), sequences, strict=True)
     ]
-
-
-def _content(component: Component, tool: tuple[float, ...], unit_m: float) -> bytes:
-    q0, qx, qy, qz, x, y, z, error = tool
-    # Any NaN means missing (field note 7): a robot must never get an incomplete pose.
-    visible = not any(map(math.isnan, tool))
-    if visible:
-        pose = (x * unit_m, y * unit_m, z * unit_m, qx, qy, qz, q0, error * unit_m)
-    else:
-        pose = (math.nan,) * 8
-    return _CONTENT.pack(component.frame_number, component.timestamp_us, visible, *pose)

@@ -12,11 +12,13 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
 from gateway.losses import Losses
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.status import OutputHealth
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.parameters import Parameters
 
 KeyPath = tuple[str, ...]
 """A key below PREFIX/SOURCE/, split at its slashes: ("parameters", "3d")."""
@@ -108,7 +110,8 @@ class ServerParameters(NamedTuple):
 
     ``session`` is the number of its session, ``version`` grows whenever the parameters change. ``message``
     is the recorded ``parameters_t`` if a take is replayed: an output that publishes this type sends it
-    unchanged.
+    unchanged. ``parsed`` is what the XML says, and ``frame`` the coordinate frame of the source's poses; in
+    answers to peers, they are not filled in.
     """
 
     xml: bytes
@@ -116,6 +119,8 @@ class ServerParameters(NamedTuple):
     version: int
     age_s: float = 0.0
     message: bytes = b""
+    parsed: Parameters = Parameters()
+    frame: CoordinateFrame = CoordinateFrame("")
 
 
 class ServerFile(NamedTuple):
@@ -273,6 +278,13 @@ class Output(ABC):
         done when they no longer can.
         """
         return None
+
+    def topic_names(self, source: str) -> Mapping[str, Mapping[str, str]]:
+        """Return the names that this output has given to items of ``source`` whose labels it cannot use.
+
+        By the component's key, and then by the label: {"6d": {"Left Foot": "Left_Foot"}}.
+        """
+        return {}
 
     def announce_file(self, source: str, file: ServerFile) -> None:
         """Announce a C3D file that the server sent."""

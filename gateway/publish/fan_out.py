@@ -6,7 +6,7 @@ from typing import Final
 
 from gateway.messages.encode import MESSAGE_TYPES, encode_content, has_lcm_form, lcm_content
 from gateway.messages.stamp import Stamp
-from gateway.outputs.contract import Output
+from gateway.outputs.contract import Output, ServerParameters
 from gateway.outputs.guard import guarded
 from gateway.outputs.status import OutputStatus
 from gateway.publish.item_counts import ItemCounts
@@ -14,7 +14,6 @@ from gateway.publish.routes import ComponentRoute, FrameRoute, OutputRoute
 from gateway.publish.tool_poses import ToolPoses
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
-from gateway.rtc3d.parameters import Parameters
 
 _MAX_PLANS: Final = 64
 """How many plans are cached. The server determines the layouts: each number of events is another one."""
@@ -274,6 +273,6 @@ class FanOut:
             if not route.clock_route.is_idle:
                 route.clock_route.send(message)
 
-    def set_parameters(self, parameters: Parameters) -> None:
-        """Set the labels (§6.3) and the unit of length (§6.2) for the poses per tool."""
+    def set_parameters(self, parameters: ServerParameters) -> None:
+        """Set the labels (§6.3) and the coordinate frame for the poses per tool."""
         self._tool_poses.set_parameters(parameters)

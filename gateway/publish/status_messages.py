@@ -8,6 +8,7 @@ import rtc3d
 
 from gateway import __version__
 from gateway.losses import Loss
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.host_time import host_clock, now_utime
 from gateway.outputs.status import OutputHealth, OutputStatus
 from gateway.stream.clock import ServerClock
@@ -41,11 +42,12 @@ def status_message(
     streams: Sequence[tuple[StreamStatus, float]],
     outputs: Iterable[tuple[OutputStatus, OutputHealth, Mapping[str, int]]],
     stall_timeout_s: float,
+    frame: CoordinateFrame,
 ) -> rtc3d.status_t:
     """Return the status of one source.
 
     ``server`` is HOST:PORT. ``streams`` are pairs of a stream's status and its frame rate in Hz. Each output
-    comes with its health and the number of queries about the source by result.
+    comes with its health and the number of queries about the source by result. ``frame`` is that of poses.
     """
     message = rtc3d.status_t()
     message.utime = message.capture_utime = now_utime()
@@ -56,6 +58,10 @@ def status_message(
     message.server = server
     message.gateway_version = __version__
     message.host = socket.gethostname()
+    message.frame_id = frame.frame_id
+    message.metres_per_unit = frame.metres_per_unit or 0.0
+    message.rotation_xyzw = list(frame.rotation_xyzw)
+    message.translation_m = list(frame.translation_m)
     message.streams = [_stream_message(stream, rate_hz, stall_timeout_s) for stream, rate_hz in streams]
     message.num_streams = len(message.streams)
     message.outputs = [_output_message(*output) for output in outputs]

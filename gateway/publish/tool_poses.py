@@ -5,13 +5,14 @@ from typing import Final
 
 import rtc3d
 
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.stamp import Stamp
-from gateway.messages.tool_pose import metres_per_unit, tool_poses
+from gateway.messages.tool_pose import tool_poses
 from gateway.messages.topics import MAX_LABEL_LENGTH, unique_name
+from gateway.outputs.contract import ServerParameters
 from gateway.publish.routes import OutputRoute, TopicRoute
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import Frame
-from gateway.rtc3d.parameters import Parameters
 
 _MAX_REMEMBERED_NAMES: Final = 1024
 """How many names of tools keep their sequence numbers. The server determines the names."""
@@ -49,7 +50,7 @@ class ToolPoses:
         self._output_routes: Sequence[OutputRoute] = ()
         self._labels: tuple[str, ...] = ()
         self._unit = ""
-        self._unit_m: float | None = 1e-3  # the unit of length in metres; None if it is unknown
+        self._frame = CoordinateFrame("")
         self._tools: list[_Tool] = []
         self._sequences: dict[str, int] = {}  # by the tools' names, also former ones
 
@@ -64,14 +65,15 @@ class ToolPoses:
         for tool in self._tools:
             tool.set_routes(output_routes)
 
-    def set_parameters(self, parameters: Parameters) -> None:
-        """Set the tools' labels (§6.3) and the unit of length (§6.2)."""
-        labels = () if parameters.tools is None else tuple(tool.label for tool in parameters.tools.tools)
+    def set_parameters(self, parameters: ServerParameters) -> None:
+        """Set the tools' labels (§6.3) and the frame of their poses, which has the unit of length (§6.2)."""
+        parsed = parameters.parsed
+        labels = () if parsed.tools is None else tuple(tool.label for tool in parsed.tools.tools)
         if labels != self._labels:
             self._labels = labels
             self._close_topics()
-        self._unit = "mm" if parameters.markers is None else parameters.markers.unit
-        self._unit_m = metres_per_unit(self._unit)
+        self._unit = "mm" if parsed.markers is None else parsed.markers.unit
+        self._frame = parameters.frame
 
     def publish(self, frame: Frame, indices: Sequence[int], stamp: Stamp) -> None:
         """Publish the pose of each tool in the frame's components at ``indices``, if there are subscribers.
@@ -79,12 +81,12 @@ class ToolPoses:
         Usually that is one component.
         """
         num_tools = _num_tools(frame, indices)
-        if self._unit_m is None:
+        if self._frame.metres_per_unit is None:
             # Publish nothing: a robot that waits is better than one that moves by a guessed unit.
             self._count_loss(
                 "unknown unit",
                 f"unit of length {self._unit[:40]!r} is unknown: no tool poses are published; "
-                "set it to mm or m in the server",
+                "set it to mm or m in the server, or set transform.units of the source in the configuration",
                 num_tools,
             )
             self.skip(frame, indices)
@@ -102,7 +104,7 @@ class ToolPoses:
             self._open_topics(most_tools)
         if any(tool.is_wanted for tool in self._tools):
             for index in indices:
-                self._send(frame.component(index), stamp, self._unit_m)
+                self._send(frame.component(index), stamp)
 
     def skip(self, frame: Frame, indices: Sequence[int]) -> int:
         """Use up the numbers of the poses that ``publish`` would publish; return how many poses that are."""
@@ -115,10 +117,10 @@ class ToolPoses:
             num_skipped += len(wanted)
         return num_skipped
 
-    def _send(self, component: Component, stamp: Stamp, unit_m: float) -> None:
+    def _send(self, component: Component, stamp: Stamp) -> None:
         tools = self._tools[: component.num_items]
         sequences = [self._sequences[tool.name] for tool in tools]
-        messages = tool_poses(component, stamp, sequences, unit_m)
+        messages = tool_poses(component, stamp, sequences, self._frame)
         for tool, message in zip(tools, messages, strict=True):
             if not tool.is_wanted:  # not sent, but not lost either
                 continue

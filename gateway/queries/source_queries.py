@@ -7,7 +7,9 @@ from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, Final
 
 from gateway.config.settings import SourceSettings
+from gateway.descriptions.source_frame import source_frame
 from gateway.errors import FrameError, QueryError
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import prefix_of
 from gateway.messages.encode import encode_message
 from gateway.messages.host_time import now_utime
@@ -25,6 +27,7 @@ from gateway.rtc3d.commands import SendCurrentFrame
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, Component, ComponentType
 from gateway.rtc3d.frames import detect_byte_order, split_frame
 from gateway.rtc3d.packets import PacketType
+from gateway.rtc3d.parameters import Parameters
 from gateway.stream.state import StreamState
 from gateway.token_bucket import TokenBucket
 
@@ -88,6 +91,12 @@ class SourceQueries:
         """The version of the server's parameters; 0 before the first."""
         return self._requests.parameters_version
 
+    @property
+    def frame(self) -> CoordinateFrame:
+        """The coordinate frame of the source's poses."""
+        newest = self.parameters.known.newest
+        return source_frame(self._settings, Parameters() if newest is None else newest.parsed.parameters)
+
     def check_control(self) -> None:
         """Raise QueryError unless peers may now start, stop or change something of this source."""
         name = self._settings.name
@@ -130,6 +139,7 @@ class SourceQueries:
             "age_s": round(cached.age_s, 3),
             "session": cached.session,
             "parameters_version": cached.version,
+            "frame": self.frame.facts,
         }
         if not self._requests.is_connected:
             attachment["stale"] = True

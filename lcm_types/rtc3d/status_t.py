@@ -12,11 +12,11 @@ import rtc3d
 class status_t(object):
     """ The status of the gateway and its connections to one source, published once per second. """
 
-    __slots__ = ["utime", "capture_utime", "sequence", "session", "parameters_version", "source", "server", "gateway_version", "host", "num_streams", "streams", "num_outputs", "outputs"]
+    __slots__ = ["utime", "capture_utime", "sequence", "session", "parameters_version", "source", "server", "gateway_version", "host", "frame_id", "metres_per_unit", "rotation_xyzw", "translation_m", "num_streams", "streams", "num_outputs", "outputs"]
 
-    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "string", "string", "string", "string", "int32_t", "rtc3d.stream_status_t", "int32_t", "rtc3d.output_status_t"]
+    __typenames__ = ["int64_t", "int64_t", "int64_t", "int32_t", "int32_t", "string", "string", "string", "string", "string", "double", "double", "double", "int32_t", "rtc3d.stream_status_t", "int32_t", "rtc3d.output_status_t"]
 
-    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, ["num_streams"], None, ["num_outputs"]]
+    __dimensions__ = [None, None, None, None, None, None, None, None, None, None, None, [4], [3], None, ["num_streams"], None, ["num_outputs"]]
 
     def __init__(self):
         self.utime = 0
@@ -65,6 +65,26 @@ class status_t(object):
         LCM Type: string
         """
 
+        self.frame_id = ""
+        """
+        The name of the coordinate frame of the poses per tool; component messages keep the server's units and axes.
+        LCM Type: string
+        """
+
+        self.metres_per_unit = 0.0
+        """
+        Metres per unit of the server, or a multiple of that if the configuration scales it; 0 if the unit is unknown.
+        LCM Type: double
+        """
+
+        self.rotation_xyzw = [ 0.0 for dim0 in range(4) ]
+        """
+        A position in the frame is metres_per_unit times the server's, rotated by rotation_xyzw, plus translation_m.
+        LCM Type: double[4]
+        """
+
+        self.translation_m = [ 0.0 for dim0 in range(3) ]
+        """ LCM Type: double[3] """
         self.num_streams = 0
         """ LCM Type: int32_t """
         self.streams = []
@@ -98,6 +118,13 @@ class status_t(object):
         buf.write(struct.pack('>I', len(__host_encoded)+1))
         buf.write(__host_encoded)
         buf.write(b"\0")
+        __frame_id_encoded = self.frame_id.encode('utf-8')
+        buf.write(struct.pack('>I', len(__frame_id_encoded)+1))
+        buf.write(__frame_id_encoded)
+        buf.write(b"\0")
+        buf.write(struct.pack(">d", self.metres_per_unit))
+        buf.write(struct.pack('>4d', *self.rotation_xyzw[:4]))
+        buf.write(struct.pack('>3d', *self.translation_m[:3]))
         buf.write(struct.pack(">i", self.num_streams))
         for i0 in range(self.num_streams):
             assert self.streams[i0]._get_packed_fingerprint() == rtc3d.stream_status_t._get_packed_fingerprint()
@@ -129,6 +156,11 @@ class status_t(object):
         self.gateway_version = buf.read(__gateway_version_len)[:-1].decode('utf-8', 'replace')
         __host_len = struct.unpack('>I', buf.read(4))[0]
         self.host = buf.read(__host_len)[:-1].decode('utf-8', 'replace')
+        __frame_id_len = struct.unpack('>I', buf.read(4))[0]
+        self.frame_id = buf.read(__frame_id_len)[:-1].decode('utf-8', 'replace')
+        self.metres_per_unit = struct.unpack(">d", buf.read(8))[0]
+        self.rotation_xyzw = struct.unpack('>4d', buf.read(32))
+        self.translation_m = struct.unpack('>3d', buf.read(24))
         self.num_streams = struct.unpack(">i", buf.read(4))[0]
         self.streams = []
         for i0 in range(self.num_streams):
@@ -143,7 +175,7 @@ class status_t(object):
     def _get_hash_recursive(parents):
         if status_t in parents: return 0
         newparents = parents + [status_t]
-        tmphash = (0x7c17e8a39b6c83+ rtc3d.stream_status_t._get_hash_recursive(newparents)+ rtc3d.output_status_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
+        tmphash = (0x4468cc37d451079e+ rtc3d.stream_status_t._get_hash_recursive(newparents)+ rtc3d.output_status_t._get_hash_recursive(newparents)) & 0xffffffffffffffff
         tmphash  = (((tmphash<<1)&0xffffffffffffffff) + (tmphash>>63)) & 0xffffffffffffffff
         return tmphash
     _packed_fingerprint = None

@@ -5,6 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from gateway.errors import ProtocolError
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import decode, to_json
 from gateway.messages.encode import encode_message
 from gateway.messages.stamp import Stamp
@@ -28,12 +29,13 @@ STATUS = status_message(
     streams=[(StreamStatus("3d", limitations=["no parameters"]), 60.0)],
     outputs=[(OutputStatus("zenoh"), OutputHealth(True), {"ok": 1})],
     stall_timeout_s=2.0,
+    frame=CoordinateFrame("lab"),
 )
 CLOCK = clock_message(1, 2, StreamStatus("3d"))
 valid = st.sampled_from(
     [
         *(encode_message(each, STAMP, 1) for each in COMPONENTS),
-        *tool_poses(TOOLS, STAMP, [1, 2]),
+        *tool_poses(TOOLS, STAMP, [1, 2], CoordinateFrame("lab")),
         STATUS.encode(),
         CLOCK.encode(),
     ]

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.doctor.observation import ObservedComponent
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import decode, to_json
 from gateway.messages.limits import encode_within_limits
 from gateway.messages.summary import summarise
@@ -89,6 +90,7 @@ class Lab:
             streams=[(self.status, 1e39)],
             outputs=[],
             stall_timeout_s=2.0,
+            frame=CoordinateFrame("lab"),
         )
         for message in (encode_within_limits(status), encode_within_limits(clock_message(1, 1, self.status))):
             decoded = decode(message)

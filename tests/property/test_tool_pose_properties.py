@@ -5,6 +5,7 @@ import rtc3d
 from hypothesis import given
 from hypothesis import strategies as st
 
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.stamp import Stamp
 from gateway.messages.tool_pose import tool_poses
 from gateway.rtc3d.components import ComponentType
@@ -24,7 +25,7 @@ def test_a_pose_is_whole_or_missing(tools: list[tuple[float, ...]], stamp: Stamp
     wire += b"".join(struct.pack(">8f", *tool) for tool in tools)
     (component,) = split_frame(wire, "big").components
     sequences = range(10, 10 + len(tools))
-    messages = tool_poses(component, stamp, sequences, metres)
+    messages = tool_poses(component, stamp, sequences, CoordinateFrame("lab", metres))
     for tool, sequence, message in zip(tools, sequences, messages, strict=True):
         pose = rtc3d.tool_pose_t.decode(message)
         assert pose.sequence == sequence

@@ -207,7 +207,11 @@ class ZenohQueries:
             del self._unsent[source]
             declared, parameters = self._declared.get(source), self._parameters.get(source)
         if declared is not None and parameters is not None:
-            attachment = {"session": parameters.session, "parameters_version": parameters.version}
+            attachment = {
+                "session": parameters.session,
+                "parameters_version": parameters.version,
+                "frame": parameters.frame.facts,
+            }
             self._put(source, declared.publisher.put, parameters.xml, attachment=json_bytes(attachment))
 
     def announce_file(self, source: str, description: Mapping[str, Any]) -> None:

@@ -16,6 +16,7 @@ from gateway.config.settings import (
     SpoolSettings,
     StreamSettings,
 )
+from gateway.config.transform import RollPitchYaw, TransformSettings
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -27,6 +28,8 @@ SECTIONS: dict[str, type[Section]] = {
     "sources[]": SourceSettings,
     "sources[].streams[]": StreamSettings,
     "sources[].reconnect": ReconnectSettings,
+    "sources[].transform": TransformSettings,
+    "sources[].transform.rotation_deg": RollPitchYaw,
     "zenoh": ZenohSettings,
     "lcm": LcmSettings,
     "takes": TakesSettings,

@@ -4,6 +4,7 @@ from typing import Any
 
 import rtc3d
 
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.encode import encode_message
 from gateway.messages.stamp import Stamp
 from gateway.messages.tool_pose import tool_poses
@@ -30,7 +31,7 @@ def component_message(vector: ComponentVector) -> bytes:
 
 def tool_pose_messages() -> list[bytes]:
     """Return the poses of a visible and a missing tool, numbers 41 and 42."""
-    return tool_poses(received(TOOLS), STAMP, [41, 42])
+    return tool_poses(received(TOOLS), STAMP, [41, 42], CoordinateFrame("lab"))
 
 
 def status_of(**stream: Any) -> bytes:
@@ -47,6 +48,7 @@ def status_of(**stream: Any) -> bytes:
         streams=streams,
         outputs=outputs,
         stall_timeout_s=2.0,
+        frame=CoordinateFrame("lab"),
     )
     return bytes(message.encode())
 

@@ -4,6 +4,7 @@ import pytest
 import rtc3d
 
 from gateway.losses import Losses
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import decode
 from gateway.messages.summary import summarise
 from gateway.outputs.status import OutputHealth, OutputStatus
@@ -90,6 +91,7 @@ def test_the_summary_of_a_status_says_what_was_lost_and_why() -> None:
         streams=[(status, 0.0)],
         outputs=[(OutputStatus("zenoh", losses=losses.report()), OutputHealth(True), {})],
         stall_timeout_s=2.0,
+        frame=CoordinateFrame("lab"),
     )
     assert summarise(decode(message.encode())) == (
         "#17 lab at 192.0.2.20:3020: [3d 6d] waiting to reconnect 0.0 Hz, 0 frames, 0 reconnects, "

@@ -6,6 +6,7 @@ from typing import Any
 import pytest
 import rtc3d
 
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.stamp import Stamp
 from gateway.messages.tool_pose import metres_per_unit, tool_poses
 from gateway.rtc3d.components import Component
@@ -17,6 +18,7 @@ STAMP = Stamp(
     utime=1_700_000_000_000_001, capture_utime=1_700_000_000_000_000, session=3, parameters_version=5
 )
 SEQUENCE = 41
+FRAME = CoordinateFrame("lab")
 # fingerprint, utime, capture_utime, sequence, session, parameters version, frame number, time stamp, visible,
 # pose and error
 POSE = struct.Struct(">8sqqqiiiqb8f")
@@ -34,7 +36,7 @@ def tools(*poses: tuple[float, ...]) -> Component:
 
 
 def pose_of(component: Component, unit_m: float = 1e-3) -> Any:
-    [message] = tool_poses(component, STAMP, [SEQUENCE], unit_m)
+    [message] = tool_poses(component, STAMP, [SEQUENCE], CoordinateFrame("lab", unit_m))
     return rtc3d.tool_pose_t.decode(message)
 
 
@@ -42,7 +44,7 @@ def pose_of(component: Component, unit_m: float = 1e-3) -> Any:
 def test_poses_are_in_metres_and_have_the_scalar_last(order: ByteOrder) -> None:
     fingerprint = rtc3d.tool_pose_t._get_packed_fingerprint()
     stamp = (1_700_000_000_000_001, 1_700_000_000_000_000)
-    visible, missing = tool_poses(received(TOOLS, order), STAMP, [41, 7])
+    visible, missing = tool_poses(received(TOOLS, order), STAMP, [41, 7], FRAME)
     assert visible == POSE.pack(
         fingerprint, *stamp, 41, 3, 5, 4, 7500, 1,
         0.1, -0.2, 1.6,
@@ -54,7 +56,7 @@ def test_poses_are_in_metres_and_have_the_scalar_last(order: ByteOrder) -> None:
 
 @both_orders
 def test_lcm_gen_decodes_poses(order: ByteOrder) -> None:
-    messages = tool_poses(received(TOOLS, order), STAMP, [41, 7])
+    messages = tool_poses(received(TOOLS, order), STAMP, [41, 7], FRAME)
     visible, missing = map(rtc3d.tool_pose_t.decode, messages)
     assert [each.encode() for each in (visible, missing)] == messages
     assert (visible.visible, missing.visible) == (True, False)
@@ -87,7 +89,7 @@ def test_a_component_in_metres_is_not_scaled() -> None:
 
 
 def test_a_component_without_tools_gives_no_poses() -> None:
-    assert tool_poses(tools(), STAMP, []) == []
+    assert tool_poses(tools(), STAMP, [], FRAME) == []
 
 
 @pytest.mark.parametrize(

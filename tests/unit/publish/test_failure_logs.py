@@ -10,6 +10,7 @@ from gateway.messages.stamp import Stamp
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import WIRE_ORDER
 from gateway.rtc3d.parameters import Parameters, Parameters3D
+from tests.server_parameters import in_metres
 from tests.toy_output import ToyOutput
 from tests.unit.publish.test_tool_poses import publish_tools
 
@@ -22,7 +23,7 @@ def logged(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 
 def set_unit(fan_out: FanOut, unit: str) -> None:
-    fan_out.set_parameters(Parameters(markers=Parameters3D(unit=unit)))
+    fan_out.set_parameters(in_metres(Parameters(markers=Parameters3D(unit=unit))))
 
 
 @pytest.mark.parametrize(
@@ -79,12 +80,12 @@ def test_an_unknown_unit_is_logged_with_what_is_lost(caplog: pytest.LogCaptureFi
     fan_out.close()
     assert logged(caplog) == [
         f"WARNING lab to toy: unit of length '{'x' * 40}' is unknown: no tool poses are published; "
-        "set it to mm or m in the server",
+        "set it to mm or m in the server, or set transform.units of the source in the configuration",
         "INFO lab to toy: lost within 0.0 s: 2 messages of 1 frame (unknown unit)",
     ]
 
 
 def test_parameters_without_markers_are_in_millimetres(caplog: pytest.LogCaptureFixture) -> None:
     fan_out = FanOut("lab", [ToyOutput(has_tool_poses=True)])
-    fan_out.set_parameters(Parameters())
+    fan_out.set_parameters(in_metres(Parameters()))
     assert not caplog.records

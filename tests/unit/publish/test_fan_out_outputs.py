@@ -8,6 +8,7 @@ from gateway.rtc3d.components import WIRE_ORDER
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool
 from tests.losses import amounts
+from tests.server_parameters import in_metres
 from tests.toy_output import ToyOutput
 from tests.vectors import FULL_FRAME
 
@@ -99,7 +100,7 @@ def test_a_new_output_shows_that_frames_arrive() -> None:
 def test_a_closed_fan_out_leaves_nothing_declared() -> None:
     output = ToyOutput("toy", "Probe", has_tool_poses=True)
     fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(PROBES)
+    fan_out.set_parameters(in_metres(PROBES))
     fan_out.show_streaming(True)
     publish(fan_out)
     fan_out.close()
@@ -111,7 +112,7 @@ def test_tool_topics_stay_open_on_an_output_that_stays() -> None:
         ToyOutput(name, "Probe", has_tool_poses=True) for name in ("stays", "side", "side")
     )
     fan_out = FanOut("lab", [stays, before])
-    fan_out.set_parameters(PROBES)
+    fan_out.set_parameters(in_metres(PROBES))
     publish(fan_out)
     fan_out.set_outputs([stays, after])
     publish(fan_out)
@@ -124,7 +125,7 @@ def test_tool_topics_stay_open_on_an_output_that_stays() -> None:
 def test_tool_topics_are_closed_where_they_are_switched_off() -> None:
     output = ToyOutput("toy", "Probe", has_tool_poses=True)
     fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(PROBES)
+    fan_out.set_parameters(in_metres(PROBES))
     publish(fan_out)
     output.has_tool_poses = False
     fan_out.set_outputs([output])

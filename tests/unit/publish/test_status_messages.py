@@ -8,6 +8,7 @@ import rtc3d
 
 from gateway import __version__
 from gateway.losses import Losses
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.host_time import host_clock, now_utime
 from gateway.outputs.status import OutputHealth, OutputStatus
 from gateway.publish.status_messages import clock_message, clock_model, status_message
@@ -66,6 +67,7 @@ def test_the_status_message_has_every_field() -> None:
                 (lcm, OutputHealth(False, "no multicast"), {}),
             ],
             stall_timeout_s=2.0,
+            frame=CoordinateFrame("hall", 0.02, (0.0, 0.0, 1.0, 0.0), (1.0, 2.0, 3.0)),
         )
     )
     assert before <= message["utime"] <= now_utime()
@@ -79,6 +81,10 @@ def test_the_status_message_has_every_field() -> None:
         "server": "192.0.2.20:3020",
         "gateway_version": __version__,
         "host": socket.gethostname(),
+        "frame_id": "hall",
+        "metres_per_unit": 0.02,
+        "rotation_xyzw": (0.0, 0.0, 1.0, 0.0),
+        "translation_m": (1.0, 2.0, 3.0),
         "num_streams": 2,
         "streams": [
             {
@@ -204,7 +210,15 @@ def test_counts_are_sorted_by_name() -> None:
     output = OutputStatus("zenoh", Counter("cab"))
     outputs = [(output, OutputHealth(True), {"rate": 1, "ok": 2})]
     message = encoded_and_decoded(
-        status_message(source="lab", server="s", sequence=0, streams=[], outputs=outputs, stall_timeout_s=2.0)
+        status_message(
+            source="lab",
+            server="s",
+            sequence=0,
+            streams=[],
+            outputs=outputs,
+            stall_timeout_s=2.0,
+            frame=CoordinateFrame("lab"),
+        )
     )
     assert [count["name"] for count in message["outputs"][0]["messages"]] == ["a", "b", "c"]
     assert [count["name"] for count in message["outputs"][0]["queries"]] == ["ok", "rate"]

@@ -12,6 +12,7 @@ from gateway.rtc3d.components import WIRE_ORDER
 from gateway.rtc3d.frames import Frame, split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters3D, Parameters6D, Tool
 from tests.losses import amounts
+from tests.server_parameters import in_metres
 from tests.toy_output import ToyOutput
 
 STAMP = Stamp(utime=2_000, capture_utime=1_000, session=1, parameters_version=1)
@@ -38,7 +39,7 @@ def publish_tools(fan_out: FanOut, count: int) -> None:
 def test_tools_have_topics_only_where_switched_on() -> None:
     with_tools, without = ToyOutput("with", "Probe", has_tool_poses=True), ToyOutput("without", "Probe")
     fan_out = FanOut("lab", [with_tools, without])
-    fan_out.set_parameters(parameters("Probe"))
+    fan_out.set_parameters(in_metres(parameters("Probe")))
     publish_tools(fan_out, 1)
     [(topic, _)] = [each for each in with_tools.messages if len(each[0].path) == 2]
     assert topic == Topic("lab", ("6d", "Probe"), "rtc3d.tool_pose_t")
@@ -48,7 +49,7 @@ def test_tools_have_topics_only_where_switched_on() -> None:
 def test_a_pose_is_published_while_it_has_a_subscriber() -> None:
     output = ToyOutput("toy", "Probe", has_tool_poses=True)
     fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(parameters("Probe", "Head"))
+    fan_out.set_parameters(in_metres(parameters("Probe", "Head")))
     publish_tools(fan_out, 2)
     assert (len(output.poses("Probe")), len(output.poses("Head"))) == (1, 0)
     output.wanted = {"Head"}
@@ -74,7 +75,7 @@ def test_a_pose_is_published_while_it_has_a_subscriber() -> None:
 def test_topics_are_named_after_the_labels(labels: list[str], names: list[str]) -> None:
     output = ToyOutput(has_tool_poses=True)
     fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(parameters(*labels))
+    fan_out.set_parameters(in_metres(parameters(*labels)))
     publish_tools(fan_out, len(names))
     assert output.tool_names() == names
 
@@ -82,7 +83,7 @@ def test_topics_are_named_after_the_labels(labels: list[str], names: list[str]) 
 def test_tools_without_parameters_are_numbered() -> None:
     output = ToyOutput(has_tool_poses=True)
     fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(Parameters())
+    fan_out.set_parameters(in_metres(Parameters()))
     publish_tools(fan_out, 2)
     assert output.tool_names() == ["tool 1", "tool 2"]
 
@@ -90,9 +91,9 @@ def test_tools_without_parameters_are_numbered() -> None:
 def test_new_labels_replace_the_topics() -> None:
     output = ToyOutput(has_tool_poses=True)
     fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(parameters("Probe", "Head"))
+    fan_out.set_parameters(in_metres(parameters("Probe", "Head")))
     publish_tools(fan_out, 2)
-    fan_out.set_parameters(parameters("Head", "Foot", "Hand"))
+    fan_out.set_parameters(in_metres(parameters("Head", "Foot", "Hand")))
     publish_tools(fan_out, 3)
     assert output.tool_names() == ["Head", "Foot", "Hand"]
 
@@ -101,7 +102,7 @@ def test_topics_stay_open_while_the_labels_stay() -> None:
     output = ToyOutput("toy", "Probe", has_tool_poses=True)
     fan_out = FanOut("lab", [output])
     for session in (1, 2):
-        fan_out.set_parameters(parameters("Probe"))
+        fan_out.set_parameters(in_metres(parameters("Probe")))
         fan_out.publish(tools_frame(IN_VIEW), Stamp(STAMP.utime, STAMP.capture_utime, session, 1), ALL)
     counted = [(pose.sequence, pose.session) for pose in output.poses("Probe")]
     assert counted == [(0, 1), (1, 2)]
@@ -112,7 +113,7 @@ def test_a_tool_that_keeps_its_label_continues_its_numbers() -> None:
     output = ToyOutput("toy", "Probe", "Head", has_tool_poses=True)
     fan_out = FanOut("lab", [output])
     for labels in (["Probe"], ["Head", "Probe"], ["Head", "Probe"]):
-        fan_out.set_parameters(parameters(*labels))
+        fan_out.set_parameters(in_metres(parameters(*labels)))
         publish_tools(fan_out, len(labels))
     assert [pose.sequence for pose in output.poses("Probe")] == [0, 1, 2]
     assert [pose.sequence for pose in output.poses("Head")] == [0, 1]
@@ -121,7 +122,7 @@ def test_a_tool_that_keeps_its_label_continues_its_numbers() -> None:
 def test_a_number_of_tools_that_goes_up_and_down_reopens_no_topic() -> None:
     output = ToyOutput("toy", "A", "B", "C", has_tool_poses=True)
     fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(parameters("A", "B", "C"))
+    fan_out.set_parameters(in_metres(parameters("A", "B", "C")))
     publish_tools(fan_out, 3)
     for count in (1, 0, 3, 2):
         publish_tools(fan_out, count)
@@ -151,7 +152,7 @@ def test_poses_are_in_metres_whatever_the_unit_of_the_server(
 ) -> None:
     output = ToyOutput("toy", "Probe", has_tool_poses=True)
     fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(parameters("Probe", unit=unit))
+    fan_out.set_parameters(in_metres(parameters("Probe", unit=unit)))
     publish_tools(fan_out, 1)
     assert output.poses("Probe")[0].position_m == pytest.approx(position_m)
 
@@ -159,7 +160,7 @@ def test_poses_are_in_metres_whatever_the_unit_of_the_server(
 def test_an_unknown_unit_is_logged_and_no_pose_is_published(caplog: pytest.LogCaptureFixture) -> None:
     output = ToyOutput("toy", "Probe", has_tool_poses=True)
     fan_out = FanOut("lab", [output])
-    fan_out.set_parameters(parameters("Probe", unit="furlong"))
+    fan_out.set_parameters(in_metres(parameters("Probe", unit="furlong")))
     publish_tools(fan_out, 1)
     assert output.poses("Probe") == []
     assert amounts(fan_out.outputs[0][1].losses) == {"unknown unit": (1, 1)}
@@ -167,7 +168,7 @@ def test_an_unknown_unit_is_logged_and_no_pose_is_published(caplog: pytest.LogCa
 
 
 def test_an_unknown_unit_is_not_logged_without_tool_poses(caplog: pytest.LogCaptureFixture) -> None:
-    FanOut("lab", [ToyOutput()]).set_parameters(parameters("Probe", unit="furlong"))
+    FanOut("lab", [ToyOutput()]).set_parameters(in_metres(parameters("Probe", unit="furlong")))
     assert not caplog.records
 
 

@@ -22,7 +22,7 @@ async def test_parameters_are_answered_with_their_xml_age_session_and_version() 
     await source.store_parameters(parameters_xml("mm"))
     answer = await source.answer("parameters")
     assert (answer.payload, answer.encoding) == (parameters_xml("mm"), XML)
-    assert answer.attachment.keys() == {"age_s", "session", "parameters_version"}
+    assert answer.attachment.keys() == {"age_s", "session", "parameters_version", "frame"}
     assert (answer.attachment["session"], answer.attachment["parameters_version"]) == (1, 1)
 
 

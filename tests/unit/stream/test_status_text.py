@@ -6,6 +6,7 @@ import pytest
 import rtc3d
 
 from gateway.config.settings import SourceSettings
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.decode import decode
 from gateway.monitoring.status_line import source_line
 from gateway.publish.status_messages import status_message
@@ -20,7 +21,13 @@ Streams = Sequence[tuple[StreamStatus, float]]
 def message_of(streams: Streams) -> rtc3d.status_t:
     server = f"{LAB.host}:{LAB.port}"
     message = status_message(
-        source="lab", server=server, sequence=0, streams=streams, outputs=[], stall_timeout_s=2.0
+        source="lab",
+        server=server,
+        sequence=0,
+        streams=streams,
+        outputs=[],
+        stall_timeout_s=2.0,
+        frame=CoordinateFrame("lab"),
     )
     decoded: rtc3d.status_t = decode(message.encode())
     return decoded

@@ -13,6 +13,7 @@ import zenoh
 from gateway.errors import QueryError
 from gateway.log import current_log_fields
 from gateway.losses import Losses
+from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.contract import Answer, KeyPath, ServerFile, ServerParameters
 from gateway.outputs.zenoh import answers as answers_module
 from gateway.outputs.zenoh import queries as queries_module
@@ -214,12 +215,22 @@ async def test_parameters_are_published_with_their_encoding_and_a_low_priority(
     lab = Lab(has_time_stamps=has_time_stamps)
     await lab.open()
     lab.subscribe("mocap/lab/parameters")
-    lab.output.publish_parameters("lab", ServerParameters(XML, 1, 4))
+    frame = CoordinateFrame("lab", 0.01, translation_m=(0, 0, 2))
+    lab.output.publish_parameters("lab", ServerParameters(XML, 1, 4, frame=frame))
     await wait_until_async(lambda: lab.samples)
     sample = lab.samples[0]
     assert (sample.payload.to_bytes(), str(sample.encoding)) == (XML, "application/xml")
     assert sample.attachment is not None
-    assert json.loads(sample.attachment.to_bytes()) == {"session": 1, "parameters_version": 4}
+    assert json.loads(sample.attachment.to_bytes()) == {
+        "session": 1,
+        "parameters_version": 4,
+        "frame": {
+            "frame_id": "lab",
+            "metres_per_unit": 0.01,
+            "rotation_xyzw": [0, 0, 0, 1],
+            "translation_m": [0, 0, 2],
+        },
+    }
     assert sample.congestion_control == zenoh.CongestionControl.BLOCK
     assert sample.priority == zenoh.Priority.DATA_LOW
     if has_time_stamps:

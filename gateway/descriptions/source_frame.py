@@ -1,0 +1,38 @@
+"""The coordinate frame of a source's poses, from its settings and the server's parameters."""
+
+import math
+from typing import Final
+
+from gateway.config.settings import SourceSettings
+from gateway.config.transform import RollPitchYaw
+from gateway.messages.coordinate_frame import CoordinateFrame, Quaternion, product
+from gateway.messages.tool_pose import metres_per_unit
+from gateway.rtc3d.parameters import Parameters
+
+_Y_UP_TO_Z_UP: Final[Quaternion] = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
+"""A quarter turn about x: (x, y, z) becomes (x, -z, y)."""
+
+
+def source_frame(settings: SourceSettings, parameters: Parameters) -> CoordinateFrame:
+    """Return the frame in which poses of a source are published; the unit is that of §6.2 if none is set."""
+    transform = settings.transform
+    unit = transform.units or ("mm" if parameters.markers is None else parameters.markers.unit)
+    metres = metres_per_unit(unit)
+    rotation = transform.rotation_xyzw or _quaternion(transform.rotation_deg)
+    if transform.up == "y":
+        rotation = product(rotation, _Y_UP_TO_Z_UP)
+    return CoordinateFrame(
+        settings.frame_id or settings.name,
+        None if metres is None else metres * transform.scale,
+        rotation,
+        transform.translation_m,
+    )
+
+
+def _quaternion(angles: RollPitchYaw) -> Quaternion:
+    """Return the rotation by roll about x, then pitch about y, then yaw about z, all of them fixed axes."""
+    roll, pitch, yaw = (math.radians(angle) / 2 for angle in (angles.roll, angles.pitch, angles.yaw))
+    about_x = (math.sin(roll), 0.0, 0.0, math.cos(roll))
+    about_y = (0.0, math.sin(pitch), 0.0, math.cos(pitch))
+    about_z = (0.0, 0.0, math.sin(yaw), math.cos(yaw))
+    return product(about_z, product(about_y, about_x))

@@ -1,0 +1,136 @@
+"""Where the positions of a source are in the world: from the server's units and axes to metres."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+import numpy.typing as npt
+
+Quaternion = tuple[float, float, float, float]
+"""x, y, z, w."""
+
+Vector = tuple[float, float, float]
+
+Pose = tuple[float, float, float, float, float, float, float, float]
+"""Position in metres (x, y, z), orientation (x, y, z, w), error in metres."""
+
+Coordinates = npt.NDArray[np.float64]
+"""Shape (n, 3)."""
+
+NO_ROTATION: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)
+NO_TRANSLATION: Final[Vector] = (0.0, 0.0, 0.0)
+
+MAX_FLOAT: Final = 3.4e38
+"""Larger values are out of the range of a 32-bit float."""
+
+
+@dataclass(frozen=True)
+class CoordinateFrame:
+    """The coordinate frame in which poses and positions of one source are published.
+
+    ``metres_per_unit`` is the length of the server's unit, or a multiple of it if the settings scale it; None
+    if the unit is unknown. Positions are first scaled, then rotated, then moved. Component messages keep the
+    server's units and axes.
+    """
+
+    frame_id: str
+    metres_per_unit: float | None = 1e-3
+    rotation_xyzw: Quaternion = NO_ROTATION
+    translation_m: Vector = NO_TRANSLATION
+
+    @cached_property
+    def matrix(self) -> npt.NDArray[np.float64]:
+        """The rotation as a matrix, shape (3, 3)."""
+        x, y, z, w = self.rotation_xyzw
+        return np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+                [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+                [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+
+    @cached_property
+    def only_scales(self) -> bool:
+        """Whether positions are neither rotated nor moved."""
+        return self.rotation_xyzw == NO_ROTATION and self.translation_m == NO_TRANSLATION
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """The frame as JSON can hold it, for peers."""
+        return {
+            "frame_id": self.frame_id,
+            "metres_per_unit": self.metres_per_unit,
+            "rotation_xyzw": self.rotation_xyzw,
+            "translation_m": self.translation_m,
+        }
+
+    def points(self, positions: npt.NDArray[Any]) -> Coordinates:
+        """Return positions of the server in metres, in this frame; NaN stays NaN.
+
+        ``positions`` has the shape (n, 3). The unit must be known.
+        """
+        points: Coordinates = positions.astype(np.float64) * self._metres
+        return points if self.only_scales else points @ self.matrix.T + self.translation_m
+
+    def vectors(self, vectors: npt.NDArray[Any]) -> Coordinates:
+        """Return vectors such as forces, shape (n, 3), with the axes of this frame and in their own unit."""
+        rotated: Coordinates = vectors.astype(np.float64)
+        return rotated if self.rotation_xyzw == NO_ROTATION else rotated @ self.matrix.T
+
+    def poses(self, tools: npt.NDArray[Any], *, accept_zeros: bool = False) -> list[Pose | None]:
+        """Return the pose of each tool; None for one out of view. The unit must be known.
+
+        ``tools`` are the items of a 6D component (§7.4), shape (n,). A tool is out of view if any of its
+        fields is NaN (field note 7). One whose values a 32-bit float cannot hold counts as out of view, too:
+        a robot must never get a pose that is not complete. So does a quaternion of zeros, which is no
+        rotation, unless ``accept_zeros``.
+        """
+        return [self._pose(tool, accept_zeros) for tool in tools.tolist()]
+
+    @property
+    def _metres(self) -> float:
+        if self.metres_per_unit is None:
+            raise ValueError("the unit of length is unknown")
+        return self.metres_per_unit
+
+    def _pose(self, tool: tuple[float, ...], accept_zeros: bool) -> Pose | None:
+        q0, qx, qy, qz, x, y, z, error = tool
+        metres = self._metres
+        pose = (x * metres, y * metres, z * metres, qx, qy, qz, q0, error * metres)
+        if not self.only_scales:
+            pose = self._moved(pose)
+        # Comparisons with NaN are false.
+        if not all(-MAX_FLOAT <= value <= MAX_FLOAT for value in pose):
+            return None
+        return pose if accept_zeros or any(tool[:4]) else None
+
+    def _moved(self, pose: Pose) -> Pose:
+        x, y, z, qx, qy, qz, qw, error_m = pose
+        tx, ty, tz = self.translation_m
+        (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = self._rows
+        return (
+            xx * x + xy * y + xz * z + tx,
+            yx * x + yy * y + yz * z + ty,
+            zx * x + zy * y + zz * z + tz,
+            *product(self.rotation_xyzw, (qx, qy, qz, qw)),
+            error_m,
+        )
+
+    @cached_property
+    def _rows(self) -> list[list[float]]:
+        rows: list[list[float]] = self.matrix.tolist()  # plain numbers are faster than an array, one by one
+        return rows
+
+
+def product(first: Quaternion, second: Quaternion) -> Quaternion:
+    """Return the rotation by ``second``, then by ``first``."""
+    x1, y1, z1, w1 = first
+    x2, y2, z2, w2 = second
+    return (
+        w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+        w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+        w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+    )

@@ -1,0 +1,88 @@
+import asyncio
+import logging
+import threading
+from concurrent.futures import CancelledError
+
+import pytest
+
+from gateway.outputs import loop_thread
+from gateway.outputs.loop_thread import LoopThread
+
+
+async def nothing() -> None: ...
+
+
+def test_calls_are_made_in_order_in_the_thread() -> None:
+    thread = LoopThread("test")
+    made: list[tuple[int, str]] = []
+    for number in range(100):
+        assert thread.offer(lambda number=number: made.append((number, threading.current_thread().name)))  # type: ignore[misc]
+    thread.run(nothing()).result(5)
+    assert made == [(number, "test") for number in range(100)]
+    thread.close(nothing, 5)
+
+
+def test_the_queue_is_bounded_by_calls_and_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(loop_thread, "MAX_CALLS", 3)
+    monkeypatch.setattr(loop_thread, "MAX_BYTES", 100)
+    thread = LoopThread("test")
+    entered, go_on = threading.Event(), threading.Event()
+
+    def wait() -> None:
+        entered.set()
+        go_on.wait()
+
+    thread.offer(wait)
+    assert entered.wait(5)
+    made: list[int] = []
+    assert thread.offer(lambda: made.append(0), 1000)  # of any size, because the queue is empty
+    assert not thread.offer(lambda: made.append(1), 1)
+    go_on.set()
+    thread.run(nothing()).result(5)
+    assert thread.offer(lambda: made.append(2), 60)
+    thread.run(nothing()).result(5)
+    assert made == [0, 2]
+    thread.close(nothing, 5)
+
+
+def test_a_call_that_raises_is_logged_and_the_next_one_is_made(caplog: pytest.LogCaptureFixture) -> None:
+    thread = LoopThread("test")
+    made = threading.Event()
+
+    def fail() -> None:
+        raise ValueError("a defect")
+
+    thread.offer(fail)
+    thread.offer(made.set)
+    assert made.wait(5)
+    thread.close(nothing, 5)
+    [record] = caplog.records
+    assert record.levelno == logging.ERROR
+
+
+def test_closing_awaits_the_last_coroutine_and_refuses_what_comes_later() -> None:
+    thread = LoopThread("test")
+    ended: list[str] = []
+
+    async def last() -> None:
+        await asyncio.sleep(0)
+        ended.append("last")
+
+    thread.close(last, 5)
+    thread.close(last, 5)
+    assert ended == ["last"]
+    assert not thread.offer(lambda: None)
+    with pytest.raises(CancelledError):
+        thread.run(nothing()).result(5)
+
+
+def test_closing_waits_no_longer_than_it_may() -> None:
+    thread = LoopThread("test")
+    go_on = threading.Event()
+
+    def wait() -> None:
+        go_on.wait()
+
+    thread.offer(wait)
+    thread.close(nothing, 0.01)
+    go_on.set()
