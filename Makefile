@@ -197,7 +197,7 @@ lock:
 	$(PYTHON) -m venv build/lock-venv
 	build/lock-venv/bin/pip install --quiet uv
 	$(UV_COMPILE) --all-extras --output-file requirements-view.txt pyproject.toml
-	$(UV_COMPILE) --extra c3d --extra foxglove --extra systemd --constraint requirements-view.txt \
+	$(UV_COMPILE) --extra c3d --extra foxglove --extra lsl --extra systemd --constraint requirements-view.txt \
 	    --output-file requirements.txt pyproject.toml
 
 # Coverage-guided fuzzing, FUZZ_SECONDS for each target; not part of the check.
