@@ -16,7 +16,7 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 # What a wheel is built from.
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-integration test-commands test-takes test-hostile test-browser test-others test-compiled check lint types contracts generated docs lcm-types samples screenshots fuzz soak stops \
+.PHONY: demo lock test test-integration test-commands test-takes test-hostile test-browser test-others test-compiled check lint types contracts generated docs lcm-types examples samples screenshots fuzz soak stops \
     mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
 
 demo: .venv/runtime
@@ -70,7 +70,7 @@ contracts: .venv/installed
 generated: .venv/installed
 	rm -rf build/lcm_types && mkdir -p build/lcm_types
 	$(BIN)/lcm-gen --python --ppath build/lcm_types lcm_types/rtc3d/*.lcm
-	diff -r --exclude='*.lcm' --exclude=__pycache__ build/lcm_types lcm_types
+	diff -r --exclude='*.lcm' --exclude=__pycache__ --exclude=vectors build/lcm_types lcm_types
 
 # Build the site in build/site; a broken link is an error. (With --quiet, --strict would not count mkdocs' warnings.)
 docs: .venv/installed
@@ -80,6 +80,10 @@ docs: .venv/installed
 lcm-types: .venv/installed
 	rm -f lcm_types/rtc3d/*.py
 	$(BIN)/lcm-gen --python --ppath lcm_types lcm_types/rtc3d/*.lcm
+
+# Build the programs in examples/ whose tools are installed, and say which were left out and why.
+examples: .venv/installed
+	$(MAKE) --no-print-directory -C examples PYTHON=$(CURDIR)/$(BIN)/python
 
 # Record the sample take and the sample C3D file again.
 samples: .venv/installed

@@ -2,42 +2,58 @@
 
     python examples/subscriber_lcm.py [SOURCE [COUNT]]        for example: subscriber_lcm.py LAB 100
 
-SOURCE is the name of the source in upper case. The program stops after COUNT frames.
+It needs the gateway's Python package, which has the module ``rtc3d`` and brings ``lcm``.
+SOURCE is the name of the source in upper case. The program stops after COUNT frames. With --vectors, it
+decodes messages from standard input instead (lcm_types/vectors/README.md).
 """
 
 import argparse
+import json
 import math
 import signal
 import struct
 import sys
 
 import lcm
-from rtc3d import markers_t
+import rtc3d
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("source", nargs="?", default="LAB", help="the source's name in upper case")
-    parser.add_argument("count", nargs="?", type=int, default=math.inf, help="stop after this many frames")
-    options = parser.parse_args()
-    source, frames_left = options.source, options.count
+def decode(lcm_type, data):
+    """Return the message, or raise ValueError."""
+    try:
+        message = lcm_type.decode(data)
+        # lcm-gen's decoder reads a string that is cut off as a shorter one.
+        is_whole = "string" not in lcm_type.__typenames__ or message.encode() == data
+    except (struct.error, ValueError) as error:
+        raise ValueError(f"not a whole {lcm_type.__name__}: {error}") from error
+    if not is_whole:
+        raise ValueError(f"not a whole {lcm_type.__name__}")
+    for name in lcm_type.__slots__:
+        if name.startswith("num_") and getattr(message, name) < 0:
+            raise ValueError(f"{name} is {getattr(message, name)}")
+    return message
+
+
+def print_markers(message) -> None:
+    visible = [marker for marker in message.markers if not math.isnan(marker.x)]
+    first = ", the first at {0.x:.3f}, {0.y:.3f}, {0.z:.3f} mm".format(visible[0]) if visible else ""
+    print(
+        f"#{message.sequence} frame {message.frame_number} at {message.timestamp / 1e6:.4f} s"
+        f" with parameters {message.parameters_version}:"
+        f" {len(visible)} of {message.num_markers} markers in view{first}"
+    )
+
+
+def subscribe(source: str, count: float) -> None:
+    frames_left = count
 
     def on_markers(_channel: str, data: bytes) -> None:
         nonlocal frames_left
         try:
-            message = markers_t.decode(data)
-        except (struct.error, ValueError) as error:
+            print_markers(decode(rtc3d.markers_t, data))
+        except ValueError as error:
             print(f"ignored a malformed message: {error}", file=sys.stderr)
             return
-        visible = [marker for marker in message.markers if not math.isnan(marker.x)]
-        position = ""
-        if visible:
-            first = visible[0]
-            position = f", the first at {first.x:.3f}, {first.y:.3f}, {first.z:.3f} mm"
-        print(
-            f"#{message.sequence} frame {message.frame_number} with parameters {message.parameters_version}: "
-            f"{len(visible)} of {message.num_markers} markers in view{position}"
-        )
         frames_left -= 1
 
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # LCM's handle() would turn Ctrl-C into an OSError
@@ -47,6 +63,38 @@ def main() -> None:
     print("listening", flush=True)
     while frames_left > 0:
         connection.handle()
+
+
+def as_json(value):
+    """Return a message, or a value in one, as what ``json`` writes."""
+    if hasattr(value, "__slots__"):
+        return {name: as_json(getattr(value, name)) for name in value.__slots__}
+    if isinstance(value, list | tuple):
+        return [as_json(item) for item in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def print_vectors() -> None:
+    """Read lines TYPE HEX, and print the values of each message, or what is wrong, as a line of JSON."""
+    for line in sys.stdin:
+        type_name, _, digits = line.strip().partition(" ")
+        try:
+            found = as_json(decode(getattr(rtc3d, type_name), bytes.fromhex(digits)))
+        except (AttributeError, ValueError) as error:
+            found = {"error": str(error)}
+        print(json.dumps(found))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("source", nargs="?", default="LAB", help="the source's name in upper case")
+    parser.add_argument("count", nargs="?", type=int, default=math.inf, help="stop after this many frames")
+    parser.add_argument("--vectors", action="store_true", help="decode lines TYPE HEX from standard input")
+    options = parser.parse_args()
+    if options.vectors:
+        print_vectors()
+    else:
+        subscribe(options.source, options.count)
 
 
 if __name__ == "__main__":

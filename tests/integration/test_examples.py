@@ -2,14 +2,12 @@
 
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 
 import lcm
 import numpy as np
@@ -17,11 +15,11 @@ import pytest
 
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.synthetic import SyntheticScene
+from tests.example_programs import COUNT, EXAMPLES, PROGRAMS, ExampleProgram
 from tests.networks import free_port, open_zenoh
 
 pytestmark = pytest.mark.netns
 
-ROOT = Path(__file__).parents[2]
 LCM_URL = "udpm://239.255.76.67:7712?ttl=0"
 PROGRAM = [sys.executable, "-m", "gateway"]
 
@@ -31,7 +29,7 @@ def run_program(*command: str, ready: str) -> Iterator[subprocess.Popen[str]]:
     """Start a program, wait for ``ready`` in its output, and end it after the block."""
     environment = {**os.environ, "LCM_DEFAULT_URL": LCM_URL}
     with subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+        command, env=environment, cwd=EXAMPLES, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     ) as process:
         assert process.stdout is not None
         try:
@@ -66,63 +64,49 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
         yield endpoint
 
 
-def printed_positions(text: str) -> list[tuple[int, list[float]]]:
-    """Return the number and the first position of each printed frame with version 1 of the parameters."""
-    found = re.findall(
-        r"frame (\d+) with parameters 1:[^\n]*?(?:\n[^#\n]*?)?(-?\d+\.\d+),\s?(-?\d+\.\d+),\s?(-?\d+\.\d+)",
-        text,
-    )
-    return [(int(number), [float(value) for value in position]) for number, *position in found]
+LINE = re.compile(
+    r"#(?P<sequence>\d+) frame (?P<number>\d+) at (?P<time_s>\d+\.\d+) s with parameters (?P<version>\d+):"
+    r" (?P<visible>\d+) of (?P<count>\d+) markers in view, the first at"
+    r" (?P<x>-?\d+\.\d+), (?P<y>-?\d+\.\d+), (?P<z>-?\d+\.\d+) mm"
+)
+"""A line that an example program prints for a frame."""
 
 
-def assert_positions_match_the_scene(text: str, at_least: int) -> None:
+def assert_lines_match_the_scene(text: str) -> None:
+    """Check the lines of consecutive frames against what the simulator sends."""
     scene = SyntheticScene(markers=20, tools=4, analog=16, plates=2, rate_hz=100, analog_rate_hz=2000)
-    printed = printed_positions(text)
-    assert len(printed) >= at_least
-    for number, position in printed:
+    printed = [match for line in text.splitlines() if (match := LINE.fullmatch(line))]
+    assert len(printed) == COUNT, text
+    first = printed[0]
+    for position, line in enumerate(printed):
+        assert int(line["sequence"]) == int(first["sequence"]) + position
+        number = int(line["number"])
+        assert number == int(first["number"]) + position
+        assert float(line["time_s"]) == pytest.approx(float(first["time_s"]) + position / 100, abs=2e-4)
+        assert line["version"] == "1"
         [items] = scene.items(ComponentType.MARKERS, np.array([number - 1]))
-        first = items[~np.isnan(items["x"])][0]
-        assert position == pytest.approx([first["x"], first["y"], first["z"]], abs=6e-4)
+        visible = items[~np.isnan(items["x"])]
+        assert (int(line["visible"]), int(line["count"])) == (len(visible), len(items))
+        coordinates = [float(line[axis]) for axis in "xyz"]
+        assert coordinates == pytest.approx([visible[0][axis] for axis in "xyz"], abs=6e-4)
 
 
-def test_the_c_example_prints_positions_from_lcm(endpoint: str, tmp_path: Path) -> None:  # noqa: ARG001
-    if shutil.which("cc") is None or shutil.which("make") is None:
-        pytest.skip("no C compiler here (cc, make)")
-    build = subprocess.run(
-        ["make", "-C", str(ROOT / "examples"), f"PYTHON={sys.executable}", f"BUILD={tmp_path}"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    assert build.returncode == 0, build.stderr
-    with run_program(str(tmp_path / "subscriber"), "LAB", "20", ready="listening") as program:
-        text = program.communicate(timeout=30)[0]
-    assert_positions_match_the_scene(text.replace(" missing", ""), 15)
-    assert program.returncode == 0
-
-
-def test_the_python_example_prints_positions_from_lcm(endpoint: str) -> None:  # noqa: ARG001
-    command = [sys.executable, str(ROOT / "examples/subscriber_lcm.py"), "LAB", "20"]
-    with run_program(*command, ready="listening") as program:
-        assert_positions_match_the_scene(program.communicate(timeout=30)[0], 15)
-
-
-def test_the_python_example_prints_positions_from_zenoh(endpoint: str) -> None:
-    command = [
-        sys.executable,
-        str(ROOT / "examples/subscriber_zenoh.py"),
-        "--connect",
-        endpoint,
-        "--count",
-        "20",
-    ]
-    with run_program(*command, ready="listening") as program:
-        assert_positions_match_the_scene(program.communicate(timeout=30)[0], 15)
+@pytest.mark.parametrize(
+    "program", [program for program in PROGRAMS if program.arguments is not None], ids=str
+)
+def test_each_program_prints_the_markers_of_every_frame(endpoint: str, program: ExampleProgram) -> None:
+    program.build()
+    with run_program(*program.run_command(endpoint), ready="listening") as process:
+        text = process.communicate(timeout=30)[0]
+    assert process.returncode == 0, text
+    assert_lines_match_the_scene(text)
 
 
 @pytest.mark.parametrize("name", ["subscriber_lcm.py", "subscriber_zenoh.py"])
 def test_the_python_examples_ignore_malformed_messages_and_end_quietly_at_ctrl_c(name: str) -> None:
     port = free_port()
     options = ["--connect", f"tcp/127.0.0.1:{port}"] if "zenoh" in name else ["OTHER"]
-    command = [sys.executable, str(ROOT / "examples" / name)]
+    command = [sys.executable, str(EXAMPLES / name)]
     assert "usage:" in subprocess.check_output([*command, "--help"], text=True)
     connection = lcm.LCM(LCM_URL)
     with (

@@ -90,8 +90,9 @@ def test_the_wheel_contains_message_types_and_configurations(
 ) -> None:
     names = request.getfixturevalue(kind).names
     message_types = {f"rtc3d/{path.name}" for path in (ROOT / "lcm_types/rtc3d").glob("*.lcm")}
+    vectors = {f"rtc3d/vectors/{name}" for name in files_in(ROOT / "lcm_types/vectors")}
     configurations = {f"gateway/_config/{name}" for name in files_in(ROOT / "config")}
-    assert message_types | configurations | {"gateway/py.typed"} | set(COMPILED_MODULES) <= names
+    assert message_types | vectors | configurations | {"gateway/py.typed"} | set(COMPILED_MODULES) <= names
     assert not any(name.startswith(("tests/", "benchmarks/")) for name in names)
 
 

@@ -1,0 +1,83 @@
+"""The programs in examples/ that receive what the gateway publishes: how each is built and run.
+
+To add a program, add it to PROGRAMS, and what builds it, if anything does, to examples/Makefile. The tests in
+tests/integration/test_examples.py and test_example_vectors.py then run it:
+
+- with the option --vectors, which lcm_types/vectors/README.md describes;
+- with its ``arguments``: it says "listening" when it has subscribed. It prints a line for each frame, such as
+  "#41 frame 7 at 0.0600 s with parameters 1: 18 of 20 markers in view, the first at 1.000, 2.000, 3.000 mm".
+  It ends with status 0 after ``COUNT`` frames.
+"""
+
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+import pytest
+
+from gateway.messages.decode import MESSAGE_TYPES_BY_NAME
+
+ROOT: Final = Path(__file__).parents[1]
+EXAMPLES: Final = ROOT / "examples"
+COUNT: Final = 20
+
+COMPONENT_TYPES: Final = frozenset({"markers_t", "tools_t", "analog_t", "forces_t", "events_t"})
+BYTE_TABLE_TYPES: Final = COMPONENT_TYPES | {"tool_pose_t"}
+"""What a program without generated code decodes."""
+
+ALL_TYPES: Final = frozenset(MESSAGE_TYPES_BY_NAME)
+_ON_LCM: Final = ("LAB", str(COUNT))
+_ON_ZENOH: Final = ("--connect", "{endpoint}", "--source", "lab", "--count", str(COUNT))
+
+
+@dataclass(frozen=True)
+class ExampleProgram:
+    """A program, in one file of examples/.
+
+    ``command`` runs it in the folder examples. ``arguments`` make it subscribe to the markers of the source
+    "lab" and end after COUNT frames; {endpoint} stands for the gateway's Zenoh endpoint. Without them, it
+    only decodes. ``types`` are those that --vectors decodes. ``target`` is its name for ``make -C examples``;
+    None if it is not built. ``tools`` are the programs that building and running it need.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    arguments: tuple[str, ...] | None = None
+    types: frozenset[str] = BYTE_TABLE_TYPES
+    target: str | None = None
+    tools: tuple[str, ...] = ()
+
+    def __str__(self) -> str:
+        return self.name
+
+    def build(self) -> None:
+        """Build the program if it is not up to date; skip the test if tools are missing, and fail in CI."""
+        missing = [tool for tool in self.tools if shutil.which(tool) is None]
+        if missing:
+            reason = f"the example {self.name} needs {' and '.join(missing)}"
+            (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)
+        if self.target is None:
+            return
+        make = ["make", "-C", str(EXAMPLES), f"PYTHON={sys.executable}", self.target]
+        environment = {name: value for name, value in os.environ.items() if name != "MAKEFLAGS"}
+        built = subprocess.run(make, env=environment, capture_output=True, text=True, check=False)
+        assert built.returncode == 0, built.stdout + built.stderr
+
+    def run_command(self, endpoint: str) -> list[str]:
+        """Return the command that prints COUNT frames."""
+        return [*self.command, *(argument.format(endpoint=endpoint) for argument in self.arguments or ())]
+
+
+def _python(file: str) -> tuple[str, ...]:
+    return (sys.executable, file)
+
+
+PROGRAMS: Final = (
+    ExampleProgram("Python, LCM", _python("subscriber_lcm.py"), _ON_LCM, ALL_TYPES),
+    ExampleProgram("Python, Zenoh", _python("subscriber_zenoh.py"), _ON_ZENOH),
+    ExampleProgram("C, LCM", ("build/subscriber",), _ON_LCM, ALL_TYPES, "c", ("cc", "make")),
+)

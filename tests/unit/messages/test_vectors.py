@@ -1,0 +1,94 @@
+"""The test vectors in lcm_types/vectors/, against lcm-gen's types and against what the gateway publishes."""
+
+from typing import Any
+
+import pytest
+import rtc3d
+
+from gateway.messages.decode import MESSAGE_TYPES_BY_NAME, decode
+from gateway.messages.encode import MESSAGE_TYPES, encode_message
+from gateway.messages.stamp import Stamp
+from gateway.rtc3d.components import ComponentType
+from tests.message_vectors import FOLDER, VECTORS, MessageVector, difference
+from tests.unit.messages.samples import received
+from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, SHORT_EVENTS, TOOLS, ComponentVector
+
+STAMP = Stamp(1_700_000_000_000_001, 1_700_000_000_000_000, session=3, parameters_version=5)
+SEQUENCE = 41
+
+each_vector = pytest.mark.parametrize("vector", VECTORS, ids=str)
+
+
+def to_vector_values(value: Any) -> Any:
+    """Return an LCM object as in the vectors: numbers that JSON cannot hold are texts."""
+    if hasattr(value, "__slots__"):
+        return {name: to_vector_values(getattr(value, name)) for name in value.__slots__}
+    if isinstance(value, list | tuple):
+        return [to_vector_values(item) for item in value]
+    return str(value) if isinstance(value, float) and value - value != 0 else value
+
+
+def from_vector_values(lcm_type: Any, values: dict[str, Any]) -> Any:
+    """Return an LCM object with the values of a vector."""
+    message = lcm_type()
+    for field, type_name in zip(lcm_type.__slots__, lcm_type.__typenames__, strict=True):
+        setattr(message, field, _from_values(type_name, values[field]))
+    return message
+
+
+def _from_values(type_name: str, value: Any) -> Any:
+    if isinstance(value, list):
+        return [_from_values(type_name, item) for item in value]
+    if isinstance(value, dict):
+        return from_vector_values(getattr(rtc3d, type_name.removeprefix("rtc3d.")), value)
+    return float(value) if type_name in {"float", "double"} else value
+
+
+def test_each_message_type_has_vectors_and_each_vector_a_name() -> None:
+    assert {path.stem for path in FOLDER.glob("*.json")} == set(MESSAGE_TYPES_BY_NAME) - {"status_t"}
+    assert len({str(vector) for vector in VECTORS}) == len(VECTORS)
+
+
+@each_vector
+def test_the_fields_of_a_vector_are_its_bytes(vector: MessageVector) -> None:
+    assert b"".join(part for part, _ in vector.fields) == vector.data
+
+
+@each_vector
+def test_the_generated_type_decodes_the_bytes_to_the_values(vector: MessageVector) -> None:
+    decoded = vector.lcm_type.decode(vector.data)
+    assert difference(vector.lcm_type, vector.values, to_vector_values(decoded)) is None
+
+
+@each_vector
+def test_the_gateway_decodes_the_bytes_to_the_values(vector: MessageVector) -> None:
+    decoded = decode(vector.data)
+    assert type(decoded) is vector.lcm_type
+    assert difference(vector.lcm_type, vector.values, to_vector_values(decoded)) is None
+
+
+@each_vector
+def test_the_generated_type_encodes_the_values_to_the_bytes(vector: MessageVector) -> None:
+    encoded = from_vector_values(vector.lcm_type, vector.values).encode()
+    # lcm-gen encodes the NaN of Python; servers mark what is missing with a NaN of which all bits are set.
+    assert encoded.replace(b"\x7f\xc0\0\0", b"\xff" * 4) == vector.data.replace(b"\x7f\xc0\0\0", b"\xff" * 4)
+
+
+@pytest.mark.parametrize(
+    ("component", "name"),
+    [
+        (MARKERS, "two markers, the second missing"),
+        (TOOLS, "two tools, the second out of view"),
+        (ANALOG, "three channels"),
+        (FORCE, "two plates"),
+        (SHORT_EVENTS, "two events that the server sent with 16 bytes"),
+        (LONG_EVENTS, "two events that the server sent with 24 bytes"),
+    ],
+)
+def test_the_gateway_publishes_the_bytes_for_the_components_of_tests_vectors(
+    component: ComponentVector, name: str
+) -> None:
+    type_name = MESSAGE_TYPES[ComponentType(component.type)].__name__
+    [vector] = [vector for vector in VECTORS if (vector.type_name, vector.name) == (type_name, name)]
+    for order in ("big", "little"):
+        assert encode_message(received(component, order), STAMP, SEQUENCE) == vector.data
