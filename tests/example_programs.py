@@ -34,6 +34,10 @@ _ON_LCM: Final = ("LAB", str(COUNT))
 _ON_ZENOH: Final = ("--connect", "{endpoint}", "--source", "lab", "--count", str(COUNT))
 
 
+_CSHARP: Final = ("mono", "build/subscriber.exe")
+_JAVA: Final = ("java", "-jar", "build/subscriber.jar")
+
+
 @dataclass(frozen=True)
 class ExampleProgram:
     """A program, in one file of examples/.
@@ -80,4 +84,7 @@ PROGRAMS: Final = (
     ExampleProgram("Python, LCM", _python("subscriber_lcm.py"), _ON_LCM, ALL_TYPES),
     ExampleProgram("Python, Zenoh", _python("subscriber_zenoh.py"), _ON_ZENOH),
     ExampleProgram("C, LCM", ("build/subscriber",), _ON_LCM, ALL_TYPES, "c", ("cc", "make")),
+    ExampleProgram("C++, LCM", ("build/subscriber_cpp",), _ON_LCM, ALL_TYPES, "cpp", ("c++", "make")),
+    ExampleProgram("Java, LCM", _JAVA, _ON_LCM, ALL_TYPES, "java", ("javac", "java", "make")),
+    ExampleProgram("C#, LCM", _CSHARP, _ON_LCM, ALL_TYPES, "csharp", ("mcs", "mono", "make")),
 )

@@ -1,0 +1,177 @@
+// Print the markers that a gateway publishes on LCM.
+//
+//   make -C examples java && java -jar examples/build/subscriber.jar [SOURCE [COUNT]]     for example: LAB 100
+//
+// Building needs a JDK (11 or newer), make, and the Python package lcm, which has lcm.jar and lcm-gen. SOURCE is the
+// name of the source in upper case. The program stops after COUNT frames. The environment variable LCM_DEFAULT_URL sets
+// the LCM URL. With --vectors, the program decodes messages from standard input instead (lcm_types/vectors/README.md).
+
+import static java.nio.charset.StandardCharsets.ISO_8859_1;
+import static java.nio.charset.StandardCharsets.UTF_8;
+
+import java.io.BufferedReader;
+import java.io.DataInput;
+import java.io.IOException;
+import java.io.InputStreamReader;
+import java.io.PrintStream;
+import java.lang.reflect.Array;
+import java.lang.reflect.Field;
+import java.lang.reflect.Modifier;
+import java.nio.ByteBuffer;
+import java.util.Locale;
+import java.util.Map;
+import java.util.StringJoiner;
+import java.util.concurrent.CountDownLatch;
+import lcm.lcm.LCM;
+import lcm.lcm.LCMDataInputStream;
+
+public final class Subscriber {
+    /** The bytes of one item of each type of component message. */
+    private static final Map<String, Integer> ITEM_BYTES =
+            Map.of("markers_t", 16, "tools_t", 32, "analog_t", 4, "forces_t", 24, "events_t", 24);
+
+    private static final PrintStream out = new PrintStream(System.out, true, UTF_8);
+
+    public static void main(String[] arguments) throws Exception {
+        if (arguments.length > 0 && arguments[0].equals("--vectors")) {
+            printVectors();
+        } else if (arguments.length > 0 && arguments[0].startsWith("-")) {
+            out.println("Print the markers that a gateway publishes on LCM.");
+            out.println("Arguments: [SOURCE [COUNT]], or --vectors < LINES");
+            System.exit(arguments[0].equals("--help") ? 0 : 2);
+        } else {
+            String source = arguments.length > 0 ? arguments[0] : "LAB";
+            subscribe(source, arguments.length > 1 ? Integer.parseInt(arguments[1]) : Integer.MAX_VALUE);
+        }
+    }
+
+    private static void subscribe(String source, int count) throws Exception {
+        CountDownLatch framesLeft = new CountDownLatch(count);
+        LCM lcm = new LCM();
+        lcm.subscribe("MOCAP_" + source + "_3D", (from, channel, input) -> {
+            try {
+                byte[] data = new byte[input.available()];
+                input.readFully(data);
+                if (framesLeft.getCount() > 0) {
+                    printMarkers((rtc3d.markers_t) decode("markers_t", data));
+                }
+                framesLeft.countDown();
+            } catch (IOException error) {
+                System.err.println("ignored a malformed message on " + channel + ": " + error.getMessage());
+            }
+        });
+        out.println("listening");
+        framesLeft.await();
+        lcm.close();
+        System.exit(0); // LCM's thread would wait for one more message
+    }
+
+    private static void printMarkers(rtc3d.markers_t message) {
+        rtc3d.marker_t first = null;
+        int visible = 0;
+        for (rtc3d.marker_t marker : message.markers) {
+            if (!Float.isNaN(marker.x)) {
+                visible++;
+                first = first == null ? marker : first;
+            }
+        }
+        String line = String.format(
+                Locale.ROOT,
+                "#%d frame %d at %.4f s with parameters %d: %d of %d markers in view",
+                message.sequence,
+                message.frame_number,
+                message.timestamp / 1e6,
+                message.parameters_version,
+                visible,
+                message.num_markers);
+        if (first != null) {
+            line += String.format(Locale.ROOT, ", the first at %.3f, %.3f, %.3f mm", first.x, first.y, first.z);
+        }
+        out.println(line);
+    }
+
+    /**
+     * Return the message as an object of its class.
+     *
+     * <p>Component messages must have as many bytes as they say that they have items, because the classes of lcm-gen
+     * allocate memory for the items before they look.
+     */
+    private static Object decode(String typeName, byte[] data) throws IOException {
+        Integer itemBytes = ITEM_BYTES.get(typeName);
+        if (itemBytes != null
+                && (data.length < 56 || data.length != 56 + (long) itemBytes * ByteBuffer.wrap(data).getInt(52))) {
+            throw new IOException(data.length + " bytes are not a whole " + typeName);
+        }
+        try {
+            LCMDataInputStream input = new LCMDataInputStream(data);
+            Object message = Class.forName("rtc3d." + typeName).getConstructor(DataInput.class).newInstance(input);
+            if (input.available() == 0) {
+                return message;
+            }
+        } catch (ReflectiveOperationException error) {
+            // An unknown type, or what its constructor throws.
+        }
+        throw new IOException(data.length + " bytes are not a whole " + typeName);
+    }
+
+    /** Read lines TYPE HEX, and print the values of each message, or what is wrong, as a line of JSON. */
+    private static void printVectors() throws IOException, IllegalAccessException {
+        BufferedReader input = new BufferedReader(new InputStreamReader(System.in, UTF_8));
+        for (String line = input.readLine(); line != null; line = input.readLine()) {
+            String[] words = line.trim().split(" ");
+            String digits = words.length > 1 ? words[1] : "";
+            byte[] data = new byte[digits.length() / 2];
+            for (int i = 0; i < data.length; i++) {
+                data[i] = (byte) Integer.parseInt(digits.substring(2 * i, 2 * i + 2), 16);
+            }
+            try {
+                out.println(toJson(decode(words[0], data)));
+            } catch (IOException error) {
+                out.println("{\"error\": " + quoted(error.getMessage()) + "}");
+            }
+        }
+    }
+
+    private static String toJson(Object value) throws IllegalAccessException {
+        if (value instanceof String) {
+            // The classes of lcm-gen make each byte of a text a character. The gateway's texts are UTF-8.
+            return quoted(new String(((String) value).getBytes(ISO_8859_1), UTF_8));
+        }
+        if (value instanceof Float || value instanceof Double) {
+            double number = ((Number) value).doubleValue();
+            if (Double.isFinite(number)) {
+                return value.toString();
+            }
+            return Double.isNaN(number) ? "\"nan\"" : number > 0 ? "\"inf\"" : "\"-inf\"";
+        }
+        if (value instanceof Number || value instanceof Boolean) {
+            return value.toString();
+        }
+        if (value.getClass().isArray()) {
+            StringJoiner items = new StringJoiner(", ", "[", "]");
+            for (int i = 0; i < Array.getLength(value); i++) {
+                items.add(toJson(Array.get(value, i)));
+            }
+            return items.toString();
+        }
+        StringJoiner fields = new StringJoiner(", ", "{", "}");
+        for (Field field : value.getClass().getFields()) {
+            if (!Modifier.isStatic(field.getModifiers())) {
+                fields.add("\"" + field.getName() + "\": " + toJson(field.get(value)));
+            }
+        }
+        return fields.toString();
+    }
+
+    private static String quoted(String text) {
+        StringBuilder quoted = new StringBuilder("\"");
+        for (char letter : text.toCharArray()) {
+            if (letter < ' ') {
+                quoted.append(String.format("\\u%04x", (int) letter));
+            } else {
+                quoted.append(letter == '"' || letter == '\\' ? "\\" : "").append(letter);
+            }
+        }
+        return quoted.append('"').toString();
+    }
+}

@@ -1,0 +1,317 @@
+// Print the markers that a gateway publishes on LCM.
+//
+//   make -C examples csharp && mono examples/build/subscriber.exe [SOURCE [COUNT]]     for example: LAB 100
+//
+// Building needs Mono (mcs), make, and the Python package lcm, which has lcm-gen. SOURCE is the name of the source in
+// upper case. The program stops after COUNT frames. The environment variable LCM_DEFAULT_URL sets the LCM URL. With
+// --vectors, the program decodes messages from standard input instead (lcm_types/vectors/README.md).
+//
+// LCM's own library for .NET is no longer maintained. What the classes of lcm-gen need from it, and the reception of
+// LCM's UDP packets, is therefore in this file.
+using System;
+using System.Collections.Generic;
+using System.Globalization;
+using System.IO;
+using System.Linq;
+using System.Net;
+using System.Net.Sockets;
+using System.Reflection;
+using System.Text;
+
+static class Subscriber
+{
+    static int Main(string[] arguments)
+    {
+        CultureInfo.DefaultThreadCurrentCulture = CultureInfo.CurrentCulture = CultureInfo.InvariantCulture;
+        Console.SetOut(new StreamWriter(Console.OpenStandardOutput(), new UTF8Encoding(false)) { AutoFlush = true });
+        if (arguments.Length > 0 && arguments[0] == "--vectors")
+            return PrintVectors();
+        if (arguments.Length > 0 && arguments[0].StartsWith("-"))
+        {
+            Console.WriteLine("Print the markers that a gateway publishes on LCM.");
+            Console.WriteLine("Arguments: [SOURCE [COUNT]], or --vectors < LINES");
+            return arguments[0] == "--help" ? 0 : 2;
+        }
+        var source = arguments.Length > 0 ? arguments[0] : "LAB";
+        Subscribe("MOCAP_" + source + "_3D", arguments.Length > 1 ? long.Parse(arguments[1]) : long.MaxValue);
+        return 0;
+    }
+
+    static void Subscribe(string channel, long count)
+    {
+        using (var receiver = new LcmReceiver(Environment.GetEnvironmentVariable("LCM_DEFAULT_URL")))
+        {
+            Console.WriteLine("listening");
+            while (count > 0)
+            {
+                var data = receiver.Receive(channel);
+                try
+                {
+                    PrintMarkers((rtc3d.markers_t)Decode("markers_t", data));
+                    count--;
+                }
+                catch (InvalidDataException error)
+                {
+                    Console.Error.WriteLine("ignored a malformed message on " + channel + ": " + error.Message);
+                }
+            }
+        }
+    }
+
+    static void PrintMarkers(rtc3d.markers_t message)
+    {
+        var visible = message.markers.Where(marker => !float.IsNaN(marker.x)).ToList();
+        var line = string.Format(
+            "#{0} frame {1} at {2:F4} s with parameters {3}: {4} of {5} markers in view",
+            message.sequence, message.frame_number, message.timestamp / 1e6, message.parameters_version,
+            visible.Count, message.num_markers);
+        if (visible.Count > 0)
+            line += string.Format(", the first at {0:F3}, {1:F3}, {2:F3} mm", visible[0].x, visible[0].y, visible[0].z);
+        Console.WriteLine(line);
+    }
+
+    // The bytes of one item of each type of component message.
+    static readonly Dictionary<string, int> itemBytes = new Dictionary<string, int>
+    {
+        { "markers_t", 16 }, { "tools_t", 32 }, { "analog_t", 4 }, { "forces_t", 24 }, { "events_t", 24 },
+    };
+
+    // Return the message as an object of its class. Component messages must have as many bytes as they say that they
+    // have items, because the classes of lcm-gen allocate memory for the items before they look.
+    static object Decode(string typeName, byte[] data)
+    {
+        int size;
+        var isWhole = true;
+        if (itemBytes.TryGetValue(typeName, out size))
+        {
+            isWhole = data.Length >= 56;
+            isWhole = isWhole && data.Length == 56 + (long)size * LCM.LCM.LCMDataInputStream.Integer(data, 52);
+        }
+        var type = Assembly.GetExecutingAssembly().GetType("rtc3d." + typeName);
+        if (isWhole && type != null)
+        {
+            var input = new LCM.LCM.LCMDataInputStream(data);
+            try
+            {
+                var message = Activator.CreateInstance(type, input);
+                if (input.Available == 0)
+                    return message;
+            }
+            catch (TargetInvocationException)
+            {
+                // A wrong fingerprint, or a message that ends too early.
+            }
+        }
+        throw new InvalidDataException(data.Length + " bytes are not a whole " + typeName);
+    }
+
+    // Read lines TYPE HEX, and print the values of each message, or what is wrong, as a line of JSON.
+    static int PrintVectors()
+    {
+        for (var line = Console.ReadLine(); line != null; line = Console.ReadLine())
+        {
+            var words = line.Trim().Split(' ');
+            var digits = words.Length > 1 ? words[1] : "";
+            var data = Enumerable.Range(0, digits.Length / 2)
+                .Select(i => Convert.ToByte(digits.Substring(2 * i, 2), 16)).ToArray();
+            try
+            {
+                Console.WriteLine(Json(Decode(words[0], data)));
+            }
+            catch (InvalidDataException error)
+            {
+                Console.WriteLine("{\"error\": " + Quoted(error.Message) + "}");
+            }
+        }
+        return 0;
+    }
+
+    static string Json(object value)
+    {
+        if (value is string)
+            return Quoted((string)value);
+        if (value is bool)
+            return (bool)value ? "true" : "false";
+        if (value is float || value is double)
+        {
+            var number = Convert.ToDouble(value);
+            if (double.IsNaN(number) || double.IsInfinity(number))
+                return double.IsNaN(number) ? "\"nan\"" : number > 0 ? "\"inf\"" : "\"-inf\"";
+            return number.ToString(value is float ? "G9" : "G17");
+        }
+        if (value is IConvertible)
+            return Convert.ToString(value);
+        if (value is Array)
+            return "[" + string.Join(", ", ((Array)value).Cast<object>().Select(Json)) + "]";
+        var fields = value.GetType().GetFields(BindingFlags.Public | BindingFlags.Instance);
+        return "{" + string.Join(", ", fields.Select(f => "\"" + f.Name + "\": " + Json(f.GetValue(value)))) + "}";
+    }
+
+    static string Quoted(string text)
+    {
+        var quoted = new StringBuilder("\"");
+        foreach (var letter in text)
+        {
+            if (letter < ' ')
+                quoted.AppendFormat("\\u{0:x4}", (int)letter);
+            else
+                quoted.Append(letter == '"' || letter == '\\' ? "\\" : "").Append(letter);
+        }
+        return quoted.Append('"').ToString();
+    }
+}
+
+// Receives the messages of a multicast group. LCM sends a message of up to 64 kB as one UDP packet: "LC02", a number of
+// 4 bytes, the channel and a NUL, the message. It cuts up larger messages, which this class does not put together.
+sealed class LcmReceiver : IDisposable
+{
+    readonly UdpClient client = new UdpClient();
+
+    public LcmReceiver(string url)
+    {
+        var address = new Uri(string.IsNullOrEmpty(url) ? "udpm://239.255.76.67:7667" : url);
+        client.Client.SetSocketOption(SocketOptionLevel.Socket, SocketOptionName.ReuseAddress, true);
+        client.Client.ReceiveBufferSize = 1 << 20;
+        client.Client.Bind(new IPEndPoint(IPAddress.Any, address.Port));
+        client.JoinMulticastGroup(IPAddress.Parse(address.Host));
+    }
+
+    // Wait for a message on this channel, and return its bytes.
+    public byte[] Receive(string channel)
+    {
+        var start = Encoding.ASCII.GetBytes(channel + "\0");
+        while (true)
+        {
+            IPEndPoint sender = null;
+            var packet = client.Receive(ref sender);
+            if (Encoding.ASCII.GetString(packet, 0, Math.Min(packet.Length, 4)) == "LC02"
+                    && packet.Skip(8).Take(start.Length).SequenceEqual(start))
+                return packet.Skip(8 + start.Length).ToArray();
+        }
+    }
+
+    public void Dispose()
+    {
+        client.Close();
+    }
+}
+
+// What the classes of lcm-gen need from LCM's library for .NET.
+namespace LCM.LCM
+{
+    public interface LCMEncodable
+    {
+        void Encode(LCMDataOutputStream output);
+    }
+
+    // Reads big-endian values, and throws EndOfStreamException at the end.
+    public sealed class LCMDataInputStream
+    {
+        readonly byte[] data;
+        int position;
+
+        public LCMDataInputStream(byte[] data)
+        {
+            this.data = data;
+        }
+
+        public int Available
+        {
+            get { return data.Length - position; }
+        }
+
+        public static int Integer(byte[] data, int position)
+        {
+            return IPAddress.NetworkToHostOrder(BitConverter.ToInt32(data, position));
+        }
+
+        public byte ReadByte()
+        {
+            return data[Advance(1)];
+        }
+
+        public bool ReadBoolean()
+        {
+            return ReadByte() != 0;
+        }
+
+        public int ReadInt32()
+        {
+            return Integer(data, Advance(4));
+        }
+
+        public long ReadInt64()
+        {
+            return IPAddress.NetworkToHostOrder(BitConverter.ToInt64(data, Advance(8)));
+        }
+
+        public float ReadSingle()
+        {
+            return BitConverter.ToSingle(BitConverter.GetBytes(ReadInt32()), 0);
+        }
+
+        public double ReadDouble()
+        {
+            return BitConverter.Int64BitsToDouble(ReadInt64());
+        }
+
+        public void ReadFully(byte[] bytes)
+        {
+            Array.Copy(data, Advance(bytes.Length), bytes, 0, bytes.Length);
+        }
+
+        int Advance(int size)
+        {
+            if (size > Available)
+                throw new EndOfStreamException();
+            position += size;
+            return position - size;
+        }
+    }
+
+    // Writes big-endian values, for programs that publish.
+    public sealed class LCMDataOutputStream
+    {
+        readonly MemoryStream data = new MemoryStream();
+
+        public byte[] ToArray()
+        {
+            return data.ToArray();
+        }
+
+        public void Write(byte[] bytes, int offset, int size)
+        {
+            data.Write(bytes, offset, size);
+        }
+
+        public void Write(byte value)
+        {
+            data.WriteByte(value);
+        }
+
+        public void Write(bool value)
+        {
+            data.WriteByte((byte)(value ? 1 : 0));
+        }
+
+        public void Write(int value)
+        {
+            Write(BitConverter.GetBytes(IPAddress.HostToNetworkOrder(value)), 0, 4);
+        }
+
+        public void Write(long value)
+        {
+            Write(BitConverter.GetBytes(IPAddress.HostToNetworkOrder(value)), 0, 8);
+        }
+
+        public void Write(float value)
+        {
+            Write(BitConverter.ToInt32(BitConverter.GetBytes(value), 0));
+        }
+
+        public void Write(double value)
+        {
+            Write(BitConverter.DoubleToInt64Bits(value));
+        }
+    }
+}
