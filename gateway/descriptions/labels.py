@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from typing import Final, NamedTuple, TypeVar
 
-from gateway.messages.topics import MAX_LABEL_LENGTH
+from gateway.messages.topics import JSON_NAME, MAX_LABEL_LENGTH
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 
@@ -114,7 +114,7 @@ def _unique_labels(labels: Iterable[str], noun: str, num_items: int) -> tuple[st
     """Return ``num_items`` different labels, as ``topics.unique_name`` makes them for the keys of tools."""
     given = [label.strip() for label, _ in zip(labels, range(num_items), strict=False)]
     given += [""] * (num_items - len(given))
-    names: dict[str, None] = {}
+    names: dict[str, None] = {JSON_NAME: None} if noun == "tool" else {}  # no key of a tool is that of JSON
     numbers: dict[str, int] = {}  # tried last, by label; many items may have the same label
     for position, label in enumerate(given, start=1):
         base = (label or f"{noun} {position}")[:MAX_LABEL_LENGTH]
@@ -125,4 +125,4 @@ def _unique_labels(labels: Iterable[str], noun: str, num_items: int) -> tuple[st
             name = base[: MAX_LABEL_LENGTH - len(suffix)] + suffix
         numbers[base] = number
         names[name] = None
-    return tuple(names)
+    return tuple(names)[-num_items:] if num_items else ()

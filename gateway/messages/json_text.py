@@ -7,7 +7,10 @@ markers, in which no frame is published. It is not faster either: for 1000 marke
 
 from functools import cache
 from json.encoder import encode_basestring
-from typing import Any
+from typing import Any, Final
+
+MAX_JSON_SOURCE_BYTES: Final = 1024 * 1024
+"""Longer messages (65,000 markers) are not converted: the text would have six times as many bytes."""
 
 
 def json_text(value: Any) -> str:

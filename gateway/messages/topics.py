@@ -11,6 +11,9 @@ MAX_CHANNEL_LENGTH = 63
 MAX_LABEL_LENGTH = 200
 """A tool's label comes from the server and becomes part of a key; Zenoh panics over keys of 64 kB."""
 
+JSON_NAME = "json"
+"""The last part of a key with JSON: the key of a component or of a tool, then this. No tool is called so."""
+
 
 class Topic(NamedTuple):
     """A series of messages of one LCM type from ``source``, with a key on Zenoh and a channel on LCM.
@@ -28,6 +31,11 @@ class Topic(NamedTuple):
 def zenoh_key(prefix: str, source: str, *path: str) -> str:
     """Return the key ``prefix/source/path…`` with each chunk of ``path`` escaped."""
     return "/".join([prefix, source, *(escape_key_chunk(name) for name in path)])
+
+
+def is_json_key(key: str) -> bool:
+    """Return whether this is a Zenoh key of JSON."""
+    return key.endswith(f"/{JSON_NAME}")
 
 
 def escape_key_chunk(label: str) -> str:

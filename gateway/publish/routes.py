@@ -14,8 +14,8 @@ from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name, message_timest
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import FramePublisher, Output
+from gateway.outputs.pacing import Pacer
 from gateway.outputs.status import OutputStatus
-from gateway.publish.pacing import Pacer
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 

@@ -8,7 +8,7 @@ import rtc3d
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.stamp import Stamp
 from gateway.messages.tool_pose import tool_poses
-from gateway.messages.topics import MAX_LABEL_LENGTH, unique_name
+from gateway.messages.topics import JSON_NAME, MAX_LABEL_LENGTH, unique_name
 from gateway.outputs.contract import ServerParameters
 from gateway.publish.routes import OutputRoute, TopicRoute
 from gateway.rtc3d.components import Component, ComponentType
@@ -135,7 +135,7 @@ class ToolPoses:
 
     def _open_topics(self, num_tools: int) -> None:
         """Open what is missing of ``num_tools`` topics. A name that had a topic before continues counting."""
-        names = {tool.name for tool in self._tools}
+        names = {JSON_NAME} | {tool.name for tool in self._tools}
         for index in range(len(self._tools), num_tools):
             label = self._labels[index].strip() if index < len(self._labels) else ""
             name = unique_name(label or f"tool {index + 1}", names, MAX_LABEL_LENGTH)

@@ -8,10 +8,7 @@ from typing import Final
 
 from gateway.errors import QueryError
 from gateway.messages.decode import decode
-from gateway.messages.json_text import json_text
-
-MAX_JSON_SOURCE_BYTES: Final = 1024 * 1024
-"""Longer messages (65,000 markers) are not converted: the text would have six times as many bytes."""
+from gateway.messages.json_text import MAX_JSON_SOURCE_BYTES, json_text
 
 JSON_RATIO: Final = 8
 """How many times as long as its message a JSON text may be, about."""

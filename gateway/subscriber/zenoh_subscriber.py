@@ -8,7 +8,7 @@ from urllib.parse import unquote
 
 import zenoh
 
-from gateway.messages.topics import lcm_channel, zenoh_key
+from gateway.messages.topics import is_json_key, lcm_channel, zenoh_key
 from gateway.outputs.lcm.settings import DEFAULT_LCM_PREFIX
 from gateway.outputs.zenoh.subscriber import no_gateway, served_sources
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
@@ -19,7 +19,7 @@ _QUERY_S: Final = 1.0
 
 _SOURCE_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,24}")
 _NO_KEYS: Final = {"c3d", "recording", "take"}
-"""Keys of a source that are not messages: they are ignored."""
+"""Keys of a source that are not messages: they are ignored, like JSON."""
 
 _PLAIN_KEYS: Final = {*COMPONENTS_BY_KEY, "status", "clock", "parameters"}
 _INT32: Final = range(-(1 << 31), 1 << 31)
@@ -46,8 +46,10 @@ class ZenohGatewaySubscriber:
         self._series: dict[str, Series | None] = {}  # by key; None: left out
         for name in self._served():
             self._source(name)
-        wanted = ["**"] if components is None else [*components, "status", "parameters"]
-        paths = dict.fromkeys("6d/**" if path == "6d" else path for path in wanted)
+        # Never **: the gateway would make JSON of everything.
+        paths = ["*"] if components is None else [*dict.fromkeys((*components, "status", "parameters"))]
+        if components is None or "6d" in components:
+            paths.append(f"{POSE}*")
         for source in sources or ("*",):
             for path in paths:
                 session.declare_subscriber(f"{zenoh_key(prefix, source)}/{path}", self._receive)
@@ -85,7 +87,7 @@ class ZenohGatewaySubscriber:
             self._reception.ignore(beyond_limit=True)
             return None
         name, _, path = key.removeprefix(f"{self._prefix}/").partition("/")
-        if path in _NO_KEYS:
+        if path in _NO_KEYS or is_json_key(path):
             return None
         label = unquote(path.removeprefix(POSE)) if path.startswith(POSE) else None
         if not _SOURCE_NAME.fullmatch(name) or (label is None and path not in _PLAIN_KEYS):

@@ -115,7 +115,7 @@ class ZenohRig:
     def subscribe(self) -> None:
         self._session = open_zenoh("client", connect=self._endpoint)
         self._subscriber = ZenohSubscriber(
-            self._session, "mocap/**", lambda *each: self.received.append(each)
+            self._session, ["mocap/**"], lambda *each: self.received.append(each)
         )
 
     def cut(self) -> None:

@@ -23,7 +23,7 @@ from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.subscriber import LcmSubscriber, channel_pattern
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
-from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_pattern, open_zenoh
+from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_patterns, open_zenoh
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ITEM_DTYPES, ComponentType
 from gateway.rtc3d_server.scene import Scene
 from gateway.simulator.c3d_scene import C3dScene
@@ -85,7 +85,7 @@ async def lab(scene: Scene, *streams: StreamSettings) -> AsyncIterator[Lab]:
         try:
             ZenohSubscriber(
                 session,
-                key_pattern("mocap", "lab", None),
+                key_patterns("mocap", "lab", None),
                 lambda key, message: running.zenoh[key.rsplit("/", 1)[-1]].append(message),
             )
             await running.until(lambda: bool(running.zenoh["status"] and running.lcm["status"]))

@@ -105,7 +105,7 @@ def subscribed(builder: SettingsBuilder) -> Iterator[ReceivedMarkers]:
     """Subscribe to the markers of all sources on Zenoh and LCM."""
     received = ReceivedMarkers()
     session = open_zenoh(builder.endpoint)
-    ZenohSubscriber(session, "*/*/3d", received.append)
+    ZenohSubscriber(session, ["*/*/3d"], received.append)
     lcm_subscriber = LcmSubscriber(open_lcm(builder.url), ".*_3D", received.append)
     try:
         yield received

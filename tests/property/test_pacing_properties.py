@@ -4,7 +4,7 @@ from itertools import pairwise
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.publish.pacing import Pacer
+from gateway.outputs.pacing import Pacer
 
 EPOCH_UTIME = 1_700_000_000_000_000
 

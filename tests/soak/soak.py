@@ -23,7 +23,7 @@ from rich.console import Console
 
 from gateway.messages.decode import decode
 from gateway.outputs.lcm.settings import LcmSettings
-from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_pattern, open_zenoh
+from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_patterns, open_zenoh
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.simulator.faults.control import Faults
 from gateway.simulator.faults.kinds import KINDS
@@ -160,7 +160,7 @@ class Soak:
             ports,
         )
         session = await asyncio.to_thread(open_zenoh, gateway.zenoh_endpoint)
-        ZenohSubscriber(session, key_pattern("mocap", "lab", None), self.messages.count)
+        ZenohSubscriber(session, key_patterns("mocap", "lab", None), self.messages.count)
         end_s = time.monotonic() + 60 * self.minutes
         try:
             await wait_until_async(lambda: self.messages.received["3d"] > RATE_HZ, 20)

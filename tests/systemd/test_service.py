@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from gateway.messages.decode import decode
-from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_pattern, open_zenoh
+from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_patterns, open_zenoh
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.fresh_clones import ROOT
@@ -169,7 +169,7 @@ def subscribed_to(endpoint: str) -> Iterator[Received]:
     received = Received()
     session = open_zenoh(endpoint)
     try:
-        ZenohSubscriber(session, key_pattern("mocap", None, "3d"), received.add)
+        ZenohSubscriber(session, key_patterns("mocap", None, "3d"), received.add)
         yield received
     finally:
         session.close()

@@ -7,7 +7,7 @@ from gateway.outputs.kind import DemoSide, OutputKind, Receive, Subscription
 from gateway.outputs.zenoh.checks import CHECKS, check_zenoh, leaves_host
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
-from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_pattern, open_zenoh, subscribe
+from gateway.outputs.zenoh.subscriber import ZenohSubscriber, key_patterns, open_zenoh, subscribe
 
 
 def _demo(_use_network: bool) -> DemoSide:
@@ -19,7 +19,7 @@ def _demo(_use_network: bool) -> DemoSide:
     )
 
     def subscribe_here(source: str, receive: Receive) -> Subscription:
-        keys = key_pattern(settings.prefix, source, None)
+        keys = key_patterns(settings.prefix, source, None)
         return ZenohSubscriber(open_zenoh(endpoint), keys, receive, owns_session=True)
 
     return DemoSide(settings, ZenohOutput(settings), subscribe_here, endpoint)

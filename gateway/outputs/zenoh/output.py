@@ -19,6 +19,7 @@ from gateway.messages.topics import Topic, zenoh_key
 from gateway.outputs.contract import Output, QueryService, ServerFile, ServerParameters
 from gateway.outputs.status import OutputHealth
 from gateway.outputs.zenoh.config import prepare_threads, zenoh_config, zenoh_reason
+from gateway.outputs.zenoh.json_keys import JsonKeys
 from gateway.outputs.zenoh.publisher import ZenohLink, ZenohPublisher
 from gateway.outputs.zenoh.queries import ZenohQueries
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -56,6 +57,7 @@ class ZenohOutput(Output):
         self.config = zenoh_config(settings.config) if config is None else config
         self._is_client = json.loads(self.config.get_json("mode") or "null") == "client"
         self._link = ZenohLink(self._refusal)
+        self._json = JsonKeys(settings.json_max_rate_hz)
         # Protects what the opening thread shares: session, publishers, tokens and queries.
         self._lock = threading.Lock()
         self._session: zenoh.Session | None = None
@@ -132,6 +134,7 @@ class ZenohOutput(Output):
         """Return a new publisher of ``topic``. It can send when the session is open."""
         key = zenoh_key(self.settings.prefix, topic.source, *topic.path)
         publisher = ZenohPublisher(self._link, key, topic.type_name, self.settings.express, self._forget)
+        publisher.json = self._json.publisher(topic, key, publisher.update_wanted)
         with self._lock:
             self._publishers.append(publisher)
             if self._session is not None:
@@ -181,7 +184,8 @@ class ZenohOutput(Output):
     # Sources: liveliness, queries, parameters.
 
     def count_losses(self, source: str, losses: Losses) -> None:
-        """Count in ``losses`` refused queries about ``source``, and parameters and files not published."""
+        """Count in ``losses`` refused queries about ``source``, and what else is not published of it."""
+        self._json.count_losses(source, losses)
         if self._queries is not None:
             self._queries.count_losses(source, losses)
 
@@ -219,6 +223,7 @@ class ZenohOutput(Output):
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
         """Publish the XML on PREFIX/SOURCE/parameters, now and for each later subscriber."""
+        self._json.set_parameters(source, parameters)
         return None if self._queries is None else self._queries.publish_parameters(source, parameters)
 
     def announce_file(self, source: str, file: ServerFile) -> None:
@@ -243,6 +248,7 @@ class ZenohOutput(Output):
     def close(self) -> None:
         """Close the session. Otherwise a process with Zenoh callbacks never ends."""
         self._closing.set()
+        self._json.close()
         if self._opener.is_alive():
             self._opener.join(_JOIN_S)  # If zenoh.open blocks longer, the thread closes what it opens.
         with self._lock:

@@ -10,6 +10,7 @@ import zenoh
 from gateway.errors import OutputError
 from gateway.outputs.encodings import LCM
 from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.outputs.zenoh.json_keys import JsonPublisher
 
 BURST_BYTES: Final = 128 * 1024
 BURST_S: Final = 0.002
@@ -58,13 +59,16 @@ class ZenohPublisher:
         self, link: ZenohLink, key: str, type_name: str, express: bool, forget: Callable[[Any], None]
     ) -> None:
         self.wanted = False
-        """Whether a subscriber matches the key now."""
+        """Whether a subscriber matches the key now, or that of the JSON."""
+        self.json: JsonPublisher | None = None
+        """Publishes the same messages as JSON; None if nothing does. Set before ``declare``."""
         self._link = link
         self._key = key
         self._type_name = type_name
         self._express = express
         self._forget = forget
         self._publisher: zenoh.Publisher | None = None
+        self._is_matched = False
         self._is_closed = False
 
     def declare(self, session: zenoh.Session) -> None:
@@ -77,17 +81,28 @@ class ZenohPublisher:
         )
         publisher.declare_matching_listener(self._on_matching)  # also reports existing subscribers
         self._publisher = publisher
+        if self.json is not None:
+            self.json.declare(session)
 
     def check_subscribers(self) -> None:
         """Check again for subscribers, because a notification may have been missed."""
         # Zenoh's type stub says that matching_status is a bool, but it is a MatchingStatus.
         publisher: Any = self._publisher
+        if self.json is not None:
+            self.json.check_subscribers()
         if publisher is not None:
-            self.wanted = publisher.matching_status.matching
+            self._is_matched = publisher.matching_status.matching
+            self.update_wanted()
 
     def _on_matching(self, status: zenoh.MatchingStatus) -> None:
-        # Runs in Zenoh's thread, so it only sets a flag.
-        self.wanted = status.matching and not self._is_closed
+        # Runs in Zenoh's thread, so it only sets flags.
+        self._is_matched = status.matching
+        self.update_wanted()
+
+    def update_wanted(self) -> None:
+        """Update ``wanted``, because a subscriber to one of the keys came or went."""
+        is_matched = self._is_matched or (self.json is not None and self.json.wanted)
+        self.wanted = is_matched and not self._is_closed
 
     def publish(self, message: bytes) -> None:
         """Pass ``message`` to Zenoh. Raises OutputError if it cannot be sent."""
@@ -98,6 +113,8 @@ class ZenohPublisher:
             link.burst_bytes_left -= len(message)
             if link.burst_bytes_left < 0:
                 link.wait_for_pace()
+            if self.json is not None and self.json.wanted:
+                self.json.offer(message)
         try:
             self._publisher.put(message)
         except zenoh.ZError as error:
@@ -114,6 +131,8 @@ class ZenohPublisher:
         self._is_closed = True
         self.wanted = False
         self._forget(self)
+        if self.json is not None:
+            self.json.close()
         publisher, self._publisher = self._publisher, None
         if publisher is not None:
             try:

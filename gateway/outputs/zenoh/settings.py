@@ -18,6 +18,13 @@ from gateway.outputs.zenoh.config import read_zenoh_config, zenoh_reason
 DEFAULT_ZENOH_PREFIX: Final = "mocap"
 
 
+JsonRate = Annotated[
+    float,
+    Field(strict=True, ge=0, le=1000, allow_inf_nan=False),
+    expects("0 for no JSON, or a number of messages per second up to 1000"),
+]
+
+
 def _key_prefix(text: str) -> str:
     if len(text) > 128 or not all(text.split("/")) or not text.isprintable() or re.search(r"[\s*$#?]", text):
         raise ValueError
@@ -91,6 +98,9 @@ class ZenohSettings(OutputSettings):
 
     max_rate_hz: MaxRates = {}  # noqa: RUF012 - pydantic copies defaults
     """The highest rate of each listed component, in Hz; further frames are left out at even intervals."""
+
+    json_max_rate_hz: JsonRate = 30.0
+    """How many messages a second to publish as JSON on each key …/json, while someone subscribes to it."""
 
     tool_poses: Switch = False
     """Whether to publish the pose of each tool on its own key, while someone subscribes to it."""

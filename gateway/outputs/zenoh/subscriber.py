@@ -1,13 +1,14 @@
 """Subscribing to a gateway's messages on Zenoh, for ``echo``, the demo and tests."""
 
 import json
-from collections.abc import Collection
+import threading
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import zenoh
 
 from gateway.errors import OutputError
-from gateway.messages.topics import escape_key_chunk, zenoh_key
+from gateway.messages.topics import escape_key_chunk, is_json_key, zenoh_key
 from gateway.outputs.discovery import missing_source
 from gateway.outputs.kind import Receive, SubscriptionRequest
 from gateway.outputs.zenoh.command_session import command_config
@@ -15,14 +16,18 @@ from gateway.outputs.zenoh.config import zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.settings import DEFAULT_ZENOH_PREFIX
 
 
-def key_pattern(prefix: str, source: str | None, component: str | None) -> str:
-    """Return the key expression of the messages. None means all sources, or all components.
+def key_patterns(prefix: str, source: str | None, component: str | None) -> tuple[str, ...]:
+    """Return the key expressions of the messages. None means all sources, or all components.
 
-    The pose of one tool is 6d/LABEL, those of all tools are 6d/*.
+    The pose of one tool is 6d/LABEL, those of all tools are 6d/*. No pattern for more than one component is
+    **, because that would have the gateway make JSON of everything.
     """
-    group, _, label = (component or "**").partition("/")
+    base = zenoh_key(prefix, source or "*")
+    if component is None:
+        return f"{base}/*", f"{base}/6d/*"
+    group, _, label = component.partition("/")
     path = (escape_key_chunk(label) if label != "*" else label,) if label else ()
-    return "/".join((zenoh_key(prefix, source or "*"), group, *path))
+    return ("/".join((base, group, *path)),)
 
 
 def open_zenoh(connect: str | None, config_file: Path | None = None) -> zenoh.Session:
@@ -48,28 +53,38 @@ def open_zenoh(connect: str | None, config_file: Path | None = None) -> zenoh.Se
 
 
 class ZenohSubscriber:
-    """Subscribes to ``keys``, a key expression. If it ``owns_session``, ``close`` closes the session, too."""
+    """Subscribes to ``keys``, key expressions. If it ``owns_session``, ``close`` closes the session, too.
+
+    It calls ``receive`` once at a time. JSON is left out, unless a key expression ends with its name.
+    """
 
     def __init__(
-        self, session: zenoh.Session, keys: str, receive: Receive, *, owns_session: bool = False
+        self, session: zenoh.Session, keys: Sequence[str], receive: Receive, *, owns_session: bool = False
     ) -> None:
+        lock = threading.Lock()
+        has_json = any(is_json_key(key) for key in keys)
+
         def on_sample(sample: zenoh.Sample) -> None:
-            receive(str(sample.key_expr), sample.payload.to_bytes())
+            key = str(sample.key_expr)
+            if has_json or not is_json_key(key):
+                with lock:
+                    receive(key, sample.payload.to_bytes())
 
         self._session = session
         self._owns_session = owns_session
-        self._subscriber = session.declare_subscriber(keys, on_sample)
+        self._subscribers = [session.declare_subscriber(key, on_sample) for key in keys]
 
     def close(self) -> None:
         """Unsubscribe."""
-        self._subscriber.undeclare()
+        for subscriber in self._subscribers:
+            subscriber.undeclare()
         if self._owns_session:
             self._session.close()
 
 
 def subscribe(request: SubscriptionRequest, receive: Receive) -> ZenohSubscriber:
     """Subscribe with a new session; ``request.address`` is the endpoint to connect to. Raises OutputError."""
-    keys = key_pattern(request.prefix or DEFAULT_ZENOH_PREFIX, request.source, request.component)
+    keys = key_patterns(request.prefix or DEFAULT_ZENOH_PREFIX, request.source, request.component)
     return ZenohSubscriber(open_zenoh(request.address, request.config), keys, receive, owns_session=True)
 
 

@@ -159,7 +159,7 @@ MISTAKES: list[tuple[str, str]] = [
     (
         "zenoh:",
         "lab.yaml:4:7: zenoh: found nothing; expected a mapping with any of the keys enabled, prefix, "
-        "config, express, max_rate_hz, tool_poses, "
+        "config, express, max_rate_hz, json_max_rate_hz, tool_poses, "
         "max_queries_per_s, max_queries_per_key_per_s, max_reply_bytes_per_s",
     ),
     ("lcm: {enabled: 1}", "lab.yaml:4:16: lcm.enabled: found 1; expected true or false"),

@@ -199,3 +199,11 @@ def test_topics_stay_open_when_tools_are_added() -> None:
     publish_tools(fan_out, 3)
     assert before == {"tool 1"}
     assert sorted(output.tool_names()) == ["tool 1", "tool 2", "tool 3"]
+
+
+def test_no_tool_has_the_name_of_the_key_with_json() -> None:
+    output = ToyOutput(has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
+    fan_out.set_parameters(in_metres(parameters("json", "JSON", "json")))
+    publish_tools(fan_out, 3)
+    assert output.tool_names() == ["json_2", "JSON", "json_3"]

@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from gateway.errors import QueryError
+from gateway.messages.json_text import MAX_JSON_SOURCE_BYTES
 from gateway.queries import payloads
-from gateway.queries.payloads import MAX_JSON_SOURCE_BYTES, FilePayload, JsonPayload, NewestJson
+from gateway.queries.payloads import FilePayload, JsonPayload, NewestJson
 from tests.unit.messages.samples import component_message
 from tests.vectors import MARKERS
 

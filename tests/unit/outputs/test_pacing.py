@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from gateway.publish.pacing import Pacer
+from gateway.outputs.pacing import Pacer
 
 EPOCH_UTIME = 1_700_000_000_000_000
 

@@ -1,0 +1,236 @@
+"""JSON for subscribers that cannot decode LCM's types: KEY/json beside the key of a component or a tool.
+
+A message is converted only while somebody subscribes to its JSON, at most ``zenoh.json_max_rate_hz`` times a
+second for each key, and in a thread of its own, which uses a fifth of a processor at most.
+"""
+
+import functools
+import json
+import logging
+import threading
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from typing import Any, Final
+
+import zenoh
+
+from gateway.descriptions.labels import describe, event_labels
+from gateway.errors import ProtocolError
+from gateway.losses import Losses
+from gateway.messages.decode import decode
+from gateway.messages.json_text import MAX_JSON_SOURCE_BYTES, json_text
+from gateway.messages.topics import JSON_NAME, Topic
+from gateway.outputs.contract import ServerParameters
+from gateway.outputs.encodings import JSON
+from gateway.outputs.pacing import Pacer
+from gateway.outputs.send_thread import SendThread
+from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
+from gateway.rtc3d.parameters import Parameters
+
+MAX_LABELS_CHARACTERS: Final = 256 * 1024
+"""Longer lists of labels are left out: they come from the server, and are in every text."""
+
+_REST: Final = 4
+"""How many times as long as a conversion the thread pauses after it."""
+
+_UTIME: Final = slice(8, 16)
+_CAPTURE_UTIME: Final = slice(16, 24)
+"""Places in a message, behind the fingerprint."""
+
+logger = logging.getLogger(__name__)
+
+
+class JsonKeys:
+    """The JSON of one Zenoh session: the thread that converts and sends, and what it needs to know."""
+
+    def __init__(self, max_rate_hz: float) -> None:
+        self._max_rate_hz = max_rate_hz
+        self._parameters: dict[str, ServerParameters] = {}  # by the source's name
+        self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, "zenoh"))
+        self._lock = threading.Lock()
+        self._thread: SendThread | None = None
+        self._closing = threading.Event()
+
+    def publisher(self, topic: Topic, key: str, on_wanted: Callable[[], None]) -> "JsonPublisher | None":
+        """Return the publisher of the JSON of ``topic``, whose own key is ``key``; None if it has none."""
+        if self._max_rate_hz == 0 or topic.path[0] not in COMPONENTS_BY_KEY:
+            return None
+        is_event = topic.path == (ComponentType.EVENT.key,)
+        pacer = None if is_event else Pacer(self._max_rate_hz)
+        return JsonPublisher(self, topic, f"{key}/{JSON_NAME}", pacer, on_wanted)
+
+    def set_parameters(self, source: str, parameters: ServerParameters) -> None:
+        """Take the labels from these parameters from now on."""
+        self._parameters[source] = parameters
+
+    def count_losses(self, source: str, losses: Losses) -> None:
+        """Count in ``losses`` what cannot be sent as JSON."""
+        self._losses[source] = losses
+
+    def parameters(self, source: str, version: int) -> Parameters | None:
+        """Return the parameters of this version; None if they are not known, or not any more."""
+        newest = self._parameters.get(source)
+        return None if newest is None or newest.version != version else newest.parsed
+
+    def lost(self, source: str, cause: str, text: str) -> None:
+        """Count a message that is not sent as JSON."""
+        self._losses[source].lost(cause, text, frames=0)
+
+    def offer(self, convert: Callable[[], None], num_bytes: int) -> bool:
+        """Have the thread make a call, which holds ``num_bytes``; return False if too many wait."""
+        with self._lock:
+            if self._closing.is_set():
+                return True  # a message more or less
+            if self._thread is None:
+                self._thread = SendThread("zenoh-json")
+        return self._thread.offer(functools.partial(self._convert, convert), num_bytes)
+
+    def _convert(self, convert: Callable[[], None]) -> None:
+        began_s = time.monotonic()
+        convert()
+        self._closing.wait(_REST * (time.monotonic() - began_s))
+
+    def close(self) -> None:
+        """End the thread."""
+        with self._lock:
+            self._closing.set()
+            if self._thread is not None:
+                self._thread.close()
+
+
+class JsonPublisher:
+    """Sends the messages of one topic as JSON on ``key``, while a subscriber matches it.
+
+    Without a ``pacer``, it sends all of them. Otherwise it leaves messages out, also those that are replaced
+    by newer ones while they wait.
+    """
+
+    def __init__(
+        self, keys: JsonKeys, topic: Topic, key: str, pacer: Pacer | None, on_wanted: Callable[[], None]
+    ) -> None:
+        self.wanted = False
+        """Whether a subscriber matches the key now."""
+        self._keys = keys
+        self._topic = topic
+        self._key = key
+        self._pacer = pacer
+        self._on_wanted = on_wanted
+        self._publisher: zenoh.Publisher | None = None
+        self._lock = threading.Lock()
+        self._newest: bytes | None = None  # the paced message that waits
+        self._labels_of: tuple[Parameters | None, int] | None = None
+        self._labels_text = ""
+
+    def declare(self, session: zenoh.Session) -> None:
+        """Declare the publisher on an open session."""
+        publisher = session.declare_publisher(
+            self._key, encoding=JSON, congestion_control=zenoh.CongestionControl.DROP
+        )
+        publisher.declare_matching_listener(lambda status: self._set_wanted(status.matching))
+        self._publisher = publisher
+
+    def check_subscribers(self) -> None:
+        """Check again for subscribers, because a notification may have been missed."""
+        publisher: Any = self._publisher  # its type stub is wrong: see ZenohPublisher
+        if publisher is not None:
+            self._set_wanted(publisher.matching_status.matching)
+
+    def _set_wanted(self, wanted: bool) -> None:
+        self.wanted = wanted
+        self._on_wanted()
+
+    def offer(self, message: bytes) -> None:
+        """Send a message as JSON soon, unless it is left out. Never raises; what is refused is counted."""
+        if self._pacer is not None and not self._is_due(self._pacer, message):
+            return
+        if len(message) > MAX_JSON_SOURCE_BYTES:
+            self._count_loss(
+                "json too long",
+                f"a message of {len(message)} bytes is too long for {self._key}; subscribe to the key "
+                f"without /{JSON_NAME}",
+            )
+        elif self._pacer is None:
+            self._offer(functools.partial(self._send, message), message)
+        else:
+            with self._lock:
+                is_waiting, self._newest = self._newest is not None, message
+            if not is_waiting and not self._offer(self._send_newest, message):
+                self._newest = None
+
+    def _is_due(self, pacer: Pacer, message: bytes) -> bool:
+        utime = int.from_bytes(message[_UTIME], "big", signed=True)
+        capture_utime = int.from_bytes(message[_CAPTURE_UTIME], "big", signed=True)
+        return pacer.due(None if capture_utime == utime else capture_utime, utime)
+
+    def _offer(self, convert: Callable[[], None], message: bytes) -> bool:
+        if self._keys.offer(convert, len(message)):
+            return True
+        self._count_loss(
+            "json queue full",
+            f"messages for {self._key} come faster than they can be converted; subscribe to fewer keys "
+            f"with /{JSON_NAME}, or set a lower zenoh.json_max_rate_hz",
+        )
+        return False
+
+    def _count_loss(self, cause: str, text: str) -> None:
+        self._keys.lost(self._topic.source, cause, text)
+
+    # In the thread.
+
+    def _send_newest(self) -> None:
+        with self._lock:
+            message, self._newest = self._newest, None
+        if message is not None:
+            self._send(message)
+
+    def _send(self, message: bytes) -> None:
+        publisher = self._publisher
+        if publisher is None or not self.wanted:
+            return
+        try:
+            publisher.put(self._text(message))
+        except ProtocolError as error:
+            self._count_loss("json failed", f"a message for {self._key} cannot be converted: {error}")
+        except zenoh.ZError as error:
+            if self._publisher is not None:
+                self._count_loss("put failed", f"Zenoh did not take {self._key}: {zenoh_reason(error)}")
+
+    def _text(self, message: bytes) -> str:
+        decoded = decode(message)
+        labels = self._labels(decoded)
+        text = json_text(decoded)
+        return f"{text[:-1]},{labels}}}" if labels else text
+
+    def _labels(self, message: Any) -> str:
+        """Return the field with the labels, as JSON; "" if they are not known."""
+        if len(self._topic.path) > 1:
+            return f'"label":{json.dumps(self._topic.path[1], ensure_ascii=False)}'
+        parameters = self._keys.parameters(self._topic.source, message.parameters_version)
+        if parameters is None:
+            return ""
+        kind = COMPONENTS_BY_KEY[self._topic.path[0]]
+        if kind is ComponentType.EVENT:
+            labels = event_labels(parameters)
+            return _labels_text([labels.get(event.id, "") for event in message.events])
+        num_items = int(getattr(message, f"num_{kind.item_noun}"))
+        if self._labels_of != (parameters, num_items):
+            self._labels_text = _labels_text(describe(kind, parameters, num_items).labels)
+            self._labels_of = parameters, num_items
+        return self._labels_text
+
+    def close(self) -> None:
+        """Undeclare the publisher."""
+        publisher, self._publisher = self._publisher, None
+        self.wanted = False
+        if publisher is not None:
+            try:
+                publisher.undeclare()
+            except zenoh.ZError as error:
+                logger.debug("undeclaring %s: %s", self._key, error)
+
+
+def _labels_text(labels: Any) -> str:
+    text = f'"labels":{json_text(list(labels))}'
+    return text if len(text) <= MAX_LABELS_CHARACTERS else ""

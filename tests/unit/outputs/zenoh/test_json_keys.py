@@ -1,0 +1,327 @@
+"""The keys with JSON: who gets them, how often, and what is counted."""
+
+import json
+import logging
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+import rtc3d
+import zenoh
+
+from gateway.losses import Losses
+from gateway.messages.decode import decode, to_json
+from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name
+from gateway.messages.json_text import MAX_JSON_SOURCE_BYTES
+from gateway.messages.topics import Topic
+from gateway.outputs.contract import ServerParameters
+from gateway.outputs.pacing import Pacer
+from gateway.outputs.zenoh.json_keys import MAX_LABELS_CHARACTERS
+from gateway.outputs.zenoh.output import ZenohOutput
+from gateway.outputs.zenoh.publisher import ZenohPublisher
+from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.rtc3d.components import MISSING, WIRE_ORDER, ComponentType
+from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
+from tests.losses import amounts
+from tests.networks import free_endpoint, open_zenoh, zenoh_keys
+from tests.spec_parameters import ALL as SPEC_PARAMETERS
+from tests.takes import frame, markers
+from tests.waiting import wait_until
+
+ITEMS: dict[ComponentType, list[Any]] = {
+    ComponentType.MARKERS: [(1.5, 2, 3, 0.1), (MISSING, MISSING, MISSING, 999)],
+    ComponentType.TOOLS: [(1, 0, 0, 0, 10, 20, 30, 0.2), (MISSING,) * 8],
+    ComponentType.ANALOG: [0.25, float("inf"), MISSING],
+    ComponentType.FORCE: [(1, 2, 3, 4, 5, 6)],
+    ComponentType.EVENT: [(0x123456, 5000, 1, 2, 3), (9, 5000, 1, 2, 3)],
+}
+LABELS = {
+    "3d": ["marker 1", "marker 2"],
+    "6d": ["tool 1", "tool 2"],
+    "analog": ["EMG1", "channel 2", "channel 3"],
+    "force": ["First force plate"],
+    "event": ["Button", ""],
+}
+"""Of the specification's parameters."""
+
+
+class Lab:
+    """A gateway's output, and a web page that subscribes to JSON."""
+
+    def __init__(self, **settings: Any) -> None:
+        endpoint = free_endpoint()
+        self.output = ZenohOutput(ZenohSettings(config=zenoh_keys("peer", listen=endpoint), **settings))
+        self.losses = Losses(logging.getLogger(__name__), "lab to zenoh")
+        self.output.count_losses("lab", self.losses)
+        self.output.start()
+        wait_until(lambda: self.output.health().connected)
+        self.page = open_zenoh("client", connect=endpoint)
+        self.samples: list[zenoh.Sample] = []
+
+    def subscribe(self, key: str = "mocap/lab/*/json") -> zenoh.Subscriber[None]:
+        return self.page.declare_subscriber(key, self.samples.append)
+
+    def publisher(self, component: ComponentType = ComponentType.MARKERS) -> ZenohPublisher:
+        """Return a publisher whose messages are wanted."""
+        type_name = lcm_type_name(MESSAGE_TYPES[component])
+        publisher = self.output.publisher(Topic("lab", (component.key,), type_name))
+        wait_until(lambda: publisher.wanted)
+        return publisher
+
+    def set_parameters(self, parameters: Parameters, version: int = 1) -> None:
+        self.output.publish_parameters("lab", ServerParameters(b"", 1, version, parsed=parameters))
+
+    @property
+    def received(self) -> list[dict[str, Any]]:
+        return [json.loads(sample.payload.to_string()) for sample in list(self.samples)]
+
+    def received_of(self, publisher: ZenohPublisher, message: bytes) -> dict[str, Any]:
+        """Publish a message; return its JSON."""
+        self.samples.clear()
+        publisher.publish(message)
+        wait_until(lambda: self.samples)
+        [received] = self.received
+        return received
+
+    @property
+    def lost(self) -> dict[str, int]:
+        return {cause: messages for cause, (messages, _) in amounts(self.losses.report()).items()}
+
+    def close(self) -> None:
+        self.output.close()
+        self.page.close()
+
+
+@pytest.fixture
+def lab(request: pytest.FixtureRequest) -> Iterator[Lab]:
+    lab = Lab(**getattr(request, "param", {}))
+    yield lab
+    lab.close()
+
+
+def settings(**settings: Any) -> pytest.MarkDecorator:
+    return pytest.mark.parametrize("lab", [settings], indirect=True, ids=[""])
+
+
+def event(sequence: int) -> bytes:
+    return frame(ComponentType.EVENT, [(7, sequence, 1, 2, 3)], sequence)[1]
+
+
+# Content ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("component", WIRE_ORDER, ids=lambda component: component.key)
+def test_a_component_as_json_has_the_fields_of_its_message_and_labels(
+    lab: Lab, component: ComponentType
+) -> None:
+    lab.set_parameters(SPEC_PARAMETERS)
+    lab.subscribe()
+    _, message = frame(component, ITEMS[component])
+    received = lab.received_of(lab.publisher(component), message)
+    labels = received.pop("labels")
+    assert received == to_json(decode(message))
+    assert labels == LABELS[component.key]
+    [sample] = lab.samples
+    assert str(sample.key_expr) == f"mocap/lab/{component.key}/json"
+    assert str(sample.encoding) == "application/json"
+
+
+def test_what_is_no_number_is_null(lab: Lab) -> None:
+    lab.subscribe()
+    _, message = frame(ComponentType.MARKERS, ITEMS[ComponentType.MARKERS])
+    received = lab.received_of(lab.publisher(), message)
+    assert received["markers"][1] == {"x": None, "y": None, "z": None, "reliability": 999}
+    _, message = frame(ComponentType.ANALOG, ITEMS[ComponentType.ANALOG])
+    received = lab.received_of(lab.publisher(ComponentType.ANALOG), message)
+    assert received["voltages"] == [0.25, None, None]
+
+
+def test_the_pose_of_a_tool_is_on_a_key_of_its_own_and_has_its_label(lab: Lab) -> None:
+    lab.subscribe("mocap/lab/6d/*/json")
+    publisher = lab.output.publisher(Topic("lab", ("6d", "Probe 1"), "rtc3d.tool_pose_t"))
+    wait_until(lambda: publisher.wanted)
+    pose: Any = rtc3d.tool_pose_t()
+    pose.visible, pose.position_m = False, [float("nan")] * 3
+    received = lab.received_of(publisher, pose.encode())
+    assert str(lab.samples[0].key_expr) == "mocap/lab/6d/Probe%201/json"
+    assert (received["label"], received["visible"]) == ("Probe 1", False)
+    assert received["position_m"] == [None] * 3
+
+
+def test_labels_are_those_of_the_parameters_that_describe_the_frame(lab: Lab) -> None:
+    lab.subscribe()
+    publisher = lab.publisher()
+    named = Parameters(markers=Parameters3D(markers=(Marker("1", "C7"), Marker("2", "C7"))))
+
+    def labels(num_markers: int, sequence: int, version: int) -> list[str] | None:
+        _, message = markers(num_markers, sequence, version=version)
+        found: list[str] | None = lab.received_of(publisher, message).get("labels")
+        return found
+
+    assert labels(2, 0, 2) is None
+    lab.set_parameters(named, 2)
+    assert labels(2, 10, 2) == ["C7", "C7_2"]
+    assert labels(1, 20, 2) == ["C7"]
+    lab.set_parameters(Parameters(markers=Parameters3D(markers=(Marker("1", 'a"\\\n'),))), 3)
+    assert labels(2, 30, 2) is None
+    assert labels(2, 40, 3) == ['a"\\', "marker 2"]
+
+
+def test_labels_that_are_too_long_together_are_left_out(lab: Lab) -> None:
+    lab.subscribe()
+    publisher = lab.publisher()
+    num_labels = MAX_LABELS_CHARACTERS // 200 + 1
+    many = tuple(Marker(str(at), f"{at:0200}") for at in range(num_labels))
+    lab.set_parameters(Parameters(markers=Parameters3D(markers=many)))
+    assert "labels" in lab.received_of(publisher, markers(10)[1])
+    received = lab.received_of(publisher, markers(num_labels, 10)[1])
+    assert (len(received["markers"]), "labels" in received) == (num_labels, False)
+
+
+# Who gets it ----------------------------------------------------------------------------------------
+
+
+def test_a_component_is_wanted_while_somebody_subscribes_to_its_json_alone(lab: Lab) -> None:
+    publisher = lab.output.publisher(Topic("lab", ("3d",), "rtc3d.markers_t"))
+    other = lab.output.publisher(Topic("lab", ("6d",), "rtc3d.tools_t"))
+    assert not publisher.wanted
+    subscriber = lab.subscribe("mocap/lab/3d/json")
+    wait_until(lambda: publisher.wanted)
+    assert not other.wanted
+    subscriber.undeclare()
+    wait_until(lambda: not publisher.wanted)
+
+
+def test_a_missed_notification_of_subscribers_is_made_up_for(lab: Lab) -> None:
+    lab.subscribe("mocap/lab/3d/json")
+    publisher = lab.publisher()
+    assert publisher.json is not None
+    publisher.json.wanted = publisher.wanted = False  # as if Zenoh had not notified
+    lab.output.maintain()
+    assert publisher.wanted
+    lab.received_of(publisher, markers(1)[1])
+
+
+def test_no_json_is_made_for_subscribers_of_the_messages(lab: Lab) -> None:
+    lab.subscribe("mocap/lab/*")
+    publisher = lab.publisher()
+    publisher.publish(markers(1)[1])
+    wait_until(lambda: lab.samples)
+    assert publisher.json is not None
+    assert not publisher.json.wanted
+    assert str(lab.samples[0].key_expr) == "mocap/lab/3d"
+
+
+@settings(json_max_rate_hz=0.0)
+def test_a_rate_of_0_switches_it_off(lab: Lab) -> None:
+    lab.subscribe("mocap/**")
+    publisher = lab.publisher()
+    publisher.publish(markers(1)[1])
+    publisher.publish(markers(1, 1)[1])
+    wait_until(lambda: len(lab.samples) >= 2)
+    assert {str(sample.key_expr) for sample in lab.samples} == {"mocap/lab/3d"}
+    assert publisher.json is None
+
+
+def test_status_and_clock_have_no_json(lab: Lab) -> None:
+    lab.subscribe("mocap/lab/*/json")
+    publisher = lab.output.publisher(Topic("lab", ("status",), "rtc3d.status_t"))
+    assert publisher.json is None
+
+
+def test_a_closed_publisher_is_not_wanted_and_sends_nothing(lab: Lab) -> None:
+    lab.subscribe()
+    publisher = lab.publisher()
+    publisher.close()
+    lab.output.maintain()
+    assert not publisher.wanted
+    assert lab.received_of(lab.publisher(), markers(3)[1])["num_markers"] == 3
+
+
+# How often ---------------------------------------------------------------------------------------------
+
+
+@settings(json_max_rate_hz=30.0)
+def test_frames_are_left_out_at_even_intervals_of_their_capture(lab: Lab) -> None:
+    """Of 100 frames per second, those that the pacer picks; nothing is lost."""
+    lab.subscribe()
+    publisher = lab.publisher()
+    pacer = Pacer(30.0)
+    expected = []
+    for number in range(200):
+        _, message = markers(1, number)
+        publisher.publish(message)
+        utime = decode(message).utime
+        if pacer.due(utime - 2000, utime):
+            expected.append(number)
+            wait_until(lambda: len(lab.samples) == len(expected))
+    assert [received["sequence"] for received in lab.received] == expected
+    assert len(expected) == 60
+    assert lab.lost == {}
+
+
+@settings(json_max_rate_hz=1000.0)
+def test_what_waits_is_replaced_by_the_newest_frame(lab: Lab) -> None:
+    lab.subscribe()
+    publisher = lab.publisher()
+    for number in range(500):
+        publisher.publish(markers(100, number)[1])
+    wait_until(lambda: any(received["sequence"] == 499 for received in lab.received))
+    numbers = [received["sequence"] for received in lab.received]
+    assert numbers == sorted(numbers)
+    assert len(numbers) < 500
+    assert lab.lost == {}
+
+
+@settings(json_max_rate_hz=1.0)
+def test_no_event_is_left_out(lab: Lab) -> None:
+    lab.subscribe()
+    publisher = lab.publisher(ComponentType.EVENT)
+    for number in range(500):
+        publisher.publish(event(number))
+    wait_until(lambda: len(lab.samples) >= 500)
+    assert [received["sequence"] for received in lab.received] == list(range(500))
+    assert lab.lost == {}
+
+
+# What is refused -----------------------------------------------------------------------------------------
+
+
+def test_events_that_come_faster_than_they_can_be_converted_are_counted(lab: Lab) -> None:
+    lab.subscribe()
+    publisher = lab.publisher(ComponentType.EVENT)
+    many = frame(ComponentType.EVENT, [(7, 0, 1, 2, 3)] * 2000)[1]
+    for _ in range(2000):
+        publisher.publish(many)  # together more bytes than may wait
+    assert set(lab.lost) == {"json queue full"}
+    assert lab.lost["json queue full"] > 100
+
+
+def test_a_frame_that_is_too_long_is_counted_and_published_without_json(lab: Lab) -> None:
+    lab.subscribe("mocap/**")
+    publisher = lab.publisher()
+    _, message = markers(MAX_JSON_SOURCE_BYTES // 16)
+    publisher.publish(message)
+    wait_until(lambda: lab.samples)
+    assert str(lab.samples[0].key_expr) == "mocap/lab/3d"
+    assert lab.lost == {"json too long": 1}
+    publisher.publish(markers(1, 100)[1])
+    wait_until(lambda: "mocap/lab/3d/json" in {str(sample.key_expr) for sample in lab.samples})
+
+
+def test_a_message_that_cannot_be_decoded_is_counted(lab: Lab) -> None:
+    lab.subscribe()
+    publisher = lab.publisher()
+    publisher.publish(b"no message")
+    wait_until(lambda: lab.lost == {"json failed": 1})
+    assert lab.received_of(publisher, markers(1)[1])
+
+
+def test_closing_does_not_wait_for_what_is_to_be_converted(lab: Lab) -> None:
+    lab.subscribe()
+    publisher = lab.publisher(ComponentType.EVENT)
+    for number in range(1000):
+        publisher.publish(event(number))
+    lab.output.close()
+    assert len(lab.samples) < 1000
+    assert lab.lost == {}
