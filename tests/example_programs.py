@@ -9,10 +9,13 @@ tests/integration/test_examples.py and test_example_vectors.py then run it:
   It ends with status 0 after ``COUNT`` frames.
 """
 
+import contextlib
 import os
 import shutil
 import subprocess
 import sys
+import threading
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -20,10 +23,12 @@ from typing import Final
 import pytest
 
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME
+from tests.networks import free_port
 
 ROOT: Final = Path(__file__).parents[1]
 EXAMPLES: Final = ROOT / "examples"
 COUNT: Final = 20
+LCM_URL: Final = "udpm://239.255.76.67:7712?ttl=0"
 
 COMPONENT_TYPES: Final = frozenset({"markers_t", "tools_t", "analog_t", "forces_t", "events_t"})
 BYTE_TABLE_TYPES: Final = COMPONENT_TYPES | {"tool_pose_t"}
@@ -88,3 +93,50 @@ PROGRAMS: Final = (
     ExampleProgram("Java, LCM", _JAVA, _ON_LCM, ALL_TYPES, "java", ("javac", "java", "make")),
     ExampleProgram("C#, LCM", _CSHARP, _ON_LCM, ALL_TYPES, "csharp", ("mcs", "mono", "make")),
 )
+
+
+@contextlib.contextmanager
+def run_program(*command: str, ready: str) -> Iterator["subprocess.Popen[str]"]:
+    """Start a program, wait for ``ready`` in its output, and end it after the block."""
+    environment = {**os.environ, "LCM_DEFAULT_URL": LCM_URL}
+    with subprocess.Popen(
+        command, env=environment, cwd=EXAMPLES, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
+    ) as process:
+        assert process.stdout is not None
+        try:
+            for line in process.stdout:
+                if ready in line:
+                    break
+            else:
+                raise AssertionError(f"{command} ended without {ready!r}")
+            yield process
+        finally:
+            process.terminate()
+
+
+@contextlib.contextmanager
+def run_gateway(folder: Path, *simulated: str, ready: str) -> Iterator[str]:
+    """Run a gateway with the source "lab", whose server is a simulator with these options.
+
+    Yields the gateway's Zenoh endpoint when it has logged ``ready``.
+    """
+    port, endpoint = free_port(), f"tcp/127.0.0.1:{free_port()}"
+    config = folder / "gateway.yaml"
+    config.write_text(
+        f"""
+        sources: [{{name: lab, host: 127.0.0.1, port: {port}}}]
+        zenoh:
+          config: {{listen: {{endpoints: ["{endpoint}"]}}, scouting: {{multicast: {{enabled: false}}}}}}
+        """
+    )
+    program = (sys.executable, "-m", "gateway")
+    simulate = (*program, "simulate", "--port", str(port), *simulated)
+    run = (*program, "run", "--config", str(config), "--log-level", "debug")
+    with (
+        run_program(*simulate, ready="RTC3D server on") as simulator,
+        run_program(*run, ready=ready) as gateway,
+    ):
+        for process in (simulator, gateway):
+            assert process.stdout is not None
+            threading.Thread(target=process.stdout.read, daemon=True).start()  # a full pipe would stop it
+        yield endpoint

@@ -1,13 +1,11 @@
 """The example programs, run as a user runs them."""
 
-import os
 import re
 import signal
 import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
 
 import lcm
 import numpy as np
@@ -15,52 +13,27 @@ import pytest
 
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.synthetic import SyntheticScene
-from tests.example_programs import COUNT, EXAMPLES, PROGRAMS, ExampleProgram
+from tests.example_programs import (
+    COUNT,
+    EXAMPLES,
+    LCM_URL,
+    PROGRAMS,
+    ExampleProgram,
+    run_gateway,
+    run_program,
+)
 from tests.networks import free_port, open_zenoh
 
 pytestmark = pytest.mark.netns
-
-LCM_URL = "udpm://239.255.76.67:7712?ttl=0"
-PROGRAM = [sys.executable, "-m", "gateway"]
-
-
-@contextmanager
-def run_program(*command: str, ready: str) -> Iterator[subprocess.Popen[str]]:
-    """Start a program, wait for ``ready`` in its output, and end it after the block."""
-    environment = {**os.environ, "LCM_DEFAULT_URL": LCM_URL}
-    with subprocess.Popen(
-        command, env=environment, cwd=EXAMPLES, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
-    ) as process:
-        assert process.stdout is not None
-        try:
-            for line in process.stdout:
-                if ready in line:
-                    break
-            else:
-                raise AssertionError(f"{command} ended without {ready!r}")
-            yield process
-        finally:
-            process.terminate()
 
 
 @pytest.fixture(scope="module")
 def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     """The Zenoh endpoint of a gateway that runs, like its simulator, as a separate program."""
-    port, endpoint = free_port(), f"tcp/127.0.0.1:{free_port()}"
-    config = tmp_path_factory.mktemp("gateway") / "gateway.yaml"
-    config.write_text(
-        f"""
-        sources: [{{name: lab, host: 127.0.0.1, port: {port}}}]
-        zenoh:
-          config: {{listen: {{endpoints: ["{endpoint}"]}}, scouting: {{multicast: {{enabled: false}}}}}}
-        """
-    )
-    simulate = [*PROGRAM, "simulate", "--port", str(port), "--markers", "20", "--rate", "100"]
-    gateway = [*PROGRAM, "run", "--config", str(config), "--log-level", "debug"]
-    with (
-        run_program(*simulate, ready="RTC3D server on"),
-        run_program(*gateway, ready="zenoh: the session is open"),
-    ):
+    folder = tmp_path_factory.mktemp("gateway")
+    with run_gateway(
+        folder, "--markers", "20", "--rate", "100", ready="zenoh: the session is open"
+    ) as endpoint:
         yield endpoint
 
 
@@ -73,16 +46,17 @@ LINE = re.compile(
 
 
 def assert_lines_match_the_scene(text: str) -> None:
-    """Check the lines of consecutive frames against what the simulator sends."""
+    """Check the lines against what the simulator sends. On a busy machine, UDP loses some messages."""
     scene = SyntheticScene(markers=20, tools=4, analog=16, plates=2, rate_hz=100, analog_rate_hz=2000)
     printed = [match for line in text.splitlines() if (match := LINE.fullmatch(line))]
     assert len(printed) == COUNT, text
     first = printed[0]
-    for position, line in enumerate(printed):
-        assert int(line["sequence"]) == int(first["sequence"]) + position
+    assert [int(line["sequence"]) for line in printed] == sorted({int(line["sequence"]) for line in printed})
+    for line in printed:
+        step = int(line["sequence"]) - int(first["sequence"])
         number = int(line["number"])
-        assert number == int(first["number"]) + position
-        assert float(line["time_s"]) == pytest.approx(float(first["time_s"]) + position / 100, abs=2e-4)
+        assert number == int(first["number"]) + step
+        assert float(line["time_s"]) == pytest.approx(float(first["time_s"]) + step / 100, abs=2e-4)
         assert line["version"] == "1"
         [items] = scene.items(ComponentType.MARKERS, np.array([number - 1]))
         visible = items[~np.isnan(items["x"])]
