@@ -276,7 +276,8 @@ void write_fields(Json &json, const rtc3d::tool_pose_t &m)
 void write_fields(Json &json, const rtc3d::status_t &m)
 {
     write_prefix(json, m)("source", m.source)("server", m.server)("gateway_version", m.gateway_version);
-    json("host", m.host);
+    json("host", m.host)("frame_id", m.frame_id)("metres_per_unit", m.metres_per_unit);
+    json("rotation_xyzw", m.rotation_xyzw)("translation_m", m.translation_m);
     json("num_streams", m.num_streams)("streams", m.streams)("num_outputs", m.num_outputs)("outputs", m.outputs);
 }
 
