@@ -129,7 +129,7 @@ def main() -> None:
     # Zenoh waits while the queue is full, so even a program that is too slow does not fill the memory.
     messages: queue.Queue[tuple[str, bytes]] = queue.Queue(maxsize=10_000)
     with zenoh.open(config) as session:
-        for component in (MARKERS, ANALOG):
+        for component in (ANALOG, MARKERS):
             session.declare_subscriber(
                 f"mocap/{options.source}/{component}",
                 lambda sample, component=component: messages.put((component, sample.payload.to_bytes())),
