@@ -6,7 +6,17 @@ from typing import Any, Final
 
 from benchmarks.report import Table, goals_table, machines_table
 
-NAMES: Final = ("own_cost", "ceiling", "latency", "loss", "resources", "scale", "queries", "replay")
+NAMES: Final = (
+    "own_cost",
+    "outputs",
+    "ceiling",
+    "latency",
+    "loss",
+    "resources",
+    "scale",
+    "queries",
+    "replay",
+)
 
 
 def part(name: str) -> ModuleType:

@@ -49,6 +49,19 @@ def cpu_s(pid: int) -> float:
     return time.clock_gettime((~pid << 3) | 2)
 
 
+def tree_cpu_s(pid: int) -> float:
+    """Return the CPU time of a process and of the processes that it has started and that still run, in s."""
+    try:
+        children = [
+            int(each)
+            for file in Path(f"/proc/{pid}/task").glob("*/children")
+            for each in file.read_text().split()
+        ]
+        return cpu_s(pid) + sum(tree_cpu_s(child) for child in children)
+    except OSError:  # it has just ended
+        return 0.0
+
+
 def memory_bytes(pid: int) -> int:
     """Return the resident memory of a process, with native libraries."""
     return _kib(f"/proc/{pid}/smaps_rollup", "Rss")

@@ -38,6 +38,14 @@ def lcm_url(port: int) -> str:
     return f"udpm://239.255.76.67:{port}?ttl=0"
 
 
+def relay_cuts(workload: Workload) -> list[tuple[int, int, str, str]]:
+    """Return what the relay publishes of each packet: first byte, end, component and type."""
+    return [
+        (cut.first, cut.last, cut.component.key, lcm_type_name(MESSAGE_TYPES[cut.component]))
+        for cut in cuts(workload.packet())
+    ]
+
+
 @dataclass
 class Workbench:
     """A context in which the gateway and the relay serve ``subscribers`` on Zenoh, LCM, or both.
@@ -106,10 +114,7 @@ class Workbench:
             "port": self.ports[RELAY],
             "zenoh": zenoh_config if self.zenoh else None,
             "lcm": self.lcm_urls[RELAY] if self.lcm else None,
-            "cuts": [
-                (cut.first, cut.last, cut.component.key, lcm_type_name(MESSAGE_TYPES[cut.component]))
-                for cut in cuts(self.workload.packet())
-            ],
+            "cuts": relay_cuts(self.workload),
         }
 
     def _wait_for_subscribers(self) -> None:

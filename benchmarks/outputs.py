@@ -1,0 +1,246 @@
+"""Part 3: what each output costs: the gateway's CPU time per frame, with nobody and with one peer.
+
+Each output has a gateway of its own, which publishes on nothing else. The bare relay to Zenoh is measured
+beside them. All are measured one after the other, again and again, so that a slow phase of the machine
+concerns all of them.
+"""
+
+import contextlib
+import statistics
+import sys
+import tempfile
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any, Final, NamedTuple, Self
+
+from benchmarks import output_peers, processes
+from benchmarks.comparison import Pair, table_cell
+from benchmarks.processes import Program, Worker, zenoh_session_config
+from benchmarks.report import Goal, Progress, Table
+from benchmarks.sender import Paced, send
+from benchmarks.workbench import lcm_url, relay_cuts
+from benchmarks.workloads import DENSE
+from gateway.messages.encode import MESSAGE_TYPES
+from gateway.outputs.registry import OUTPUTS
+from tests.networks import free_port
+
+TITLE: Final = "CPU time per frame of five components at 1000 Hz, by output"
+RELAY: Final = "relay"
+_SOURCE: Final = "lab"
+_FIRST_FRAMES: Final = 300
+_LCM_PORT: Final = 7690
+
+_TEXTS: Final = {
+    RELAY: "the bare relay, to Zenoh",
+    "zenoh": "Zenoh",
+    "lcm": "LCM",
+    "ros2": "ROS 2",
+    "rtc3d": "RTC3D",
+    "vrpn": "VRPN",
+    "lsl": "LSL",
+    "foxglove": "Foxglove",
+}
+_NOTE: Final = (
+    "The whole process, with its libraries' threads and its children. LCM sends without a peer, too."
+)
+
+ROS2_POSES: Final = "ros2_poses_us"
+GOAL_ROS2_POSES_US: Final = 30.0
+
+
+class Endpoints(NamedTuple):
+    """Where an output and its peer meet: a port, the endpoint of a router, and a folder for files."""
+
+    port: int
+    router: str
+    folder: Path
+
+
+class _Case(NamedTuple):
+    """How to measure an output: its section in the configuration, and its peer."""
+
+    settings: Callable[[Endpoints], dict[str, Any]]
+    peer: Callable[[Endpoints], Worker]
+    num_topics: int = 1
+    """How many topics the peer receives, as it counts them."""
+
+
+def _endpoint(port: int) -> str:
+    return f"tcp/127.0.0.1:{port}"
+
+
+def _lsl_config(at: Endpoints) -> Path:
+    file = at.folder / "lsl_api.cfg"
+    file.write_text(output_peers.LSL_CONFIG)
+    return file
+
+
+def _zenoh_peer(endpoint: str, keys: str) -> Worker:
+    config = zenoh_session_config("client", connect=[endpoint])
+    return Worker(output_peers.zenoh_peer, config, keys)
+
+
+_CASES: Final = {
+    "zenoh": _Case(
+        lambda at: {"config": zenoh_session_config("peer", listen=[_endpoint(at.port)])},
+        lambda at: _zenoh_peer(_endpoint(at.port), f"mocap/{_SOURCE}/*"),
+        len(MESSAGE_TYPES),
+    ),
+    "lcm": _Case(
+        lambda _: {"url": lcm_url(_LCM_PORT)},
+        lambda _: Worker(output_peers.lcm_peer, lcm_url(_LCM_PORT)),
+        len(MESSAGE_TYPES),
+    ),
+    "ros2": _Case(
+        lambda at: {"connect": at.router},
+        lambda at: _zenoh_peer(at.router, "0/**"),
+        DENSE.plates + 3,  # wrenches, markers, analog and /tf; each tool in view has a topic, too
+    ),
+    "rtc3d": _Case(
+        lambda at: {"ports": {_SOURCE: at.port}},
+        lambda at: Worker(output_peers.rtc3d_peer, at.port),
+    ),
+    "vrpn": _Case(
+        lambda at: {"port": at.port},
+        lambda at: Worker(output_peers.vrpn_peer, at.port),
+    ),
+    "lsl": _Case(
+        lambda at: {"config": str(_lsl_config(at))},
+        lambda at: Worker(output_peers.lsl_peer, _lsl_config(at), len(MESSAGE_TYPES)),
+        len(MESSAGE_TYPES),
+    ),
+    "foxglove": _Case(
+        lambda at: {"port": at.port},
+        lambda at: Worker(output_peers.foxglove_peer, at.port),
+    ),
+}
+
+
+def _names() -> list[str]:
+    return [name for name in OUTPUTS if name in _CASES]
+
+
+class _Bench:
+    """A context in which a gateway for each output runs, and the relay. ``connect_peers`` comes later."""
+
+    def __enter__(self) -> Self:
+        with contextlib.ExitStack() as stack:
+            folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="rtc3d-bench-")))
+            self._endpoints: dict[str, Endpoints] = {}
+            self._router = _endpoint(free_port())
+            stack.enter_context(processes.router(self._router))
+            self.sender = stack.enter_context(Worker(send, DENSE, [RELAY, *_names()]))
+            self.programs: dict[str, Program] = {}
+            self.peers: dict[str, Worker] = {}
+            for name in (RELAY, *_names()):
+                program = self._program(name, folder / name)
+                self.programs[name] = stack.enter_context(program)
+            self._stack = stack.pop_all()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stack.close()
+
+    def _program(self, name: str, folder: Path) -> Program:
+        folder.mkdir()
+        at = self._endpoints[name] = Endpoints(free_port(), self._router, folder)
+        port = self.sender.started[name]
+        if name == RELAY:
+            config = zenoh_session_config("peer", listen=[_endpoint(at.port)])
+            plan = {"name": _SOURCE, "port": port, "zenoh": config, "lcm": None}
+            return processes.relay({**plan, "cuts": relay_cuts(DENSE)})
+        settings: dict[str, Any] = {
+            "sources": [processes.source(_SOURCE, port)],
+            "metrics": {"port": free_port()},
+            **{each: {"enabled": False} for each in OUTPUTS},
+            name: {"enabled": True, **_CASES[name].settings(at)},
+        }
+        return processes.gateway(folder / "gateway.yaml", settings)
+
+    def connect_peers(self) -> None:
+        """Connect one peer to each output, and wait until it receives every topic."""
+        for name in self.programs:
+            case = _CASES["zenoh" if name == RELAY else name]
+            self.peers[name] = self._stack.enter_context(case.peer(self._endpoints[name]))
+            processes.wait_until(partial(self._receives, name, case.num_topics), f"{name}'s peer receives")
+
+    def _receives(self, name: str, num_topics: int) -> bool:
+        self.cost_us(name, _FIRST_FRAMES)
+        return len(self.peers[name].ask("count")) >= num_topics
+
+    def cost_us(self, name: str, frames: int) -> float:
+        """Send frames at 1000 Hz; return the CPU time of the program and its children per frame, in µs."""
+        program = self.programs[name]
+        before_s = processes.tree_cpu_s(program.pid)
+        self.sender.ask(Paced(name, frames, DENSE.rate_hz))
+        return 1e6 * (processes.tree_cpu_s(program.pid) - before_s) / frames
+
+
+def _plan(quick: bool) -> tuple[int, int]:
+    """Return the number of rounds, and of frames in each."""
+    return (2, 300) if quick else (9, 2000)
+
+
+def expected_s(quick: bool) -> float:
+    """Return the approximate duration in s."""
+    rounds, frames = _plan(quick)
+    return (len(_names()) + 1) * (2 * rounds * frames / DENSE.rate_hz + 3)
+
+
+def measure(quick: bool, progress: Progress) -> dict[str, Any]:
+    """Return the CPU times per frame of each output, without and with a peer, in µs."""
+    rounds, frames = _plan(quick)
+    costs: dict[str, dict[str, list[float]]] = {}
+    with _Bench() as bench:
+        for number, peers in enumerate(("nobody", "one peer")):
+            progress.step("connecting peers" if number else "starting", number / 2)
+            if number:
+                bench.connect_peers()
+            for name in bench.programs:
+                bench.cost_us(name, _FIRST_FRAMES)  # warms up
+            costs[peers] = {name: [] for name in bench.programs}
+            for each in range(rounds):
+                progress.step(f"{peers}, round {each + 1} of {rounds}", (number + each / rounds) / 2)
+                for name, values in costs[peers].items():
+                    values.append(float(f"{bench.cost_us(name, frames):.5g}"))
+    return {"cpu_us_per_frame": costs, **_ros2_poses()}
+
+
+def _ros2_poses() -> dict[str, float]:
+    if "ros2" not in OUTPUTS:
+        return {}
+    command = [sys.executable, "-m", "benchmarks.ros2_poses"]
+    return {ROS2_POSES: float(processes.run_measured(command))}
+
+
+def tables(result: dict[str, Any]) -> list[Table]:
+    """Return the tables of the result."""
+    without, with_peer = result["cpu_us_per_frame"].values()
+    rows = []
+    for name, costs in with_peer.items():
+        pair = Pair.of({name: costs, RELAY: with_peer[RELAY]}) if name != RELAY else None
+        rows.append(
+            [
+                _TEXTS[name],
+                f"{statistics.median(without[name]):.0f}",
+                f"{statistics.median(costs):.0f}",
+                "" if pair is None else table_cell(pair),
+            ]
+        )
+    return [Table(TITLE, ["output", "nobody, µs", "one peer, µs", "times the relay's cost"], rows, _NOTE)]
+
+
+def goals(result: dict[str, Any]) -> list[Goal]:
+    """Return the cost of poses for ROS 2, if it was measured."""
+    if ROS2_POSES not in result:
+        return []
+    cost_us = result[ROS2_POSES]
+    return [
+        Goal(
+            "own code for ROS 2, a frame of 6 poses and tf",
+            f"at most {GOAL_ROS2_POSES_US:g} µs",
+            f"{cost_us:.1f} µs",
+            cost_us <= GOAL_ROS2_POSES_US,
+        )
+    ]
