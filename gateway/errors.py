@@ -19,6 +19,7 @@
     │   ├── DefectError           a defect in this program ended it
     │   └── ClosedError           it was closed by the server, by the gateway, or by the network
     ├── OutputError               an output did not open or did not accept a message
+    ├── PeerError                 a client of an output violates its protocol; the connection must end
     ├── SpoolError                a C3D file from a server could not be stored
     ├── ViewError                 the live view cannot be served
     └── QueryError                a peer's query cannot be answered; the text goes to the peer
@@ -110,6 +111,10 @@ class OutputError(GatewayError):
     def __init__(self, message: str, *, cause: str) -> None:
         super().__init__(message)
         self.cause = cause
+
+
+class PeerError(GatewayError):
+    """A client of an output violates its protocol, or speaks another one; the connection must end."""
 
 
 class SpoolError(GatewayError):

@@ -1,0 +1,1 @@
+"""The output vrpn: a VRPN server with a tracker for each tool."""
