@@ -7,9 +7,10 @@ from gateway.outputs.contract import Output
 from gateway.outputs.kind import OutputKind
 from gateway.outputs.lcm.kind import LCM
 from gateway.outputs.takes.kind import TAKES
+from gateway.outputs.vrpn.kind import VRPN
 from gateway.outputs.zenoh.kind import ZENOH
 
-OUTPUTS: Final[dict[str, OutputKind]] = {kind.name: kind for kind in (ZENOH, LCM, TAKES)}
+OUTPUTS: Final[dict[str, OutputKind]] = {kind.name: kind for kind in (ZENOH, LCM, TAKES, VRPN)}
 
 
 def settings_type() -> type[Settings]:

@@ -5,6 +5,7 @@ from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.registry import OUTPUTS, build_outputs
 from gateway.outputs.takes.settings import TakesSettings
+from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.components import ComponentType
@@ -19,6 +20,7 @@ def test_every_output_has_its_section() -> None:
         "zenoh": ZenohSettings,
         "lcm": LcmSettings,
         "takes": TakesSettings,
+        "vrpn": VrpnSettings,
     }
     assert list(OUTPUTS) == list(settings.outputs)
 

@@ -1,0 +1,82 @@
+"""The doctor's checks of VRPN: the port, and who can connect."""
+
+import ipaddress
+import socket
+from collections.abc import Sequence
+from typing import Final
+
+from gateway.findings import Finding, MessageLoad, Subject
+from gateway.outputs.vrpn.protocol import COOKIE_BYTES, COOKIE_START
+from gateway.outputs.vrpn.settings import VrpnSettings
+
+CHECKS: Final = ("port", "access")
+
+_TIMEOUT_S: Final = 2.0
+
+_vrpn: Final = Subject("vrpn")
+
+
+def check_vrpn(
+    settings: VrpnSettings, _sources: Sequence[str], _loads: Sequence[MessageLoad], _seconds: float
+) -> list[Finding]:
+    """Check that the port can be used, and say who can connect."""
+    return [_check_port(settings), _check_access(settings)]
+
+
+def leaves_host(settings: VrpnSettings) -> bool:
+    """Return whether other computers can connect."""
+    if settings.host == "localhost":
+        return False
+    try:
+        return not ipaddress.ip_address(settings.host).is_loopback
+    except ValueError:  # a name
+        return True
+
+
+def _check_port(settings: VrpnSettings) -> Finding:
+    where = f"{settings.host}, port {settings.port}"
+    try:
+        for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
+            _bind(settings, kind)
+    except OSError as error:
+        if _is_served(settings):
+            return _vrpn.passing("port", f"a VRPN server answers on {where}")
+        return _vrpn.failing(
+            "port",
+            f"cannot listen on {where}: {error.strerror or error}, and no VRPN server answers there",
+            "Stop the program that uses the port, or set vrpn.host and vrpn.port to an address of this "
+            "computer and a free port.",
+        )
+    return _vrpn.passing("port", f"TCP and UDP are free on {where}; no gateway serves VRPN there now")
+
+
+def _bind(settings: VrpnSettings, kind: socket.SocketKind) -> None:
+    """Bind the port as the server does, and release it. Raises OSError."""
+    ((family, _, _, _, address), *_) = socket.getaddrinfo(settings.host, settings.port, type=kind)
+    with socket.socket(family, kind) as bound:
+        if kind is socket.SOCK_STREAM:
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind(address)
+        if kind is socket.SOCK_STREAM:
+            bound.listen(1)
+
+
+def _is_served(settings: VrpnSettings) -> bool:
+    """Return whether a VRPN server answers on the port. Every address of this host reaches 0.0.0.0 and ::."""
+    try:
+        with socket.create_connection((settings.host, settings.port), _TIMEOUT_S) as connection:
+            connection.settimeout(_TIMEOUT_S)
+            cookie = connection.recv(COOKIE_BYTES, socket.MSG_WAITALL)
+    except OSError:
+        return False
+    return cookie.startswith(COOKIE_START)
+
+
+def _check_access(settings: VrpnSettings) -> Finding:
+    if not leaves_host(settings):
+        return _vrpn.passing("access", "only programs on this computer can connect")
+    return _vrpn.note(
+        "access",
+        f"any computer that reaches {settings.host} can connect: VRPN has no password and no encryption",
+        "Open the port in the firewall for the computers that need it, or set vrpn.host to 127.0.0.1.",
+    )

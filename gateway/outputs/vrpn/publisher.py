@@ -1,0 +1,137 @@
+"""The publisher of one source: hands frames to the server's thread, and makes messages of them there."""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Final
+
+from gateway.descriptions.labels import describe
+from gateway.errors import OutputError
+from gateway.losses import Losses
+from gateway.messages.stamp import Stamp
+from gateway.outputs.contract import ServerParameters
+from gateway.outputs.vrpn.protocol import encode_pose
+from gateway.outputs.vrpn.server import VrpnServer
+from gateway.outputs.vrpn.trackers import MAX_TRACKERS
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import Frame
+
+MAX_TOOLS: Final = 256
+"""How many tools of a source can be trackers. The server determines the number of tools in a frame."""
+
+_MAX_VERSIONS: Final = 8
+"""How many versions of the parameters are kept: frames of a backlog may belong to an earlier one."""
+
+Offer = Callable[[Callable[[], None], int], bool]
+"""LoopThread.offer of the server's thread."""
+
+_NO_PARAMETERS: Final = ServerParameters(b"", 0, 0)
+
+
+class VrpnPublisher:
+    """Takes whole frames of one source and sends the poses of its tools.
+
+    Methods without an underscore are for the gateway's event loop, the others run in the server's thread.
+    """
+
+    def __init__(self, source: str, server: VrpnServer, offer: Offer) -> None:
+        self.losses: Losses | None = None
+        """Counts the poses that are lost."""
+        self._source = source
+        self._server = server
+        self._offer = offer
+        self._parameters: dict[int, ServerParameters] = {}  # by version, the newest last
+        self._newest = _NO_PARAMETERS
+        self._shown: ServerParameters | None = None  # those that the trackers are named by
+
+    @property
+    def wanted(self) -> bool:
+        """Whether a client is connected."""
+        return self._server.has_clients
+
+    def set_parameters(self, parameters: ServerParameters) -> None:
+        """Take note of the newest parameters."""
+        self._parameters.pop(parameters.version, None)
+        self._parameters[parameters.version] = self._newest = parameters
+        for version in list(self._parameters)[:-_MAX_VERSIONS]:
+            del self._parameters[version]
+        self.name_trackers()
+
+    def name_trackers(self) -> None:
+        """Name the trackers by the newest parameters. If too many calls wait, the next frame does so."""
+        self._offer(partial(self._show, self._newest, 0), len(self._newest.xml))
+
+    def publish(
+        self,
+        frame: Frame,
+        stamp: Stamp,
+        sequence: int,  # noqa: ARG002 - VRPN has no sequence numbers
+        components: frozenset[ComponentType],
+    ) -> None:
+        """Hand over a frame with tools. Raises OutputError if too many wait, or if the unit is unknown."""
+        if not self._server.has_clients or ComponentType.TOOLS not in components:
+            return
+        indices = [
+            index
+            for index, component in enumerate(frame.layout.components)
+            if component.type is ComponentType.TOOLS
+        ]
+        if not indices:
+            return
+        parameters = self._parameters.get(stamp.parameters_version, self._newest)
+        if parameters.frame.metres_per_unit is None:
+            raise OutputError(
+                "the unit of length is unknown: no poses are published; set it to mm or m in the server, or "
+                "set transform.units of the source in the configuration",
+                cause="unknown unit",
+            )
+        call = partial(self._send, parameters, frame, indices, stamp)
+        if not self._offer(call, len(frame.body)):
+            raise OutputError("frames arrive faster than they can be sent", cause="queue full")
+
+    def close(self) -> None:
+        """Remove the source's trackers."""
+        self._offer(partial(self._server.trackers.remove, self._source), 0)
+
+    def _show(self, parameters: ServerParameters, num_tools: int) -> None:
+        """Name the trackers of ``num_tools`` tools, or of more if the parameters have more."""
+        tools = parameters.parsed.tools
+        num_labels = 0 if tools is None else len(tools.tools)
+        num_trackers = min(max(num_labels, num_tools), MAX_TOOLS)
+        labels = describe(ComponentType.TOOLS, parameters.parsed, num_trackers).labels
+        self._server.trackers.set_tools(self._source, labels)
+        self._server.describe_trackers()
+        self._shown = parameters
+
+    def _send(self, parameters: ServerParameters, frame: Frame, indices: Sequence[int], stamp: Stamp) -> None:
+        trackers = self._server.trackers
+        for index in indices:
+            items = frame.component(index).items()
+            if self._shown is not parameters or len(items) > len(trackers.of_source(self._source)):
+                self._show(parameters, len(items))
+            poses = parameters.frame.poses(items[:MAX_TOOLS])
+            pairs = list(zip(trackers.of_source(self._source).values(), poses, strict=False))
+            messages = [
+                encode_pose(tracker.number, stamp.capture_utime, pose)
+                for tracker, pose in pairs
+                if tracker is not None and pose is not None
+            ]
+            num_without_tracker = len(items) - sum(tracker is not None for tracker, _ in pairs)
+            if num_without_tracker:
+                self._count_loss(
+                    "too many tools",
+                    f"{num_without_tracker} tools have no tracker: there can be {MAX_TOOLS} of a source and "
+                    f"{MAX_TRACKERS} of all; remove tools that are not used from the server",
+                    num_without_tracker,
+                )
+            slow = self._server.send(b"".join(messages)) if messages else []
+            if slow:
+                self._count_loss(
+                    "slow client",
+                    f"poses for {slow[0]} are lost, because it does not read them fast enough; look at that "
+                    "program",
+                    len(messages) * len(slow),
+                )
+
+    def _count_loss(self, cause: str, text: str, num_poses: int) -> None:
+        if self.losses is not None:
+            self.losses.lost(cause, text, messages=num_poses)

@@ -1,0 +1,201 @@
+"""The VRPN server: accepts clients over TCP, calls back those that ask by UDP, and sends poses to all.
+
+Everything here runs in the event loop of the output's own thread, unless it says otherwise. Clients are
+untrusted: their number, how fast they connect, and how much is read from them and kept for them is bounded.
+"""
+
+import asyncio
+import contextlib
+import logging
+import socket
+from collections.abc import Callable
+from typing import Final
+
+from gateway.log import DefectLog, EventLog, FailureLog, defect_text
+from gateway.outputs.vrpn.client import Client
+from gateway.outputs.vrpn.knocks import Knocks
+from gateway.outputs.vrpn.trackers import TrackerNames, Trackers
+from gateway.token_bucket import TokenBucket
+
+MAX_CLIENTS: Final = 64
+
+MAX_HANDSHAKES: Final = 16
+"""How many clients may be connected without having sent a cookie. One more disconnects the oldest."""
+
+_ACCEPTS_PER_S: Final = 20.0
+_ACCEPTS_BURST: Final = 40.0
+_READ_BYTES_PER_S: Final = 128 * 1024.0
+_READ_BURST_BYTES: Final = 1024 * 1024.0
+_RETRY_S: Final = 1.0
+_ACCEPT_PAUSE_S: Final = 0.1
+_BACKLOG: Final = 64
+
+logger = logging.getLogger(__name__)
+
+
+class VrpnServer:
+    """Serves ``trackers`` on a TCP and a UDP port of the same number.
+
+    ``on_wanted_changed`` is called when ``has_clients`` has changed.
+    """
+
+    def __init__(
+        self,
+        host: str,
+        port: int,
+        names: TrackerNames,
+        on_wanted_changed: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.trackers = Trackers(names)
+        self.read_budget = TokenBucket(_READ_BYTES_PER_S, _READ_BURST_BYTES)
+        """See ClientOwner."""
+        self.problem = f"it does not listen on {host}, port {port} yet"
+        """Why clients cannot connect, and what to do; "" if they can."""
+        self._on_wanted_changed = on_wanted_changed
+        self._host = host
+        self._port = port
+        self._clients: dict[Client, None] = {}  # the oldest first
+        self._ready: tuple[Client, ...] = ()
+        self._serving: asyncio.Task[None] | None = None
+        self._accepts = TokenBucket(_ACCEPTS_PER_S, _ACCEPTS_BURST)
+        self._failures = FailureLog(logger, "vrpn")
+        self._events = EventLog(logger, "vrpn")
+        self._defects = DefectLog(logger, "vrpn")
+
+    @property
+    def has_clients(self) -> bool:
+        """Whether a client is connected that has shown that it speaks VRPN. Any thread may ask."""
+        return bool(self._ready)
+
+    def send(self, poses: bytes) -> list[str]:
+        """Send messages with poses to all clients. Return the names of those that miss them."""
+        return [client.name for client in self._ready if not client.send(poses)]
+
+    def describe_trackers(self) -> None:
+        """Describe trackers that are new to all clients."""
+        for client in self._ready:
+            client.describe_trackers()
+
+    # Listening ------------------------------------------------------------------------------
+
+    async def serve(self) -> None:
+        """Accept clients until ``close``. If the port cannot be used, try again every second."""
+        self._serving = asyncio.current_task()
+        while True:
+            try:
+                with contextlib.ExitStack() as sockets:
+                    await self._listen(sockets)
+            except OSError as error:
+                self.problem = (
+                    f"{error.strerror or error}; stop the program that uses the port, or set vrpn.host and "
+                    "vrpn.port to an address of this computer and a free port"
+                )
+                self._failures.failed(self.problem)
+            except Exception as defect:  # noqa: BLE001 - try again
+                self.problem = f"{defect_text(defect)}; report this with the log"
+                self._defects.log(defect)
+            await asyncio.sleep(_RETRY_S)
+
+    async def _listen(self, sockets: contextlib.ExitStack) -> None:
+        """Accept clients. Raises OSError if a socket cannot be bound."""
+        tcp = sockets.enter_context(await self._bind(socket.SOCK_STREAM))
+        udp = sockets.enter_context(await self._bind(socket.SOCK_DGRAM))
+        tcp.listen(_BACKLOG)
+        knocks = Knocks(udp, self._call_back, self._call_failed, self._port)
+        sockets.callback(knocks.close)
+        self.problem = ""
+        self._failures.succeeded(f"trackers are served on {self._host}, port {self._port}")
+        while True:
+            await self._accept(tcp)
+
+    async def _bind(self, kind: socket.SocketKind) -> socket.socket:
+        """Return a socket that is bound. Raises OSError, whose text says which port it is."""
+        protocol = "TCP" if kind is socket.SOCK_STREAM else "UDP"
+        try:
+            loop = asyncio.get_running_loop()
+            ((family, _, _, _, address), *_) = await loop.getaddrinfo(self._host, self._port, type=kind)
+            bound = socket.socket(family, kind)
+            try:
+                bound.setblocking(False)
+                if kind is socket.SOCK_STREAM:  # the port may have old connections that are not over yet
+                    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                bound.bind(address)
+            except OSError:
+                bound.close()
+                raise
+        except OSError as error:
+            reason = error.strerror or error
+            raise OSError(f"cannot listen on {self._host}, {protocol} port {self._port}: {reason}") from error
+        return bound
+
+    async def _accept(self, tcp: socket.socket) -> None:
+        """Accept one client. Those that come too fast wait in the kernel, or are refused there."""
+        while not self._accepts.try_take():  # noqa: ASYNC110 - time makes it true, not an event
+            await asyncio.sleep(_ACCEPT_PAUSE_S)
+        loop = asyncio.get_running_loop()
+        try:
+            connection, _ = await loop.sock_accept(tcp)
+            await loop.connect_accepted_socket(lambda: Client(self), connection)
+        except OSError as error:
+            # The client has gone, or the process has too many open files.
+            self._log("accept", f"a client could not be accepted: {error.strerror or error}", logging.WARNING)
+            await asyncio.sleep(_ACCEPT_PAUSE_S)
+
+    async def _call_back(self, host: str, port: int) -> None:
+        await asyncio.get_running_loop().create_connection(lambda: Client(self), host, port)
+
+    def _call_failed(self, host: str, port: int, reason: str) -> None:
+        self._log(
+            "call",
+            f"{host} asked by UDP to be connected to on TCP port {port}, which does not work ({reason}); "
+            "allow this in its firewall, or let the client use the address tcp://HOST:PORT",
+        )
+
+    # For clients ----------------------------------------------------------------------------
+
+    def client_opened(self, client: Client) -> bool:
+        """See ClientOwner."""
+        if len(self._ready) >= MAX_CLIENTS:
+            self._log(
+                "full", f"{client.name} is refused: {MAX_CLIENTS} clients are connected", logging.WARNING
+            )
+            return False
+        waiting = [other for other in self._clients if not other.is_ready]
+        if len(waiting) >= MAX_HANDSHAKES:
+            waiting[0].abort()
+        self._clients[client] = None
+        return True
+
+    def client_ready(self, client: Client) -> None:
+        """See ClientOwner."""
+        self._set_ready((*self._ready, client))
+        self._log("connected", f"{client.name} is connected; clients now: {len(self._ready)}")
+
+    def client_failed(self, client: Client, text: str) -> None:
+        """See ClientOwner."""
+        self._log("failed", f"{client.name} is disconnected: {text}")
+
+    def client_closed(self, client: Client) -> None:
+        """See ClientOwner."""
+        self._clients.pop(client, None)
+        if client in self._ready:
+            self._set_ready(tuple(other for other in self._ready if other is not client))
+            self._log("closed", f"{client.name} has disconnected; clients now: {len(self._ready)}")
+
+    def _set_ready(self, clients: tuple[Client, ...]) -> None:
+        had_clients, self._ready = self.has_clients, clients
+        if self.has_clients is not had_clients:
+            self._on_wanted_changed()
+
+    def _log(self, kind: str, text: str, level: int = logging.INFO) -> None:
+        self._events.log(level, text, kind)
+
+    async def close(self) -> None:
+        """Stop listening and disconnect all clients."""
+        if self._serving is not None:
+            self._serving.cancel()
+            await asyncio.wait([self._serving])
+        for client in list(self._clients):
+            client.abort()
+        while self._clients:  # noqa: ASYNC110 - until the loop has closed their sockets
+            await asyncio.sleep(0)

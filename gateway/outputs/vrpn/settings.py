@@ -1,0 +1,26 @@
+"""The section ``vrpn`` of the configuration."""
+
+from typing import Annotated, Final
+
+from gateway.config.section import expects
+from gateway.config.settings import OutputSettings
+from gateway.config.values import Host, Port, Switch
+from gateway.outputs.vrpn.trackers import TrackerNames
+
+DEFAULT_VRPN_PORT: Final = 3883
+
+
+class VrpnSettings(OutputSettings):
+    """The settings of the VRPN server."""
+
+    enabled: Switch = False
+    """Whether to serve the tools as VRPN trackers."""
+
+    host: Host = "127.0.0.1"
+    """The address to listen on: one of this host, or 0.0.0.0 for all. There is no password."""
+
+    port: Port = DEFAULT_VRPN_PORT
+    """The port, for TCP and UDP."""
+
+    tracker_names: Annotated[TrackerNames, expects("auto, tool or source/tool")] = "auto"
+    """The names of trackers: tool, source/tool, or auto for tool if there is only one source."""
