@@ -49,7 +49,10 @@ class VrpnServer:
         self.trackers = Trackers(names)
         self.read_budget = TokenBucket(_READ_BYTES_PER_S, _READ_BURST_BYTES)
         """See ClientOwner."""
-        self.problem = f"it does not listen on {host}, port {port} yet"
+        self.problem = (
+            f"it does not listen on {host}, port {port} yet; if this lasts, check vrpn.host and the name "
+            "server (DNS)"
+        )
         """Why clients cannot connect, and what to do; "" if they can."""
         self._on_wanted_changed = on_wanted_changed
         self._host = host
@@ -138,27 +141,27 @@ class VrpnServer:
             await loop.connect_accepted_socket(lambda: Client(self), connection)
         except OSError as error:
             # The client has gone, or the process has too many open files.
-            self._log("accept", f"a client could not be accepted: {error.strerror or error}", logging.WARNING)
+            text = f"a client could not be accepted: {error.strerror or error}"
+            self._events.log(logging.WARNING, text, "not accepted")
             await asyncio.sleep(_ACCEPT_PAUSE_S)
 
     async def _call_back(self, host: str, port: int) -> None:
         await asyncio.get_running_loop().create_connection(lambda: Client(self), host, port)
 
     def _call_failed(self, host: str, port: int, reason: str) -> None:
-        self._log(
-            "call",
+        text = (
             f"{host} asked by UDP to be connected to on TCP port {port}, which does not work ({reason}); "
-            "allow this in its firewall, or let the client use the address tcp://HOST:PORT",
+            "allow this in its firewall, or let the client use the address tcp://HOST:PORT"
         )
+        self._events.log(logging.INFO, text, "not called")
 
     # For clients ----------------------------------------------------------------------------
 
     def client_opened(self, client: Client) -> bool:
         """See ClientOwner."""
         if len(self._ready) >= MAX_CLIENTS:
-            self._log(
-                "full", f"{client.name} is refused: {MAX_CLIENTS} clients are connected", logging.WARNING
-            )
+            text = f"{client.name} is refused: {MAX_CLIENTS} clients are connected"
+            self._events.log(logging.WARNING, text, "refused")
             return False
         waiting = [other for other in self._clients if not other.is_ready]
         if len(waiting) >= MAX_HANDSHAKES:
@@ -169,26 +172,25 @@ class VrpnServer:
     def client_ready(self, client: Client) -> None:
         """See ClientOwner."""
         self._set_ready((*self._ready, client))
-        self._log("connected", f"{client.name} is connected; clients now: {len(self._ready)}")
+        text = f"{client.name} is connected; clients now: {len(self._ready)}"
+        self._events.log(logging.INFO, text, "connected")
 
     def client_failed(self, client: Client, text: str) -> None:
         """See ClientOwner."""
-        self._log("failed", f"{client.name} is disconnected: {text}")
+        self._events.log(logging.INFO, f"{client.name} is disconnected: {text}", "failed")
 
     def client_closed(self, client: Client) -> None:
         """See ClientOwner."""
         self._clients.pop(client, None)
         if client in self._ready:
             self._set_ready(tuple(other for other in self._ready if other is not client))
-            self._log("closed", f"{client.name} has disconnected; clients now: {len(self._ready)}")
+            text = f"{client.name} has disconnected; clients now: {len(self._ready)}"
+            self._events.log(logging.INFO, text, "closed")
 
     def _set_ready(self, clients: tuple[Client, ...]) -> None:
         had_clients, self._ready = self.has_clients, clients
         if self.has_clients is not had_clients:
             self._on_wanted_changed()
-
-    def _log(self, kind: str, text: str, level: int = logging.INFO) -> None:
-        self._events.log(level, text, kind)
 
     async def close(self) -> None:
         """Stop listening and disconnect all clients."""

@@ -9,6 +9,7 @@ from gateway.config.section import Section
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import ConfigError
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.registry import OUTPUTS
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.commands import Frequency
 from gateway.rtc3d.components import ComponentType
@@ -292,7 +293,7 @@ def test_an_empty_file_is_refused(file: Path, content: str) -> None:
 def test_a_file_that_is_no_mapping_is_refused(file: Path, content: str, found: str) -> None:
     assert refused(file, content) == [
         f"lab.yaml:1:1: found {found}; expected a mapping with any of the keys "
-        "sources, spool, metrics, zenoh, lcm, takes"
+        f"sources, spool, metrics, {', '.join(OUTPUTS)}"
     ]
 
 

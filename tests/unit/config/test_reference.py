@@ -19,6 +19,7 @@ from gateway.config.settings import (
 from gateway.config.transform import RollPitchYaw, TransformSettings
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.takes.settings import TakesSettings
+from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from tests.configurations import MODEL
 
@@ -33,6 +34,7 @@ SECTIONS: dict[str, type[Section]] = {
     "zenoh": ZenohSettings,
     "lcm": LcmSettings,
     "takes": TakesSettings,
+    "vrpn": VrpnSettings,
     "spool": SpoolSettings,
     "metrics": MetricsSettings,
 }

@@ -9,6 +9,7 @@ from gateway.config.values import SourceName
 from gateway.config.words import describe
 from gateway.messages import topics
 from gateway.outputs.lcm.settings import ChannelPrefix, LcmSettings, lcm_queries_url
+from gateway.outputs.registry import OUTPUTS
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.rtc3d.components import ComponentType
 from tests.configurations import MODEL, make_settings
@@ -132,11 +133,9 @@ def test_requests_use_the_next_port_only_for_multicast_urls(url: str, queries_ur
 
 def test_at_least_one_output_must_be_enabled() -> None:
     off = {"enabled": False}
+    *others, last = (f"{name}.enabled" for name in OUTPUTS)
     assert mistakes(MODEL, {"sources": [source()], "zenoh": off, "lcm": off}) == [
-        (
-            "takes.enabled",
-            "found false here and in zenoh.enabled and lcm.enabled; expected true in at least one of them",
-        )
+        (last, f"found false here and in {' and '.join(others)}; expected true in at least one of them")
     ]
     assert MODEL.model_validate({"sources": [source()], "zenoh": off}).lcm.enabled
     assert MODEL.model_validate({"sources": [source()], "lcm": off}).zenoh.enabled
