@@ -194,6 +194,7 @@ class VrpnServer:
 
     async def close(self) -> None:
         """Stop listening and disconnect all clients."""
+        self.problem = "the VRPN server is closed; start the gateway again"
         if self._serving is not None:
             self._serving.cancel()
             await asyncio.wait([self._serving])

@@ -1,0 +1,82 @@
+"""The VRPN output, and clients that are sockets with a thread each."""
+
+import contextlib
+import socket
+import struct
+import threading
+from typing import ClassVar, Final
+
+from gateway.outputs.contract import Output
+from gateway.outputs.vrpn.output import VrpnOutput
+from gateway.outputs.vrpn.settings import VrpnSettings
+from tests.contract.frame_rigs import FrameRig, Received
+from tests.networks import free_port
+from tests.vrpn_client import COOKIE
+
+HEADER: Final = struct.Struct(">IIIiiI")
+BODY: Final = struct.Struct(">ii7d")
+
+
+class Rig(FrameRig):
+    """Clients that connect over TCP. With several sources, a tracker is called SOURCE/TOOL."""
+
+    remedies: ClassVar[tuple[str, ...]] = ("stop the program that uses the port",)
+    listens: ClassVar[bool] = True
+
+    def __init__(self) -> None:
+        self._port = self.tcp_port = self.udp_port = free_port()
+        self._received: list[Received] = []
+        self.output = self.create()
+        self._clients: list[socket.socket] = []
+        self._other_program: socket.socket | None = None
+
+    def create(self) -> Output:
+        return VrpnOutput(VrpnSettings(enabled=True, port=self._port, tracker_names="source/tool"))
+
+    @property
+    def received(self) -> list[Received]:
+        return self._received
+
+    def subscribe(self) -> None:
+        threading.Thread(target=self._read, args=(self._connect(),), daemon=True).start()
+
+    def _connect(self) -> socket.socket:
+        client = socket.create_connection(("127.0.0.1", self._port))
+        self._clients.append(client)
+        client.sendall(COOKIE)
+        return client
+
+    def _read(self, client: socket.socket) -> None:
+        names: dict[int, str] = {}
+        with contextlib.suppress(OSError, EOFError):
+            stream = client.makefile("rb")
+            assert stream.read(24) == COOKIE
+            while header := stream.read(HEADER.size):
+                length, _, _, number, message_type, _ = HEADER.unpack(header)
+                body = stream.read(-(-(length - 24) // 8) * 8)
+                if message_type == -1:
+                    names[number] = body[4:].partition(b"\0")[0].decode()
+                elif message_type == 0:
+                    self._received.append((names[number].partition("/")[0], BODY.unpack(body)[2]))
+
+    def unsubscribe(self) -> None:
+        while self._clients:
+            client = self._clients.pop()
+            with contextlib.suppress(OSError):
+                client.shutdown(socket.SHUT_RDWR)
+            client.close()
+
+    def stall(self) -> None:
+        self._connect()
+
+    def cut(self) -> None:
+        self._other_program = socket.create_server(("127.0.0.1", self._port))
+
+    def restore(self) -> None:
+        assert self._other_program is not None
+        self._other_program.close()
+
+    def close(self) -> None:
+        self.unsubscribe()
+        if self._other_program is not None:
+            self._other_program.close()
