@@ -9,6 +9,7 @@
  */
 #define _POSIX_C_SOURCE 200809L
 #include <inttypes.h>
+#include <limits.h>
 #include <lcm/lcm.h>
 #include <math.h>
 #include <stdbool.h>
@@ -32,14 +33,99 @@
 #include "rtc3d_tool_pose_t.h"
 #include "rtc3d_tools_t.h"
 
-/* Whether a component message has as many bytes as it says that it has items. The functions of lcm-gen allocate
- * memory for the items before they look, and would crash if there is not enough. */
-static bool is_whole(const void *data, size_t size, size_t item_bytes)
+/* The functions of lcm-gen trust a message: they allocate as many items as it says that it has, and expect a NUL at the
+ * end of each text. So that a damaged message does no harm, this program first walks through the bytes, with the
+ * descriptions of the types that `lcm-gen --c-typeinfo` adds. */
+
+#define TYPE(name) {#name, rtc3d_##name##_get_type_info}
+
+static const struct type {
+    const char *name;
+    const lcm_type_info_t *(*info)(void);
+} types[] = {
+    TYPE(markers_t), TYPE(tools_t), TYPE(analog_t), TYPE(forces_t), TYPE(events_t), TYPE(tool_pose_t), TYPE(status_t),
+    TYPE(clock_t), TYPE(parameters_t), TYPE(parameters_request_t), TYPE(parameters_reply_t), TYPE(command_request_t),
+    TYPE(command_reply_t), TYPE(take_t),
+    /* parts of messages */
+    TYPE(marker_t), TYPE(tool_t), TYPE(force_t), TYPE(event_t), TYPE(clock_model_t), TYPE(count_t), TYPE(loss_t),
+    TYPE(stream_status_t), TYPE(output_status_t),
+};
+
+static const lcm_type_info_t *find_type(const char *name)
 {
-    const uint8_t *count = (const uint8_t *)data + 52;
-    if (size < 56)
+    for (size_t i = 0; i < sizeof types / sizeof types[0]; i++) {
+        if (strcmp(types[i].name, name) == 0)
+            return types[i].info();
+    }
+    return NULL;
+}
+
+static int32_t read_int32(const uint8_t *data)
+{
+    return (int32_t)((uint32_t)data[0] << 24 | (uint32_t)data[1] << 16 | (uint32_t)data[2] << 8 | data[3]);
+}
+
+static bool walk_struct(const lcm_type_info_t *info, const uint8_t **data, const uint8_t *end);
+
+/* Move `data` behind a value. Return false if it ends behind `end`, or is a text without a NUL at its end. */
+static bool walk_value(const lcm_field_t *field, const uint8_t **data, const uint8_t *end)
+{
+    int64_t size = 0;
+    switch (field->type) {
+    case LCM_FIELD_INT64_T:
+    case LCM_FIELD_DOUBLE:
+        size = 8;
+        break;
+    case LCM_FIELD_INT32_T:
+    case LCM_FIELD_FLOAT:
+        size = 4;
+        break;
+    case LCM_FIELD_BOOLEAN:
+        size = 1;
+        break;
+    case LCM_FIELD_STRING:
+        size = end - *data < 4 ? -1 : read_int32(*data);
+        if (size < 1 || size > end - *data - 4 || (*data)[4 + size - 1] != 0)
+            return false;
+        size += 4;
+        break;
+    case LCM_FIELD_USER_TYPE:
+        return walk_struct(find_type(field->typestr), data, end);
+    default:
+        return false; /* no field of the gateway */
+    }
+    if (size > end - *data)
         return false;
-    return ((uint64_t)count[0] << 24 | count[1] << 16 | count[2] << 8 | count[3]) * item_bytes == size - 56;
+    *data += size;
+    return true;
+}
+
+static bool walk_struct(const lcm_type_info_t *info, const uint8_t **data, const uint8_t *end)
+{
+    void *numbers = calloc(1, info->struct_size()); /* of items: get_field looks them up in a message */
+    bool is_whole = true;
+    for (int i = 0; i < info->num_fields() && is_whole; i++) {
+        lcm_field_t field;
+        info->get_field(numbers, i, &field);
+        const int32_t items = field.num_dim == 0 ? 1 : field.dim_size[0];
+        is_whole = items >= 0;
+        for (int32_t k = 0; k < items && is_whole; k++)
+            is_whole = walk_value(&field, data, end);
+        if (is_whole && field.num_dim == 0 && field.type == LCM_FIELD_INT32_T)
+            *(int32_t *)field.data = read_int32(*data - 4);
+    }
+    free(numbers);
+    return is_whole;
+}
+
+/* Decode into `message`, which has the size of the type. Return whether the bytes are one whole message. */
+static bool decode(const lcm_type_info_t *info, const void *bytes, size_t size, void *message)
+{
+    const uint8_t *data = bytes, *end = data + size;
+    if (size < 8 || size > INT_MAX)
+        return false;
+    data += 8; /* the fingerprint, which the function of lcm-gen checks */
+    return walk_struct(info, &data, end) && data == end && info->decode(bytes, 0, (int)size, message) >= 0;
 }
 
 static long frames_left;
@@ -48,8 +134,7 @@ static void on_markers(const lcm_recv_buf_t *buffer, const char *channel, void *
 {
     (void)user;
     rtc3d_markers_t message;
-    if (!is_whole(buffer->data, buffer->data_size, 16) ||
-        rtc3d_markers_t_decode(buffer->data, 0, (int)buffer->data_size, &message) < 0) {
+    if (!decode(rtc3d_markers_t_get_type_info(), buffer->data, buffer->data_size, &message)) {
         fprintf(stderr, "ignored a malformed message on %s\n", channel);
         return;
     }
@@ -76,8 +161,7 @@ static void on_events(const lcm_recv_buf_t *buffer, const char *channel, void *u
 {
     (void)user;
     rtc3d_events_t message;
-    if (!is_whole(buffer->data, buffer->data_size, 24) ||
-        rtc3d_events_t_decode(buffer->data, 0, (int)buffer->data_size, &message) < 0) {
+    if (!decode(rtc3d_events_t_get_type_info(), buffer->data, buffer->data_size, &message)) {
         fprintf(stderr, "ignored a malformed message on %s\n", channel);
         return;
     }
@@ -111,34 +195,7 @@ static int subscribe(const char *source, long count)
     return 0;
 }
 
-/* The rest is for --vectors: any message as JSON, by the descriptions that `lcm-gen --c-typeinfo` adds to each type. */
-
-#define TYPE(name) #name, rtc3d_##name##_get_type_info
-
-static const struct type {
-    const char *name;
-    const lcm_type_info_t *(*info)(void);
-    size_t item_bytes; /* of a component message; 0 for others */
-} types[] = {
-    {TYPE(markers_t), 16},         {TYPE(tools_t), 32},          {TYPE(analog_t), 4},
-    {TYPE(forces_t), 24},          {TYPE(events_t), 24},         {TYPE(tool_pose_t), 0},
-    {TYPE(status_t), 0},           {TYPE(clock_t), 0},           {TYPE(parameters_t), 0},
-    {TYPE(parameters_request_t), 0}, {TYPE(parameters_reply_t), 0}, {TYPE(command_request_t), 0},
-    {TYPE(command_reply_t), 0},    {TYPE(take_t), 0},
-    /* parts of messages */
-    {TYPE(marker_t), 0},           {TYPE(tool_t), 0},            {TYPE(force_t), 0},
-    {TYPE(event_t), 0},            {TYPE(clock_model_t), 0},     {TYPE(count_t), 0},
-    {TYPE(loss_t), 0},             {TYPE(stream_status_t), 0},   {TYPE(output_status_t), 0},
-};
-
-static const struct type *find_type(const char *name)
-{
-    for (size_t i = 0; i < sizeof types / sizeof types[0]; i++) {
-        if (strcmp(types[i].name, name) == 0)
-            return &types[i];
-    }
-    return NULL;
-}
+/* The rest is for --vectors: any message as JSON. */
 
 static void print_text(const char *text)
 {
@@ -187,7 +244,7 @@ static const void *print_value(const lcm_field_t *field, const void *data)
         print_text(*(char *const *)data);
         return (char *const *)data + 1;
     case LCM_FIELD_USER_TYPE: {
-        const lcm_type_info_t *info = find_type(field->typestr)->info();
+        const lcm_type_info_t *info = find_type(field->typestr);
         print_struct(info, data);
         return (const char *)data + info->struct_size();
     }
@@ -220,20 +277,18 @@ static void print_struct(const lcm_type_info_t *info, const void *message)
 
 static void print_vector(const char *type_name, const uint8_t *data, size_t size)
 {
-    const struct type *type = find_type(type_name);
-    if (!type) {
+    const lcm_type_info_t *info = find_type(type_name);
+    if (!info) {
         printf("{\"error\": \"unknown type\"}\n");
         return;
     }
-    const lcm_type_info_t *info = type->info();
     void *message = calloc(1, info->struct_size());
-    if ((type->item_bytes && !is_whole(data, size, type->item_bytes)) ||
-        info->decode(data, 0, (int)size, message) != (int)size) {
-        printf("{\"error\": \"%zu bytes are not a whole %s\"}\n", size, type_name);
-    } else {
+    if (decode(info, data, size, message)) {
         print_struct(info, message);
         printf("\n");
         info->decode_cleanup(message);
+    } else {
+        printf("{\"error\": \"%zu bytes are not a whole %s\"}\n", size, type_name);
     }
     free(message);
 }

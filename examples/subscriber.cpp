@@ -13,6 +13,7 @@
 #include <optional>
 #include <sstream>
 #include <string>
+#include <sys/resource.h>
 #include <type_traits>
 #include <vector>
 
@@ -337,6 +338,9 @@ template <class... Messages> std::string to_json(const std::string &name, const 
 // Read lines TYPE HEX.
 int print_vectors()
 {
+    // What a damaged message claims to have must not fill the computer's memory.
+    const rlimit quarter_gigabyte{1 << 28, 1 << 28};
+    setrlimit(RLIMIT_AS, &quarter_gigabyte);
     for (std::string line; std::getline(std::cin, line);) {
         std::istringstream words(line);
         std::string name, digits, data;

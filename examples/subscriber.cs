@@ -70,25 +70,11 @@ static class Subscriber
         Console.WriteLine(line);
     }
 
-    // The bytes of one item of each type of component message.
-    static readonly Dictionary<string, int> itemBytes = new Dictionary<string, int>
-    {
-        { "markers_t", 16 }, { "tools_t", 32 }, { "analog_t", 4 }, { "forces_t", 24 }, { "events_t", 24 },
-    };
-
-    // Return the message as an object of its class. Component messages must have as many bytes as they say that they
-    // have items, because the classes of lcm-gen allocate memory for the items before they look.
+    // Return the message as an object of its class.
     static object Decode(string typeName, byte[] data)
     {
-        int size;
-        var isWhole = true;
-        if (itemBytes.TryGetValue(typeName, out size))
-        {
-            isWhole = data.Length >= 56;
-            isWhole = isWhole && data.Length == 56 + (long)size * LCM.LCM.LCMDataInputStream.Integer(data, 52);
-        }
         var type = Assembly.GetExecutingAssembly().GetType("rtc3d." + typeName);
-        if (isWhole && type != null)
+        if (type != null)
         {
             var input = new LCM.LCM.LCMDataInputStream(data);
             try
@@ -99,7 +85,7 @@ static class Subscriber
             }
             catch (TargetInvocationException)
             {
-                // A wrong fingerprint, or a message that ends too early.
+                // A wrong fingerprint, a message that ends too early, or an impossible number of items.
             }
         }
         throw new InvalidDataException(data.Length + " bytes are not a whole " + typeName);
@@ -220,9 +206,12 @@ namespace LCM.LCM
             get { return data.Length - position; }
         }
 
-        public static int Integer(byte[] data, int position)
+        // Return a number of items or of bytes in a text if the rest of the message can have as many.
+        public int Limit(int count)
         {
-            return IPAddress.NetworkToHostOrder(BitConverter.ToInt32(data, position));
+            if (count < 0 || count > Available)
+                throw new EndOfStreamException();
+            return count;
         }
 
         public byte ReadByte()
@@ -237,7 +226,7 @@ namespace LCM.LCM
 
         public int ReadInt32()
         {
-            return Integer(data, Advance(4));
+            return IPAddress.NetworkToHostOrder(BitConverter.ToInt32(data, Advance(4)));
         }
 
         public long ReadInt64()

@@ -8,6 +8,7 @@ decodes messages from standard input instead (lcm_types/vectors/README.md).
 """
 
 import argparse
+import io
 import json
 import math
 import signal
@@ -20,10 +21,11 @@ import rtc3d
 
 def decode(lcm_type, data):
     """Return the message, or raise ValueError."""
+    buffer = io.BytesIO(data)
     try:
-        message = lcm_type.decode(data)
+        message = lcm_type.decode(buffer)
         # lcm-gen's decoder reads a string that is cut off as a shorter one.
-        is_whole = "string" not in lcm_type.__typenames__ or message.encode() == data
+        is_whole = not buffer.read(1) and ("string" not in lcm_type.__typenames__ or message.encode() == data)
     except (struct.error, ValueError) as error:
         raise ValueError(f"not a whole {lcm_type.__name__}: {error}") from error
     if not is_whole:

@@ -40,7 +40,7 @@ _ON_ZENOH: Final = ("--connect", "{endpoint}", "--source", "lab", "--count", str
 
 
 _CSHARP: Final = ("mono", "build/subscriber.exe")
-_JAVA: Final = ("java", "-jar", "build/subscriber.jar")
+_JAVA: Final = ("java", "-Xmx256m", "-jar", "build/subscriber.jar")
 
 
 @dataclass(frozen=True)
@@ -112,6 +112,17 @@ def run_program(*command: str, ready: str) -> Iterator["subprocess.Popen[str]"]:
             yield process
         finally:
             process.terminate()
+
+
+def output_until_the_end(process: "subprocess.Popen[str]") -> str:
+    """Return what a program of ``run_program`` prints until it ends by itself.
+
+    (``communicate`` would lose what came together with the line that ``run_program`` waited for.)
+    """
+    assert process.stdout is not None
+    text = process.stdout.read()
+    process.wait(30)
+    return text
 
 
 @contextlib.contextmanager

@@ -12,7 +12,14 @@ import rtc3d
 
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.synthetic import SyntheticScene
-from tests.example_programs import EXAMPLES, LCM_URL, ExampleProgram, run_gateway, run_program
+from tests.example_programs import (
+    EXAMPLES,
+    LCM_URL,
+    ExampleProgram,
+    output_until_the_end,
+    run_gateway,
+    run_program,
+)
 from tests.joined_components import MARKERS, SCENARIOS, Pair, Scenario
 
 pytestmark = pytest.mark.netns
@@ -38,7 +45,7 @@ def endpoint(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     sizes = ["--markers", "5", "--tools", "0", "--analog", "2", "--plates", "0"]
     rates = ["--rate", "200", "--analog-rate", "2000"]
     folder = tmp_path_factory.mktemp("gateway")
-    with run_gateway(folder, *sizes, *rates, ready="lab (analog): idle → streaming") as endpoint:
+    with run_gateway(folder, *sizes, *rates, ready="lab (analog): connected to") as endpoint:
         yield endpoint
 
 
@@ -48,7 +55,7 @@ def test_each_frame_of_markers_is_printed_with_its_ten_analog_samples(
 ) -> None:
     program.build()
     with run_program(*program.run_command(endpoint), ready="listening") as process:
-        text = process.communicate(timeout=30)[0]
+        text = output_until_the_end(process)
     assert process.returncode == 0, text
     lines = [LINE.fullmatch(line) for line in text.splitlines()]
     assert len(lines) == COUNT, text

@@ -1,6 +1,7 @@
 """The option --vectors of each example program, with the test vectors and with damaged messages."""
 
 import json
+import random
 import subprocess
 from typing import Any
 
@@ -18,9 +19,10 @@ def decode_with(program: ExampleProgram, messages: list[tuple[str, bytes]]) -> l
     """Return what the program prints for each type and message."""
     program.build()
     lines = "".join(f"{type_name} {data.hex()}\n" for type_name, data in messages)
+    command = [*program.command, "--vectors"]
     run = subprocess.run(
-        [*program.command, "--vectors"],
-        input=lines, cwd=EXAMPLES, capture_output=True, text=True, encoding="utf-8", check=False, timeout=60,
+        command, input=lines, cwd=EXAMPLES, capture_output=True,
+        encoding="utf-8", errors="replace", check=False, timeout=60,
     )  # fmt: skip
     assert (run.returncode, run.stderr) == (0, "")
     printed = [json.loads(line) for line in run.stdout.splitlines()]
@@ -41,14 +43,14 @@ def test_each_program_decodes_the_test_vectors(program: ExampleProgram) -> None:
 
 
 def damaged_messages(types: frozenset[str]) -> list[tuple[str, bytes]]:
-    """Return messages that nobody can decode: cut off, of other types, or with wrong numbers of items."""
+    """Return messages that nobody can decode: too short, too long, of other types, with wrong numbers."""
     damaged = []
     for vector in VECTORS:
         if vector.type_name not in types:
             continue
         name, data = vector.type_name, vector.data
         damaged += [(name, data[:length]) for length in {0, 1, 7, 8, len(data) // 2, len(data) - 1}]
-        damaged += [(name, bytes(8) + data[8:]), (name, b"\xff" * len(data))]
+        damaged += [(name, bytes(8) + data[8:]), (name, b"\xff" * len(data)), (name, data + b"\0")]
         damaged += [(other, data) for other in types if other != name]
         if name in COMPONENT_TYPES:
             before, after = data[:COUNT_OFFSET], data[COUNT_OFFSET + 4 :]
@@ -68,6 +70,21 @@ def test_each_program_reports_messages_that_it_cannot_decode(program: ExamplePro
         if list(answer) != ["error"] or not isinstance(answer["error"], str)
     ]
     assert not wrong
+
+
+@each_program
+def test_each_program_survives_messages_with_random_bytes(program: ExampleProgram) -> None:
+    generator = random.Random(17)
+    messages = []
+    for vector in VECTORS:
+        for _ in range(40 if vector.type_name in program.types else 0):
+            data = bytearray(vector.data)
+            for _ in range(generator.randint(1, 3)):
+                data[generator.randrange(8, len(data))] = generator.choice(
+                    (0, 0x7F, 0xFF, generator.randrange(256))
+                )
+            messages.append((vector.type_name, bytes(data)))
+    assert all(isinstance(values, dict) for values in decode_with(program, messages))
 
 
 @each_program

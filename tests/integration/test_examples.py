@@ -19,6 +19,7 @@ from tests.example_programs import (
     LCM_URL,
     PROGRAMS,
     ExampleProgram,
+    output_until_the_end,
     run_gateway,
     run_program,
 )
@@ -71,7 +72,7 @@ def assert_lines_match_the_scene(text: str) -> None:
 def test_each_program_prints_the_markers_of_every_frame(endpoint: str, program: ExampleProgram) -> None:
     program.build()
     with run_program(*program.run_command(endpoint), ready="listening") as process:
-        text = process.communicate(timeout=30)[0]
+        text = output_until_the_end(process)
     assert process.returncode == 0, text
     assert_lines_match_the_scene(text)
 
@@ -99,7 +100,7 @@ def test_the_python_examples_ignore_malformed_messages_and_end_quietly_at_ctrl_c
         assert program.stdout is not None
         line = program.stdout.readline()
         program.send_signal(signal.SIGINT)
-        rest = program.communicate(timeout=30)[0]
+        rest = output_until_the_end(program)
         stop.set()
         sender.join()
     assert line.startswith("ignored a malformed message: ")
