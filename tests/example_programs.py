@@ -41,6 +41,8 @@ _ON_ZENOH: Final = ("--connect", "{endpoint}", "--source", "lab", "--count", str
 
 _CSHARP: Final = ("mono", "build/subscriber.exe")
 _JAVA: Final = ("java", "-Xmx256m", "-jar", "build/subscriber.jar")
+_RUST: Final = ("build/rust/release/subscriber",)
+_OCTAVE: Final = ("sh", "-c", "exec octave-cli --quiet --no-init-file --eval \"read_take('$0')\"")
 
 
 @dataclass(frozen=True)
@@ -67,7 +69,8 @@ class ExampleProgram:
         """Build the program if it is not up to date; skip the test if tools are missing, and fail in CI."""
         missing = [tool for tool in self.tools if shutil.which(tool) is None]
         if missing:
-            reason = f"the example {self.name} needs {' and '.join(missing)}"
+            packages = "docs/how-to/languages.md says what to install, and .ci/run installs it"
+            reason = f"the example {self.name} needs {' and '.join(missing)}: {packages}"
             (pytest.fail if os.environ.get("CI") == "true" else pytest.skip)(reason)
         if self.target is None:
             return
@@ -92,6 +95,10 @@ PROGRAMS: Final = (
     ExampleProgram("C++, LCM", ("build/subscriber_cpp",), _ON_LCM, ALL_TYPES, "cpp", ("c++", "make")),
     ExampleProgram("Java, LCM", _JAVA, _ON_LCM, ALL_TYPES, "java", ("javac", "java", "make")),
     ExampleProgram("C#, LCM", _CSHARP, _ON_LCM, ALL_TYPES, "csharp", ("mcs", "mono", "make")),
+    ExampleProgram("Go, LCM", ("build/subscriber_go",), _ON_LCM, target="go", tools=("go", "make")),
+    ExampleProgram("Rust, LCM", _RUST, _ON_LCM, target="rust", tools=("cargo", "make")),
+    ExampleProgram("JavaScript, LCM", ("node", "subscriber.js"), _ON_LCM, tools=("node",)),
+    ExampleProgram("Octave, takes", _OCTAVE, tools=("octave-cli",)),
 )
 
 
