@@ -97,8 +97,10 @@ PROGRAMS: Final = (
     ExampleProgram("C#, LCM", _CSHARP, _ON_LCM, ALL_TYPES, "csharp", ("mcs", "mono", "make")),
     ExampleProgram("Go, LCM", ("build/subscriber_go",), _ON_LCM, target="go", tools=("go", "make")),
     ExampleProgram("Rust, LCM", _RUST, _ON_LCM, target="rust", tools=("cargo", "make")),
-    ExampleProgram("JavaScript, LCM", ("node", "subscriber.js"), _ON_LCM, tools=("node",)),
-    ExampleProgram("Octave, takes", _OCTAVE, tools=("octave-cli",)),
+    ExampleProgram(
+        "JavaScript, LCM", ("node", "subscriber.js"), _ON_LCM, target="javascript", tools=("node",)
+    ),
+    ExampleProgram("Octave, takes", _OCTAVE, target="octave", tools=("octave-cli",)),
 )
 
 

@@ -77,6 +77,15 @@ def test_each_program_prints_the_markers_of_every_frame(endpoint: str, program: 
     assert_lines_match_the_scene(text)
 
 
+@pytest.mark.parametrize("program", [program for program in PROGRAMS if program.target], ids=str)
+def test_make_builds_and_runs_each_program(program: ExampleProgram) -> None:
+    program.build()
+    arguments = "ARGS=--help" if program.arguments else "ARGS="
+    make = ["make", "-C", str(EXAMPLES), f"PYTHON={sys.executable}", f"run-{program.target}", arguments]
+    text = subprocess.check_output(make, text=True, stderr=subprocess.STDOUT)
+    assert "Print the markers" in text or "MOCAP_LAB_3D sequence 0 at" in text
+
+
 @pytest.mark.parametrize("name", ["subscriber_lcm.py", "subscriber_zenoh.py"])
 def test_the_python_examples_ignore_malformed_messages_and_end_quietly_at_ctrl_c(name: str) -> None:
     port = free_port()
