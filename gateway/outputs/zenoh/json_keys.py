@@ -16,7 +16,6 @@ from typing import Any, Final
 import zenoh
 
 from gateway.descriptions.labels import describe, event_labels
-from gateway.errors import ProtocolError
 from gateway.losses import Losses
 from gateway.messages.decode import decode
 from gateway.messages.json_text import MAX_JSON_SOURCE_BYTES, json_text
@@ -190,12 +189,13 @@ class JsonPublisher:
         if publisher is None or not self.wanted:
             return
         try:
-            publisher.put(self._text(message))
-        except ProtocolError as error:
-            self._count_loss("json failed", f"a message for {self._key} cannot be converted: {error}")
+            publisher.put(self._text(message).encode())
         except zenoh.ZError as error:
             if self._publisher is not None:
                 self._count_loss("put failed", f"Zenoh did not take {self._key}: {zenoh_reason(error)}")
+        except Exception as error:
+            self._count_loss("json failed", f"a message for {self._key} cannot be converted: {error!r}")
+            logger.debug("zenoh: %s", self._key, exc_info=error)
 
     def _text(self, message: bytes) -> str:
         decoded = decode(message)
