@@ -24,6 +24,7 @@ from gateway.outputs.lcm.connection import open_lcm
 from tests.hostile.servers import SERVERS, streaming
 from tests.hostile.test_parameters import ATTACKS as PARAMETERS
 from tests.hostile.test_parameters import giving
+from tests.hostile.vrpn_clients import ATTACKS as VRPN_CLIENTS
 from tests.hostile.zenoh_peer import KINDS
 from tests.networks import open_zenoh
 from tests.servers import Client, Script, ScriptedServer, c3d_file, packet
@@ -44,6 +45,7 @@ class Target:
     lcm_url: str
     queries_url: str
     metrics_port: int
+    vrpn_port: int
     pid: int
     ports: tuple[int, ...]
     """Where the gateway expects hostile servers."""
@@ -137,6 +139,10 @@ async def _held_http_connections(target: Target) -> None:
         writer.close()
 
 
+def _vrpn_client(attack: Callable[[int], Awaitable[None]]) -> Attack:
+    return lambda target: attack(target.vrpn_port)
+
+
 async def _reloads(target: Target) -> None:
     while True:
         os.kill(target.pid, signal.SIGHUP)
@@ -156,6 +162,7 @@ ATTACKS: Final[dict[str, Attack]] = {
     "sender: LCM": _lcm_garbage,
     "Zenoh peer: stalled subscribers": _stalled_subscribers,
     **{f"Zenoh peer: {kind}": _zenoh_peer(kind) for kind in KINDS},
+    **{f"VRPN client: {name}": _vrpn_client(attack) for name, attack in VRPN_CLIENTS.items()},
     "host: HTTP connections": _held_http_connections,
     "host: reloads": _reloads,
 }

@@ -129,6 +129,7 @@ class Soak:
             markers=20, tools=3, analog=8, plates=1, rate_hz=RATE_HZ, analog_rate_hz=RATE_HZ
         )
         ports = {name: free_port() for name in HOSTILE}
+        vrpn_port = free_port()
         with tempfile.TemporaryDirectory() as folder, simulator_process(*HEALTHY_SCENE) as (healthy_port, _):
             async with Simulator(scene, port=free_port()) as simulator:
                 sources: dict[str, Source] = {
@@ -143,19 +144,29 @@ class Soak:
                 }
                 with dead_name_server(Path(folder)) as before_command:
                     async with run_gateway(
-                        Path(folder), healthy_port, sources, before_command=before_command
+                        Path(folder),
+                        healthy_port,
+                        sources,
+                        settings={"vrpn": {"enabled": True, "port": vrpn_port}},
+                        before_command=before_command,
                     ) as gateway:
-                        await self._run(simulator, gateway, tuple(ports.values()), console)
+                        await self._run(simulator, gateway, vrpn_port, tuple(ports.values()), console)
                 self.gateway_report = gateway.report
 
     async def _run(
-        self, simulator: Simulator, gateway: RunningGateway, ports: tuple[int, ...], console: Console
+        self,
+        simulator: Simulator,
+        gateway: RunningGateway,
+        vrpn_port: int,
+        ports: tuple[int, ...],
+        console: Console,
     ) -> None:
         target = Target(
             gateway.zenoh_endpoint,
             gateway.lcm_url,
             LcmSettings(url=gateway.lcm_url).effective_queries_url,
             gateway.metrics_port,
+            vrpn_port,
             gateway.process.pid,
             ports,
         )

@@ -22,8 +22,8 @@ MAX_CLIENTS: Final = 64
 MAX_HANDSHAKES: Final = 16
 """How many clients may be connected without having sent a cookie. One more disconnects the oldest."""
 
-_ACCEPTS_PER_S: Final = 20.0
-_ACCEPTS_BURST: Final = 40.0
+_ACCEPTS_PER_S: Final = 50.0
+_ACCEPTS_BURST: Final = 100.0
 _READ_BYTES_PER_S: Final = 128 * 1024.0
 _READ_BURST_BYTES: Final = 1024 * 1024.0
 _RETRY_S: Final = 1.0

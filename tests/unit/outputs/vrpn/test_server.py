@@ -83,6 +83,22 @@ async def test_client_is_called_back_at_its_own_address(running: Running) -> Non
         await wait_until_async(lambda: client.poses)
 
 
+async def test_only_the_address_that_asks_is_called_back(running: Running) -> None:
+    _, port = running
+    with (
+        socket.create_server(("127.0.0.2", 0)) as asker,
+        socket.create_server(("127.0.0.3", asker.getsockname()[1])) as stranger,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp,
+    ):
+        udp.bind(("127.0.0.2", 0))
+        udp.sendto(f"127.0.0.3 {asker.getsockname()[1]}\0".encode(), ("127.0.0.1", port))
+        connection, _ = await asyncio.to_thread(asker.accept)
+        connection.close()
+        stranger.setblocking(False)
+        with pytest.raises(BlockingIOError):
+            stranger.accept()
+
+
 async def test_repeated_request_does_not_connect_twice(running: Running) -> None:
     server, port = running
     with socket.create_server(("127.0.0.1", 0)) as listener:
