@@ -8,6 +8,7 @@ from typing import Final
 from gateway.findings import Finding, MessageLoad, Subject
 from gateway.outputs.vrpn.protocol import COOKIE_BYTES, COOKIE_START
 from gateway.outputs.vrpn.settings import VrpnSettings
+from gateway.outputs.vrpn.sockets import bind
 
 CHECKS: Final = ("port", "access")
 
@@ -37,7 +38,7 @@ def _check_port(settings: VrpnSettings) -> Finding:
     where = f"{settings.host}, port {settings.port}"
     try:
         for kind in (socket.SOCK_STREAM, socket.SOCK_DGRAM):
-            _bind(settings, kind)
+            bind(socket.getaddrinfo(settings.host, settings.port, type=kind), kind).close()
     except OSError as error:
         if _is_served(settings):
             return _vrpn.passing("port", f"a VRPN server answers on {where}")
@@ -48,17 +49,6 @@ def _check_port(settings: VrpnSettings) -> Finding:
             "computer and a free port.",
         )
     return _vrpn.passing("port", f"TCP and UDP are free on {where}; no gateway serves VRPN there now")
-
-
-def _bind(settings: VrpnSettings, kind: socket.SocketKind) -> None:
-    """Bind the port as the server does, and release it. Raises OSError."""
-    ((family, _, _, _, address), *_) = socket.getaddrinfo(settings.host, settings.port, type=kind)
-    with socket.socket(family, kind) as bound:
-        if kind is socket.SOCK_STREAM:
-            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        bound.bind(address)
-        if kind is socket.SOCK_STREAM:
-            bound.listen(1)
 
 
 def _is_served(settings: VrpnSettings) -> bool:

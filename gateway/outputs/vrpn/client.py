@@ -29,12 +29,15 @@ _READ_BURST_BYTES: Final = 256 * 1024.0
 _READ_PAUSE_S: Final = 0.25
 
 _KEEPALIVE: Final = {
-    socket.TCP_KEEPIDLE: 10,
-    socket.TCP_KEEPINTVL: 5,
-    socket.TCP_KEEPCNT: 4,
-    socket.TCP_USER_TIMEOUT: int(1000 * UNREAD_TIMEOUT_S),
+    "TCP_KEEPIDLE": 10,
+    "TCP_KEEPINTVL": 5,
+    "TCP_KEEPCNT": 4,
+    "TCP_USER_TIMEOUT": int(1000 * UNREAD_TIMEOUT_S),
 }
-"""Ends a connection whose other side has disappeared, after about UNREAD_TIMEOUT_S."""
+"""Options of TCP that end a connection whose other side has disappeared, after about UNREAD_TIMEOUT_S.
+
+Not every system has all of them.
+"""
 
 
 class ClientOwner(Protocol):
@@ -97,8 +100,9 @@ class Client(asyncio.BufferedProtocol):
             return
         connection = cast(socket.socket, transport.get_extra_info("socket"))
         connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for option, value in _KEEPALIVE.items():
-            connection.setsockopt(socket.IPPROTO_TCP, option, value)
+        for name, value in _KEEPALIVE.items():
+            if hasattr(socket, name):
+                connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
         self._transport.set_write_buffer_limits(high=MAX_UNREAD_BYTES)
         self._transport.write(COOKIE)
         self._set_timeout(

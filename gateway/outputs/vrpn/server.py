@@ -14,6 +14,7 @@ from typing import Final
 from gateway.log import DefectLog, EventLog, FailureLog, defect_text
 from gateway.outputs.vrpn.client import Client
 from gateway.outputs.vrpn.knocks import Knocks
+from gateway.outputs.vrpn.sockets import bind
 from gateway.outputs.vrpn.trackers import TrackerNames, Trackers
 from gateway.token_bucket import TokenBucket
 
@@ -28,7 +29,6 @@ _READ_BYTES_PER_S: Final = 128 * 1024.0
 _READ_BURST_BYTES: Final = 1024 * 1024.0
 _RETRY_S: Final = 1.0
 _ACCEPT_PAUSE_S: Final = 0.1
-_BACKLOG: Final = 64
 
 logger = logging.getLogger(__name__)
 
@@ -103,7 +103,6 @@ class VrpnServer:
         """Accept clients. Raises OSError if a socket cannot be bound."""
         tcp = sockets.enter_context(await self._bind(socket.SOCK_STREAM))
         udp = sockets.enter_context(await self._bind(socket.SOCK_DGRAM))
-        tcp.listen(_BACKLOG)
         knocks = Knocks(udp, self._call_back, self._call_failed, self._port)
         sockets.callback(knocks.close)
         self.problem = ""
@@ -116,20 +115,10 @@ class VrpnServer:
         protocol = "TCP" if kind is socket.SOCK_STREAM else "UDP"
         try:
             loop = asyncio.get_running_loop()
-            ((family, _, _, _, address), *_) = await loop.getaddrinfo(self._host, self._port, type=kind)
-            bound = socket.socket(family, kind)
-            try:
-                bound.setblocking(False)
-                if kind is socket.SOCK_STREAM:  # the port may have old connections that are not over yet
-                    bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-                bound.bind(address)
-            except OSError:
-                bound.close()
-                raise
+            return bind(await loop.getaddrinfo(self._host, self._port, type=kind), kind)
         except OSError as error:
             reason = error.strerror or error
             raise OSError(f"cannot listen on {self._host}, {protocol} port {self._port}: {reason}") from error
-        return bound
 
     async def _accept(self, tcp: socket.socket) -> None:
         """Accept one client. Those that come too fast wait in the kernel, or are refused there."""

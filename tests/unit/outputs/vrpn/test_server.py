@@ -13,6 +13,7 @@ from gateway.outputs.vrpn import client as client_module
 from gateway.outputs.vrpn import server as server_module
 from gateway.outputs.vrpn.protocol import encode_pose
 from gateway.outputs.vrpn.server import MAX_CLIENTS, MAX_HANDSHAKES, VrpnServer
+from gateway.outputs.vrpn.sockets import bind
 from tests.networks import free_port
 from tests.vrpn_client import COOKIE, Pose, VrpnClient, description, message, send_datagram
 from tests.waiting import wait_until_async
@@ -368,6 +369,24 @@ async def test_host_of_another_computer_is_a_problem() -> None:
     await wait_until_async(lambda: "cannot listen on 192.0.2.1" in server.problem)
     await server.close()
     assert serving.done()
+
+
+async def test_name_of_this_computer_means_its_ipv4_address() -> None:
+    port = free_port()
+    server = VrpnServer("localhost", port, "auto")
+    serving = asyncio.create_task(server.serve())
+    await wait_until_async(lambda: not server.problem)
+    async with await VrpnClient.knock(port) as client:  # on 127.0.0.1
+        await wait_until_async(lambda: client.types)
+    await server.close()
+    assert serving.done()
+
+
+def test_addresses_of_ipv4_come_first() -> None:
+    six = socket.getaddrinfo("::1", 0, type=socket.SOCK_DGRAM)
+    four = socket.getaddrinfo("127.0.0.1", 0, type=socket.SOCK_DGRAM)
+    with bind([*six, *four], socket.SOCK_DGRAM) as bound:
+        assert bound.getsockname()[0] == "127.0.0.1"
 
 
 async def test_port_is_free_after_close() -> None:
