@@ -4,6 +4,7 @@ With 69 channels, they need a fifth of the space of JSON, and a thirtieth of the
 """
 
 import unicodedata
+from collections import Counter
 from collections.abc import Sequence
 from typing import Final
 
@@ -24,6 +25,9 @@ _MAX_NAME_BYTES: Final = 100
 MAX_FIELDS: Final = 10_000
 """Protobuf for Python reads no message of more than 64 KiB in fields."""
 
+_MAX_LIVE_RECORDS: Final = 20
+"""How many a live output remembers. More can only come from labels that change all the time."""
+
 _FIXED_32_BITS: Final = 5
 """The wire type of float."""
 
@@ -31,14 +35,17 @@ _FIXED_32_BITS: Final = 5
 class FloatTopics:
     """The topics of one source whose messages have a number for each label.
 
-    Programs decode all messages of a topic in the same way. So there is another topic for other labels, such
-    as /lab/analog_2.
+    Programs decode all messages of a topic in the same way, and look up the fields by the name of the schema.
+    So in a file, there is another topic for other labels, such as /lab/analog_2. With ``one_topic``, there is
+    only another schema: a live output withdraws the topic and announces it again.
     """
 
-    def __init__(self, source: str) -> None:
+    def __init__(self, source: str, *, one_topic: bool = False) -> None:
         self.source = source
+        self._one_topic = one_topic
         self._package = f"rtc3d.{field_names([source], 'source')[0]}"
         self._records: dict[tuple[str, tuple[str, ...]], FloatRecord] = {}
+        self._numbers: Counter[str] = Counter()
 
     def record(self, name: str, fields: tuple[str, ...]) -> "FloatRecord":
         """Return the messages with these fields, which ``field_names`` has made.
@@ -47,12 +54,14 @@ class FloatTopics:
         """
         found = self._records.get((name, fields))
         if found is None:
-            number = 1 + sum(key[0] == name for key in self._records)
+            if self._one_topic and len(self._records) >= _MAX_LIVE_RECORDS:
+                self._records.clear()
+            self._numbers[name] += 1
+            number = self._numbers[name]
             suffix = f"_{number}" if number > 1 else ""
-            # Programs look up the fields by the name of the schema, so each is different.
             schema_name = f"{self._package}.{name.capitalize()}{suffix}"
-            found = FloatRecord(f"/{self.source}/{name}{suffix}", schema_name, fields)
-            self._records[name, fields] = found
+            topic_name = f"/{self.source}/{name}" + ("" if self._one_topic else suffix)
+            found = self._records[name, fields] = FloatRecord(topic_name, schema_name, fields)
         return found
 
 

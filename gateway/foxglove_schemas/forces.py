@@ -1,8 +1,11 @@
 """Force plates in Foxglove's 3D scene: their outlines, and an arrow for each force."""
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from typing import Final
 
+import numpy as np
 from foxglove.messages import (
     ArrowPrimitive,
     Color,
@@ -22,6 +25,8 @@ from foxglove.messages import (
 
 from gateway.descriptions.plate_forces import METRES_PER_NEWTON, PlacedPlate, force_on, placed_plates
 from gateway.foxglove_schemas.topics import FoxgloveMessage, timestamp, topic_of
+from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.tool_pose import metres_per_unit
 from gateway.rtc3d.components import Items
 from gateway.rtc3d.parameters import Parameters
 
@@ -39,11 +44,11 @@ _LIFETIME: Final = Duration(1)
 class ForceScene:
     """The plates of one source and the forces on them. Plates without a known place are not drawn."""
 
-    def __init__(self, source: str, parameters: Parameters) -> None:
-        self._source = source
+    def __init__(self, source: str, parameters: Parameters, frame: CoordinateFrame) -> None:
+        self.outlines_topic = topic_of(f"/{source}/plates", SceneUpdate)
+        self.arrows_topic = topic_of(f"/{source}/forces", SceneUpdate)
         self._plates = placed_plates(parameters)
-        self._outlines = topic_of(f"/{source}/plates", SceneUpdate)
-        self._arrows = topic_of(f"/{source}/forces", SceneUpdate)
+        self._frame = _frame_of_metres(frame, parameters)
 
     def plates(self, utime: int) -> FoxgloveMessage:
         """Return the outlines and labels of the plates, in place of all earlier ones."""
@@ -53,16 +58,16 @@ class ForceScene:
             entities=[
                 SceneEntity(
                     timestamp=time,
-                    frame_id=self._source,
+                    frame_id=self._frame.frame_id,
                     id=plate.label,
-                    lines=[_outline(plate)],
-                    texts=[_text(plate)],
+                    lines=[_outline(plate, self._frame)],
+                    texts=[_text(plate, self._frame)],
                 )
                 for plate in self._plates
                 if plate is not None
             ],
         )
-        return FoxgloveMessage(self._outlines, utime, update.encode())
+        return FoxgloveMessage(self.outlines_topic, utime, update.encode())
 
     def arrows(self, items: Items, utime: int) -> FoxgloveMessage:
         """Return an arrow from each centre of pressure; ``items`` are those of the Force component."""
@@ -71,24 +76,36 @@ class ForceScene:
             # An entity without an arrow removes the one before.
             SceneEntity(
                 timestamp=time,
-                frame_id=self._source,
+                frame_id=self._frame.frame_id,
                 id=plate.label,
                 lifetime=_LIFETIME,
-                arrows=_arrow(plate, load),
+                arrows=_arrow(plate, load, self._frame),
             )
             for plate, load in zip(self._plates, items.tolist(), strict=False)
             if plate is not None
         ]
-        return FoxgloveMessage(self._arrows, utime, SceneUpdate(entities=entities).encode())
+        return FoxgloveMessage(self.arrows_topic, utime, SceneUpdate(entities=entities).encode())
 
 
-def _arrow(plate: PlacedPlate, load: tuple[float, ...]) -> list[ArrowPrimitive]:
+def _frame_of_metres(frame: CoordinateFrame, parameters: Parameters) -> CoordinateFrame:
+    """Return the same frame for plates, which are in metres already: they are scaled like the markers."""
+    unit_m = metres_per_unit("mm" if parameters.markers is None else parameters.markers.unit)
+    scale = frame.metres_per_unit / unit_m if frame.metres_per_unit and unit_m else 1.0
+    return replace(frame, metres_per_unit=scale)
+
+
+def _placed(points: Sequence[Sequence[float]], frame: CoordinateFrame) -> list[list[float]]:
+    moved: list[list[float]] = frame.points(np.array(points)).tolist()
+    return moved
+
+
+def _arrow(plate: PlacedPlate, load: tuple[float, ...], frame: CoordinateFrame) -> list[ArrowPrimitive]:
     """Return the arrow of a load; [] if it is too small or not known."""
     found = force_on(plate, load)
     if found is None:
         return []
-    x, y, z = found.position
-    fx, fy, fz = found.force
+    [[x, y, z]] = _placed([found.position], frame)
+    [[fx, fy, fz]] = frame.vectors(np.array([found.force])).tolist()
     force = math.hypot(fx, fy, fz)
     length = force * METRES_PER_NEWTON
     head = min(_HEAD_M, length / 2)
@@ -116,18 +133,18 @@ def _from_x_axis(x: float, y: float, z: float) -> Quaternion:
     return Quaternion(x=0.0, y=-z / length, z=y / length, w=w / length)
 
 
-def _outline(plate: PlacedPlate) -> LinePrimitive:
+def _outline(plate: PlacedPlate, frame: CoordinateFrame) -> LinePrimitive:
     return LinePrimitive(
         type=LinePrimitiveLineType.LineLoop,
         pose=Pose(position=Vector3(), orientation=Quaternion(w=1.0)),
         thickness=_LINE_M,
-        points=[Point3(x=x, y=y, z=z) for x, y, z in plate.corners],
+        points=[Point3(x=x, y=y, z=z) for x, y, z in _placed(plate.corners, frame)],
         color=_PLATE_COLOR,
     )
 
 
-def _text(plate: PlacedPlate) -> TextPrimitive:
-    x, y, z = plate.centre
+def _text(plate: PlacedPlate, frame: CoordinateFrame) -> TextPrimitive:
+    [[x, y, z]] = _placed([plate.centre], frame)
     return TextPrimitive(
         pose=Pose(position=Vector3(x=x, y=y, z=z), orientation=Quaternion(w=1.0)),
         billboard=True,

@@ -1,9 +1,10 @@
 """The messages of one source as Foxglove's, one at a time: for a file, or live.
 
-docs/reference/takes.md has the table of topics. Positions are in metres, in the frame of the source.
+docs/reference/takes.md has the table of topics.
 """
 
-import json
+import itertools
+from collections.abc import Container
 from typing import Any, Final
 
 import numpy as np
@@ -22,9 +23,18 @@ from foxglove.messages import (
 
 from gateway.descriptions.event_texts import MAX_EVENT_AGE_US, event_text
 from gateway.descriptions.labels import describe, event_labels
-from gateway.foxglove_schemas.float_topics import FloatRecord, FloatTopics, field_names
+from gateway.foxglove_schemas.float_topics import MAX_FIELDS, FloatRecord, FloatTopics, field_names
 from gateway.foxglove_schemas.forces import ForceScene
-from gateway.foxglove_schemas.topics import MAX_UTIME, FoxgloveMessage, json_topic, timestamp, topic_of
+from gateway.foxglove_schemas.topics import (
+    MAX_UTIME,
+    FoxgloveMessage,
+    Topic,
+    json_topic,
+    timestamp,
+    topic_of,
+)
+from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.json_text import json_text
 from gateway.messages.tool_pose import metres_per_unit
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType, Items
 from gateway.rtc3d.parameters import Parameters
@@ -48,6 +58,9 @@ _NO_POSE: Final = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
 """Points without a pose are not valid in rerun."""
 
 _LOADS: Final = ("fx", "fy", "fz", "mx", "my", "mz")
+_NUMBERS: Final = {ComponentType.ANALOG: "channel", ComponentType.FORCE: "plate"}
+"""The components whose messages have a field for each number, and what fields without a name are called."""
+
 _MAX_LAYOUTS: Final = 100
 """How many different numbers of items of one component are remembered."""
 
@@ -58,21 +71,31 @@ class FoxgloveSource:
     """Converts messages of one source, as long as its parameters are the same.
 
     When they change, create another one with the same ``topics``. ``version`` is that of the parameters.
-    ``problem`` is a sentence about what the parameters lack; "" if nothing.
+    Positions are in ``frame``, whose unit must be known where positions are converted. None means the
+    server's axes, in metres; an unknown unit counts as mm then, and ``problem`` says so in a sentence.
     """
 
-    def __init__(self, topics: FloatTopics, parameters: Parameters, version: int) -> None:
+    def __init__(
+        self,
+        topics: FloatTopics,
+        parameters: Parameters,
+        version: int,
+        frame: CoordinateFrame | None = None,
+    ) -> None:
         self.source = source = topics.source
         self.problem = ""
         self._topics = topics
         self._parameters = parameters
         self._version = version
-        unit = "mm" if parameters.markers is None else parameters.markers.unit
-        metres = metres_per_unit(unit)
-        if metres is None:
-            self.problem = f"the unit of length {unit!r} is unknown; positions are shown as if it were mm"
-        self._metres = metres or _MILLIMETRE
-        self._forces = ForceScene(source, parameters)
+        self._facts = {} if frame is None else {"frame": frame.facts}
+        if frame is None:
+            unit = "mm" if parameters.markers is None else parameters.markers.unit
+            metres = metres_per_unit(unit)
+            if metres is None:
+                self.problem = f"the unit of length {unit!r} is unknown; positions are shown as if it were mm"
+            frame = CoordinateFrame(source, metres or _MILLIMETRE)
+        self._frame = frame
+        self._forces = ForceScene(source, parameters, frame)
         self._labels: dict[tuple[ComponentType, int], tuple[str, ...]] = {}
         self._records: dict[tuple[ComponentType, int], FloatRecord] = {}
         self._markers = topic_of(f"/{source}/markers", PointCloud)
@@ -80,36 +103,81 @@ class FoxgloveSource:
         self._events = topic_of(f"/{source}/events", Log)
         self._description = json_topic(f"/{source}/parameters", "rtc3d.Parameters", {"type": "object"})
 
+    @property
+    def description_topics(self) -> tuple[Topic, ...]:
+        """The topics of ``describe``."""
+        return self._description, self._forces.outlines_topic
+
+    @property
+    def known_topics(self) -> list[Topic]:
+        """All topics, those of numbers only if the parameters say how many there are."""
+        counts = _announced(self._parameters)
+        found = [self.topics(component, counts.get(component, 0)) for component in WIRE_ORDER]
+        return [*self.description_topics, *itertools.chain.from_iterable(found)]
+
+    @property
+    def changed_names(self) -> dict[str, dict[str, str]]:
+        """The names of fields that are not the labels of channels or plates, by component key and label."""
+        found: dict[str, dict[str, str]] = {}
+        for component, noun in _NUMBERS.items():
+            labels = self._labels_of(component, _announced(self._parameters).get(component, 0))
+            names = zip(labels, field_names(labels, noun), strict=True)
+            found[component.key] = {label: name for label, name in names if label != name}
+        return {key: names for key, names in found.items() if names}
+
+    def topics(self, component: ComponentType, num_items: int) -> tuple[Topic, ...]:
+        """Return the topics that a component with this many items has."""
+        match component:
+            case ComponentType.MARKERS:
+                return (self._markers,)
+            case ComponentType.TOOLS:
+                return (self._tools,)
+            case ComponentType.ANALOG:
+                return self._number_topics(component, num_items)
+            case ComponentType.FORCE:
+                return (
+                    *self._number_topics(component, num_items * len(_LOADS)),
+                    self._forces.arrows_topic,
+                )
+            case ComponentType.EVENT:
+                return (self._events,)
+
     def describe(self, utime: int) -> list[FoxgloveMessage]:
         """Return what is the same for all messages: labels, units and rates, and the outlines of plates."""
-        content = {"version": self._version, **_description(self._parameters)}
-        text = json.dumps(content, ensure_ascii=False, allow_nan=False)
-        return [FoxgloveMessage(self._description, utime, text.encode()), self._forces.plates(utime)]
+        content = {"version": self._version, **self._facts, **_description(self._parameters)}
+        data = json_text(content).encode()
+        return [FoxgloveMessage(self._description, utime, data), self._forces.plates(utime)]
 
     def convert(
-        self, component: ComponentType, items: Items, capture_utime: int, timestamp_us: int
+        self,
+        component: ComponentType,
+        items: Items,
+        capture_utime: int,
+        timestamp_us: int,
+        wanted: Container[Topic] | None = None,
     ) -> list[FoxgloveMessage]:
-        """Return the messages of one component.
+        """Return the messages of one component, on the ``wanted`` topics; None means all.
 
         ``items`` has the shape (items,) and the dtype of ITEM_DTYPES, big-endian. ``capture_utime`` is in µs
         since 1970, from 0 to MAX_UTIME, and ``timestamp_us`` the server's time stamp.
         """
-        match component:
-            case ComponentType.MARKERS:
-                return [FoxgloveMessage(self._markers, capture_utime, self._cloud(items, capture_utime))]
-            case ComponentType.TOOLS:
-                # Without a transform, rerun would reject the messages before and after this one, too.
+        found: list[FoxgloveMessage] = []
+        for topic in self.topics(component, len(items)):
+            if wanted is not None and topic not in wanted:
+                continue
+            if topic is self._markers:
+                found.append(FoxgloveMessage(topic, capture_utime, self._cloud(items, capture_utime)))
+            elif topic is self._tools:
                 data = self._transforms(items, capture_utime)
-                return [FoxgloveMessage(self._tools, capture_utime, data)] if data else []
-            case ComponentType.ANALOG:
-                return self._numbers(component, items, capture_utime)
-            case ComponentType.FORCE:
-                return [
-                    *self._numbers(component, items.view(">f4"), capture_utime),
-                    self._forces.arrows(items, capture_utime),
-                ]
-            case ComponentType.EVENT:
-                return [self._log(item, capture_utime, timestamp_us) for item in items]
+                if data:
+                    found.append(FoxgloveMessage(topic, capture_utime, data))
+            elif topic is self._events:
+                found += [self._log(item, capture_utime, timestamp_us) for item in items]
+            elif topic is self._forces.arrows_topic:
+                found.append(self._forces.arrows(items, capture_utime))
+            else:
+                found.append(self._numbers(component, items.view(">f4"), capture_utime))
+        return found
 
     def _cloud(self, items: Items, utime: int) -> bytes:
         """Return the visible markers; each has its position in the parameters, from 0."""
@@ -117,11 +185,11 @@ class FoxgloveSource:
         visible = np.flatnonzero(np.isfinite(values[:, :3]).all(axis=1))
         points = np.empty((len(visible), 5), "<f4")
         points[:, :4] = values[visible]
-        points[:, :3] *= self._metres
+        points[:, :3] = self._frame.points(points[:, :3])
         points.view("<u4")[:, 4] = visible
         return PointCloud(
             timestamp=timestamp(utime),
-            frame_id=self.source,
+            frame_id=self._frame.frame_id,
             pose=_NO_POSE,
             point_stride=_POINT.itemsize,
             fields=_POINT_FIELDS,
@@ -129,46 +197,51 @@ class FoxgloveSource:
         ).encode()
 
     def _transforms(self, items: Items, utime: int) -> bytes:
-        """Return the poses of the visible tools; b"" if there are none."""
-        values = items.view(">f4").reshape(-1, 8).astype(np.float64)
-        # Any NaN means missing (field note 7), and a quaternion of zeros is no rotation.
-        is_visible = np.logical_and(np.isfinite(values).all(axis=1), values[:, :4].any(axis=1)).tolist()
-        if not any(is_visible):
-            return b""
-        labels = self._labels_of(ComponentType.TOOLS, len(values))
-        values[:, 4:7] *= self._metres
-        time = timestamp(utime)
-        return FrameTransforms(
-            transforms=[
-                FrameTransform(
-                    timestamp=time,
-                    parent_frame_id=self.source,
-                    child_frame_id=f"{self.source}/{labels[index]}",
-                    translation=Vector3(x=x, y=y, z=z),
-                    rotation=Quaternion(x=qx, y=qy, z=qz, w=q0),
-                )
-                for index, (q0, qx, qy, qz, x, y, z, _) in enumerate(values.tolist())
-                if is_visible[index]
-            ]
-        ).encode()
+        """Return the poses of the visible tools; b"" if there are none.
 
-    def _numbers(self, component: ComponentType, values: Items, utime: int) -> list[FoxgloveMessage]:
-        """Return the values of a component by their labels; [] if there are none."""
-        if not len(values):
-            return []
-        found = self._records.get((component, len(values)))
+        Without a transform, rerun would reject the messages before and after this one, too.
+        """
+        poses = self._frame.poses(items)
+        labels = self._labels_of(ComponentType.TOOLS, len(poses))
+        time = timestamp(utime)
+        transforms = []
+        for label, pose in zip(labels, poses, strict=True):
+            if pose is not None:
+                x, y, z, qx, qy, qz, qw, _ = pose
+                transforms.append(
+                    FrameTransform(
+                        timestamp=time,
+                        parent_frame_id=self._frame.frame_id,
+                        child_frame_id=f"{self.source}/{label}",
+                        translation=Vector3(x=x, y=y, z=z),
+                        rotation=Quaternion(x=qx, y=qy, z=qz, w=qw),
+                    )
+                )
+        return FrameTransforms(transforms=transforms).encode() if transforms else b""
+
+    def _number_topics(self, component: ComponentType, num_values: int) -> tuple[Topic, ...]:
+        """Return the topic of the values of a component by their labels; () if there are none or too many."""
+        return (self._number_record(component, num_values).topic,) if 0 < num_values <= MAX_FIELDS else ()
+
+    def _numbers(self, component: ComponentType, values: Items, utime: int) -> FoxgloveMessage:
+        """Return the values of a component by their labels."""
+        record = self._number_record(component, len(values))
+        return FoxgloveMessage(record.topic, utime, record.encode(values))
+
+    def _number_record(self, component: ComponentType, num_values: int) -> FloatRecord:
+        found = self._records.get((component, num_values))
         if found is None:
-            found = self._record(component, len(values))
+            found = self._record(component, num_values)
             if len(self._records) >= _MAX_LAYOUTS:
                 self._records.clear()
-            self._records[component, len(values)] = found
-        return [FoxgloveMessage(found.topic, utime, found.encode(values))]
+            self._records[component, num_values] = found
+        return found
 
     def _record(self, component: ComponentType, num_values: int) -> FloatRecord:
         if component is ComponentType.ANALOG:
-            names = field_names(self._labels_of(component, num_values), "channel")
+            names = field_names(self._labels_of(component, num_values), _NUMBERS[component])
             return self._topics.record("analog", names)
-        plates = field_names(self._labels_of(component, num_values // len(_LOADS)), "plate")
+        plates = field_names(self._labels_of(component, num_values // len(_LOADS)), _NUMBERS[component])
         labels = [f"{plate}_{load}" for plate in plates for load in _LOADS]
         return self._topics.record("loads", field_names(labels, "load"))
 

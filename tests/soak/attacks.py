@@ -10,7 +10,7 @@ import os
 import signal
 import socket
 import sys
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import AsyncExitStack
 from dataclasses import dataclass
 from typing import Final
@@ -21,6 +21,7 @@ import zenoh
 
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm
+from tests.hostile.foxglove_viewers import ATTACKS as VIEWERS
 from tests.hostile.servers import SERVERS, streaming
 from tests.hostile.test_parameters import ATTACKS as PARAMETERS
 from tests.hostile.test_parameters import giving
@@ -45,7 +46,8 @@ class Target:
     lcm_url: str
     queries_url: str
     metrics_port: int
-    vrpn_port: int
+    output_ports: Mapping[str, int]
+    """The port of each output that is a server."""
     pid: int
     ports: tuple[int, ...]
     """Where the gateway expects hostile servers."""
@@ -139,8 +141,8 @@ async def _held_http_connections(target: Target) -> None:
         writer.close()
 
 
-def _vrpn_client(attack: Callable[[int], Awaitable[None]]) -> Attack:
-    return lambda target: attack(target.vrpn_port)
+def _on_port_of(output: str, attack: Callable[[int], Awaitable[None]]) -> Attack:
+    return lambda target: attack(target.output_ports[output])
 
 
 async def _reloads(target: Target) -> None:
@@ -162,7 +164,8 @@ ATTACKS: Final[dict[str, Attack]] = {
     "sender: LCM": _lcm_garbage,
     "Zenoh peer: stalled subscribers": _stalled_subscribers,
     **{f"Zenoh peer: {kind}": _zenoh_peer(kind) for kind in KINDS},
-    **{f"VRPN client: {name}": _vrpn_client(attack) for name, attack in VRPN_CLIENTS.items()},
+    **{f"VRPN client: {name}": _on_port_of("vrpn", attack) for name, attack in VRPN_CLIENTS.items()},
+    **{f"viewer: {name}": _on_port_of("foxglove", attack) for name, attack in VIEWERS.items()},
     "host: HTTP connections": _held_http_connections,
     "host: reloads": _reloads,
 }

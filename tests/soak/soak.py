@@ -13,7 +13,7 @@ import tempfile
 import time
 from asyncio.subprocess import DEVNULL
 from collections import Counter
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager, suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -129,7 +129,7 @@ class Soak:
             markers=20, tools=3, analog=8, plates=1, rate_hz=RATE_HZ, analog_rate_hz=RATE_HZ
         )
         ports = {name: free_port() for name in HOSTILE}
-        vrpn_port = free_port()
+        output_ports = {name: free_port() for name in ("vrpn", "foxglove")}
         with tempfile.TemporaryDirectory() as folder, simulator_process(*HEALTHY_SCENE) as (healthy_port, _):
             async with Simulator(scene, port=free_port()) as simulator:
                 sources: dict[str, Source] = {
@@ -147,17 +147,19 @@ class Soak:
                         Path(folder),
                         healthy_port,
                         sources,
-                        settings={"vrpn": {"enabled": True, "port": vrpn_port}},
+                        settings={
+                            name: {"enabled": True, "port": port} for name, port in output_ports.items()
+                        },
                         before_command=before_command,
                     ) as gateway:
-                        await self._run(simulator, gateway, vrpn_port, tuple(ports.values()), console)
+                        await self._run(simulator, gateway, output_ports, tuple(ports.values()), console)
                 self.gateway_report = gateway.report
 
     async def _run(
         self,
         simulator: Simulator,
         gateway: RunningGateway,
-        vrpn_port: int,
+        output_ports: Mapping[str, int],
         ports: tuple[int, ...],
         console: Console,
     ) -> None:
@@ -166,7 +168,7 @@ class Soak:
             gateway.lcm_url,
             LcmSettings(url=gateway.lcm_url).effective_queries_url,
             gateway.metrics_port,
-            vrpn_port,
+            output_ports,
             gateway.process.pid,
             ports,
         )

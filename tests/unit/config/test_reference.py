@@ -17,6 +17,7 @@ from gateway.config.settings import (
     StreamSettings,
 )
 from gateway.config.transform import RollPitchYaw, TransformSettings
+from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.vrpn.settings import VrpnSettings
@@ -35,6 +36,7 @@ SECTIONS: dict[str, type[Section]] = {
     "lcm": LcmSettings,
     "takes": TakesSettings,
     "vrpn": VrpnSettings,
+    "foxglove": FoxgloveSettings,
     "spool": SpoolSettings,
     "metrics": MetricsSettings,
 }

@@ -1,6 +1,7 @@
 """The registry: which sections the configuration has, and which outputs it builds."""
 
 from gateway.config.settings import SourceSettings
+from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.registry import OUTPUTS, build_outputs
@@ -21,6 +22,7 @@ def test_every_output_has_its_section() -> None:
         "lcm": LcmSettings,
         "takes": TakesSettings,
         "vrpn": VrpnSettings,
+        "foxglove": FoxgloveSettings,
     }
     assert list(OUTPUTS) == list(settings.outputs)
 

@@ -1,0 +1,111 @@
+"""The doctor's checks of the output for viewers: its packages, and its port."""
+
+import ipaddress
+import json
+import socket
+from collections.abc import Sequence
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, Final
+
+from gateway.findings import Finding, MessageLoad, Subject
+from gateway.outputs.foxglove.settings import FoxgloveSettings
+
+CHECKS: Final = ("package", "port")
+
+_PACKAGES: Final = ("foxglove-sdk", "protobuf", "websockets")
+_TIMEOUT_S: Final = 2.0
+_MAX_MESSAGES: Final = 20
+
+_foxglove: Final = Subject("foxglove")
+
+
+def check_foxglove(
+    settings: FoxgloveSettings, sources: Sequence[str], _loads: Sequence[MessageLoad], _seconds: float
+) -> list[Finding]:
+    """Check that viewers can be served: at once, or already by a gateway that is running."""
+    versions = {}
+    for name in _PACKAGES:
+        try:
+            versions[name] = version(name)
+        except PackageNotFoundError:
+            return [
+                _foxglove.failing(
+                    "package",
+                    f"the package {name} is not installed",
+                    "Install it with: pip install 'rtc3d-gateway[foxglove]'",
+                ),
+                _foxglove.not_tested("port", "it needs package, which failed"),
+            ]
+    found = ", ".join(f"{name} {number}" for name, number in versions.items())
+    return [_foxglove.passing("package", found), _check_port(settings, sources)]
+
+
+def leaves_host(settings: FoxgloveSettings) -> bool:
+    """Return whether messages may leave this computer: whether others can connect."""
+    if settings.host == "localhost":
+        return False
+    try:
+        return not ipaddress.ip_address(settings.host).is_loopback
+    except ValueError:
+        return True
+
+
+def _check_port(settings: FoxgloveSettings, sources: Sequence[str]) -> Finding:
+    address = f"ws://{_in_url(settings.host)}:{settings.port}"
+    try:
+        with socket.create_server((settings.host, settings.port), family=_family(settings.host), backlog=1):
+            return _foxglove.passing("port", f"viewers will be able to connect to {address}")
+    except OSError as error:
+        problem = error.strerror or str(error)
+    topics = _advertised_topics(settings)
+    if topics is None:
+        return _foxglove.failing(
+            "port",
+            f"cannot listen on {address}: {problem}, and what is there is no gateway",
+            f"`ss -ltnp` shows which program uses port {settings.port}. Stop it, or correct foxglove.host "
+            "and foxglove.port.",
+        )
+    missing = [source for source in sources if not any(topic.startswith(f"/{source}/") for topic in topics)]
+    if missing:
+        return _foxglove.warning(
+            "port",
+            f"a gateway serves viewers at {address}, but not {', '.join(missing)}",
+            "Reload the gateway, or start it with this configuration.",
+        )
+    return _foxglove.passing("port", f"a gateway serves viewers at {address}, with {len(topics)} topics")
+
+
+def _advertised_topics(settings: FoxgloveSettings) -> list[str] | None:
+    """Return the topics of the gateway that listens there; None if it is none."""
+    from websockets.exceptions import WebSocketException  # noqa: PLC0415 - needs the extra foxglove
+    from websockets.sync.client import connect  # noqa: PLC0415
+    from websockets.typing import Subprotocol  # noqa: PLC0415
+
+    from gateway.outputs.foxglove.protocol import SUBPROTOCOLS  # noqa: PLC0415
+
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(settings.host, settings.host)  # noqa: S104 - no bind
+    names = [Subprotocol(name) for name in SUBPROTOCOLS]
+    try:
+        with connect(
+            f"ws://{_in_url(host)}:{settings.port}",
+            subprotocols=names,
+            open_timeout=_TIMEOUT_S,
+            close_timeout=_TIMEOUT_S,
+            max_size=None,
+            proxy=None,
+        ) as viewer:
+            for _ in range(_MAX_MESSAGES):
+                message: Any = json.loads(viewer.recv(timeout=_TIMEOUT_S))
+                if message.get("op") == "advertise":
+                    return [channel["topic"] for channel in message["channels"]]
+    except (OSError, WebSocketException, ValueError, AttributeError, KeyError, TypeError):
+        return None
+    return None
+
+
+def _family(host: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ":" in host else socket.AF_INET
+
+
+def _in_url(host: str) -> str:
+    return f"[{host}]" if ":" in host else host

@@ -1,0 +1,139 @@
+"""The connections of viewers, with limits on what they can use up: clients are not trusted."""
+
+import time
+from typing import Any, Final
+
+from websockets.asyncio.server import ServerConnection, broadcast
+from websockets.http11 import Request, Response
+
+from gateway.outputs.foxglove import protocol
+from gateway.token_bucket import TokenBucket
+
+MAX_CLIENTS: Final = 32
+"""How many viewers may be connected; others get the HTTP status 503."""
+
+MAX_HANDSHAKES: Final = 64
+"""How many connections may have no complete handshake; one more ends the oldest of these."""
+
+HANDSHAKE_TIMEOUT_S: Final = 5.0
+
+MAX_REQUEST_BYTES: Final = 64 * 1024
+"""The size limit of a message from a viewer: about 1000 subscriptions."""
+
+_RECEIVED_BYTES_PER_S: Final = 64 * 1024
+_RECEIVED_BURST_BYTES: Final = 256 * 1024
+"""A viewer sends some kB when a panel opens. One that sends more than this is disconnected."""
+
+MAX_WAITING_BYTES: Final = 1024 * 1024
+"""How much may wait for a viewer that does not read fast enough; then it loses messages."""
+
+MAX_CONTROL_BYTES: Final = 8 * MAX_WAITING_BYTES
+"""How much may wait with the messages about channels, which are not left out; then it is disconnected."""
+
+MAX_STALL_S: Final = 30.0
+"""A viewer that has read nothing for this long, while so much waits, is disconnected."""
+
+_SLOW: Final = "Send buffer limit reached"
+"""The words of Foxglove's own bridge. Lichtblick adds an explanation to them."""
+
+
+class Admission:
+    """Decides which connections may stay open."""
+
+    def __init__(self) -> None:
+        self.num_clients = 0
+        """How many viewers have completed the handshake."""
+        self._handshakes: dict[ServerConnection, None] = {}  # oldest first
+
+    def begin(self, connection: ServerConnection) -> None:
+        """Admit a new connection to the handshake."""
+        if len(self._handshakes) >= MAX_HANDSHAKES:
+            oldest = next(iter(self._handshakes))
+            del self._handshakes[oldest]
+            oldest.transport.abort()
+        self._handshakes[connection] = None
+
+    def end(self, connection: ServerConnection) -> None:
+        """Take note that the handshake is complete, or has failed."""
+        self._handshakes.pop(connection, None)
+
+    def refuse(self, connection: ServerConnection, _request: Request) -> Response | None:
+        """Return the response to a viewer that is one too many; None to accept it."""
+        if self.num_clients < MAX_CLIENTS:
+            return None
+        return connection.respond(503, f"{MAX_CLIENTS} viewers are connected already; close one of them.\n")
+
+
+class Connection(ServerConnection):
+    """A connection that is closed if the peer sends more than a viewer does."""
+
+    def __init__(self, admission: Admission, *args: Any, **options: Any) -> None:
+        super().__init__(*args, **options)
+        self._admission = admission
+        self._received = TokenBucket(_RECEIVED_BYTES_PER_S, _RECEIVED_BURST_BYTES)
+
+    def connection_made(self, transport: Any) -> None:
+        """See asyncio.Protocol."""
+        super().connection_made(transport)
+        self._admission.begin(self)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """See asyncio.Protocol."""
+        self._admission.end(self)
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        """See asyncio.Protocol."""
+        if self._received.try_take(len(data)):
+            super().data_received(data)
+        else:
+            self.transport.abort()
+
+
+class Viewer:
+    """A connected viewer."""
+
+    def __init__(self, connection: ServerConnection) -> None:
+        self.subscriptions: dict[int, int] = {}
+        """The numbers of channels by those of subscriptions."""
+        self._connection = connection
+        self._was_slow = False
+        self._stalled_s: float | None = None  # since when too much waits, on the monotonic clock
+
+    @property
+    def address(self) -> str:
+        """Its address for messages, such as 192.0.2.7:40512."""
+        host, port, *_ = self._connection.remote_address or ("?", 0)
+        return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+    def send_data(self, subscription: int, utime: int, data: bytes) -> bool:
+        """Send a message of a channel, or return False if too much waits already: then it is lost."""
+        if self._waiting_bytes > MAX_WAITING_BYTES:
+            self._stall()
+            return False
+        self._stalled_s = None
+        broadcast((self._connection,), protocol.message_data(subscription, utime, data))
+        return True
+
+    def _stall(self) -> None:
+        """Tell the user once that messages are lost; disconnect a viewer that does not read at all."""
+        now_s = time.monotonic()
+        if self._stalled_s is None:
+            self._stalled_s = now_s
+        elif now_s - self._stalled_s > MAX_STALL_S:
+            self._connection.transport.abort()  # a ping of websockets would wait until it is sent
+        if not self._was_slow:
+            self._was_slow = True
+            self.send_control(protocol.warning(_SLOW))
+
+    def send_control(self, message: str) -> None:
+        """Send a message about channels, which the viewer must not miss."""
+        if self._waiting_bytes > MAX_CONTROL_BYTES:
+            self._connection.transport.abort()
+        else:
+            broadcast((self._connection,), message)
+
+    @property
+    def _waiting_bytes(self) -> int:
+        waiting: int = self._connection.transport.get_write_buffer_size()
+        return waiting

@@ -1,0 +1,160 @@
+"""The way of one source's frames from the gateway's event loop to the thread that serves viewers."""
+
+import asyncio
+import contextlib
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Final
+
+from gateway.errors import OutputError
+from gateway.losses import Losses
+from gateway.messages.stamp import Stamp
+from gateway.outputs.contract import ServerParameters
+from gateway.outputs.foxglove.live_source import LiveSource
+from gateway.outputs.foxglove.server import FoxgloveServer
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import Frame, FrameLayout
+
+QUEUE_FULL: Final = "queue full"
+
+_MAX_LAYOUTS: Final = 64
+
+
+class ServedSource:
+    """One source: whether viewers want it, and the calls of its LiveSource in the thread.
+
+    ``call`` has the thread make a call. ``call_in_time`` does so if not too many wait, and returns whether it
+    does; it takes the call and the number of bytes that it holds.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        server: FoxgloveServer,
+        call: Callable[[Callable[[], None]], None],
+        call_in_time: Callable[[Callable[[], None], int], bool],
+    ) -> None:
+        self.wanted = False
+        """Whether a viewer has subscribed to anything that is in frames."""
+        self.losses: Losses | None = None
+        """Where to count what viewers lose."""
+        self._name = name
+        self._server = server
+        self._call = call
+        self._call_in_time = call_in_time
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._on_change: Callable[[], None] = lambda: None
+        self._source: LiveSource | None = None  # assigned in the thread only
+        self._is_closed = False
+
+    def watch_wanted(self, on_change: Callable[[], None]) -> None:
+        """Call ``on_change`` in this event loop when ``wanted`` has changed."""
+        self._on_change = on_change
+        self._loop = asyncio.get_running_loop()
+
+    def open(self) -> None:
+        """Advertise the channels of the source."""
+        self._call(self._open)
+
+    def set_parameters(self, parameters: ServerParameters) -> None:
+        """Convert the next frames with these parameters."""
+        self._call(partial(self._set_parameters, parameters))
+
+    def announce_numbers(self, layout: FrameLayout) -> None:
+        """Advertise the channels whose schemas depend on the number of items in frames."""
+        self._call_in_time(partial(self._announce_numbers, layout), 0)
+
+    def offer(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> bool:
+        """Have the components of a frame sent; return False if too many frames wait."""
+        return self._call_in_time(partial(self._send, frame, stamp, components), len(frame.body))
+
+    @property
+    def field_names(self) -> Mapping[str, Mapping[str, str]]:
+        """See ``Output.topic_names``."""
+        return {} if self._source is None else self._source.field_names
+
+    def close(self) -> None:
+        """Withdraw the channels of the source."""
+        self._is_closed = True
+        self.wanted = False
+        self._call(self._close)
+
+    # In the thread.
+
+    def _open(self) -> None:
+        if self._source is None:
+            self._source = LiveSource(self._name, self._server, self._report_wanted)
+            self._source.losses = self.losses
+
+    def _set_parameters(self, parameters: ServerParameters) -> None:
+        if self._source is not None:
+            self._source.set_parameters(parameters)
+
+    def _announce_numbers(self, layout: FrameLayout) -> None:
+        if self._source is not None:
+            self._source.announce_numbers(layout.components)
+
+    def _send(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
+        if self._source is not None:
+            self._source.send_frame(frame, stamp, components)
+
+    def _close(self) -> None:
+        if self._source is not None:
+            self._source.close()
+            self._source = None
+
+    def _report_wanted(self, wanted: bool) -> None:
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # the gateway's loop has ended
+                self._loop.call_soon_threadsafe(self._set_wanted, wanted)
+
+    # In the gateway's loop.
+
+    def _set_wanted(self, wanted: bool) -> None:
+        if wanted is not self.wanted and not self._is_closed:
+            self.wanted = wanted
+            self._on_change()
+
+
+class FoxglovePublisher:
+    """Hands over the frames of one source to the thread, while a viewer wants them."""
+
+    def __init__(self, name: str, source: ServedSource) -> None:
+        self._name = name
+        self._source = source
+        self._layouts: set[FrameLayout] = set()
+        self._is_closed = False
+
+    @property
+    def wanted(self) -> bool:
+        """Whether a viewer has subscribed to anything that is in frames."""
+        return self._source.wanted and not self._is_closed
+
+    def publish(
+        self,
+        frame: Frame,
+        stamp: Stamp,
+        sequence: int,  # noqa: ARG002 - the signature is that of FramePublisher
+        components: frozenset[ComponentType],
+    ) -> None:
+        """Hand over a frame if a viewer wants it; see FramePublisher."""
+        if self._is_closed:
+            raise OutputError(f"foxglove: {self._name} is closed; ask for a new publisher", cause="closed")
+        if frame.layout not in self._layouts:
+            self._note_layout(frame.layout)
+        if self._source.wanted and not self._source.offer(frame, stamp, components):
+            raise OutputError(
+                f"foxglove: the frames of {self._name} come faster than they can be converted; show fewer "
+                "topics in the viewers",
+                cause=QUEUE_FULL,
+            )
+
+    def _note_layout(self, layout: FrameLayout) -> None:
+        if len(self._layouts) >= _MAX_LAYOUTS:
+            self._layouts.clear()
+        self._layouts.add(layout)
+        self._source.announce_numbers(layout)
+
+    def close(self) -> None:
+        """Refuse all frames from now on."""
+        self._is_closed = True

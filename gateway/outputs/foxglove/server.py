@@ -1,0 +1,190 @@
+"""A server of Foxglove's WebSocket protocol: channels and their subscribers.
+
+It is not that of foxglove-sdk 0.30, which does not count what a slow client loses, limits neither clients nor
+handshakes, ends for ever when the process has too many open files, and waits in ``stop`` for a client that
+does not read. docs/design.md has more about this.
+"""
+
+import logging
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Final
+
+from websockets.asyncio.server import Server, ServerConnection, serve
+from websockets.exceptions import ConnectionClosed
+from websockets.typing import Subprotocol
+
+from gateway.errors import QueryError
+from gateway.foxglove_schemas.topics import Topic
+from gateway.log import DefectLog
+from gateway.outputs.foxglove import protocol
+from gateway.outputs.foxglove.connections import (
+    HANDSHAKE_TIMEOUT_S,
+    MAX_REQUEST_BYTES,
+    Admission,
+    Connection,
+    Viewer,
+)
+
+SERVER_NAME: Final = "rtc3d-gateway"
+
+_CLOSE_TIMEOUT_S: Final = 0.5
+_PING_INTERVAL_S: Final = 10.0
+_PING_TIMEOUT_S: Final = 20.0
+"""A viewer that does not answer a ping for this long is disconnected: its computer may have gone."""
+
+logger = logging.getLogger(__name__)
+
+_library_logger: Final = logging.getLogger(f"{__name__}.websockets")
+_library_logger.setLevel(logging.CRITICAL)  # websockets logs a traceback for whatever a port scan sends
+
+
+class Channel:
+    """An advertised topic. ``subscribers`` are the viewers, each with its number for the subscription.
+
+    ``on_change`` is called with a viewer that subscribes, and with None when one unsubscribes.
+    """
+
+    def __init__(self, number: int, topic: Topic, on_change: Callable[[Viewer | None], None]) -> None:
+        self.number = number
+        self.topic = topic
+        self.text = protocol.channel_text(number, topic)
+        self.subscribers: dict[Viewer, int] = {}
+        self.on_change = on_change
+
+
+class FoxgloveServer:
+    """Advertises channels to viewers, and sends messages to those that subscribe to them.
+
+    All methods are called in one event loop. Channels can be opened before the server listens.
+    """
+
+    def __init__(self, host: str, port: int, session: str) -> None:
+        self._host = host
+        self._port = port
+        self._info = protocol.server_info(SERVER_NAME, session)
+        self._channels: dict[int, Channel] = {}
+        self._last_number = 0
+        self._viewers: set[Viewer] = set()
+        self._admission = Admission()
+        self._server: Server | None = None
+        self._defects = DefectLog(logger, "foxglove")
+
+    @property
+    def port(self) -> int:
+        """The port on which it listens; 0 if it does not."""
+        if self._server is None or not self._server.sockets:
+            return 0
+        port: int = self._server.sockets[0].getsockname()[1]
+        return port
+
+    async def open(self) -> None:
+        """Listen. Raises OSError."""
+        create: Any = partial(Connection, self._admission)
+        self._server = await serve(
+            self._serve,
+            self._host,
+            self._port,
+            subprotocols=[Subprotocol(name) for name in protocol.SUBPROTOCOLS],
+            compression=None,  # it would cost more than a network in a laboratory
+            process_request=self._admission.refuse,
+            open_timeout=HANDSHAKE_TIMEOUT_S,
+            ping_interval=_PING_INTERVAL_S,
+            ping_timeout=_PING_TIMEOUT_S,
+            close_timeout=_CLOSE_TIMEOUT_S,
+            max_size=MAX_REQUEST_BYTES,
+            logger=_library_logger,
+            create_connection=create,
+        )
+
+    async def close(self) -> None:
+        """Stop listening, and disconnect all viewers."""
+        if self._server is not None:
+            self._server.close()
+            await self._server.wait_closed()
+
+    # Channels.
+
+    def open_channel(self, topic: Topic, on_change: Callable[[Viewer | None], None]) -> Channel:
+        """Advertise a topic. ``on_change`` is that of the channel."""
+        self._last_number += 1
+        channel = Channel(self._last_number, topic, on_change)
+        self._channels[channel.number] = channel
+        for viewer in self._viewers:
+            viewer.send_control(protocol.advertise([channel.text]))
+        return channel
+
+    def close_channels(self, channels: list[Channel]) -> None:
+        """Withdraw channels, with all subscriptions to them."""
+        for channel in channels:
+            del self._channels[channel.number]
+            for viewer, number in channel.subscribers.items():
+                del viewer.subscriptions[number]
+            channel.subscribers.clear()
+        if channels:
+            message = protocol.unadvertise([channel.number for channel in channels])
+            for viewer in self._viewers:
+                viewer.send_control(message)
+
+    # Viewers.
+
+    async def _serve(self, connection: ServerConnection) -> None:
+        """Serve a viewer until it disconnects."""
+        self._admission.end(connection)
+        viewer = Viewer(connection)
+        logger.debug("foxglove: %s connected", viewer.address)
+        self._admission.num_clients += 1
+        self._viewers.add(viewer)
+        try:
+            viewer.send_control(self._info)
+            viewer.send_control(protocol.advertise(channel.text for channel in self._channels.values()))
+            async for message in connection:
+                self._handle(viewer, message)
+        except ConnectionClosed:
+            pass
+        except Exception as defect:  # noqa: BLE001 - the other viewers are served nevertheless
+            self._defects.log(defect)
+        finally:
+            self._admission.num_clients -= 1
+            self._viewers.discard(viewer)
+            for number in list(viewer.subscriptions):
+                self._unsubscribe(viewer, number)
+            logger.debug("foxglove: %s disconnected", viewer.address)
+
+    def _handle(self, viewer: Viewer, message: str | bytes) -> None:
+        try:
+            request = protocol.parse_request(message)
+        except QueryError as error:
+            viewer.send_control(protocol.warning(str(error)))
+            return
+        for subscription in request.subscriptions:
+            self._subscribe(viewer, *subscription)
+        for number in request.ended:
+            self._unsubscribe(viewer, number)
+
+    def _subscribe(self, viewer: Viewer, number: int, channel_number: int) -> None:
+        channel = self._channels.get(channel_number)
+        # A viewer may subscribe to a channel that has just been withdrawn. It will receive that soon.
+        if channel is None or number in viewer.subscriptions or viewer in channel.subscribers:
+            return
+        viewer.subscriptions[number] = channel_number
+        channel.subscribers[viewer] = number
+        channel.on_change(viewer)
+
+    def _unsubscribe(self, viewer: Viewer, number: int) -> None:
+        channel = self._channels.get(viewer.subscriptions.pop(number, -1))
+        if channel is not None:
+            del channel.subscribers[viewer]
+            channel.on_change(None)
+
+
+def send(channel: Channel, utime: int, data: bytes) -> list[Viewer]:
+    """Send a message to all subscribers; return those that lose it because they do not read fast enough."""
+    return [
+        viewer for viewer, number in channel.subscribers.items() if not viewer.send_data(number, utime, data)
+    ]
+
+
+def send_to(viewer: Viewer, channel: Channel, utime: int, data: bytes) -> bool:
+    """Send a message to one subscriber; return False if it loses the message."""
+    return viewer.send_data(channel.subscribers[viewer], utime, data)

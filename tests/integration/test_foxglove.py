@@ -1,0 +1,183 @@
+"""Viewers of a real gateway: what they get is what the server sent, and what a take exports."""
+
+import asyncio
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+
+from gateway.config.settings import MetricsSettings, SourceSettings
+from gateway.export.formats import export_take
+from gateway.export.job import ExportJob
+from gateway.gateway import Gateway
+from gateway.outputs.foxglove.output import FoxgloveOutput
+from gateway.outputs.foxglove.settings import FoxgloveSettings
+from gateway.outputs.takes.output import TakesOutput
+from gateway.outputs.takes.settings import TakesSettings
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.simulator.simulator import Simulator
+from gateway.simulator.synthetic import SyntheticScene
+from tests.configurations import make_settings
+from tests.foxglove_viewer import viewing
+from tests.networks import free_port
+from tests.running_gateway import running_gateway
+from tests.unit.export.read_mcap import floats_of, points_of
+from tests.waiting import wait_until_async
+
+SCENE = SyntheticScene(markers=20, tools=3, analog=12, plates=2, rate_hz=100, analog_rate_hz=500)
+FRAMES = ("markers", "tools", "analog", "loads", "forces", "events")
+TOPICS = tuple(f"/lab/{name}" for name in (*FRAMES, "plates", "parameters"))
+
+
+def settings(port: int, *names: str, **source: Any) -> Any:
+    """Return settings with these sources, all on the server at ``port``."""
+    sources = tuple(
+        SourceSettings(name=name, host="127.0.0.1", port=port, **source) for name in names or ("lab",)
+    )
+    return make_settings(sources=sources, metrics=MetricsSettings(enabled=False))
+
+
+def raw_messages(path: Path) -> dict[str, list[tuple[int, bytes]]]:
+    """Return the time and the bytes of each message of an MCAP file, by topic."""
+    found: defaultdict[str, list[tuple[int, bytes]]] = defaultdict(list)
+    with path.open("rb") as file:
+        for _, channel, message in make_reader(file).iter_messages(log_time_order=False):
+            found[channel.topic].append((message.log_time, message.data))
+    return found
+
+
+async def test_viewers_get_the_same_bytes_that_a_take_exports(tmp_path: Path) -> None:
+    takes = TakesOutput(TakesSettings(enabled=True, directory=str(tmp_path / "takes")))
+    viewers = FoxgloveOutput(FoxgloveSettings(enabled=True, port=free_port()))
+    async with Simulator(SCENE) as server:
+        gateway = Gateway(settings(server.port), [takes, viewers])
+        async with running_gateway(gateway):
+            await gateway.opened.wait()
+            async with viewing(viewers.settings.port, *TOPICS) as viewer:
+                for name in FRAMES:
+                    await viewer.wait_for(f"/lab/{name}")
+                await takes.takes.start("lab", "take")
+                for name in ("markers", "analog"):
+                    await viewer.wait_for(f"/lab/{name}", len(viewer.received[f"/lab/{name}"]) + 100)
+                await viewer.wait_for("/lab/events", len(viewer.received["/lab/events"]) + 1)
+                await takes.takes.stop("lab")
+                await viewer.wait_for("/lab/analog", len(viewer.received["/lab/analog"]) + 100)
+                schemas = viewer.topics
+                description = viewer.received["/lab/parameters"][0].content
+                [(_, status)] = [pair for pair in gateway.sources[0].fan_out.outputs if pair[0] is viewers]
+                assert not status.losses
+    [take] = (tmp_path / "takes").glob("*/*.lcmlog")
+    job = ExportJob(take, tmp_path / "take.mcap")
+    export_take(job)
+    assert job.notes == []
+    exported = raw_messages(tmp_path / "take.mcap")
+    assert exported.keys() == schemas.keys()
+    for name in FRAMES:
+        live = [(log.time_ns, log.data) for log in viewer.received[f"/lab/{name}"]]
+        first = live.index(exported[f"/lab/{name}"][0])
+        assert live[first : first + len(exported[f"/lab/{name}"])] == exported[f"/lab/{name}"]
+    assert description.pop("frame")["frame_id"] == "lab"
+    assert len(description["3d"]["labels"]) == 20
+
+
+async def test_values_are_those_of_the_server_in_the_configured_frame() -> None:
+    viewers = FoxgloveOutput(FoxgloveSettings(enabled=True, port=free_port()))
+    transform = {"translation_m": [0, 0, 2], "up": "y"}
+    async with Simulator(SCENE) as server:
+        gateway = Gateway(settings(server.port, frame_id="hall", transform=transform), [viewers])
+        async with running_gateway(gateway):
+            await gateway.opened.wait()
+            topics = ("/lab/markers", "/lab/tools", "/lab/analog")
+            async with viewing(viewers.settings.port, *topics) as viewer:
+                clouds = await viewer.wait_for("/lab/markers", 50)
+                transforms = await viewer.wait_for("/lab/tools", 50)
+                analog = await viewer.wait_for("/lab/analog", 50)
+    numbers = np.arange(2000)
+    markers = SCENE.items(ComponentType.MARKERS, numbers)
+    points = points_of(clouds[0].content)
+    assert clouds[0].content.frame_id == "hall"
+    expected = np.stack([markers["x"], -markers["z"], markers["y"]], axis=-1) / 1000 + (0, 0, 2)
+    shown = np.stack([points[axis] for axis in "xyz"], axis=-1)
+    distances = np.abs(expected[:, points["marker"]] - shown).max(axis=(1, 2))
+    number = int(np.nan_to_num(distances, nan=np.inf).argmin())  # NaN: another marker was hidden
+    assert distances[number] < 1e-5
+    # The other frames follow, one by one.
+    for later, cloud in enumerate(clouds[:50]):
+        points = points_of(cloud.content)
+        shown = np.stack([points[axis] for axis in "xyz"], axis=-1)
+        assert np.allclose(expected[number + later, points["marker"]], shown, atol=1e-5)
+    assert {each.parent_frame_id for log in transforms for each in log.content.transforms} == {"hall"}
+    values = SCENE.items(ComponentType.ANALOG, np.arange(10_000)).astype(np.float32)
+    first = np.array(list(floats_of(analog[0].content).values()), np.float32)
+    [at] = np.flatnonzero((values == first).all(axis=1))[:1]
+    for later, log in enumerate(analog[:50]):
+        assert list(floats_of(log.content).values()) == values[at + later].tolist()
+
+
+async def test_streams_on_demand_run_while_a_viewer_is_subscribed() -> None:
+    viewers = FoxgloveOutput(FoxgloveSettings(enabled=True, port=free_port()))
+    streams = [
+        {"components": ["3d", "6d"], "on_demand": True},
+        {"components": ["analog", "force"], "on_demand": True},
+    ]
+    async with Simulator(SCENE) as server:
+        gateway = Gateway(settings(server.port, streams=streams), [viewers])
+        [source] = gateway.sources
+        async with running_gateway(gateway):
+            await gateway.opened.wait()
+            async with viewing(viewers.settings.port) as viewer:
+                await viewer.wait_until(lambda: "/lab/analog" in viewer.topics)
+                assert not any(source.fan_out.frames.values())
+                viewer.subscribe("/lab/analog")
+                await viewer.wait_for("/lab/analog")
+            await wait_until_async(lambda: not source.fan_out.has_subscribers(WIRE_ORDER))
+
+
+async def test_sources_come_and_go_on_reload_while_viewers_stay() -> None:
+    port = free_port()
+    foxglove = FoxgloveSettings(enabled=True, port=port)
+    off = {"zenoh": {"enabled": False}, "lcm": {"enabled": False}, "foxglove": foxglove.model_dump()}
+    async with Simulator(SCENE) as server:
+
+        def configured(*names: str, **source: Any) -> Any:
+            base = settings(server.port, *names, **source)
+            return make_settings(sources=base.sources, metrics=base.metrics, **off)
+
+        gateway = Gateway(configured("lab"))
+        async with running_gateway(gateway):
+            await gateway.opened.wait()
+            async with viewing(port, "/lab/markers") as viewer:
+                await viewer.wait_for("/lab/markers")
+                await gateway.reload(configured("lab", "hall"))
+                await viewer.wait_until(lambda: "/hall/markers" in viewer.topics)
+                viewer.subscribe("/hall/markers")
+                await viewer.wait_for("/hall/markers")
+                await viewer.wait_for("/lab/markers", len(viewer.received["/lab/markers"]) + 10)
+                assert viewer.withdrawn == []
+                await gateway.reload(configured("hall"))
+                await viewer.wait_until(lambda: "/lab/markers" in viewer.withdrawn)
+                assert not any(topic.startswith("/lab/") for topic in viewer.topics)
+                await viewer.wait_for("/hall/markers", len(viewer.received["/hall/markers"]) + 10)
+                await gateway.reload(configured("lab", "hall", frame_id="world"))
+                await viewer.wait_until(lambda: "/lab/markers" in viewer.topics)
+                viewer.subscribe("/lab/markers", "/lab/parameters")
+                before = len(viewer.received["/lab/markers"])
+                after = (await viewer.wait_for("/lab/markers", before + 1))[before]
+                assert after.content.frame_id == "world"
+
+
+@pytest.mark.netns
+async def test_viewers_connect_over_ipv6() -> None:
+    viewers = FoxgloveOutput(FoxgloveSettings(enabled=True, host="::1", port=free_port()))
+    async with Simulator(SCENE) as server:
+        gateway = Gateway(settings(server.port), [viewers])
+        async with running_gateway(gateway):
+            await gateway.opened.wait()
+            assert viewers.health().connected, viewers.health()
+            reader, writer = await asyncio.open_connection("::1", viewers.settings.port)
+            writer.write(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n")
+            assert (await reader.readline()).startswith(b"HTTP/1.1 426 ")
+            writer.close()

@@ -1,0 +1,92 @@
+"""An output with viewers, and a source that publishes on it as in the gateway."""
+
+from collections.abc import AsyncIterator, Iterable, Mapping
+from contextlib import asynccontextmanager
+from typing import Any, Final
+
+import numpy as np
+
+from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.stamp import Stamp
+from gateway.outputs.contract import ServerParameters
+from gateway.outputs.foxglove.output import FoxgloveOutput
+from gateway.outputs.foxglove.settings import FoxgloveSettings
+from gateway.publish.fan_out import FanOut
+from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, ByteOrder, ComponentType, encode_component
+from gateway.rtc3d.frames import Frame, encode_frame, split_frame
+from gateway.rtc3d.parameters import AnalogChannel, Parameters, ParametersAnalog
+from tests.losses import amounts
+from tests.networks import free_port
+from tests.waiting import wait_until_async
+
+UTIME: Final = 1_700_000_000_000_000
+
+
+def frame_of(
+    items: Mapping[ComponentType, Iterable[Any]], order: ByteOrder = "big", timestamp_us: int = 0
+) -> Frame:
+    """Return a frame with these components."""
+    encoded = [
+        encode_component(kind, 1, timestamp_us, np.array(list(each), ITEM_DTYPES[kind]), order)
+        for kind, each in items.items()
+    ]
+    return split_frame(encode_frame(encoded, order), order)
+
+
+def channels(*labels: str) -> Parameters:
+    """Return parameters with these analog channels."""
+    return Parameters(
+        analog=ParametersAnalog(tuple(AnalogChannel(str(n), label) for n, label in enumerate(labels)))
+    )
+
+
+class LiveSource:
+    """A source that publishes on ``output``. ``num_changes`` counts the calls of ``on_change``."""
+
+    def __init__(self, name: str, output: FoxgloveOutput) -> None:
+        self.name = name
+        self.output = output
+        self.fan_out = FanOut(name, [output])
+
+    def set_parameters(
+        self, parsed: Parameters, version: int = 1, frame: CoordinateFrame | None = None
+    ) -> None:
+        described = ServerParameters(
+            b"<xml/>", 1, version, parsed=parsed, frame=frame or CoordinateFrame(self.name)
+        )
+        self.output.publish_parameters(self.name, described)
+
+    def publish(self, frame: Frame, utime: int = UTIME) -> None:
+        self.fan_out.publish(frame, Stamp(utime, utime, 1, 1), frozenset(WIRE_ORDER))
+
+    def publish_items(self, kind: ComponentType, items: Iterable[Any], utime: int = UTIME) -> None:
+        self.publish(frame_of({kind: items}), utime)
+
+    @property
+    def wanted(self) -> bool:
+        return self.fan_out.has_subscribers(WIRE_ORDER)
+
+    async def wait_until_wanted(self, wanted: bool = True) -> None:
+        await wait_until_async(lambda: self.wanted is wanted)
+
+    @property
+    def losses(self) -> dict[str, tuple[int, int]]:
+        """The (messages, frames) that were lost, by cause."""
+        [(_, status)] = self.fan_out.outputs
+        return amounts(status.losses)
+
+
+@asynccontextmanager
+async def serving(*names: str) -> AsyncIterator[tuple[int, list[LiveSource]]]:
+    """Run an output with these sources; yield its port and the sources."""
+    port = free_port()
+    output = FoxgloveOutput(FoxgloveSettings(enabled=True, port=port))
+    output.start()
+    try:
+        await wait_until_async(lambda: output.health().connected)
+        sources = [LiveSource(name, output) for name in names]
+        yield port, sources
+        for source in sources:
+            source.fan_out.close()
+    finally:
+        output.close()

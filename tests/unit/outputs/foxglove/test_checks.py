@@ -1,0 +1,95 @@
+"""The doctor's checks: the packages, and the port, which a running gateway may use already."""
+
+import asyncio
+import importlib.metadata
+import socket
+import sys
+
+import pytest
+
+from gateway.errors import ConfigError
+from gateway.findings import Finding, Result
+from gateway.outputs.foxglove import checks
+from gateway.outputs.foxglove.checks import check_foxglove, leaves_host
+from gateway.outputs.foxglove.kind import FOXGLOVE
+from gateway.outputs.foxglove.settings import FoxgloveSettings
+from tests.networks import free_port
+from tests.unit.outputs.foxglove.live import serving
+
+
+def check(port: int, *sources: str, host: str = "127.0.0.1") -> tuple[Finding, Finding]:
+    package, port_finding = check_foxglove(FoxgloveSettings(host=host, port=port), sources, (), 1.0)
+    return package, port_finding
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "::1", "0.0.0.0", "localhost"])  # noqa: S104 - free at once
+def test_a_free_port_passes(host: str) -> None:
+    package, port = check(free_port(), host=host)
+    assert (package.result, port.result) == (Result.PASSING, Result.PASSING)
+    assert "foxglove-sdk" in package.found
+    assert "will be able to connect to ws://" in port.found
+
+
+async def test_a_gateway_that_is_running_passes_if_it_serves_all_sources() -> None:
+    async with serving("lab", "hall") as (port, _):
+        _, found = await asyncio.to_thread(check, port, "lab", "hall")
+        assert found.result is Result.PASSING
+        assert found.found == f"a gateway serves viewers at ws://127.0.0.1:{port}, with 12 topics"
+        _, found = await asyncio.to_thread(check, port, "lab", "stage")
+        assert found.result is Result.WARNING
+        assert found.found.endswith("but not stage")
+
+
+def test_a_port_of_another_program_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(checks, "_TIMEOUT_S", 0.1)
+    with socket.create_server(("127.0.0.1", 0)) as other:
+        port = other.getsockname()[1]
+        _, found = check(port)
+    assert found.result is Result.FAILING
+    assert "Address already in use" in found.found
+    assert f"uses port {port}" in found.remedy
+
+
+def test_an_address_of_another_computer_fails() -> None:
+    _, found = check(free_port(), host="192.0.2.1")
+    assert found.result is Result.FAILING
+    assert "Cannot assign requested address" in found.found
+
+
+def test_a_package_that_is_missing_is_named_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    def version(name: str) -> str:
+        if name == "websockets":
+            raise importlib.metadata.PackageNotFoundError(name)
+        return "1.0"
+
+    monkeypatch.setattr(checks, "version", version)
+    package, port = check(free_port())
+    assert (package.result, port.result) == (Result.FAILING, Result.NOT_TESTED)
+    assert "websockets is not installed" in package.found
+    assert "pip install 'rtc3d-gateway[foxglove]'" in package.remedy
+
+
+def test_without_its_packages_the_output_is_refused_in_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    for name in list(sys.modules):
+        if name.startswith(("gateway.foxglove_schemas", "gateway.outputs.foxglove.")):
+            monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(ConfigError, match=r"pip install 'rtc3d-gateway\[foxglove\]'"):
+        FOXGLOVE.create(FoxgloveSettings(enabled=True))
+
+
+@pytest.mark.parametrize(
+    ("host", "leaves"),
+    [
+        ("127.0.0.1", False),
+        ("127.0.0.2", False),
+        ("::1", False),
+        ("localhost", False),
+        ("0.0.0.0", True),  # noqa: S104 - not bound
+        ("::", True),
+        ("192.0.2.1", True),
+        ("lab.example.org", True),
+    ],
+)
+def test_data_leaves_the_computer_unless_the_address_is_loopback(host: str, leaves: bool) -> None:
+    assert leaves_host(FoxgloveSettings(host=host)) is leaves

@@ -1,0 +1,393 @@
+"""What viewers get: channels, subscriptions, descriptions and values."""
+
+import asyncio
+import math
+import socket
+from typing import Any
+
+import numpy as np
+import pytest
+
+from gateway.foxglove_schemas import forces, messages
+from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.outputs.foxglove.output import FoxgloveOutput
+from gateway.outputs.foxglove.settings import FoxgloveSettings
+from gateway.rtc3d.components import MISSING, ByteOrder, ComponentType
+from gateway.rtc3d.parameters import (
+    Marker,
+    Parameters,
+    Parameters3D,
+    Parameters6D,
+    ParametersForce,
+    Plate,
+    Point,
+    Tool,
+)
+from tests.foxglove_viewer import HandshakeRefusedError, Viewer, viewing
+from tests.networks import free_port
+from tests.unit.export.read_mcap import floats_of, points_of
+from tests.unit.outputs.foxglove.live import UTIME, channels, frame_of, serving
+from tests.waiting import wait_until_async
+
+MARKERS, TOOLS, ANALOG, FORCE, EVENT = (
+    ComponentType.MARKERS,
+    ComponentType.TOOLS,
+    ComponentType.ANALOG,
+    ComponentType.FORCE,
+    ComponentType.EVENT,
+)
+ALWAYS = {
+    "/lab/markers": "foxglove.PointCloud",
+    "/lab/tools": "foxglove.FrameTransforms",
+    "/lab/events": "foxglove.Log",
+    "/lab/forces": "foxglove.SceneUpdate",
+    "/lab/plates": "foxglove.SceneUpdate",
+    "/lab/parameters": "rtc3d.Parameters",
+}
+PLATE = Plate(
+    "1",
+    "left",
+    corners=tuple(
+        Point(x, y, 0.0, "mm") for x, y in ((600.0, 400.0), (0.0, 400.0), (0.0, 0.0), (600.0, 0.0))
+    ),
+)
+QUARTER_TURN = CoordinateFrame("hall", 1e-3, (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)), (10.0, 0.0, 0.0))
+"""Turns x to y, and then moves 10 m along x."""
+
+
+def pose(x: float, y: float, z: float) -> tuple[float, ...]:
+    return (1, 0, 0, 0, x, y, z, 0.1)
+
+
+# Channels ---------------------------------------------------------------------------------------
+
+
+async def test_the_channels_of_each_source_are_advertised_before_it_has_frames() -> None:
+    async with serving("lab", "hall") as (port, [lab, _]), viewing(port) as viewer:
+        await viewer.wait_until(lambda: len(viewer.topics) == 2 * len(ALWAYS))
+        assert viewer.info["name"] == "rtc3d-gateway"
+        assert viewer.info["capabilities"] == []
+        assert {name: schema for name, schema in viewer.topics.items() if "/lab/" in name} == ALWAYS
+        lab.set_parameters(channels("EMG 1", "EMG 2"))
+        await viewer.wait_until(lambda: viewer.topics.get("/lab/analog") == "rtc3d.lab.Analog")
+    async with serving("lab") as (port, _), viewing(port) as again:
+        assert again.info["sessionId"] != viewer.info["sessionId"]
+
+
+async def test_channels_of_numbers_appear_with_the_first_frame_if_the_parameters_are_unknown() -> None:
+    async with serving("lab") as (port, [lab]), viewing(port) as viewer:
+        lab.publish(frame_of({ANALOG: [1, 2], FORCE: [(1, 2, 3, 4, 5, 6)]}))
+        await viewer.wait_until(lambda: {"/lab/analog", "/lab/loads"} <= viewer.topics.keys())
+        viewer.subscribe("/lab/analog", "/lab/loads")
+        await lab.wait_until_wanted()
+        lab.publish(frame_of({ANALOG: [1, 2], FORCE: [(1, 2, 3, 4, 5, 6)]}))
+        [analog] = await viewer.wait_for("/lab/analog")
+        assert floats_of(analog.content) == {"channel_1": 1, "channel_2": 2}
+        [loads] = await viewer.wait_for("/lab/loads")
+        assert floats_of(loads.content) == {
+            f"plate_1_{load}": number for number, load in enumerate(("fx", "fy", "fz", "mx", "my", "mz"), 1)
+        }
+
+
+async def test_channels_are_withdrawn_with_their_source_and_come_back_with_it() -> None:
+    async with serving("lab", "hall") as (port, [lab, hall]), viewing(port, "/lab/markers") as viewer:
+        await lab.wait_until_wanted()
+        lab.fan_out.set_outputs(())
+        await viewer.wait_until(lambda: not any(name.startswith("/lab/") for name in viewer.topics))
+        assert set(viewer.withdrawn) == ALWAYS.keys()
+        lab.fan_out.set_outputs([hall.output])
+        await viewer.wait_until(lambda: viewer.topics.keys() >= ALWAYS.keys())
+        assert not lab.wanted
+        viewer.subscribe("/lab/markers")
+        await lab.wait_until_wanted()
+        lab.publish_items(MARKERS, [(1, 2, 3, 0)])
+        await viewer.wait_for("/lab/markers")
+
+
+async def test_other_labels_of_channels_replace_the_topic_by_one_with_another_schema() -> None:
+    async with serving("lab") as (port, [lab]):
+        lab.set_parameters(channels("EMG 1", "EMG 2"))
+        async with viewing(port, "/lab/analog") as viewer:
+            await lab.wait_until_wanted()
+            lab.set_parameters(channels("EMG 1", "EMG 2"), 2)
+            lab.publish_items(ANALOG, [1, 2])
+            await viewer.wait_for("/lab/analog")
+            assert viewer.withdrawn == []
+            lab.set_parameters(channels("left", "right", "time"), 3)
+            await viewer.wait_until(lambda: viewer.topics.get("/lab/analog") == "rtc3d.lab.Analog_2")
+            assert viewer.withdrawn == ["/lab/analog"]
+            await lab.wait_until_wanted(False)
+            viewer.subscribe("/lab/analog")
+            await lab.wait_until_wanted()
+            lab.publish_items(ANALOG, [1, 2, 3])
+            _, after = await viewer.wait_for("/lab/analog", 2)
+            assert floats_of(after.content) == {"left": 1, "right": 2, "time": 3}
+
+
+async def test_a_number_of_channels_that_goes_up_and_down_is_counted_and_not_followed_each_time() -> None:
+    async with serving("lab") as (port, [lab]):
+        lab.set_parameters(channels("a", "b"))
+        async with viewing(port, "/lab/analog", "/lab/markers") as viewer:
+            await lab.wait_until_wanted()
+            lab.publish_items(ANALOG, range(3))
+            await viewer.wait_until(lambda: viewer.topics.get("/lab/analog") == "rtc3d.lab.Analog_2")
+            viewer.subscribe("/lab/analog")
+            lab.publish_items(ANALOG, range(3))
+            while not viewer.received["/lab/analog"]:
+                lab.publish_items(ANALOG, range(3))
+                await asyncio.sleep(0)
+            for number in range(100):
+                lab.publish_items(ANALOG, range(number % 2 + 2))
+            lab.publish_items(MARKERS, [(1, 2, 3, 0)])
+            await viewer.wait_for("/lab/markers")
+            assert lab.losses["labels change too often"] == (50, 50)
+            assert viewer.withdrawn == ["/lab/analog"]
+
+
+# Subscriptions --------------------------------------------------------------------------------
+
+
+async def test_a_source_is_wanted_while_a_viewer_subscribes_to_its_frames() -> None:
+    async with serving("lab", "hall") as (port, [lab, hall]):
+        await lab.wait_until_wanted(False)
+        async with viewing(port, "/lab/markers") as first:
+            await lab.wait_until_wanted()
+            async with viewing(port, "/lab/tools", "/lab/parameters"):
+                first.unsubscribe("/lab/markers")
+                first.subscribe("/hall/plates")
+                first.subscribe("/hall/parameters")
+                first.subscribe("/hall/events")
+                await hall.wait_until_wanted()
+                await lab.wait_until_wanted()
+            await lab.wait_until_wanted(False)
+            first.unsubscribe("/hall/events")
+            await hall.wait_until_wanted(False)
+
+
+async def test_nothing_is_converted_but_what_somebody_subscribes_to(monkeypatch: pytest.MonkeyPatch) -> None:
+    converted: list[str] = []
+    for owner, name in (
+        (messages.FoxgloveSource, "_cloud"),
+        (messages.FoxgloveSource, "_transforms"),
+        (messages.FoxgloveSource, "_numbers"),
+        (messages.FoxgloveSource, "_log"),
+        (forces.ForceScene, "arrows"),
+    ):
+        original = getattr(owner, name)
+
+        def spy(*arguments: object, name: str = name, original: object = original) -> object:
+            converted.append(name)
+            return original(*arguments)  # type: ignore[operator]
+
+        monkeypatch.setattr(owner, name, spy)
+    everything: dict[ComponentType, list[Any]] = {
+        MARKERS: [(1, 2, 3, 0)],
+        TOOLS: [pose(1, 2, 3)],
+        ANALOG: [1],
+        FORCE: [(0, 0, 500, 0, 0, 0)],
+        EVENT: [(7, 0, 1, 2, 3)],
+    }
+    async with serving("lab") as (port, [lab]), viewing(port) as viewer:
+        lab.publish(frame_of(everything))
+        await viewer.wait_until(lambda: "/lab/loads" in viewer.topics)
+        viewer.subscribe("/lab/loads")
+        await lab.wait_until_wanted()
+        lab.publish(frame_of(everything))
+        await viewer.wait_for("/lab/loads")
+        assert converted == ["_numbers"]
+        viewer.unsubscribe("/lab/loads")
+        await lab.wait_until_wanted(False)
+        lab.publish(frame_of(everything))
+        viewer.subscribe("/lab/forces", "/lab/events")
+        await lab.wait_until_wanted()
+        lab.publish(frame_of(everything))
+        await viewer.wait_for("/lab/events")
+        assert sorted(converted) == ["_log", "_numbers", "arrows"]
+
+
+async def test_viewers_have_their_own_subscriptions() -> None:
+    async with (
+        serving("lab") as (port, [lab]),
+        viewing(port, "/lab/markers", subprotocol="foxglove.websocket.v1") as first,
+        viewing(port, "/lab/markers", "/lab/tools") as second,
+    ):
+        assert (first.subprotocol, second.subprotocol) == ("foxglove.websocket.v1", "foxglove.sdk.v1")
+        await wait_until_async(lambda: lab.wanted)
+        frame = frame_of({MARKERS: [(1, 2, 3, 0)], TOOLS: [pose(1, 2, 3)]})
+
+        def both_receive() -> bool:
+            lab.publish(frame)
+            return bool(first.received["/lab/markers"] and second.received["/lab/tools"])
+
+        await wait_until_async(both_receive)
+        assert not first.received["/lab/tools"]
+
+
+async def test_requests_that_make_no_sense_are_answered_or_ignored() -> None:
+    async with serving("lab") as (port, [lab]), viewing(port, "/lab/markers") as viewer:
+        await lab.wait_until_wanted()
+        number = viewer.channel("/lab/markers")["id"]
+        for request in (
+            {"op": "subscribe", "subscriptions": [{"id": 7, "channelId": number}]},  # a second time
+            {"op": "subscribe", "subscriptions": [{"id": 8, "channelId": 99999}]},
+            {"op": "unsubscribe", "subscriptionIds": [9]},
+            {"op": "getParameters", "parameterNames": []},
+        ):
+            viewer.send(request)
+        await viewer.wait_until(lambda: viewer.warnings)
+        assert viewer.warnings == ["only subscribe and unsubscribe are served"]
+        lab.publish_items(MARKERS, [(1, 2, 3, 0)])
+        await viewer.wait_for("/lab/markers")
+
+
+async def test_clients_of_other_protocols_are_refused() -> None:
+    async with serving("lab") as (port, _):
+        with pytest.raises(HandshakeRefusedError, match="400"):
+            await Viewer.open(port, "chat")
+
+
+# Descriptions ----------------------------------------------------------------------------------
+
+
+async def test_parameters_and_plates_are_sent_to_each_viewer_that_subscribes_and_when_they_change() -> None:
+    async with serving("lab") as (port, [lab]):
+        described = Parameters(
+            markers=Parameters3D(100.0, "mm", (Marker("1", "knee"),)), force=ParametersForce((PLATE,))
+        )
+        lab.set_parameters(described, 3, QUARTER_TURN)
+        for _ in range(2):
+            async with viewing(port, "/lab/parameters", "/lab/plates") as viewer:
+                [parameters] = await viewer.wait_for("/lab/parameters")
+                assert parameters.content["version"] == 3
+                assert parameters.content["3d"]["labels"] == ["knee"]
+                assert parameters.content["frame"] == {
+                    "frame_id": "hall",
+                    "metres_per_unit": 1e-3,
+                    "rotation_xyzw": list(QUARTER_TURN.rotation_xyzw),
+                    "translation_m": [10, 0, 0],
+                }
+                [plates] = await viewer.wait_for("/lab/plates")
+                [entity] = plates.content.entities
+                assert (entity.frame_id, entity.id) == ("hall", "left")
+                corners = [(p.x, p.y) for p in entity.lines[0].points]
+                assert np.allclose(corners, [(9.6, 0.6), (9.6, 0), (10, 0), (10, 0.6)])
+        async with viewing(port, "/lab/parameters", "/lab/plates") as viewer:
+            await viewer.wait_for("/lab/plates")
+            lab.set_parameters(Parameters(), 4)
+            await viewer.wait_for("/lab/plates", 2)
+            assert [log.content["version"] for log in viewer.received["/lab/parameters"]] == [3, 4]
+            assert not viewer.received["/lab/plates"][1].content.entities
+        assert not lab.wanted
+
+
+async def test_names_of_fields_that_are_not_the_labels_can_be_queried() -> None:
+    async with serving("lab") as (port, [lab]), viewing(port) as viewer:
+        lab.set_parameters(channels("EMG 1", "EMG_1", "time"))
+        await viewer.wait_until(lambda: "/lab/analog" in viewer.topics)
+        assert lab.output.topic_names("lab") == {"analog": {"EMG 1": "EMG_1", "EMG_1": "EMG_1_2"}}
+        assert lab.output.topic_names("none") == {}
+
+
+# Values ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("order", ["big", "little"])
+async def test_positions_are_in_the_frame_of_the_source(order: ByteOrder) -> None:
+    async with serving("lab") as (port, [lab]), viewing(port, "/lab/markers", "/lab/tools") as viewer:
+        lab.set_parameters(Parameters(tools=Parameters6D(100.0, (Tool("1", "cup"),))), 1, QUARTER_TURN)
+        await lab.wait_until_wanted()
+        lab.publish(
+            frame_of(
+                {MARKERS: [(MISSING,) * 4, (1000, 2000, 3000, 0.5)], TOOLS: [pose(1000, 2000, 3000)]}, order
+            )
+        )
+        [cloud] = await viewer.wait_for("/lab/markers")
+        assert (cloud.content.frame_id, cloud.time_ns) == ("hall", UTIME * 1000)
+        assert np.allclose(points_of(cloud.content).tolist(), [(8, 1, 3, 0.5, 1)])
+        [transforms] = await viewer.wait_for("/lab/tools")
+        [cup] = transforms.content.transforms
+        assert (cup.parent_frame_id, cup.child_frame_id) == ("hall", "lab/cup")
+        p, q = cup.translation, cup.rotation
+        assert np.allclose((p.x, p.y, p.z), (8, 1, 3))
+        assert np.allclose((q.x, q.y, q.z, q.w), QUARTER_TURN.rotation_xyzw)
+
+
+async def test_forces_act_in_the_frame_of_the_source() -> None:
+    async with serving("lab") as (port, [lab]), viewing(port, "/lab/forces") as viewer:
+        turned = CoordinateFrame("hall", 1e-3, (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5)), (0.0, 0.0, 1.0))
+        lab.set_parameters(
+            Parameters(force=ParametersForce((PLATE,))), 1, turned
+        )  # y becomes z, z becomes -y
+        await lab.wait_until_wanted()
+        lab.publish_items(FORCE, [(0, 0, 500, 0, 0, 0)])
+        [update] = await viewer.wait_for("/lab/forces")
+        [arrow] = update.content.entities[0].arrows
+        p, q = arrow.pose.position, arrow.pose.orientation
+        assert np.allclose((p.x, p.y, p.z), (0.3, 0, 1.2))
+        assert arrow.shaft_length + arrow.head_length == pytest.approx(0.5)
+        # The arrow along x is turned to -y.
+        assert np.allclose((2 * (q.x * q.y + q.w * q.z), q.w**2 + q.x**2 - q.y**2 - q.z**2), (-1, 0))
+
+
+async def test_without_a_known_unit_no_position_is_sent_and_the_loss_is_counted() -> None:
+    async with serving("lab") as (port, [lab]), viewing(port, "/lab/markers", "/lab/events") as viewer:
+        lab.set_parameters(
+            Parameters(markers=Parameters3D(100.0, "furlong")), 1, CoordinateFrame("lab", None)
+        )
+        await lab.wait_until_wanted()
+        lab.publish(frame_of({MARKERS: [(1, 2, 3, 0)], EVENT: [(7, 0, 1, 2, 3)]}))
+        await viewer.wait_for("/lab/events")
+        assert lab.losses == {"unknown unit": (1, 1)}
+        assert not viewer.received["/lab/markers"]
+
+
+async def test_what_viewers_cannot_show_is_left_out_and_counted() -> None:
+    async with serving("lab") as (port, [lab]), viewing(port, "/lab/markers") as viewer:
+        await lab.wait_until_wanted()
+        lab.publish_items(MARKERS, [(1, 2, 3, 0)], utime=-1)
+        lab.publish_items(ANALOG, range(10_001))
+        lab.publish_items(MARKERS, [(1, 2, 3, 0)])
+        await viewer.wait_for("/lab/markers")
+        assert lab.losses == {"time out of range": (1, 1), "too many numbers": (1, 1)}
+        assert "/lab/analog" not in viewer.topics
+
+
+async def test_thousands_of_channels_have_a_field_each() -> None:
+    async with serving("lab") as (port, [lab]):
+        labels = [f"EMG {number}" for number in range(5000)]
+        lab.set_parameters(channels(*labels))
+        async with viewing(port, "/lab/analog") as viewer:
+            await lab.wait_until_wanted()
+            lab.publish_items(ANALOG, range(5000))
+            [analog] = await viewer.wait_for("/lab/analog")
+            assert list(floats_of(analog.content).values()) == list(range(5000))
+
+
+# The port ------------------------------------------------------------------------------------------
+
+
+async def test_a_port_that_is_taken_is_a_problem_until_it_is_free(caplog: pytest.LogCaptureFixture) -> None:
+    port = free_port()
+    output = FoxgloveOutput(FoxgloveSettings(enabled=True, port=port))
+    with socket.create_server(("127.0.0.1", port)):
+        output.start()
+        await wait_until_async(lambda: "choose another foxglove.port" in output.health().problem)
+        assert f"127.0.0.1:{port}" in output.health().problem
+    try:
+        await wait_until_async(lambda: output.health().connected)
+        async with await Viewer.open(port):
+            pass
+    finally:
+        output.close()
+    warnings = [record for record in caplog.records if record.levelname == "WARNING"]
+    assert len(warnings) == 1
+
+
+async def test_an_address_of_another_computer_is_a_problem() -> None:
+    output = FoxgloveOutput(FoxgloveSettings(enabled=True, host="192.0.2.1", port=free_port()))
+    output.start()
+    try:
+        await wait_until_async(lambda: "correct foxglove.host" in output.health().problem)
+    finally:
+        output.close()
+    assert not output.health().connected

@@ -1,0 +1,104 @@
+"""The messages of Foxglove's WebSocket protocol, worked out by hand from its description."""
+
+import json
+
+import pytest
+
+from gateway.errors import QueryError
+from gateway.foxglove_schemas.topics import Topic
+from gateway.outputs.foxglove.protocol import (
+    Request,
+    Subscription,
+    advertise,
+    channel_text,
+    message_data,
+    parse_request,
+    server_info,
+    unadvertise,
+    warning,
+)
+
+
+def test_message_data_is_opcode_subscription_and_nanoseconds_little_endian() -> None:
+    # 1; 258 = 0x0102; 1 700 000 000 000 001 µs = 1 700 000 000 000 001 000 ns = 0x17979CFE362A03E8.
+    head = bytes.fromhex("01 02010000 e8032a36fe9c9717")
+    assert message_data(258, 1_700_000_000_000_001, b"data") == head + b"data"
+
+
+def test_the_server_introduces_itself() -> None:
+    assert json.loads(server_info("gateway", "17")) == {
+        "op": "serverInfo",
+        "name": "gateway",
+        "capabilities": [],
+        "sessionId": "17",
+    }
+
+
+def test_binary_schemas_are_advertised_as_base64_and_json_schemas_as_text() -> None:
+    cloud = Topic("/lab/markers", "protobuf", "foxglove.PointCloud", "protobuf", b"\x00\xff\x10")
+    text = Topic('/lab/"parameters"', "json", "rtc3d.Parameters", "jsonschema", b'{"type": "object"}')
+    message = advertise([channel_text(1, cloud), channel_text(2, text)])
+    assert json.loads(message) == {
+        "op": "advertise",
+        "channels": [
+            {
+                "id": 1,
+                "topic": "/lab/markers",
+                "encoding": "protobuf",
+                "schemaName": "foxglove.PointCloud",
+                "schemaEncoding": "protobuf",
+                "schema": "AP8Q",
+            },
+            {
+                "id": 2,
+                "topic": '/lab/"parameters"',
+                "encoding": "json",
+                "schemaName": "rtc3d.Parameters",
+                "schemaEncoding": "jsonschema",
+                "schema": '{"type": "object"}',
+            },
+        ],
+    }
+    assert json.loads(advertise([])) == {"op": "advertise", "channels": []}
+    assert json.loads(unadvertise([2, 1])) == {"op": "unadvertise", "channelIds": [2, 1]}
+    assert json.loads(warning("slow")) == {"op": "status", "level": 1, "message": "slow"}
+
+
+def test_requests_of_viewers() -> None:
+    # JavaScript writes 3.0 as 3, but other languages do not.
+    subscribe = (
+        '{"op":"subscribe","subscriptions":[{"id":0,"channelId":3.0},{"id":4294967295,"channelId":5,"x":1}]}'
+    )
+    assert parse_request(subscribe) == Request((Subscription(0, 3), Subscription(4294967295, 5)))
+    assert parse_request('{"op":"unsubscribe","subscriptionIds":[1, 2]}') == Request(ended=(1, 2))
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        b"\x01\x00\x00\x00\x00",
+        "",
+        "[",
+        "[" * 100_000,
+        "1" * 5000,
+        "null",
+        "[]",
+        '{"op":"advertise","channels":[]}',
+        '{"op":"getParameters","parameterNames":[]}',
+        '{"op":"subscribe"}',
+        '{"op":"subscribe","subscriptions":{}}',
+        '{"op":"subscribe","subscriptions":[1]}',
+        '{"op":"subscribe","subscriptions":[{"id":1}]}',
+        '{"op":"subscribe","subscriptions":[{"id":true,"channelId":1}]}',
+        '{"op":"subscribe","subscriptions":[{"id":-1,"channelId":1}]}',
+        '{"op":"subscribe","subscriptions":[{"id":4294967296,"channelId":1}]}',
+        '{"op":"subscribe","subscriptions":[{"id":"1","channelId":1}]}',
+        '{"op":"unsubscribe","subscriptionIds":[null]}',
+        '{"op":"unsubscribe","subscriptionIds":[NaN]}',
+        '{"op":"unsubscribe","subscriptionIds":[1e999]}',
+    ],
+)
+def test_anything_else_is_refused_with_a_reason(message: str | bytes) -> None:
+    with pytest.raises(QueryError) as caught:
+        parse_request(message)
+    assert str(caught.value)
