@@ -2,9 +2,13 @@
 
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Final
 
 from gateway.rtc3d.commands import Frequency, FrequencyDivisor, Rate
 from gateway.rtc3d_server.scene import FrameSource
+
+_SAME_RATE: Final = Fraction(101, 100)
+"""Measured rates within this factor are one rate."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,17 +27,26 @@ class FrameRequest:
 class FrameSchedule:
     """The frames of a client's StreamFrames during one measurement (§5.3.5).
 
-    Frame j of the stream (from 0) is the frame of tick ``first_tick`` + ⌈j · stride⌉.
+    Frame j of the stream (from 0) is the frame of tick ⌈first + j · stride⌉. If the rate of the frames
+    changes, so that ``Frequency:n`` needs another stride, the stream continues with that one.
     """
 
     def __init__(self, frames: FrameSource, rate: Rate | None, first_tick: int) -> None:
         self.frames = frames
-        self._first_tick = first_tick
-        stride = _stride(rate, frames.rate)
-        self._numerator, self._denominator = stride.numerator, stride.denominator
-        self._num_passed = 0  # frames of this stream that were sent or dropped
+        self._rate = rate
+        self._base_rate = frames.rate
+        self._set_stride(Fraction(first_tick))
         self.tick = first_tick
         """The tick of the next frame."""
+
+    def _set_stride(self, first: Fraction) -> None:
+        """Count the frames of this stream from the one at ``first`` on."""
+        stride = _stride(self._rate, self._base_rate)
+        # As integers with one denominator, because this is computed for every frame of every client.
+        self._denominator = first.denominator * stride.denominator
+        self._first = first.numerator * stride.denominator
+        self._stride = stride.numerator * first.denominator
+        self._num_passed = 0  # frames that were sent or dropped
 
     @property
     def due_us(self) -> int:
@@ -43,12 +56,24 @@ class FrameSchedule:
     def advance(self, count: int = 1) -> None:
         """Advance by ``count`` frames, which were sent or dropped."""
         self._num_passed += count
-        self.tick = self._first_tick - (-self._num_passed * self._numerator // self._denominator)
+        position = self._first + self._num_passed * self._stride
+        if isinstance(self._rate, Frequency) and self._has_other_rate():
+            self._set_stride(Fraction(position, self._denominator).limit_denominator(1000))
+            position = self._first
+        self.tick = -(-position // self._denominator)
+
+    def _has_other_rate(self) -> bool:
+        rate = self.frames.rate
+        if self._base_rate < rate * _SAME_RATE and rate < self._base_rate * _SAME_RATE:
+            return False
+        self._base_rate = rate
+        return True
 
     def num_due(self, elapsed_us: int) -> int:
         """Return how many frames are due at ``elapsed_us``."""
-        ticks = self.frames.tick_after(elapsed_us) - 1 - self._first_tick
-        return max(0, ticks * self._denominator // self._numerator + 1 - self._num_passed)
+        last_tick = self.frames.tick_after(elapsed_us) - 1
+        num_begun = (last_tick * self._denominator - self._first) // self._stride + 1
+        return max(0, num_begun - self._num_passed)
 
 
 def _stride(rate: Rate | None, base_rate: Fraction) -> Fraction:

@@ -1,0 +1,1 @@
+"""The output rtc3d: the gateway as an RT server for the clients of its sources."""

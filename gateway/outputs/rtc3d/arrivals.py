@@ -1,0 +1,204 @@
+"""The frames of a live source in the order of their arrival, and the rates of its streams."""
+
+from collections import deque
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from statistics import median_low
+from typing import Final, Generic, NamedTuple, TypeVar
+
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import Frame, FrameLayout
+
+_KEPT_ARRIVALS: Final = 256
+_KEPT_BYTES: Final = 8 * 1024 * 1024
+"""How much of the past is kept for clients that ask for the current frame."""
+
+_INTERVALS: Final = 32  # their median is the period of a stream
+
+_Item = TypeVar("_Item")
+
+
+class Composition(NamedTuple):
+    """Which wanted components are in the frames of one layout, and whether these are all that it has."""
+
+    measured: frozenset[ComponentType]
+    has_events: bool
+    is_complete: bool
+
+
+class Arrival:
+    """A frame, when it arrived and on which stream.
+
+    ``time_us`` is on the clock of the measurement and grows with every arrival. ``timestamp_us`` is the
+    server's. ``stream`` is the number of the connection.
+    """
+
+    __slots__ = ("composition", "frame", "stream", "time_us", "timestamp_us")
+
+    def __init__(self, frame: Frame, composition: Composition, stream: int, time_us: int) -> None:
+        self.frame = frame
+        self.composition = composition
+        self.stream = stream
+        self.time_us = time_us
+        self.timestamp_us = frame.number_and_timestamp[1]
+
+    @property
+    def num_bytes(self) -> int:
+        """The size of the frame."""
+        return len(self.frame.body)
+
+
+class Kept(Generic[_Item]):
+    """The newest items of a series: at most so many, and so many bytes, but at least one.
+
+    Items have numbers from 0. ``first`` is the number of the oldest item that is kept.
+    """
+
+    def __init__(self, most: int, max_bytes: int, num_bytes: Callable[[_Item], int]) -> None:
+        self.first = 0
+        self._items: deque[_Item] = deque()
+        self._most = most
+        self._max_bytes = max_bytes
+        self._num_bytes = num_bytes
+        self._bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._items)
+
+    @property
+    def end(self) -> int:
+        """The number of the next item."""
+        return self.first + len(self._items)
+
+    @property
+    def newest(self) -> _Item:
+        """The newest item. Raises IndexError if there is none."""
+        return self._items[-1]
+
+    @property
+    def oldest(self) -> _Item:
+        """The oldest item. Raises IndexError if there is none."""
+        return self._items[0]
+
+    def __getitem__(self, number: int) -> _Item:
+        return self._items[number - self.first]
+
+    def since(self, number: int) -> Iterator[_Item]:
+        """Yield the items from this number on that are kept."""
+        for index in range(max(0, number - self.first), len(self._items)):
+            yield self._items[index]
+
+    def append(self, item: _Item) -> None:
+        """Append an item, and drop the oldest ones that are too many."""
+        self._items.append(item)
+        self._bytes += self._num_bytes(item)
+        while len(self._items) > self._most or (self._bytes > self._max_bytes and len(self._items) > 1):
+            self.pop_oldest()
+
+    def pop_oldest(self) -> _Item:
+        """Drop the oldest item and return it. Raises IndexError if there is none."""
+        item = self._items.popleft()
+        self._bytes -= self._num_bytes(item)
+        self.first += 1
+        return item
+
+    def clear(self) -> None:
+        """Drop all items; their numbers are used up."""
+        self.first = self.end
+        self._items.clear()
+        self._bytes = 0
+
+
+class StreamRate:
+    """How often frames come on one stream: from the server's time stamps, or else from their arrivals."""
+
+    def __init__(self) -> None:
+        self.time_us = 0
+        """When the newest frame arrived."""
+        self.timestamp_us = 0
+        """The newest time stamp."""
+        self.has_times = False
+        """Whether the time stamps increase."""
+        self._num_frames = 0
+        self._intervals_us: deque[int] = deque(maxlen=_INTERVALS)
+        self._period_us = 0
+
+    def add(self, arrival: Arrival) -> None:
+        """Count a frame."""
+        step_us = arrival.timestamp_us - self.timestamp_us
+        elapsed_us = arrival.time_us - self.time_us
+        self.time_us, self.timestamp_us = arrival.time_us, arrival.timestamp_us
+        self._num_frames += 1
+        if self._num_frames > 1:
+            self.has_times = step_us > 0
+            self._intervals_us.append(step_us if step_us > 0 else elapsed_us)
+            self._period_us = 0
+
+    @property
+    def period_us(self) -> int | None:
+        """The usual time between two frames; None before the third frame."""
+        if len(self._intervals_us) < 2:
+            return None
+        if not self._period_us:
+            self._period_us = max(1, median_low(self._intervals_us))
+        return self._period_us
+
+
+class Arrivals:
+    """The newest frames of a source, and the streams on which its components come.
+
+    With ``streams: auto``, components of different rates come in different frames on different connections.
+    """
+
+    def __init__(self) -> None:
+        self.frames: Kept[Arrival] = Kept(_KEPT_ARRIVALS, _KEPT_BYTES, lambda arrival: arrival.num_bytes)
+        """The newest frames."""
+        self.stream_of: dict[ComponentType, int] = {}
+        """On which stream each measured component came last."""
+        self.rates: dict[int, StreamRate] = {}
+        """The rate of each stream, by its number."""
+        self.newest_us = -1
+        """When the newest frame arrived."""
+        self.began_us = 0
+        """When the first frame of the measurement arrived."""
+        self._composition = lru_cache(64)(_composition)
+
+    def add(
+        self, frame: Frame, stream: int, wanted: frozenset[ComponentType], elapsed_us: int
+    ) -> Arrival | None:
+        """Add a frame with its ``wanted`` components; return None if it has none of them."""
+        composition = self._composition(frame.layout, wanted)
+        if not composition.measured and not composition.has_events:
+            return None
+        self.newest_us = max(elapsed_us, self.newest_us + 1)
+        arrival = Arrival(frame, composition, stream, self.newest_us)
+        if composition.measured:
+            rate = self.rates.get(stream)
+            if rate is None:
+                rate = self._new_stream(stream)
+            rate.add(arrival)
+            for component in composition.measured:
+                if self.stream_of.get(component) != stream:
+                    self._move(component, stream)
+        self.frames.append(arrival)
+        return arrival
+
+    def _new_stream(self, stream: int) -> StreamRate:
+        if not self.rates:
+            self.began_us = self.newest_us
+        rate = self.rates[stream] = StreamRate()
+        return rate
+
+    def _move(self, component: ComponentType, stream: int) -> None:
+        """Note that a component comes on another stream now, and forget streams that have ended."""
+        self.stream_of[component] = stream
+        used = set(self.stream_of.values())
+        self.rates = {number: rate for number, rate in self.rates.items() if number in used}
+
+
+def _composition(layout: FrameLayout, wanted: frozenset[ComponentType]) -> Composition:
+    types = [component.type for component in layout.components]
+    present = wanted.intersection(types)
+    return Composition(
+        present - {ComponentType.EVENT}, ComponentType.EVENT in present, wanted.issuperset(types)
+    )

@@ -1,0 +1,294 @@
+"""The frames of a live source that have certain components, joined by time stamp where they come apart."""
+
+from bisect import bisect_left, bisect_right
+from collections import deque
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from functools import lru_cache
+from operator import attrgetter
+from typing import Final, NamedTuple
+
+from gateway.outputs.rtc3d.arrivals import Arrival, Arrivals, Kept
+from gateway.outputs.rtc3d.frame_bytes import Events, encode_events, encode_joined, events_of, unchanged_body
+from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
+from gateway.rtc3d.packets import PacketType, encode_packet
+from gateway.rtc3d_server.frame_builder import exact_rate
+from gateway.rtc3d_server.scene import NOT_YET_US, DataPacket
+
+WAIT_US: Final = 50_000
+"""How long a frame waits for the samples of faster components at its time stamp."""
+
+_ALIVE_US: Final = 1_000_000
+_ALIVE_PERIODS: Final = 3
+"""A stream counts as long as its newest frame is not older than this, whichever is longer."""
+
+_FASTER_ALIVE_US: Final = 500_000
+"""How long frames wait for a faster stream without frames."""
+
+_FIRST_US: Final = 1_000_000
+"""How long faster components wait for the first frame of a slower one that the server announces."""
+
+_ROUNDING_US: Final = 2
+"""Time stamps of the same moment can differ by this much, because rates are rounded."""
+
+_OTHER_CLOCK_US: Final = 1_000_000
+"""A stream whose time stamps are this far behind another one has another time base."""
+
+_SAME_RATE: Final = 1.01  # rates within this factor are one rate
+_DEFAULT_RATE: Final = Fraction(100)
+_FORGOTTEN_US: Final = -1  # the time of a frame that is not kept: long ago
+
+_KEPT_FRAMES: Final = 64
+_KEPT_SAMPLES: Final = 2048
+_KEPT_EVENTS: Final = 4096
+_KEPT_BYTES: Final = 8 * 1024 * 1024
+_CACHED_PACKETS: Final = 64  # clients with equal streams share them
+
+_time_us: Final = attrgetter("time_us")
+
+
+class _LiveFrame(NamedTuple):
+    """A frame for clients: one that arrived, and the samples of faster streams at its time stamp."""
+
+    time_us: int
+    main: Arrival
+    others: tuple[Arrival, ...]
+
+    @property
+    def num_bytes(self) -> int:
+        return self.main.num_bytes + sum(arrival.num_bytes for arrival in self.others)
+
+
+class LiveFrames:
+    """The frames of a live source with a choice of components (see FrameSource).
+
+    The slowest stream that has components of the choice sets the rate (§5.3.5): there is a frame for each of
+    its frames, with the newest sample of each faster component up to its time stamp, if it is newer than the
+    one in the frame before. A frame waits for these samples, but not longer than WAIT_US. If all components
+    come on one stream, its frames are passed on as they are. While the slowest stream has no frames, the next
+    slower one sets the rate. Events are kept until the next frame; if there is nothing else, they are frames
+    of their own.
+
+    ``requested`` are the components of a command; an empty sequence means all. ``announced_hz`` are the
+    rates in the parameters.
+    """
+
+    def __init__(
+        self,
+        requested: Sequence[ComponentType],
+        arrivals: Arrivals,
+        announced_hz: Mapping[ComponentType, float],
+    ) -> None:
+        self.chosen = frozenset(requested or WIRE_ORDER)
+        self.has_events = ComponentType.EVENT in self.chosen
+        self.measured = tuple(
+            each for each in WIRE_ORDER if each in self.chosen and each is not ComponentType.EVENT
+        )
+        self.is_used = False
+        """Whether a client has asked for frames since the scene last set this to False."""
+        self._takes_all = not requested or self.chosen == frozenset(WIRE_ORDER)
+        self._measured = frozenset(self.measured)
+        self._arrivals = arrivals
+        self._announced_hz = announced_hz
+        self._next_arrival = arrivals.frames.first
+        self._frames: Kept[_LiveFrame] = Kept(_KEPT_FRAMES, _KEPT_BYTES, lambda frame: frame.num_bytes)
+        self._events: Kept[Events] = Kept(_KEPT_EVENTS, _KEPT_BYTES, lambda events: events.num_bytes)
+        self._waiting: deque[Arrival] = deque()
+        self._samples: dict[int, Kept[Arrival]] = {}  # of faster streams, by the stream's number
+        self._packet = lru_cache(_CACHED_PACKETS)(self._build_packet)
+
+    # FrameSource ----------------------------------------------------------------------------
+
+    @property
+    def rate(self) -> Fraction:
+        """See FrameSource."""
+        periods_us = [self._period_us(stream) for stream in self._streams]
+        longest_us = max((period_us for period_us in periods_us if period_us), default=None)
+        if longest_us:
+            return exact_rate(1e6 / longest_us)
+        announced_hz = [self._announced_hz[each] for each in self.measured if each in self._announced_hz]
+        return exact_rate(min(announced_hz)) if announced_hz else _DEFAULT_RATE
+
+    def time_us(self, tick: int) -> int:
+        """See FrameSource."""
+        self._use()
+        if tick >= self._frames.end:
+            return NOT_YET_US
+        return self._frames[tick].time_us if tick >= self._frames.first else _FORGOTTEN_US
+
+    def tick_after(self, elapsed_us: int) -> int:
+        """See FrameSource."""
+        self._use()
+        frames = self._frames
+        if not frames or frames.newest.time_us <= elapsed_us:
+            return frames.end
+        return frames.first + bisect_right(list(frames.since(frames.first)), elapsed_us, key=_time_us)
+
+    def oldest_us(self, elapsed_us: int) -> int:
+        """See FrameSource."""
+        return self._frames.oldest.time_us - 1 if self._frames else elapsed_us
+
+    def packet(self, byte_order: ByteOrder, tick: int, events_from_us: int | None = None) -> DataPacket:
+        """See FrameSource. Events of earlier frames follow the frame's own."""
+        if events_from_us is None or not self._events or self._events.newest.time_us < events_from_us:
+            return self._packet(byte_order, tick, 0, 0)
+        kept = list(self._events.since(self._events.first))
+        first = bisect_left(kept, events_from_us, key=_time_us)
+        end = bisect_right(kept, self._frames[tick].time_us, key=_time_us)
+        return self._packet(byte_order, tick, self._events.first + first, self._events.first + end)
+
+    def _build_packet(self, byte_order: ByteOrder, tick: int, first_event: int, end_event: int) -> DataPacket:
+        frame = self._frames[tick]
+        events = [self._events[number] for number in range(first_event, end_event)]
+        components = frame.main.composition.measured & self._measured
+        if not frame.others:
+            own_events = [frame.main.time_us] if frame.main.composition.has_events else []
+            if own_events == [each.time_us for each in events]:
+                body = unchanged_body(frame.main, self.chosen, byte_order, takes_all=self._takes_all)
+                if body is not None:
+                    return DataPacket(
+                        encode_packet(PacketType.DATA, body), self._in_wire_order(components, bool(events))
+                    )
+        for other in frame.others:
+            components |= other.composition.measured & self._measured
+        body = encode_joined(
+            (frame.main, *frame.others), self._measured, encode_events(events, byte_order), byte_order
+        )
+        return DataPacket(encode_packet(PacketType.DATA, body), self._in_wire_order(components, bool(events)))
+
+    @staticmethod
+    def _in_wire_order(components: frozenset[ComponentType], has_events: bool) -> tuple[ComponentType, ...]:
+        measured = tuple(each for each in WIRE_ORDER if each in components)
+        return (*measured, ComponentType.EVENT) if has_events else measured
+
+    # For the scene --------------------------------------------------------------------------
+
+    def update(self, elapsed_us: int) -> int | None:
+        """Take the frames that have arrived; return when a frame that waits is to be sent anyway."""
+        arrived = self._arrivals.frames
+        if self._next_arrival != arrived.end:
+            for arrival in arrived.since(self._next_arrival):
+                self._take(arrival)
+            self._next_arrival = arrived.end
+        if self._waiting:
+            self._release(elapsed_us)
+            if self._waiting:
+                return self._waiting[0].time_us + WAIT_US
+        return None
+
+    def forget(self) -> None:
+        """Forget all frames so far."""
+        self._frames.clear()
+        self._events.clear()
+        self._waiting.clear()
+        self._samples.clear()
+        self._next_arrival = self._arrivals.frames.end
+
+    def _use(self) -> None:
+        if not self.is_used:
+            self.is_used = True
+            self.update(self._arrivals.newest_us)
+
+    # Which arrivals become frames -----------------------------------------------------------
+
+    def _take(self, arrival: Arrival) -> None:
+        composition = arrival.composition
+        has_events = self.has_events and composition.has_events
+        if has_events:
+            self._events.append(events_of(arrival))
+        found = composition.measured & self._measured
+        if not found:
+            if has_events and self._slowest_stream(arrival.time_us) is None:
+                self._add(arrival)
+        elif self._is_early(arrival, found) or self._slowest_stream(arrival.time_us) != arrival.stream:
+            self._add_sample(arrival)
+        elif len(self._streams) == 1:
+            self._add(arrival)
+        else:
+            self._waiting.append(arrival)
+            if len(self._waiting) > _KEPT_FRAMES:
+                self._add_joined(self._waiting.popleft())
+
+    @property
+    def _streams(self) -> set[int]:
+        """The streams on which the components of the choice come."""
+        stream_of = self._arrivals.stream_of
+        return {stream_of[each] for each in self.measured if each in stream_of}
+
+    def _period_us(self, stream: int) -> int | None:
+        return self._arrivals.rates[stream].period_us
+
+    def _slowest_stream(self, now_us: int) -> int | None:
+        """Return the stream that sets the rate; None if no stream of the choice has frames.
+
+        One whose rate is not known yet counts as slow. With ``streams: auto``, the first is the slowest.
+        """
+        slowest: int | None = None
+        slowest_us = 0.0
+        for stream in sorted(self._streams):
+            period_us = self._period_us(stream)
+            alive_us = max(_ALIVE_US, _ALIVE_PERIODS * (period_us or 0))
+            if now_us - self._arrivals.rates[stream].time_us > alive_us:
+                continue
+            if slowest is None or (period_us or float("inf")) > slowest_us * _SAME_RATE:
+                slowest, slowest_us = stream, period_us or float("inf")
+        return slowest
+
+    def _is_early(self, arrival: Arrival, found: frozenset[ComponentType]) -> bool:
+        """Return whether a slower component of the choice is still to come, as the parameters announce."""
+        if arrival.time_us - self._arrivals.began_us > _FIRST_US:
+            return False
+        missing = self._measured - self._arrivals.stream_of.keys()
+        hz = self._announced_hz
+        fastest_hz = max((hz[each] for each in found if each in hz), default=0.0)
+        return any(each in hz and hz[each] * _SAME_RATE < fastest_hz for each in missing)
+
+    def _add_sample(self, arrival: Arrival) -> None:
+        samples = self._samples.get(arrival.stream)
+        if samples is None:
+            current = self._streams
+            self._samples = {number: each for number, each in self._samples.items() if number in current}
+            samples = Kept(_KEPT_SAMPLES, _KEPT_BYTES, lambda sample: sample.num_bytes)
+            self._samples[arrival.stream] = samples
+        elif samples and arrival.timestamp_us < samples.newest.timestamp_us:
+            samples.clear()  # a new measurement
+        samples.append(arrival)
+
+    def _release(self, now_us: int) -> None:
+        while self._waiting:
+            arrival = self._waiting[0]
+            if now_us - arrival.time_us < WAIT_US and not self._has_all_samples(arrival, now_us):
+                return
+            self._add_joined(self._waiting.popleft())
+
+    def _has_all_samples(self, arrival: Arrival, now_us: int) -> bool:
+        """Return whether all other streams have reached the frame's time stamp, or have no frames now."""
+        for stream in self._streams:
+            rate = self._arrivals.rates[stream]
+            behind_us = arrival.timestamp_us - rate.timestamp_us
+            if (
+                stream != arrival.stream
+                and rate.has_times
+                and _ROUNDING_US < behind_us < _OTHER_CLOCK_US
+                and now_us - rate.time_us < _FASTER_ALIVE_US
+            ):
+                return False
+        return True
+
+    def _add_joined(self, arrival: Arrival) -> None:
+        others = []
+        for stream, samples in self._samples.items():
+            rate = self._arrivals.rates.get(stream)
+            newest: Arrival | None = None
+            until_us = arrival.timestamp_us + _ROUNDING_US
+            while samples and (
+                samples.oldest.timestamp_us <= until_us or (rate is not None and not rate.has_times)
+            ):
+                newest = samples.pop_oldest()
+            if newest is not None and stream != arrival.stream:
+                others.append(newest)
+        self._add(arrival, tuple(others))
+
+    def _add(self, arrival: Arrival, others: tuple[Arrival, ...] = ()) -> None:
+        last_us = self._frames.newest.time_us if self._frames else -1
+        self._frames.append(_LiveFrame(max(arrival.time_us, last_us + 1), arrival, others))
