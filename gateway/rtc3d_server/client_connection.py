@@ -15,6 +15,7 @@ from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks,
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
 from gateway.rtc3d_server.scene import FrameSource, Scene
 from gateway.rtc3d_server.sent_counts import SentCounts
+from gateway.token_bucket import TokenBucket
 
 MAX_COMMAND_BYTES: Final = 64 * 1024
 """The largest packet that a client may send."""
@@ -22,6 +23,13 @@ MAX_COMMAND_BYTES: Final = 64 * 1024
 MAX_UNREAD_BYTES: Final = 4 * 1024 * 1024
 """How many bytes are kept for a client that does not read; beyond this, its frames are dropped."""
 
+MAX_COMMANDS_PER_S: Final = 1000.0
+"""How many packets of one client are answered in a second; further ones wait."""
+
+_MAX_WAITING_PACKETS: Final = 100
+"""With more unanswered packets, the server reads nothing more from a client."""
+
+_COMMANDS_PAUSE_S: Final = 0.05  # for a client that sends too many
 _MAX_LOGGED_BYTES: Final = 200  # of a command
 _log = logging.getLogger(__name__)
 
@@ -56,8 +64,16 @@ class ConnectionOwner(Protocol):
         """Add a new connection; return its number."""
         ...
 
-    def connection_closed(self, connection: "ClientConnection") -> None:
-        """Remove a connection that has ended."""
+    def connection_closed(self, connection: "ClientConnection", error: Exception | None) -> None:
+        """Remove a connection that has ended, because of ``error`` or regularly."""
+        ...
+
+    def reading_stopped(self, connection: "ClientConnection", *, is_first: bool) -> None:
+        """Note that a client does not read, for the first time or again."""
+        ...
+
+    def reading_resumed(self, connection: "ClientConnection") -> None:
+        """Note that a client reads again."""
         ...
 
     def new_filter(self, connection: FilteredConnection) -> ConnectionFilter:
@@ -65,7 +81,7 @@ class ConnectionOwner(Protocol):
         ...
 
     def schedule(self) -> None:
-        """Reset the timer, because the connection's ``due_us`` may have changed."""
+        """Set the timer again soon, because the connection's ``due_us`` may have changed."""
         ...
 
 
@@ -75,7 +91,7 @@ class ClientConnection(asyncio.Protocol):
     Nagle's algorithm is off (§2.1): asyncio and uvloop switch it off for every TCP connection. Each
     packet is written at once and by itself, because common clients read a packet with one recv
     (field note 15). While a client does not read, the server drops its frames and does not read from
-    it either.
+    it either. Nor does it read from a client that sends commands faster than they are answered.
     """
 
     transport: asyncio.Transport
@@ -90,6 +106,9 @@ class ClientConnection(asyncio.Protocol):
         self._loop = asyncio.get_running_loop()
         self._reader = PacketReader(max_packet_bytes=MAX_COMMAND_BYTES, max_c3d_bytes=MAX_COMMAND_BYTES)
         self._inbox: deque[Packet] = deque()
+        self._commands = TokenBucket(MAX_COMMANDS_PER_S)
+        self._is_processing = False  # whether _process_inbox is to be called
+        self._is_held = False  # whether the packets in _inbox wait for the answer to the one before
         self._is_full = False  # whether MAX_UNREAD_BYTES wait for the client to read
         self._was_full = False  # whether it has been full before
         self._first_sent_s: float | None = None  # when the first frame was sent, on the monotonic clock
@@ -120,26 +139,19 @@ class ClientConnection(asyncio.Protocol):
         self.session.name = f"{address}:{port}"
         self.filter = self._owner.new_filter(self)
         self.number = self._owner.connection_opened(self)
-        _log.info("%s: connected, number %d", self.name, self.number)
 
     def connection_lost(self, exc: Exception | None) -> None:
         """See asyncio.Protocol."""
-        _log.info("%s: disconnected%s", self.name, f" ({exc})" if exc else "")
         self._inbox.clear()
         self.filter.connection_lost()
-        self._owner.connection_closed(self)
+        self._owner.connection_closed(self, exc)
         self.closed.set_result(None)
 
     def pause_writing(self) -> None:
         """Stop sending and reading: the client does not read (asyncio.Protocol)."""
         self._is_full = True
         self.transport.pause_reading()
-        _log.log(
-            logging.DEBUG if self._was_full else logging.WARNING,
-            "%s does not read: %d MiB wait for it; dropping its frames until it reads again",
-            self.name,
-            MAX_UNREAD_BYTES >> 20,
-        )
+        self._owner.reading_stopped(self, is_first=not self._was_full)
         self._was_full = True
 
     def resume_writing(self) -> None:
@@ -148,14 +160,14 @@ class ClientConnection(asyncio.Protocol):
         elapsed_us = self._owner.elapsed_us()
         if elapsed_us is not None:
             self.session.drop_due_frames(elapsed_us)
-        _log.info("%s reads again; %d of its frames were dropped", self.name, self.session.frames_dropped)
+        self._owner.reading_resumed(self)
         self.resume_reading()
         self._owner.schedule()
-        self._process_inbox()
+        self._process_soon()
 
     def resume_reading(self) -> None:
-        """Read from the socket again, unless the client does not read or the connection is closing."""
-        if self._can_send():
+        """Read from the socket again, unless enough is waiting or the connection is closing."""
+        if self._can_send() and len(self._inbox) <= _MAX_WAITING_PACKETS:
             self.transport.resume_reading()
 
     def data_received(self, data: bytes) -> None:
@@ -164,10 +176,20 @@ class ClientConnection(asyncio.Protocol):
 
     def handle(self, data: bytes) -> None:
         """Read packets from the next bytes of the client, and answer them."""
-        is_idle = not self._inbox
         self._inbox.extend(self._reader.feed(data))
-        if is_idle:
+        if len(self._inbox) > _MAX_WAITING_PACKETS:
+            self.transport.pause_reading()
+        if not self._is_processing:
             self._process_inbox()
+
+    def hold_commands(self) -> None:
+        """Answer no further packets until ``continue_commands``."""
+        self._is_held = True
+
+    def continue_commands(self) -> None:
+        """Answer packets again."""
+        self._is_held = False
+        self._process_soon()
 
     def answer(self, packet: Packet) -> list[bytes]:
         """Execute a client's packet; return the replies, each one packet."""
@@ -203,15 +225,40 @@ class ClientConnection(asyncio.Protocol):
         self.filter.flush()
         self.transport.close()
 
+    def continue_sending(self) -> None:
+        """Send frames and replies again, because the filter is no longer busy."""
+        elapsed_us = self._owner.elapsed_us()
+        if elapsed_us is not None:
+            self.session.drop_due_frames(elapsed_us)
+        self._owner.schedule()
+        self._process_soon()
+
     def _can_send(self) -> bool:
-        return not (self._is_full or self.transport.is_closing())
+        return not (self._is_full or self.filter.is_busy or self.transport.is_closing())
+
+    def _process_soon(self, delay_s: float = 0.0) -> None:
+        if not self._is_processing:
+            self._is_processing = True
+            if delay_s:
+                self._loop.call_later(delay_s, self._process_next)
+            else:
+                self._loop.call_soon(self._process_next)
+
+    def _process_next(self) -> None:
+        self._is_processing = False
+        self._process_inbox()
 
     def _process_inbox(self) -> None:
         """Answer one packet. The next one waits for the loop's next turn, so no client delays the others."""
-        if not self._can_send():
+        if self._is_held or not self._can_send():
             return
         if self._inbox:
+            if not self._commands.try_take():
+                self._process_soon(_COMMANDS_PAUSE_S)
+                return
             packet = self._inbox.popleft()
+            if len(self._inbox) == _MAX_WAITING_PACKETS:
+                self.resume_reading()
             _log.debug("%s: received %s", self.name, _described(packet))
             for reply in self.filter.answer(packet):
                 self.send(reply)
@@ -223,8 +270,8 @@ class ClientConnection(asyncio.Protocol):
                 self.send_due_frames(elapsed_us)
             self._owner.schedule()
         if self._inbox:
-            self._loop.call_soon(self._process_inbox)
-        elif self._reader.error is not None:
+            self._process_soon()
+        elif self._reader.error is not None and not self._is_held:
             size = self._reader.error.size
             self.send(
                 error_packet(f"A packet of {size} bytes is out of bounds (8 to {MAX_COMMAND_BYTES}); closing")

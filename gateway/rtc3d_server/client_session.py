@@ -75,9 +75,15 @@ class ClientSession:
     @property
     def due_us(self) -> int | None:
         """When the next frame is due; None without a request, a known frame, or a measurement."""
-        waiting = (self._schedule, self._frame_requests[0] if self._frame_requests else None)
-        due_us = min((frames.due_us for frames in waiting if frames is not None), default=NOT_YET_US)
+        due_us = NOT_YET_US if self._schedule is None else self._schedule.due_us
+        if self._frame_requests:
+            due_us = min(due_us, self._frame_requests[0].due_us)
         return None if due_us == NOT_YET_US else due_us
+
+    @property
+    def wants_frames(self) -> bool:
+        """Whether the client streams, or waits for a frame."""
+        return self._stream_command is not None or bool(self._frame_requests)
 
     def measurement_started(self) -> None:
         """Start the client's stream, if it requested one, with the measurement's first frame."""
@@ -209,19 +215,30 @@ class ClientSession:
 
     def _switch_recording(self, body: bytes) -> list[bytes]:
         try:
-            components = split_frame(body, detect_byte_order(body, self.byte_order)).components
+            start = recording_switch(body, self.byte_order)
         except FrameError as error:
             return [error_packet(f"Not a data frame: {error}")]
-        if len(components) == 1 and components[0].type is ComponentType.EVENT:
-            events = components[0].items()
-            if components[0].frame_number == -1 and events["id"].tolist() in ([0], [1]):
-                self._set_recording(start=bool(events["id"][0]))
-                return []
+        if start is not None:
+            self._set_recording(start=start)
+            return []
         return [
             error_packet(
                 "The only data frame accepted is a recording control: one event, 1 to start, 0 to stop"
             )
         ]
+
+
+def recording_switch(body: bytes, byte_order: ByteOrder) -> bool | None:
+    """Return whether a client's data frame starts a recording (True) or stops it (False; field note 16).
+
+    Returns None if the frame is something else; raises FrameError if it is none.
+    """
+    components = split_frame(body, detect_byte_order(body, byte_order)).components
+    if len(components) == 1 and components[0].type is ComponentType.EVENT:
+        events = components[0].items()
+        if components[0].frame_number == -1 and events["id"].tolist() in ([0], [1]):
+            return bool(events["id"][0])
+    return None
 
 
 def error_packet(text: str) -> bytes:

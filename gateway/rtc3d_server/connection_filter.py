@@ -34,6 +34,18 @@ class FilteredConnection(Protocol):
         """Read from the socket again after ``transport.pause_reading``."""
         ...
 
+    def hold_commands(self) -> None:
+        """Answer no further packets until ``continue_commands``."""
+        ...
+
+    def continue_commands(self) -> None:
+        """Answer packets again."""
+        ...
+
+    def continue_sending(self) -> None:
+        """Send frames and replies again after ``is_busy``; the frames in between are dropped."""
+        ...
+
 
 class ConnectionFilter:
     """Passes one connection's bytes through unchanged.
@@ -41,6 +53,9 @@ class ConnectionFilter:
     Subclasses override methods to change, delay or drop them. They reach the socket and the server only
     through ``connection``.
     """
+
+    is_busy: bool = False
+    """Whether no frame and no reply may be sent now. Frames are dropped, commands wait."""
 
     def __init__(self, connection: FilteredConnection) -> None:
         self.connection = connection

@@ -9,7 +9,7 @@ from typing import Final, Self
 
 from gateway.errors import GatewayError
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d_server.client_connection import ClientConnection
+from gateway.rtc3d_server.client_connection import MAX_UNREAD_BYTES, ClientConnection
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
 from gateway.rtc3d_server.measurement import Measurement
 from gateway.rtc3d_server.scene import FrameSource, Scene
@@ -58,6 +58,7 @@ class RtServer:
         self._dropped_for_closed = 0  # frames dropped on connections that have ended
         self._server: asyncio.Server | None = None
         self._timer: asyncio.TimerHandle | None = None
+        self._is_scheduling = False  # whether _set_timer is to be called
 
     @property
     def scene(self) -> Scene:
@@ -93,6 +94,13 @@ class RtServer:
 
         Raises GatewayError if the server cannot listen on the address.
         """
+        await self.listen()
+        self._starts_on_request = self._once
+        if not self._once:
+            self.start_measurement()
+
+    async def listen(self) -> None:
+        """Listen for clients. Raises GatewayError if that is not possible on the address."""
         loop = asyncio.get_running_loop()
         try:
             self._server = await loop.create_server(lambda: ClientConnection(self), self.host, self.port)
@@ -103,9 +111,6 @@ class RtServer:
             ) from error
         self.port = self._server.sockets[0].getsockname()[1]
         self._num_accepted = 0
-        self._starts_on_request = self._once
-        if not self._once:
-            self.start_measurement()
 
     async def close(self) -> None:
         """Stop the measurement, close the connections, and stop listening."""
@@ -207,18 +212,46 @@ class RtServer:
         """See ConnectionOwner."""
         self._num_accepted += 1
         self.connections.add(connection)
+        _log.info("%s: connected, number %d", connection.name, self._num_accepted)
         if not self.is_listening:
             connection.transport.abort()  # accepted at the moment of a crash
         return self._num_accepted
 
-    def connection_closed(self, connection: ClientConnection) -> None:
+    def connection_closed(self, connection: ClientConnection, error: Exception | None) -> None:
         """See ConnectionOwner."""
+        _log.info("%s: disconnected%s", connection.name, f" ({error})" if error else "")
         self.connections.discard(connection)
         self._dropped_for_closed += connection.session.frames_dropped
         self.schedule()
 
+    def reading_stopped(self, connection: ClientConnection, *, is_first: bool) -> None:
+        """See ConnectionOwner."""
+        _log.log(
+            logging.WARNING if is_first else logging.DEBUG,
+            "%s does not read: %d MiB wait for it; dropping its frames until it reads again",
+            connection.name,
+            MAX_UNREAD_BYTES >> 20,
+        )
+
+    def reading_resumed(self, connection: ClientConnection) -> None:
+        """See ConnectionOwner."""
+        _log.info(
+            "%s reads again; %d of its frames were dropped",
+            connection.name,
+            connection.session.frames_dropped,
+        )
+
+    # Sending --------------------------------------------------------------------------------
+
     def schedule(self) -> None:
+        """Set the timer again in the loop's next turn, once for all connections that ask for it."""
+        if not self._is_scheduling:
+            self._is_scheduling = True
+            asyncio.get_running_loop().call_soon(self._set_timer)
+
+    def _set_timer(self) -> None:
         """Set the timer to when the next frame is due for any client, or when the measurement ends."""
+        self._is_scheduling = False
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -233,9 +266,10 @@ class RtServer:
         ]
         next_us = min((time_us for time_us in due_us if time_us is not None), default=None)
         if next_us is not None:
-            self._timer = call_after_us(next_us - elapsed_us, self._send_due_frames)
+            self._timer = call_after_us(next_us - elapsed_us, self.send_due_frames)
 
-    def _send_due_frames(self) -> None:
+    def send_due_frames(self) -> None:
+        """Send every client the frames that are due, and set the timer for the next ones."""
         self._measurement.advance()
         elapsed_us = self.elapsed_us()
         if elapsed_us is None:
@@ -245,4 +279,4 @@ class RtServer:
         if elapsed_us == self._measurement.last_us:
             self.stop_measurement()
         else:
-            self.schedule()
+            self._set_timer()
