@@ -56,8 +56,9 @@ class _ComponentPlan:
 class _Plan:
     """How to publish the ``wanted`` components of a layout. Made once per layout, not for every frame.
 
-    ``tool_indices`` are the indices of 6D components whose poses are published per tool. ``num_items`` are
-    the numbers of markers, tools, channels and plates.
+    ``frame_routes`` are those of the outputs that want whole frames now. ``tool_indices`` are the indices
+    of 6D components whose poses are published per tool. ``num_items`` are the numbers of markers, tools,
+    channels and plates.
     """
 
     def __init__(
@@ -65,11 +66,13 @@ class _Plan:
         layout: FrameLayout,
         wanted: frozenset[ComponentType],
         components: list[_ComponentPlan],
+        frame_routes: list[FrameRoute],
         tool_indices: list[int],
     ) -> None:
         self.layout = layout
         self.wanted = wanted
         self.components = components
+        self.frame_routes = frame_routes
         self.tool_indices = tool_indices
         self.num_items: dict[ComponentType, int] = {
             component.type: component.num_items
@@ -170,7 +173,7 @@ class FanOut:
         plan = self._plan_of(frame, stamp, wanted)
         if not plan.components:
             return
-        for frame_route in self._frame_routes:
+        for frame_route in plan.frame_routes:
             frame_route.publish(frame, stamp, self._frame_sequence, wanted)
         self._frame_sequence += 1
         for component in plan.components:
@@ -193,7 +196,7 @@ class FanOut:
         for component in plan.components:
             message = component.next_message(frame, stamp)
             is_lost = [route.skip(message, stamp) for route in component.routes]
-            num_lost += any(is_lost) or bool(self._frame_routes)
+            num_lost += any(is_lost) or bool(plan.frame_routes)
         return num_lost
 
     def _plan_of(self, frame: Frame, stamp: Stamp, wanted: frozenset[ComponentType]) -> _Plan:
@@ -221,7 +224,8 @@ class FanOut:
             for index, component in indexed
         ]
         tools = [index for index, component in indexed if component.type is ComponentType.TOOLS]
-        return _Plan(layout, wanted, plans, tools if self._tool_poses.is_used else [])
+        frame_routes = [route for route in self._frame_routes if not route.is_idle]
+        return _Plan(layout, wanted, plans, frame_routes, tools if self._tool_poses.is_used else [])
 
     def forget_layouts(self) -> None:
         """Forget how to publish earlier frames: the connection ended, or an output wants something else."""

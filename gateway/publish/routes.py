@@ -200,6 +200,11 @@ class FrameRoute:
         self._output_route = output_route
         self._sent = output_route.sent.setdefault("frame", SentCounter())
 
+    @property
+    def is_idle(self) -> bool:
+        """Whether to publish nothing now, because the output wants nothing."""
+        return self._output_route.is_selective and not self.publisher.wanted
+
     def publish(self, frame: Frame, stamp: Stamp, sequence: int, wanted: frozenset[ComponentType]) -> None:
         """Publish and count one frame; never raises, because outputs must not disturb each other."""
         try:

@@ -163,7 +163,7 @@ class RtServer:
             return
         self._measurement.start()
         self._starts_on_request = False
-        _log.info("Measurement started")
+        self.log_measurement("Measurement started")
         for connection in self.connections:
             connection.session.measurement_started()
         self.schedule()
@@ -173,7 +173,7 @@ class RtServer:
         if not self._measurement.is_running:
             return
         self._measurement.stop()
-        _log.info("Measurement stopped")
+        self.log_measurement("Measurement stopped")
         for connection in list(self.connections):
             for packet in connection.session.measurement_stopped():
                 connection.send(packet)
@@ -212,16 +212,16 @@ class RtServer:
         """See ConnectionOwner."""
         self._num_accepted += 1
         self.connections.add(connection)
-        _log.info("%s: connected, number %d", connection.name, self._num_accepted)
+        self.log_opened(connection)
         if not self.is_listening:
             connection.transport.abort()  # accepted at the moment of a crash
         return self._num_accepted
 
     def connection_closed(self, connection: ClientConnection, error: Exception | None) -> None:
         """See ConnectionOwner."""
-        _log.info("%s: disconnected%s", connection.name, f" ({error})" if error else "")
         self.connections.discard(connection)
         self._dropped_for_closed += connection.session.frames_dropped
+        self.log_closed(connection, error)
         self.schedule()
 
     def reading_stopped(self, connection: ClientConnection, *, is_first: bool) -> None:
@@ -240,6 +240,20 @@ class RtServer:
             connection.name,
             connection.session.frames_dropped,
         )
+
+    # For subclasses -------------------------------------------------------------------------
+
+    def log_opened(self, connection: ClientConnection) -> None:
+        """Log a new connection, which may be closed here."""
+        _log.info("%s: connected, number %d", connection.name, self._num_accepted)
+
+    def log_closed(self, connection: ClientConnection, error: Exception | None) -> None:
+        """Log that a connection has ended."""
+        _log.info("%s: disconnected%s", connection.name, f" ({error})" if error else "")
+
+    def log_measurement(self, text: str) -> None:
+        """Log that a measurement has started or stopped."""
+        _log.info(text)
 
     # Sending --------------------------------------------------------------------------------
 

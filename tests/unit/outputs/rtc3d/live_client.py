@@ -2,15 +2,14 @@
 
 import struct
 from collections.abc import Sequence
-from itertools import count
 
+from gateway.outputs.rtc3d.live_scene import LiveScene
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import General
-from gateway.outputs.rtc3d.live_scene import LiveScene
 from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks
-from tests.unit.rtc3d_server.wire import COMMAND, DATA, EVENT, WireComponent, components_in, packets_in
+from tests.unit.rtc3d_server.wire import COMMAND, EVENT, WireComponent, components_in, packets_in
 
 _ITEM = {1: "4f", 2: "f", 3: "6f", 4: "8f", EVENT: "iqiii"}
 SLOW, FAST = 1, 2  # the numbers of streams
@@ -118,6 +117,3 @@ class LiveClient:
         """Return the frame numbers of the components of each of these frames."""
         return [[each.frame_number for each in frame] for frame in self.take()]
 
-
-assert DATA == 3
-del count

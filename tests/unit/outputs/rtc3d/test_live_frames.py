@@ -1,5 +1,7 @@
 """Frames of a live source for its clients: passed on unchanged, cut, converted, joined by time stamp."""
 
+from itertools import pairwise
+
 import pytest
 
 from gateway.outputs.rtc3d.live_frames import WAIT_US
@@ -14,7 +16,7 @@ from tests.unit.outputs.rtc3d.live_client import (
     event,
     markers,
 )
-from tests.unit.rtc3d_server.wire import ANALOG, EVENT, MARKERS, TOOLS
+from tests.unit.rtc3d_server.wire import EVENT, MARKERS
 
 TOOL_OUT_OF_VIEW = bytes.fromhex("00000038 00000004 00000007 0000000000002710 00000001" + "ff" * 32)
 
@@ -97,7 +99,7 @@ def test_a_frequency_is_that_of_the_time_stamps() -> None:
     for number in range(1, 401):
         source.arrive(body(markers(number, 5_000 * number)))
     numbers = [frame[0] for frame in client.numbers()][20:]
-    gaps = [later - earlier for earlier, later in zip(numbers, numbers[1:], strict=False)]
+    gaps = [later - earlier for earlier, later in pairwise(numbers)]
     assert set(gaps) == {3, 4}
     assert sum(gaps) / len(gaps) == pytest.approx(200 / 60, rel=0.02)
 
@@ -335,5 +337,3 @@ def test_little_is_kept_of_large_frames() -> None:
         client.bodies.clear()
     assert sum(arrival.num_bytes for arrival in source.scene._arrivals.frames.since(0)) < 10_000_000
 
-
-_ = (ANALOG, TOOLS)

@@ -1,0 +1,84 @@
+"""The doctor's checks of the output for RTC3D clients: the names of the sources, and their ports."""
+
+import socket
+from collections.abc import Sequence
+from typing import Final
+
+from gateway.findings import Finding, MessageLoad, Subject
+from gateway.outputs.rtc3d.settings import Rtc3dSettings
+from gateway.rtc3d.commands import Version, encode_command
+from gateway.rtc3d.packets import PACKET_HEADER, PACKET_HEADER_BYTES, PacketType, encode_packet
+
+CHECKS: Final = ("sources", "ports")
+
+_MAX_REPLY_BYTES: Final = 64 * 1024
+
+_THIS_COMPUTER: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104 - it connects, it does not listen
+
+_rtc3d: Final = Subject("rtc3d")
+
+
+def check_rtc3d(
+    settings: Rtc3dSettings, sources: Sequence[str], _loads: Sequence[MessageLoad], seconds: float
+) -> list[Finding]:
+    """Check that each port belongs to a source, and is free or has the gateway's own RT server."""
+    return [_check_sources(settings, sources), *_check_ports(settings, seconds)]
+
+
+def _check_sources(settings: Rtc3dSettings, sources: Sequence[str]) -> Finding:
+    unknown = [source for source in settings.ports if source not in sources]
+    if unknown:
+        return _rtc3d.warning(
+            "sources",
+            f"rtc3d.ports has a port for {', '.join(unknown)}, which is no source",
+            f"Correct the name; the sources are {', '.join(sources)}.",
+        )
+    missing = [source for source in sources if source not in settings.ports]
+    if missing:
+        return _rtc3d.note(
+            "sources",
+            f"RTC3D clients cannot connect to {', '.join(missing)}",
+            "If they should, add a port in rtc3d.ports.",
+        )
+    return _rtc3d.passing("sources", "each source has a port for RTC3D clients")
+
+
+def _check_ports(settings: Rtc3dSettings, seconds: float) -> list[Finding]:
+    return [_check_port(settings.host, source, port, seconds) for source, port in settings.ports.items()] or [
+        _rtc3d.not_tested("ports", "rtc3d.ports is empty")
+    ]
+
+
+def _check_port(host: str, source: str, port: int, seconds: float) -> Finding:
+    place = f"{host}, port {port} (for {source})"
+    try:
+        with socket.create_server((host, port), family=_family(host)):
+            return _rtc3d.passing("ports", f"{place} is free")
+    except OSError as error:
+        problem = error.strerror or str(error)
+    if _is_rt_server(host, port, seconds):
+        return _rtc3d.passing("ports", f"an RT server answers on {place}: the gateway, if it runs")
+    return _rtc3d.failing(
+        "ports",
+        f"cannot listen on {place}: {problem}",
+        f"Choose another port in rtc3d.ports.{source}, correct rtc3d.host, or stop the program that has it.",
+    )
+
+
+def _family(host: str) -> socket.AddressFamily:
+    return socket.AF_INET6 if ":" in host else socket.AF_INET
+
+
+def _is_rt_server(host: str, port: int, seconds: float) -> bool:
+    """Return whether a server on this port answers a command of the protocol."""
+    command = encode_packet(PacketType.COMMAND, encode_command(Version()))
+    try:
+        with socket.create_connection((_THIS_COMPUTER.get(host, host), port), timeout=seconds) as tcp:
+            tcp.sendall(command)
+            header = tcp.recv(PACKET_HEADER_BYTES, socket.MSG_WAITALL)
+    except OSError:
+        return False
+    if len(header) < PACKET_HEADER_BYTES:
+        return False
+    size, packet_type = PACKET_HEADER.unpack(header)
+    return packet_type in {PacketType.ERROR, PacketType.COMMAND} and size <= _MAX_REPLY_BYTES

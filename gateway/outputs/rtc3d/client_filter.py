@@ -1,0 +1,213 @@
+"""What the gateway adds to the connection of an RTC3D client: limits, control of recordings, C3D files."""
+
+import asyncio
+import contextlib
+import logging
+import socket
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any, BinaryIO, Final, Protocol
+
+from gateway.errors import CommandError, FrameError, QueryError
+from gateway.log import DefectLog
+from gateway.rtc3d import commands
+from gateway.rtc3d.packets import PACKET_HEADER, PACKET_HEADER_BYTES, Packet, PacketType
+from gateway.rtc3d_server.client_session import error_packet, recording_switch
+from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
+from gateway.worker_thread import WorkerThread
+
+FIRST_COMMAND_S: Final = 10.0
+"""A client that has sent no command of the protocol within this time is disconnected."""
+
+_CONTROL_S: Final = 30.0
+"""How long a client waits at most for the start or the end of a recording."""
+
+_CHUNK_BYTES: Final = 256 * 1024
+_FILE_BUFFER_BYTES: Final = 1024 * 1024
+_FILE_POLL_S: Final = 0.01
+_MAX_FILES: Final = 4
+"""C3D files are sent in pieces, as fast as the client reads. So many wait for one client."""
+
+_MAX_HELD_PACKETS: Final = 16  # replies and No Data while a file is sent
+
+_KEEPALIVE: Final = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}  # in s, in s, probes
+
+_log = logging.getLogger(__name__)
+
+ControlRecording = Callable[[str, bool, str], Coroutine[Any, Any, None]]
+"""Starts (True) or stops the recording of a source, with a name or ""; raises QueryError."""
+
+
+class FilterOwner(Protocol):
+    """What a filter needs from its server."""
+
+    disk: WorkerThread
+    """Reads C3D files."""
+
+    def apply_parameters(self) -> None:
+        """Serve the newest parameters of the source."""
+
+    def control_recording(self, *, start: bool, name: str) -> Coroutine[Any, Any, None]:
+        """Start or stop a recording on the source's server. Raises QueryError."""
+
+    def check_wanted(self) -> None:
+        """Note whether any client asks for frames now."""
+
+
+class ClientFilter(ConnectionFilter):
+    """Limits what a client can do without a command, and lets it control recordings and get files."""
+
+    def __init__(self, connection: FilteredConnection, owner: FilterOwner) -> None:
+        super().__init__(connection)
+        self._owner = owner
+        self.has_greeted = False
+        """Whether the client has sent a command of the protocol."""
+        self._files: list[Path] = []
+        self._held: list[bytes] = []  # packets that wait for the end of a file
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._defects = DefectLog(_log, "rtc3d")
+        self._greeting = asyncio.get_running_loop().call_later(FIRST_COMMAND_S, self._give_up)
+        _keep_alive(connection.transport.get_extra_info("socket"))
+
+    def send(self, packet: bytes) -> None:
+        """Send a packet, or hold it until the end of a file."""
+        if not self.is_busy:
+            self.connection.write(packet)
+        elif len(self._held) < _MAX_HELD_PACKETS:
+            self._held.append(packet)
+
+    def answer(self, packet: Packet) -> list[bytes]:
+        """Return the replies to a packet; those to the control of a recording come later."""
+        control = recording_control(packet)
+        if control is not None:
+            self._greet()
+            self.connection.hold_commands()
+            self._start(self._control(packet, control))
+            return []
+        self._owner.apply_parameters()
+        replies = self.connection.answer(packet)
+        if not self.has_greeted and any(reply[7] != PacketType.ERROR for reply in replies):
+            self._greet()
+        self._owner.check_wanted()
+        return replies
+
+    def connection_lost(self) -> None:
+        """End what is done for the client."""
+        self._greeting.cancel()
+        for task in self._tasks:
+            task.cancel()
+
+    def _greet(self) -> None:
+        self.has_greeted = True
+        self._greeting.cancel()
+
+    def _give_up(self) -> None:
+        name = self.connection.name
+        _log.debug("%s sent no command within %g s; closing", name, FIRST_COMMAND_S)
+        self.connection.write(error_packet(f"No command within {FIRST_COMMAND_S:g} s; closing"))
+        self.connection.transport.close()
+
+    def _start(self, work: Coroutine[Any, Any, None]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    # Recordings -----------------------------------------------------------------------------
+
+    async def _control(self, packet: Packet, control: commands.ControlRecording) -> None:
+        try:
+            async with asyncio.timeout(_CONTROL_S):
+                await self._owner.control_recording(start=control.start, name=recording_name(control.options))
+            replies = self.connection.answer(packet)
+        except (QueryError, TimeoutError) as error:
+            text = str(error) or f"no answer within {_CONTROL_S:g} s"
+            replies = [error_packet(f"The recording was not {_done(control)}: {text}")]
+        except Exception as defect:  # noqa: BLE001 - a defect in the gateway must not stop the client
+            self._defects.log(defect)
+            replies = [error_packet(f"The recording was not {_done(control)}: a defect in the gateway")]
+        for reply in replies:
+            self.send(reply)
+        self.connection.continue_commands()
+
+    # Files ----------------------------------------------------------------------------------
+
+    def send_file(self, path: Path) -> None:
+        """Send a C3D file after those that wait. Frames are dropped meanwhile; events and replies wait."""
+        if len(self._files) < _MAX_FILES:
+            self._files.append(path)
+            if len(self._files) == 1:
+                self._start(self._send_files())
+
+    async def _send_files(self) -> None:
+        while self._files:
+            try:
+                await self._send_file(self._files[0])
+            except OSError as error:
+                _log.debug("%s does not get %s: %s", self.connection.name, self._files[0], error)
+            self._files.pop(0)
+
+    async def _send_file(self, path: Path) -> None:
+        """Send one file. Raises OSError; if that is in the middle of the file, the connection ends."""
+        file: BinaryIO = await self._owner.disk.run(lambda: path.open("rb"))
+        try:
+            num_bytes = await self._owner.disk.run(lambda: path.stat().st_size)
+            self.is_busy = True
+            try:
+                self.connection.write(PACKET_HEADER.pack(PACKET_HEADER_BYTES + num_bytes, PacketType.C3D))
+                await self._send_content(file, num_bytes)
+            except OSError:
+                self.connection.transport.abort()
+                raise
+            finally:
+                self.is_busy = False
+        finally:
+            self._owner.disk.submit(file.close)
+        held, self._held = self._held, []
+        for packet in held:
+            self.connection.write(packet)
+        self.connection.continue_sending()
+
+    async def _send_content(self, file: BinaryIO, num_bytes: int) -> None:
+        transport = self.connection.transport
+        while num_bytes:
+            size = min(num_bytes, _CHUNK_BYTES)
+            chunk = await self._owner.disk.run(lambda size=size: file.read(size))  # type: ignore[misc]
+            if len(chunk) != size:
+                raise OSError("it is shorter than it was")
+            self.connection.write(chunk)
+            num_bytes -= size
+            # Nobody says when this much has been read: the limits of the transport are higher.
+            while transport.get_write_buffer_size() > _FILE_BUFFER_BYTES:  # noqa: ASYNC110
+                await asyncio.sleep(_FILE_POLL_S)
+
+
+def recording_control(packet: Packet) -> commands.ControlRecording | None:
+    """Return how a packet controls a recording (field notes 16 and 18); None if it is something else."""
+    try:
+        if packet.type == PacketType.COMMAND:
+            command = commands.parse_command(packet.body)
+            return command if isinstance(command, commands.ControlRecording) else None
+        if packet.type == PacketType.DATA:
+            start = recording_switch(packet.body, "big")
+            return None if start is None else commands.ControlRecording(start)
+    except (CommandError, FrameError):
+        pass  # the session refuses it in its own words
+    return None
+
+
+def recording_name(options: str) -> str:
+    """Return the name in the options of a recording, such as ",file=take 1.c3d"; "" if there is none."""
+    name, _, value = options.strip(" ,").partition("=")
+    return value.strip().removesuffix(".c3d") if name.strip().lower() == "file" else ""
+
+
+def _done(control: commands.ControlRecording) -> str:
+    return "started" if control.start else "stopped"
+
+
+def _keep_alive(tcp: socket.socket) -> None:
+    """Let the system find out when the client's computer has vanished."""
+    with contextlib.suppress(OSError):
+        tcp.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+        for name, value in _KEEPALIVE.items():
+            tcp.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)

@@ -1,0 +1,230 @@
+"""The RT server of one live source. It runs in the event loop of the output's thread."""
+
+import asyncio
+import logging
+from collections.abc import Callable, Coroutine
+from pathlib import Path
+from typing import Any, Final
+
+from gateway.log import EventLog
+from gateway.losses import Losses
+from gateway.outputs.contract import ServerParameters
+from gateway.outputs.rtc3d.client_filter import ClientFilter, ControlRecording
+from gateway.outputs.rtc3d.live_scene import LiveScene
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import Frame
+from gateway.rtc3d_server.client_connection import MAX_UNREAD_BYTES, ClientConnection
+from gateway.rtc3d_server.client_session import error_packet
+from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
+from gateway.rtc3d_server.server import RtServer
+from gateway.worker_thread import WorkerThread
+
+SLOW_CLIENT: Final = "client too slow"
+"""The cause of frames that a client did not get because it does not read fast enough."""
+
+_NO_FRAMES_S: Final = 2.0
+"""How long a client waits for frames before it gets No Data, if it is unknown whether a measurement runs."""
+
+_log = logging.getLogger(__name__)
+
+
+class SourceState:
+    """What the gateway knows about a source, and whether its clients ask for frames.
+
+    The gateway's event loop assigns all attributes but ``wanted``; the thread of the clients reads them.
+    """
+
+    def __init__(self, source: str) -> None:
+        self.source = source
+        self.is_streaming = False
+        """Whether frames arrive."""
+        self.is_measuring: bool | None = None
+        """Whether a measurement runs; None if that is unknown."""
+        self.parameters = ServerParameters(b"", 0, 0)
+        self.losses: Losses | None = None
+        self.wanted = False
+        """Whether any client asks for frames. The server assigns it."""
+
+    @property
+    def has_no_measurement(self) -> bool:
+        """Whether it is known that no frames can come now."""
+        return not self.is_streaming and self.is_measuring is False
+
+
+class LiveServer(RtServer):
+    """Serves a live source to RTC3D clients.
+
+    A measurement runs from the first frame that arrives until the source has no more. A request for frames
+    while nothing is known waits _NO_FRAMES_S for them, because the gateway may have to ask the server first.
+    ``wanted_changed`` is called after ``state.wanted`` has changed, ``control`` to start or stop a recording.
+    """
+
+    def __init__(
+        self,
+        state: SourceState,
+        host: str,
+        port: int,
+        max_clients: int,
+        wanted_changed: Callable[[], None],
+        control: ControlRecording,
+    ) -> None:
+        self._live_scene = LiveScene(state.source)
+        super().__init__(self._live_scene, host, port, name=f"rtc3d.ports.{state.source}")
+        self.max_clients = max_clients
+        self._state = state
+        self._applied_parameters: ServerParameters | None = None
+        self._wanted_changed = wanted_changed
+        self._control = control
+        self._events = EventLog(_log, f"{state.source} to rtc3d")
+        self._giving_up: asyncio.TimerHandle | None = None  # waits for frames, before No Data
+        self._num_counted: dict[ClientConnection, int] = {}  # dropped frames that are in the losses
+        self.disk = WorkerThread(f"{state.source} files")
+        """Reads C3D files."""
+
+    # From the gateway -----------------------------------------------------------------------
+
+    def take(self, frame: Frame, stream: int, wanted: frozenset[ComponentType]) -> None:
+        """Send a frame that has just arrived on this stream to the clients that want it."""
+        if not self._state.wanted:
+            return
+        self.apply_parameters()
+        self._stop_waiting()
+        elapsed_us = self.elapsed_us()
+        if elapsed_us is None:
+            self.start_measurement()
+            elapsed_us = self.elapsed_us() or 0
+        if self._live_scene.add(frame, stream, wanted, elapsed_us):
+            self.send_due_frames()
+            self.check_wanted()
+
+    def apply_state(self) -> None:
+        """End the measurement if the source has ended it, or has no frames any more."""
+        state = self._state
+        if state.has_no_measurement or not (state.is_streaming or self._giving_up is not None):
+            self._stop_waiting()
+            self.stop_measurement()
+
+    def apply_parameters(self) -> None:
+        """Serve the newest parameters of the source."""
+        parameters = self._state.parameters
+        if parameters is not self._applied_parameters:
+            self._applied_parameters = parameters
+            self._live_scene.set_parameters(parameters.xml, parameters.parsed)
+
+    def send_file(self, path: Path) -> None:
+        """Send a C3D file to every client that has sent a command."""
+        for connection in self.connections:
+            client = connection.filter
+            if isinstance(client, ClientFilter) and client.has_greeted:
+                client.send_file(path)
+
+    def count_losses(self) -> None:
+        """Count the frames that slow clients have lost. Call it once a second."""
+        for connection in self.connections:
+            self._count_dropped(connection)
+
+    # RtServer -------------------------------------------------------------------------------
+
+    def elapsed_us(self) -> int | None:
+        """See RtServer. The newest frame is never in the future."""
+        elapsed_us = super().elapsed_us()
+        return None if elapsed_us is None else max(elapsed_us, self._live_scene.newest_us)
+
+    def frames_requested(self) -> int | None:
+        """See ConnectionOwner."""
+        if self.elapsed_us() is None and not self._state.has_no_measurement:
+            self.start_measurement()
+            if not self._state.is_streaming:
+                self._giving_up = asyncio.get_running_loop().call_later(_NO_FRAMES_S, self._give_up)
+        return self.elapsed_us()
+
+    def new_filter(self, connection: FilteredConnection) -> ConnectionFilter:
+        """See ConnectionOwner."""
+        return ClientFilter(connection, self)
+
+    async def close(self) -> None:
+        """See RtServer."""
+        self._stop_waiting()
+        await super().close()
+        self.check_wanted()
+
+    # For connections ------------------------------------------------------------------------
+
+    def control_recording(self, *, start: bool, name: str) -> Coroutine[Any, Any, None]:
+        """Start or stop a recording on the source's server. Raises QueryError."""
+        return self._control(self._state.source, start, name)
+
+    def check_wanted(self) -> None:
+        """Note whether any client asks for frames now."""
+        wanted = any(connection.session.wants_frames for connection in self.connections)
+        if wanted is not self._state.wanted:
+            self._state.wanted = wanted
+            if not wanted:
+                self._live_scene.forget_frames()
+            self._wanted_changed()
+
+    def log_opened(self, connection: ClientConnection) -> None:
+        """Log a new client, and turn away one that is too many."""
+        num_clients = len(self.connections)
+        if num_clients <= self.max_clients:
+            text = f"client {connection.name} connected ({num_clients} now)"
+            self._events.log(logging.INFO, text, "connected")
+            return
+        self._events.log(
+            logging.WARNING,
+            f"client {connection.name} was turned away: {self.max_clients} clients are connected; close "
+            "some, or raise rtc3d.max_clients",
+            "too many",
+        )
+        connection.write(error_packet(f"This gateway serves {self.max_clients} clients at most; closing"))
+        connection.close()
+
+    def log_closed(self, connection: ClientConnection, error: Exception | None) -> None:
+        """Log that a client has gone, and count what it lost."""
+        self._count_dropped(connection)
+        self._num_counted.pop(connection, None)
+        self.check_wanted()
+        reason = f" ({error})" if error else ""
+        self._events.log(logging.INFO, f"client {connection.name} disconnected{reason}", "disconnected")
+
+    def reading_stopped(self, connection: ClientConnection, *, is_first: bool) -> None:
+        """See ConnectionOwner."""
+        text = (
+            f"client {connection.name} does not read: {MAX_UNREAD_BYTES >> 20} MiB wait for it; its frames "
+            "are dropped until it reads again; check that program, or the network to it"
+        )
+        self._events.log(logging.WARNING if is_first else logging.DEBUG, text, "slow")
+
+    def reading_resumed(self, connection: ClientConnection) -> None:
+        """See ConnectionOwner."""
+        self._count_dropped(connection)
+        num_dropped = connection.session.frames_dropped
+        text = f"client {connection.name} reads again; {num_dropped} of its frames were dropped"
+        self._events.log(logging.INFO, text, "reads again")
+
+    def log_measurement(self, text: str) -> None:
+        """Log nothing loudly: the status of the source says whether a measurement runs."""
+        _log.debug("%s: %s", self._state.source, text)
+
+    def _count_dropped(self, connection: ClientConnection) -> None:
+        num_dropped = connection.session.frames_dropped
+        num_new = num_dropped - self._num_counted.get(connection, 0)
+        if num_new and self._state.losses is not None:
+            self._num_counted[connection] = num_dropped
+            self._state.losses.lost(
+                SLOW_CLIENT,
+                f"client {connection.name} does not read fast enough; only its own frames are dropped; check "
+                "that program, or let it ask for fewer frames",
+                messages=num_new,
+                frames=num_new,
+                level=logging.DEBUG,  # reading_stopped has logged it
+            )
+
+    def _give_up(self) -> None:
+        self._giving_up = None
+        self.apply_state()
+
+    def _stop_waiting(self) -> None:
+        if self._giving_up is not None:
+            self._giving_up.cancel()
+            self._giving_up = None

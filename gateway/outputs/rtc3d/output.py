@@ -1,0 +1,287 @@
+"""The output that serves RTC3D clients: an RT server for each source that has a port."""
+
+import asyncio
+import logging
+from collections.abc import Callable, Coroutine
+from functools import partial
+from typing import Any, Final
+
+from gateway.errors import GatewayError
+from gateway.log import DefectLog, FailureLog, defect_text, log_fields
+from gateway.losses import Losses
+from gateway.messages.topics import Topic
+from gateway.outputs.contract import (
+    CONTROL_OPTION,
+    FramePublisher,
+    Output,
+    Publisher,
+    QueryService,
+    ServerFile,
+    ServerParameters,
+)
+from gateway.outputs.loop_thread import LoopThread
+from gateway.outputs.no_topics import IgnoringPublisher
+from gateway.outputs.rtc3d.live_server import SLOW_CLIENT, LiveServer, SourceState
+from gateway.outputs.rtc3d.publisher import QUEUE_FULL, Rtc3dPublisher
+from gateway.outputs.rtc3d.settings import Rtc3dSettings
+from gateway.outputs.status import OutputHealth
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import Frame
+
+_FIRST_RETRY_S: Final = 0.2
+_MAX_RETRY_S: Final = 5.0
+"""How long to wait before a port that was in use is tried again: longer each time, up to this."""
+
+_CLOSING_S: Final = 3.0
+_RECORDING: Final = ("recording",)
+
+_log = logging.getLogger(__name__)
+
+
+class _Served:
+    """A source that is served: its port, its server while that is open, and the task that keeps it open."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+        self.server: LiveServer | None = None
+        self.problem = f"port {port} is not open yet"
+        self.task: asyncio.Task[None] | None = None
+        self.is_stopped = False
+
+
+class Rtc3dOutput(Output):
+    """Serves RTC3D clients in a thread of its own. They share the gateway's session with each server."""
+
+    name = "rtc3d"
+    drop_causes = (SLOW_CLIENT, QUEUE_FULL)
+
+    def __init__(self, settings: Rtc3dSettings) -> None:
+        self._settings = settings
+        self._states: dict[str, SourceState] = {}
+        self._announced: set[str] = set()
+        self._served: dict[str, _Served] = {}  # by source; replaced when the settings change
+        self._on_wanted: dict[str, Callable[[], None]] = {}
+        self._queries: QueryService | None = None
+        self._loop: asyncio.AbstractEventLoop | None = None  # of the gateway
+        self._thread: LoopThread | None = None
+        self._is_closed = False
+        self._defects = DefectLog(_log, self.name)
+
+    # The core -------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Open the ports."""
+        if self._thread is None and not self._is_closed:
+            self._thread = LoopThread(self.name)
+            self._open_ports()
+            for source in self._settings.ports.keys() - self._announced:
+                _log.warning("rtc3d.ports has a port for %s, which is no source; correct its name", source)
+
+    def publisher(self, topic: Topic) -> Publisher:  # noqa: ARG002 - the protocol has no topics
+        """Return a publisher that ignores status and clock."""
+        return IgnoringPublisher()
+
+    def frame_publisher(self, source: str) -> FramePublisher:
+        """Return a publisher of whole frames."""
+        return Rtc3dPublisher(self._state(source), lambda: self._thread, self._take)
+
+    def health(self) -> OutputHealth:
+        """Return whether clients can connect to all sources that have a port."""
+        if self._thread is None or self._is_closed:
+            return OutputHealth(False, "rtc3d is not open")
+        problems = [served.problem for served in list(self._served.values()) if served.problem]
+        return OutputHealth(not problems, "; ".join(problems))
+
+    def close(self) -> None:
+        """Close all connections and ports."""
+        self._is_closed = True
+        if self._thread is not None:
+            self._thread.close(self._stop_all, _CLOSING_S)
+
+    def _state(self, source: str) -> SourceState:
+        if source not in self._states:
+            self._states[source] = SourceState(source)
+        return self._states[source]
+
+    # Maintenance ----------------------------------------------------------------------------
+
+    def maintain(self) -> None:
+        """Let the thread count what slow clients have lost."""
+        self._call(self._maintain)
+
+    def _maintain(self) -> None:
+        for served in list(self._served.values()):
+            if served.server is not None:
+                served.server.apply_state()
+                served.server.count_losses()
+
+    def is_configured_like(self, other: Output) -> bool:
+        """Any settings can be taken over."""
+        return isinstance(other, Rtc3dOutput)
+
+    def take_over(self, other: Output) -> bool:
+        """Apply other settings. Clients of sources whose address stays the same notice nothing."""
+        assert isinstance(other, Rtc3dOutput)  # noqa: S101 - is_configured_like says so
+        before, self._settings = self._settings, other._settings  # noqa: SLF001 - the same class
+        if before == self._settings:
+            return False
+        if before.host != self._settings.host:
+            self._close_ports(list(self._served))
+        self._open_ports()
+        return True
+
+    def count_losses(self, source: str, losses: Losses) -> None:
+        """Count in ``losses`` what slow clients do not get."""
+        self._state(source).losses = losses
+
+    def watch_wanted(self, source: str, on_change: Callable[[], None]) -> bool:
+        """Frames are wanted while any client asks for them."""
+        self._loop = asyncio.get_running_loop()
+        self._on_wanted[source] = on_change
+        return True
+
+    # Sources --------------------------------------------------------------------------------
+
+    def announce(self, source: str) -> None:
+        """Open the port of ``source``."""
+        self._announced.add(source)
+        self._open_ports()
+
+    def withdraw(self, source: str) -> None:
+        """Close the port of ``source`` and the connections of its clients."""
+        self._announced.discard(source)
+        self._open_ports()
+
+    def show_streaming(self, source: str, is_streaming: bool) -> None:
+        """Let clients know when frames end."""
+        self._state(source).is_streaming = is_streaming
+        self._call(self._maintain)
+
+    def show_measurement(self, source: str, is_running: bool | None) -> None:
+        """Let clients know when a measurement ends."""
+        self._state(source).is_measuring = is_running
+        self._call(self._maintain)
+
+    def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
+        """Serve these parameters to clients that ask for them."""
+        self._state(source).parameters = parameters
+
+    def announce_file(self, source: str, file: ServerFile) -> None:
+        """Pass a C3D file on to the clients."""
+        self._call(lambda: self._send_file(source, file))
+
+    def _send_file(self, source: str, file: ServerFile) -> None:
+        served = self._served.get(source)
+        if served is not None and served.server is not None:
+            served.server.send_file(file.path)
+
+    def _take(self, source: str, frame: Frame, stream: int, wanted: frozenset[ComponentType]) -> None:
+        try:
+            served = self._served.get(source)
+            if served is not None and served.server is not None:
+                served.server.take(frame, stream, wanted)
+        except Exception as defect:  # noqa: BLE001 - the next frame may be different
+            self._defects.log(defect)
+
+    def _call(self, call: Callable[[], None]) -> None:
+        if self._thread is not None:
+            self._thread.offer(call)
+
+    # Recordings -----------------------------------------------------------------------------
+
+    def serve_queries(self, service: QueryService) -> None:
+        """Use ``service`` for clients that start and stop recordings."""
+        self._queries = service
+
+    def _control(self, source: str, start: bool, name: str) -> Coroutine[Any, Any, None]:
+        return self._control_recording(source, start, name)
+
+    async def _control_recording(self, source: str, start: bool, name: str) -> None:
+        """Ask the gateway's event loop. Called in the thread. Raises QueryError."""
+        assert self._loop is not None  # noqa: S101 - there is a source, so watch_wanted was called
+        assert self._queries is not None  # noqa: S101 - the gateway has set it before ``start``
+        options = {CONTROL_OPTION: "start" if start else "stop"}
+        if start and name:
+            options["name"] = name
+        answer = asyncio.run_coroutine_threadsafe(_awaited(self._queries, source, options), self._loop)
+        await asyncio.wrap_future(answer)
+
+    # Ports ----------------------------------------------------------------------------------
+
+    def _open_ports(self) -> None:
+        """Open the ports of the sources that are announced, and close others."""
+        ports = {source: port for source, port in self._settings.ports.items() if source in self._announced}
+        self._close_ports(
+            [source for source, served in self._served.items() if ports.get(source) != served.port]
+        )
+        if self._thread is None:
+            return
+        for source, port in ports.items():
+            if source not in self._served:
+                served = self._served[source] = _Served(port)
+                self._thread.run(self._keep_open(self._state(source), served))
+            self._call(partial(self._set_max_clients, source, self._settings.max_clients))
+
+    def _set_max_clients(self, source: str, max_clients: int) -> None:
+        served = self._served.get(source)
+        if served is not None and served.server is not None:
+            served.server.max_clients = max_clients
+
+    def _close_ports(self, sources: list[str]) -> None:
+        for source in sources:
+            served = self._served.pop(source)
+            served.is_stopped = True
+            if self._thread is not None:
+                self._thread.run(_stop(served))
+
+    async def _stop_all(self) -> None:
+        await asyncio.gather(*(_stop(served) for served in self._served.values()))
+
+    async def _keep_open(self, state: SourceState, served: _Served) -> None:
+        """Listen on the port until stopped; try again while that is not possible."""
+        served.task = asyncio.current_task()
+        host, port = self._settings.host, served.port
+        failures = FailureLog(_log, f"{state.source} to rtc3d")
+        delay_s = _FIRST_RETRY_S
+        with log_fields(source=state.source):
+            while not served.is_stopped:
+                server = LiveServer(
+                    state,
+                    host,
+                    port,
+                    self._settings.max_clients,
+                    partial(self._wanted_changed, state.source),
+                    self._control,
+                )
+                try:
+                    await server.listen()
+                except Exception as error:  # noqa: BLE001 - the next try may succeed
+                    served.problem = str(error) if isinstance(error, GatewayError) else defect_text(error)
+                    failures.failed(served.problem)
+                    await asyncio.sleep(delay_s)
+                    delay_s = min(2 * delay_s, _MAX_RETRY_S)
+                    continue
+                served.problem = ""
+                served.server = server
+                failures.succeeded(f"clients can connect to {host}, port {port}")
+                try:
+                    await asyncio.Event().wait()  # until cancelled
+                finally:
+                    served.server = None
+                    await server.close()
+
+    def _wanted_changed(self, source: str) -> None:
+        on_change = self._on_wanted.get(source)
+        if on_change is not None and self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(on_change)
+
+
+async def _awaited(service: QueryService, source: str, options: dict[str, str]) -> None:
+    await service.answer(source, _RECORDING, options)
+
+
+async def _stop(served: _Served) -> None:
+    served.is_stopped = True
+    if served.task is not None:
+        served.task.cancel()
+        await asyncio.wait([served.task])

@@ -1,0 +1,58 @@
+"""The section ``rtc3d`` of the configuration."""
+
+from collections.abc import Mapping
+from typing import Annotated, Final, Self
+
+from pydantic import AfterValidator, Field, PlainSerializer, model_validator
+
+from gateway.config.section import expects, validation_error
+from gateway.config.settings import OutputSettings
+from gateway.config.values import Host, Port, SourceName, Switch
+
+DEFAULT_MAX_CLIENTS: Final = 128
+
+
+def _check_different(ports: Mapping[str, int]) -> Mapping[str, int]:
+    owners: dict[int, str] = {}
+    for source, port in ports.items():
+        if port in owners:
+            raise validation_error(
+                f"found {port}, which {owners[port]} has too; expected another port for each source", source
+            )
+        owners[port] = source
+    return ports
+
+
+Ports = Annotated[
+    dict[SourceName, Port],
+    AfterValidator(_check_different),
+    PlainSerializer(dict),
+    expects("a port for each source that is served, as in {lab: 3120}"),
+]
+MaxClients = Annotated[
+    int, Field(strict=True, ge=1, le=1000), expects("a whole number of clients from 1 to 1000")
+]
+
+
+class Rtc3dSettings(OutputSettings):
+    """The settings of the output that serves RTC3D clients."""
+
+    enabled: Switch = False
+    """Whether RTC3D clients can connect to the gateway, and share its session with the server."""
+
+    host: Host = "127.0.0.1"
+    """The address to listen on: one of this host, or 0.0.0.0 or "::" for all."""
+
+    ports: Ports = {}  # noqa: RUF012 - pydantic copies defaults
+    """A TCP port for each source that is served: {NAME: PORT}."""
+
+    max_clients: MaxClients = DEFAULT_MAX_CLIENTS
+    """How many clients each source can have at the same time."""
+
+    @model_validator(mode="after")
+    def _check_any_port(self) -> Self:
+        if self.enabled and not self.ports:
+            raise validation_error(
+                "found nothing; expected a port for each source that is served, as in {lab: 3120}", "ports"
+            )
+        return self
