@@ -55,12 +55,11 @@ class FrameSchedule:
 
     def advance(self, count: int = 1) -> None:
         """Advance by ``count`` frames, which were sent or dropped."""
-        self._num_passed += count
-        position = self._first + self._num_passed * self._stride
         if isinstance(self._rate, Frequency) and self._has_other_rate():
-            self._set_stride(Fraction(position, self._denominator).limit_denominator(1000))
-            position = self._first
-        self.tick = -(-position // self._denominator)
+            position = Fraction(self._first + self._num_passed * self._stride, self._denominator)
+            self._set_stride(position.limit_denominator(1000))
+        self._num_passed += count
+        self.tick = -(-(self._first + self._num_passed * self._stride) // self._denominator)
 
     def _has_other_rate(self) -> bool:
         rate = self.frames.rate

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.integration.served import Served, directly, through_a_gateway
 from tests.networks import free_endpoint, open_zenoh
 
 
@@ -14,3 +15,10 @@ def router() -> Iterator[str]:
     session = open_zenoh("router", listen=endpoint)
     yield endpoint
     session.close()
+
+
+@pytest.fixture(params=[directly, through_a_gateway])
+def served(request: pytest.FixtureRequest) -> Served:
+    """How clients reach a simulator."""
+    serve: Served = request.param
+    return serve

@@ -13,6 +13,7 @@ from gateway.rtc3d_server.client_connection import MAX_UNREAD_BYTES
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests.integration.raw_client import TIMEOUT_S, connected, consecutive, until
+from tests.integration.served import Served
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
     ANALOG,
@@ -40,8 +41,12 @@ FAST_HZ = 1000.0
 # The protocol -------------------------------------------------------------------------------
 
 
-async def test_a_client_can_follow_the_order_of_the_specification() -> None:
-    async with Simulator(SyntheticScene(rate_hz=FAST_HZ)) as simulator, connected(simulator) as client:
+async def test_a_client_can_follow_the_order_of_the_specification(served: Served) -> None:
+    async with (
+        Simulator(SyntheticScene(rate_hz=FAST_HZ)) as simulator,
+        served(simulator) as server,
+        connected(server) as client,
+    ):
         assert await client.ask("Version 1.0\0") == (COMMAND, b"OK-Version 1.0")
         assert await client.ask("SetByteOrder BigEndian") == (COMMAND, b"OK-SetByteOrder BigEndian")
         packet_type, xml = await client.ask("SendParameters All")
@@ -73,9 +78,11 @@ async def test_a_client_can_follow_the_order_of_the_specification() -> None:
         assert packets_in(await client.rest())[-1] == (COMMAND, b"bye")
 
 
-async def test_ndis_client_can_request_little_endian_first_and_events_in_the_current_frame() -> None:
+async def test_ndis_client_can_request_little_endian_first_and_events_in_the_current_frame(
+    served: Served,
+) -> None:
     scene = CountingScene()
-    async with Simulator(scene) as simulator, connected(simulator) as client:
+    async with Simulator(scene) as simulator, served(simulator) as server, connected(server) as client:
         assert await client.ask("SetByteOrder LittleEndian") == (COMMAND, b"OK-SetByteOrder LittleEndian")
         sent = "SendCurrentFrame 3D 6D Analog Force Events "
         for _ in range(10):
@@ -99,16 +106,24 @@ async def test_nothing_follows_bye() -> None:
 
 @pytest.mark.parametrize("ending", ["", "\0", "\n", "\r\n", " \n\0"])
 @pytest.mark.parametrize("words", ["streamframes allframes analog", "STREAMFRAMES ALLFRAMES ANALOG "])
-async def test_commands_can_have_any_ending_and_any_case(words: str, ending: str) -> None:
-    async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
+async def test_commands_can_have_any_ending_and_any_case(served: Served, words: str, ending: str) -> None:
+    async with (
+        Simulator(CountingScene()) as simulator,
+        served(simulator) as server,
+        connected(server) as client,
+    ):
         assert await client.ask(words + ending) == (COMMAND, f"OK-{words.strip()}".encode())
         frames = await client.frames(30)
         assert {component.type for frame in frames for component in frame} == {ANALOG}
         assert consecutive(frames)
 
 
-async def test_commands_can_arrive_in_pieces_or_several_at_once() -> None:
-    async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
+async def test_commands_can_arrive_in_pieces_or_several_at_once(served: Served) -> None:
+    async with (
+        Simulator(CountingScene()) as simulator,
+        served(simulator) as server,
+        connected(server) as client,
+    ):
         bunch = command("Version 1.0") + command("SetByteOrder LittleEndian") + command("Version 1.0")
         for byte in bunch:
             client.send(bytes([byte]))
@@ -135,8 +150,14 @@ async def test_commands_can_arrive_in_pieces_or_several_at_once() -> None:
         packet(77, b"?"),
     ],
 )
-async def test_invalid_packets_get_an_error_packet_and_the_connection_stays_open(bad: bytes) -> None:
-    async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
+async def test_invalid_packets_get_an_error_packet_and_the_connection_stays_open(
+    served: Served, bad: bytes
+) -> None:
+    async with (
+        Simulator(CountingScene()) as simulator,
+        served(simulator) as server,
+        connected(server) as client,
+    ):
         client.send(bad)
         packet_type, text = await client.read()
         assert packet_type == ERROR
@@ -146,9 +167,13 @@ async def test_invalid_packets_get_an_error_packet_and_the_connection_stays_open
 
 @pytest.mark.parametrize("size", [0, 7, 64 * 1024 + 1, 0xFFFFFFFF])
 async def test_a_size_out_of_bounds_gets_an_error_packet_and_ends_the_connection(
-    size: int,
+    served: Served, size: int
 ) -> None:
-    async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
+    async with (
+        Simulator(CountingScene()) as simulator,
+        served(simulator) as server,
+        connected(server) as client,
+    ):
         client.send(command("Version 1.0"), struct.pack(">II", size, COMMAND))
 
         [reply, (packet_type, text)] = packets_in(await client.rest())
@@ -203,8 +228,12 @@ async def test_commands_are_logged_as_debug(caplog: pytest.LogCaptureFixture) ->
     assert received == [r"'Version 1.0\x00'", repr("x" * 200), "a packet of type 3 with 4 bytes"]
 
 
-async def test_each_packet_is_sent_with_one_send() -> None:
-    async with Simulator(SyntheticScene(markers=50)) as simulator, connected(simulator) as client:
+async def test_each_packet_is_sent_with_one_send(served: Served) -> None:
+    async with (
+        Simulator(SyntheticScene(markers=50)) as simulator,
+        served(simulator) as server,
+        connected(server) as client,
+    ):
         client.send(command("StreamFrames"), command("SendParameters"))
         for _ in range(60):
             await client.read()

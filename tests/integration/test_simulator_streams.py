@@ -13,6 +13,7 @@ from gateway.rtc3d_server.scene import Scene
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.simulator import Simulator
 from tests.integration.raw_client import connected, numbers
+from tests.integration.served import Served
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
     ANALOG,
@@ -47,21 +48,29 @@ FAST_HZ = 1000.0
         ("StreamFrames Frequency:250 Analog", [40] * 59),
     ],
 )
-async def test_frames_are_sent_at_the_requested_rate(sent: str, gaps: list[int]) -> None:
-    async with Simulator(CountingScene(FAST_HZ)) as simulator, connected(simulator) as client:
+async def test_frames_are_sent_at_the_requested_rate(served: Served, sent: str, gaps: list[int]) -> None:
+    async with (
+        Simulator(CountingScene(FAST_HZ)) as simulator,
+        served(simulator) as server,
+        connected(server) as client,
+    ):
         await client.ask(sent)
         frames = await client.frames(60)
 
     assert np.diff(numbers(frames)).tolist() == gaps
 
 
-async def test_time_stamps_are_those_of_the_measurement_and_equal_within_a_frame() -> None:
-    async with Simulator(CountingScene(FAST_HZ)) as simulator, connected(simulator) as client:
+async def test_time_stamps_are_those_of_the_measurement_and_equal_within_a_frame(served: Served) -> None:
+    async with (
+        Simulator(CountingScene()) as simulator,
+        served(simulator) as server,
+        connected(server) as client,
+    ):
         await client.ask("StreamFrames FrequencyDivisor:3 All")
-        for components in await client.frames(100):
+        for components in await client.frames(30):
             measured = [component for component in components if component.type != EVENT]
             assert {component.timestamp_us for component in components} == {
-                (components[0].frame_number - 1) * 1000
+                (components[0].frame_number - 1) * 10_000
             }
             per_frame = {MARKERS: 1, TOOLS: 1, ANALOG: 10}
             for component in measured:
@@ -71,11 +80,12 @@ async def test_time_stamps_are_those_of_the_measurement_and_equal_within_a_frame
                 assert component.items[0][0] == component.frame_number - 1
 
 
-async def test_each_client_has_its_own_rate_and_byte_order() -> None:
+async def test_each_client_has_its_own_rate_and_byte_order(served: Served) -> None:
     async with (
         Simulator(CountingScene(FAST_HZ)) as simulator,
-        connected(simulator) as big,
-        connected(simulator) as little,
+        served(simulator) as server,
+        connected(server) as big,
+        connected(server) as little,
     ):
         await little.ask("SetByteOrder LittleEndian")
         await big.ask("StreamFrames 3D")
@@ -89,8 +99,12 @@ async def test_each_client_has_its_own_rate_and_byte_order() -> None:
     assert np.diff(numbers(little_frames)).tolist() == [2] * 49
 
 
-async def test_no_event_is_lost_at_a_low_rate() -> None:
-    async with Simulator(CountingScene(FAST_HZ)) as simulator, connected(simulator) as client:
+async def test_no_event_is_lost_at_a_low_rate(served: Served) -> None:
+    async with (
+        Simulator(CountingScene(FAST_HZ)) as simulator,
+        served(simulator) as server,
+        connected(server) as client,
+    ):
         await client.ask("StreamFrames FrequencyDivisor:50 3D Events")
         frames = await client.frames(10)
 
@@ -105,8 +119,12 @@ async def test_no_event_is_lost_at_a_low_rate() -> None:
     assert np.diff(events).tolist() == [1.0] * (len(events) - 1)
 
 
-async def test_events_can_be_sent_in_16_bytes() -> None:
-    async with Simulator(CountingScene(), event_bytes=16) as simulator, connected(simulator) as client:
+async def test_events_can_be_sent_in_16_bytes(served: Served) -> None:
+    async with (
+        Simulator(CountingScene(), event_bytes=16) as simulator,
+        served(simulator) as server,
+        connected(server) as client,
+    ):
         await client.ask("StreamFrames Events")
         _, body = await client.read()
 
@@ -117,8 +135,12 @@ async def test_events_can_be_sent_in_16_bytes() -> None:
 # Measurements -------------------------------------------------------------------------------
 
 
-async def test_the_end_and_the_start_of_a_measurement_reach_a_streaming_client() -> None:
-    async with Simulator(CountingScene(FAST_HZ)) as simulator, connected(simulator) as client:
+async def test_the_end_and_the_start_of_a_measurement_reach_a_streaming_client(served: Served) -> None:
+    async with (
+        Simulator(CountingScene(FAST_HZ)) as simulator,
+        served(simulator) as server,
+        connected(server) as client,
+    ):
         await client.ask("StreamFrames 3D")
         await client.frames(5)
         simulator.stop_measurement()
@@ -131,8 +153,12 @@ async def test_the_end_and_the_start_of_a_measurement_reach_a_streaming_client()
         assert numbers(await client.frames(5)) == [1, 2, 3, 4, 5]
 
 
-async def test_without_a_measurement_clients_get_no_data_and_everything_else_works() -> None:
-    async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
+async def test_without_a_measurement_clients_get_no_data_and_everything_else_works(served: Served) -> None:
+    async with (
+        Simulator(CountingScene()) as simulator,
+        served(simulator) as server,
+        connected(server) as client,
+    ):
         simulator.stop_measurement()
 
         assert await client.ask("SendCurrentFrame") == (COMMAND, b"OK-SendCurrentFrame")
@@ -145,8 +171,12 @@ async def test_without_a_measurement_clients_get_no_data_and_everything_else_wor
         assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
 
 
-async def test_each_current_frame_is_newer_than_the_one_before() -> None:
-    async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
+async def test_each_current_frame_is_newer_than_the_one_before(served: Served) -> None:
+    async with (
+        Simulator(CountingScene()) as simulator,
+        served(simulator) as server,
+        connected(server) as client,
+    ):
         client.send(command("SendCurrentFrame 3D"))
         frames = []
         for _ in range(10):
@@ -158,7 +188,10 @@ async def test_each_current_frame_is_newer_than_the_one_before() -> None:
 
 
 async def test_a_pending_request_for_the_current_frame_ends_with_the_measurement() -> None:
-    async with Simulator(CountingScene(rate_hz=0.001)) as simulator, connected(simulator) as client:
+    async with (
+        Simulator(CountingScene(rate_hz=0.001)) as simulator,
+        connected(simulator) as client,
+    ):
         await client.ask("SendCurrentFrame 3D")
         assert numbers(await client.frames(1)) == [1]
         assert await client.ask("SendCurrentFrame 3D") == (COMMAND, b"OK-SendCurrentFrame 3D")

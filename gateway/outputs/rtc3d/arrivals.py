@@ -3,6 +3,7 @@
 from collections import deque
 from collections.abc import Callable, Iterator
 from functools import lru_cache
+from operator import attrgetter
 from statistics import median_low
 from typing import Final, Generic, NamedTuple, TypeVar
 
@@ -13,6 +14,7 @@ _KEPT_ARRIVALS: Final = 256
 _KEPT_BYTES: Final = 8 * 1024 * 1024
 """How much of the past is kept for clients that ask for the current frame."""
 
+_LONG_AGO_US: Final = 3_600_000_000
 _INTERVALS: Final = 32  # their median is the period of a stream
 
 _Item = TypeVar("_Item")
@@ -134,6 +136,14 @@ class StreamRate:
             self._intervals_us.append(step_us if step_us > 0 else elapsed_us)
             self._period_us = 0
 
+    def restart(self) -> None:
+        """Go on with a new measurement, whose clock starts at 0; the rate is probably the same."""
+        self.time_us = self._num_frames = 0
+
+    def follow(self, former: "StreamRate") -> None:
+        """Begin with the rate of a stream that this one replaces."""
+        self._intervals_us.extend(former._intervals_us)  # noqa: SLF001 - the same class
+
     @property
     def period_us(self) -> int | None:
         """The usual time between two frames; None before the third frame."""
@@ -151,7 +161,7 @@ class Arrivals:
     """
 
     def __init__(self) -> None:
-        self.frames: Kept[Arrival] = Kept(_KEPT_ARRIVALS, _KEPT_BYTES, lambda arrival: arrival.num_bytes)
+        self.frames: Kept[Arrival] = Kept(_KEPT_ARRIVALS, _KEPT_BYTES, attrgetter("num_bytes"))
         """The newest frames."""
         self.stream_of: dict[ComponentType, int] = {}
         """On which stream each measured component came last."""
@@ -159,8 +169,8 @@ class Arrivals:
         """The rate of each stream, by its number."""
         self.newest_us = -1
         """When the newest frame arrived."""
-        self.began_us = 0
-        """When the first frame of the measurement arrived."""
+        self.began_us: int | None = None
+        """When the first frame of the first measurement arrived; None before it."""
         self._composition = lru_cache(64)(_composition)
 
     def add(
@@ -171,6 +181,8 @@ class Arrivals:
         if not composition.measured and not composition.has_events:
             return None
         self.newest_us = max(elapsed_us, self.newest_us + 1)
+        if self.began_us is None:
+            self.began_us = self.newest_us
         arrival = Arrival(frame, composition, stream, self.newest_us)
         if composition.measured:
             rate = self.rates.get(stream)
@@ -183,14 +195,24 @@ class Arrivals:
         self.frames.append(arrival)
         return arrival
 
+    def restart(self) -> None:
+        """Forget the frames: a new measurement begins. Which component comes on which stream stays known."""
+        self.frames.clear()
+        self.newest_us = -1
+        if self.began_us is not None:
+            self.began_us = -_LONG_AGO_US
+        for rate in self.rates.values():
+            rate.restart()
+
     def _new_stream(self, stream: int) -> StreamRate:
-        if not self.rates:
-            self.began_us = self.newest_us
         rate = self.rates[stream] = StreamRate()
         return rate
 
     def _move(self, component: ComponentType, stream: int) -> None:
         """Note that a component comes on another stream now, and forget streams that have ended."""
+        former = self.rates.get(self.stream_of.get(component, stream))
+        if former is not None and self.rates[stream].period_us is None:
+            self.rates[stream].follow(former)
         self.stream_of[component] = stream
         used = set(self.stream_of.values())
         self.rates = {number: rate for number, rate in self.rates.items() if number in used}

@@ -18,9 +18,6 @@ from gateway.rtc3d.frames import Frame, encode_frame
 
 _HEADER_BYTES: Final = 8  # size and type, before a component's content
 
-_MAX_EVENT_COMPONENTS: Final = 16
-"""With more, events become one component: readers limit the number of components."""
-
 
 class Events(NamedTuple):
     """The event components of a frame that arrived at ``time_us``."""
@@ -111,23 +108,24 @@ def _in_order(component: Component, byte_order: ByteOrder) -> Items:
     return items.astype(items.dtype.newbyteorder(byte_order), copy=False)
 
 
-def encode_events(events: Sequence[Events], byte_order: ByteOrder) -> list[bytes]:
-    """Return event components as they came, each with its frame number and time stamp.
+def encode_events(events: Sequence[Events], main: Arrival, byte_order: ByteOrder) -> list[bytes]:
+    """Return the event components of a frame: those of ``main`` as they came, if there are no others.
 
-    More than _MAX_EVENT_COMPONENTS become one component for each size of events, with the frame number and
-    time stamp of the newest.
+    Otherwise all events become one component for each size of events, as a server sends them at a low rate:
+    with the time stamp of the frame.
     """
     components = [component for each in events for component in each.components]
-    if len(components) <= _MAX_EVENT_COMPONENTS:
+    if all(each.time_us == main.time_us for each in events):
         return [_encoded(component, byte_order) for component in components]
     by_size: dict[int, list[Component]] = {}
     for component in components:
         by_size.setdefault(component.item_bytes, []).append(component)
+    frame_number, timestamp_us = main.frame.number_and_timestamp
     return [
         encode_component(
             ComponentType.EVENT,
-            same_size[-1].frame_number,
-            same_size[-1].timestamp_us,
+            frame_number,
+            timestamp_us,
             np.concatenate([_in_order(component, byte_order) for component in same_size]),
             byte_order,
         )

@@ -8,7 +8,7 @@ from functools import lru_cache
 from operator import attrgetter
 from typing import Final, NamedTuple
 
-from gateway.outputs.rtc3d.arrivals import Arrival, Arrivals, Kept
+from gateway.outputs.rtc3d.arrivals import Arrival, Arrivals, Kept, StreamRate
 from gateway.outputs.rtc3d.frame_bytes import Events, encode_events, encode_joined, events_of, unchanged_body
 from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.packets import PacketType, encode_packet
@@ -25,8 +25,10 @@ _ALIVE_PERIODS: Final = 3
 _FASTER_ALIVE_US: Final = 500_000
 """How long frames wait for a faster stream without frames."""
 
-_FIRST_US: Final = 1_000_000
-"""How long faster components wait for the first frame of a slower one that the server announces."""
+_LEARN_US: Final = 100_000
+_LEARN_ANNOUNCED_US: Final = 300_000
+"""How long frames wait at first, until it is known which components come on which stream, and how often. The
+second is for components that the server announces."""
 
 _ROUNDING_US: Final = 2
 """Time stamps of the same moment can differ by this much, because rates are rounded."""
@@ -38,13 +40,14 @@ _SAME_RATE: Final = 1.01  # rates within this factor are one rate
 _DEFAULT_RATE: Final = Fraction(100)
 _FORGOTTEN_US: Final = -1  # the time of a frame that is not kept: long ago
 
-_KEPT_FRAMES: Final = 64
+_KEPT_FRAMES: Final = 1024
 _KEPT_SAMPLES: Final = 2048
 _KEPT_EVENTS: Final = 4096
 _KEPT_BYTES: Final = 8 * 1024 * 1024
 _CACHED_PACKETS: Final = 64  # clients with equal streams share them
 
 _time_us: Final = attrgetter("time_us")
+_num_bytes: Final = attrgetter("num_bytes")
 
 
 class _LiveFrame(NamedTuple):
@@ -91,10 +94,13 @@ class LiveFrames:
         self._arrivals = arrivals
         self._announced_hz = announced_hz
         self._next_arrival = arrivals.frames.first
-        self._frames: Kept[_LiveFrame] = Kept(_KEPT_FRAMES, _KEPT_BYTES, lambda frame: frame.num_bytes)
-        self._events: Kept[Events] = Kept(_KEPT_EVENTS, _KEPT_BYTES, lambda events: events.num_bytes)
+        self._frames: Kept[_LiveFrame] = Kept(_KEPT_FRAMES, _KEPT_BYTES, _num_bytes)
+        self._events: Kept[Events] = Kept(_KEPT_EVENTS, _KEPT_BYTES, _num_bytes)
+        # Frames that have arrived while it is not known yet what sets the rate; None once it is.
+        self._undecided: Kept[Arrival] | None = Kept(_KEPT_SAMPLES, _KEPT_BYTES, _num_bytes)
         self._waiting: deque[Arrival] = deque()
         self._samples: dict[int, Kept[Arrival]] = {}  # of faster streams, by the stream's number
+        self._joined: set[int] = set()  # the faster streams that have had a sample in a frame
         self._packet = lru_cache(_CACHED_PACKETS)(self._build_packet)
 
     # FrameSource ----------------------------------------------------------------------------
@@ -129,7 +135,7 @@ class LiveFrames:
         return self._frames.oldest.time_us - 1 if self._frames else elapsed_us
 
     def packet(self, byte_order: ByteOrder, tick: int, events_from_us: int | None = None) -> DataPacket:
-        """See FrameSource. Events of earlier frames follow the frame's own."""
+        """See FrameSource. Events of several frames become one component."""
         if events_from_us is None or not self._events or self._events.newest.time_us < events_from_us:
             return self._packet(byte_order, tick, 0, 0)
         kept = list(self._events.since(self._events.first))
@@ -152,7 +158,10 @@ class LiveFrames:
         for other in frame.others:
             components |= other.composition.measured & self._measured
         body = encode_joined(
-            (frame.main, *frame.others), self._measured, encode_events(events, byte_order), byte_order
+            (frame.main, *frame.others),
+            self._measured,
+            encode_events(events, frame.main, byte_order),
+            byte_order,
         )
         return DataPacket(encode_packet(PacketType.DATA, body), self._in_wire_order(components, bool(events)))
 
@@ -168,8 +177,15 @@ class LiveFrames:
         arrived = self._arrivals.frames
         if self._next_arrival != arrived.end:
             for arrival in arrived.since(self._next_arrival):
-                self._take(arrival)
+                if self._undecided is None:
+                    self._take(arrival)
+                else:
+                    self._undecided.append(arrival)
             self._next_arrival = arrived.end
+        if self._undecided is not None:
+            due_us = self._decide(self._undecided, elapsed_us)
+            if due_us is not None:
+                return due_us
         if self._waiting:
             self._release(elapsed_us)
             if self._waiting:
@@ -182,6 +198,9 @@ class LiveFrames:
         self._events.clear()
         self._waiting.clear()
         self._samples.clear()
+        self._joined.clear()
+        if self._undecided is not None:
+            self._undecided.clear()
         self._next_arrival = self._arrivals.frames.end
 
     def _use(self) -> None:
@@ -190,6 +209,26 @@ class LiveFrames:
             self.update(self._arrivals.newest_us)
 
     # Which arrivals become frames -----------------------------------------------------------
+
+    def _decide(self, undecided: Kept[Arrival], now_us: int) -> int | None:
+        """Take the frames so far if it is known what sets the rate; return when to try again otherwise."""
+        due_us = self._learned_us()
+        if due_us is not None and due_us > now_us:
+            return due_us if undecided else None
+        self._undecided = None
+        for arrival in undecided.since(undecided.first):
+            self._take(arrival)
+        return None
+
+    def _learned_us(self) -> int | None:
+        """Return until when to wait for the streams of the choice; None if they are known."""
+        arrivals = self._arrivals
+        missing = self._measured - arrivals.stream_of.keys()
+        if not missing and all(self._period_us(stream) is not None for stream in self._streams):
+            return None
+        is_announced = not missing.isdisjoint(self._announced_hz)
+        began_us = max(arrivals.newest_us, 0) if arrivals.began_us is None else arrivals.began_us
+        return began_us + (_LEARN_ANNOUNCED_US if is_announced else _LEARN_US)
 
     def _take(self, arrival: Arrival) -> None:
         composition = arrival.composition
@@ -200,7 +239,7 @@ class LiveFrames:
         if not found:
             if has_events and self._slowest_stream(arrival.time_us) is None:
                 self._add(arrival)
-        elif self._is_early(arrival, found) or self._slowest_stream(arrival.time_us) != arrival.stream:
+        elif self._slowest_stream(arrival.time_us) != arrival.stream:
             self._add_sample(arrival)
         elif len(self._streams) == 1:
             self._add(arrival)
@@ -215,40 +254,33 @@ class LiveFrames:
         stream_of = self._arrivals.stream_of
         return {stream_of[each] for each in self.measured if each in stream_of}
 
-    def _period_us(self, stream: int) -> int | None:
-        return self._arrivals.rates[stream].period_us
+    def _period_us(self, stream: int) -> float | None:
+        """Return the time between two frames of a stream, as measured or else as announced."""
+        period_us = self._arrivals.rates[stream].period_us
+        if period_us is not None:
+            return period_us
+        stream_of = self._arrivals.stream_of
+        announced_hz = [hz for each, hz in self._announced_hz.items() if stream_of.get(each) == stream]
+        return 1e6 / min(announced_hz) if announced_hz else None
 
     def _slowest_stream(self, now_us: int) -> int | None:
-        """Return the stream that sets the rate; None if no stream of the choice has frames.
-
-        One whose rate is not known yet counts as slow. With ``streams: auto``, the first is the slowest.
-        """
+        """Return the stream that sets the rate; None if no stream of the choice has frames now."""
         slowest: int | None = None
         slowest_us = 0.0
         for stream in sorted(self._streams):
-            period_us = self._period_us(stream)
-            alive_us = max(_ALIVE_US, _ALIVE_PERIODS * (period_us or 0))
-            if now_us - self._arrivals.rates[stream].time_us > alive_us:
-                continue
-            if slowest is None or (period_us or float("inf")) > slowest_us * _SAME_RATE:
-                slowest, slowest_us = stream, period_us or float("inf")
+            period_us = self._period_us(stream) or 1.0
+            alive_us = max(_ALIVE_US, _ALIVE_PERIODS * period_us)
+            is_alive = now_us - self._arrivals.rates[stream].time_us <= alive_us
+            if is_alive and period_us > slowest_us * _SAME_RATE:
+                slowest, slowest_us = stream, period_us
         return slowest
-
-    def _is_early(self, arrival: Arrival, found: frozenset[ComponentType]) -> bool:
-        """Return whether a slower component of the choice is still to come, as the parameters announce."""
-        if arrival.time_us - self._arrivals.began_us > _FIRST_US:
-            return False
-        missing = self._measured - self._arrivals.stream_of.keys()
-        hz = self._announced_hz
-        fastest_hz = max((hz[each] for each in found if each in hz), default=0.0)
-        return any(each in hz and hz[each] * _SAME_RATE < fastest_hz for each in missing)
 
     def _add_sample(self, arrival: Arrival) -> None:
         samples = self._samples.get(arrival.stream)
         if samples is None:
             current = self._streams
             self._samples = {number: each for number, each in self._samples.items() if number in current}
-            samples = Kept(_KEPT_SAMPLES, _KEPT_BYTES, lambda sample: sample.num_bytes)
+            samples = Kept(_KEPT_SAMPLES, _KEPT_BYTES, _num_bytes)
             self._samples[arrival.stream] = samples
         elif samples and arrival.timestamp_us < samples.newest.timestamp_us:
             samples.clear()  # a new measurement
@@ -276,18 +308,31 @@ class LiveFrames:
         return True
 
     def _add_joined(self, arrival: Arrival) -> None:
+        """Add a frame with the newest samples of the other streams up to its time stamp.
+
+        At first, a stream may begin with a sample that is later. Then this frame is left out, because it is
+        from before the clients asked.
+        """
         others = []
-        for stream, samples in self._samples.items():
-            rate = self._arrivals.rates.get(stream)
+        until_us = arrival.timestamp_us + _ROUNDING_US
+        for stream in self._streams - {arrival.stream}:
+            rate, samples = self._arrivals.rates[stream], self._samples.get(stream, ())
             newest: Arrival | None = None
-            until_us = arrival.timestamp_us + _ROUNDING_US
-            while samples and (
-                samples.oldest.timestamp_us <= until_us or (rate is not None and not rate.has_times)
-            ):
+            while samples and (not rate.has_times or samples.oldest.timestamp_us <= until_us):
                 newest = samples.pop_oldest()
-            if newest is not None and stream != arrival.stream:
+            if newest is not None:
                 others.append(newest)
+                self._joined.add(stream)
+            elif stream not in self._joined and self._begins_later(arrival, rate, samples):
+                return
         self._add(arrival, tuple(others))
+
+    @staticmethod
+    def _begins_later(arrival: Arrival, rate: StreamRate, samples: "Kept[Arrival] | tuple[()]") -> bool:
+        """Return whether a stream that has had no sample in a frame has only later ones so far."""
+        if arrival.time_us - rate.time_us >= _FASTER_ALIVE_US:
+            return False
+        return not samples or samples.oldest.timestamp_us < arrival.timestamp_us + _OTHER_CLOCK_US
 
     def _add(self, arrival: Arrival, others: tuple[Arrival, ...] = ()) -> None:
         last_us = self._frames.newest.time_us if self._frames else -1

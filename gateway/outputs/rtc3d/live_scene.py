@@ -95,7 +95,7 @@ class LiveScene:
 
     def stop(self) -> None:
         """See Scene."""
-        self._arrivals = Arrivals()
+        self._arrivals.restart()
         self._frames = []
 
     def frames(self, components: Sequence[ComponentType], event_bytes: int) -> LiveFrames:  # noqa: ARG002

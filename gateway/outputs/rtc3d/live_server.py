@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+import math
 from collections.abc import Callable, Coroutine
 from pathlib import Path
 from typing import Any, Final
@@ -24,6 +25,9 @@ SLOW_CLIENT: Final = "client too slow"
 
 _NO_FRAMES_S: Final = 2.0
 """How long a client waits for frames before it gets No Data, if it is unknown whether a measurement runs."""
+
+_END_S: Final = 0.1
+"""How long no frame must have come before a measurement ends."""
 
 _log = logging.getLogger(__name__)
 
@@ -77,6 +81,8 @@ class LiveServer(RtServer):
         self._control = control
         self._events = EventLog(_log, f"{state.source} to rtc3d")
         self._giving_up: asyncio.TimerHandle | None = None  # waits for frames, before No Data
+        self._ending: asyncio.TimerHandle | None = None  # waits for the last frames, before No Data
+        self._last_frame_s = -math.inf
         self._num_counted: dict[ClientConnection, int] = {}  # dropped frames that are in the losses
         self.disk = WorkerThread(f"{state.source} files")
         """Reads C3D files."""
@@ -89,6 +95,7 @@ class LiveServer(RtServer):
             return
         self.apply_parameters()
         self._stop_waiting()
+        self._last_frame_s = asyncio.get_running_loop().time()
         elapsed_us = self.elapsed_us()
         if elapsed_us is None:
             self.start_measurement()
@@ -98,11 +105,24 @@ class LiveServer(RtServer):
             self.check_wanted()
 
     def apply_state(self) -> None:
-        """End the measurement if the source has ended it, or has no frames any more."""
+        """End the measurement if the source has no frames any more.
+
+        Frames of a backlog may still come, so it ends when none has come for a moment.
+        """
         state = self._state
-        if state.has_no_measurement or not (state.is_streaming or self._giving_up is not None):
+        is_waiting = self._giving_up is not None and not state.has_no_measurement
+        if self.elapsed_us() is None or state.is_streaming or is_waiting:
+            return
+        loop = asyncio.get_running_loop()
+        if loop.time() - self._last_frame_s >= _END_S:
             self._stop_waiting()
             self.stop_measurement()
+        elif self._ending is None:
+            self._ending = loop.call_later(_END_S, self._end)
+
+    def _end(self) -> None:
+        self._ending = None
+        self.apply_state()
 
     def apply_parameters(self) -> None:
         """Serve the newest parameters of the source."""
@@ -145,6 +165,8 @@ class LiveServer(RtServer):
     async def close(self) -> None:
         """See RtServer."""
         self._stop_waiting()
+        if self._ending is not None:
+            self._ending.cancel()
         await super().close()
         self.check_wanted()
 

@@ -44,8 +44,11 @@ def event(number: int, timestamp_us: int, event_id: int) -> bytes:
 class LiveSource:
     """A live source with clients; time passes only by ``wait``."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, is_new: bool = False) -> None:
+        """With ``is_new``, nothing is known of its streams, so frames wait at first."""
         self.scene = LiveScene("lab")
+        if not is_new:
+            self.scene._arrivals.began_us = -1_000_000_000
         self.now_us = 0
         self._clients: list[LiveClient] = []
         self.scene.start()
@@ -116,4 +119,3 @@ class LiveClient:
     def numbers(self) -> list[list[int]]:
         """Return the frame numbers of the components of each of these frames."""
         return [[each.frame_number for each in frame] for frame in self.take()]
-

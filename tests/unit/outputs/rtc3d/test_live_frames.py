@@ -153,20 +153,12 @@ def test_no_event_is_lost_at_a_low_rate() -> None:
     frames = client.take()
     assert [frame[0].frame_number for frame in frames] == [1, 5, 9]
     events = [each for frame in frames for each in frame if each.type == EVENT]
-    assert [each.items[0][0] for each in events] == list(range(1, 10))
-    assert [each.frame_number for each in events] == list(range(1, 10))
-
-
-def test_many_events_become_one_component() -> None:
-    source = LiveSource()
-    client = source.client()
-    client.send("StreamFrames FrequencyDivisor:50 3D Events")
-    for number in range(1, 52):
-        source.arrive(body(markers(number, 10_000 * number), event(number, 10_000 * number, number)))
-    last = client.take()[-1]
-    assert [each.type for each in last] == [MARKERS, EVENT]
-    assert [item[0] for item in last[1].items] == list(range(2, 52))
-    assert last[1].frame_number == 51
+    assert [item[:2] for each in events for item in each.items] == [
+        (number, 10_000 * number) for number in range(1, 10)
+    ]
+    assert [(each.frame_number, each.timestamp_us) for each in events] == [
+        (1, 10_000), (5, 50_000), (9, 90_000),
+    ]  # fmt: skip
 
 
 def test_events_without_other_components_are_frames_of_their_own() -> None:
@@ -193,7 +185,8 @@ def test_events_in_frames_of_their_own_do_not_shift_a_divisor() -> None:
     assert [[each.frame_number for each in frame if each.type == MARKERS] for frame in frames] == [
         [1], [3], [5],
     ]  # fmt: skip
-    assert [each.items[0][0] for frame in frames for each in frame if each.type == EVENT] == [1, 2, 3, 4]
+    events = [each for frame in frames for each in frame if each.type == EVENT]
+    assert [item[0] for each in events for item in each.items] == [1, 2, 3, 4]
 
 
 # Several streams -----------------------------------------------------------------------------
@@ -240,29 +233,53 @@ def test_a_client_of_one_stream_gets_every_frame_of_it() -> None:
     assert client.numbers() == [[number] for number in range(10, 60)]
 
 
-def test_a_faster_stream_that_was_seen_first_waits_for_the_slower_one_that_is_announced() -> None:
-    source = LiveSource()
+def test_at_first_frames_wait_until_the_announced_components_are_known() -> None:
+    source = LiveSource(is_new=True)
     source.scene._announced_hz = {ComponentType.MARKERS: 100.0, ComponentType.ANALOG: 1000.0}
     client = source.client()
     client.send("StreamFrames 3D Analog")
     for step in range(5):
         source.arrive(body(analog(5 + step, 5000 + 1000 * step)), FAST)
         source.wait(1000)
+    assert client.take() == []
     play(source, 1, 3, fast_first=False)
     assert client.numbers() == [[1, 10], [2, 20], [3, 30]]
 
 
-def test_a_component_that_is_announced_and_never_comes_is_not_waited_for_long() -> None:
-    source = LiveSource()
+def test_at_first_frames_wait_until_the_rates_are_known() -> None:
+    source = LiveSource(is_new=True)
+    client = source.client()
+    client.send("StreamFrames 3D Analog")
+    play(source, 1, 20, fast_first=True)
+    assert client.numbers() == [[number, 10 * number] for number in range(1, 21)]
+
+
+def test_components_that_are_announced_and_never_come_are_not_waited_for_long() -> None:
+    source = LiveSource(is_new=True)
     source.scene._announced_hz = {ComponentType.MARKERS: 100.0, ComponentType.ANALOG: 1000.0}
     client = source.client()
     client.send("StreamFrames 3D Analog")
-    for step in range(1200):
+    for step in range(250):
         source.arrive(body(analog(step, 1000 * step)), FAST)
         source.wait(1000)
-    numbers = client.numbers()
-    assert numbers[-1] == [1199]
-    assert len(numbers) == 1199 - 1000
+    assert client.take() == []
+    source.wait(50_000)
+    assert client.numbers() == [[step] for step in range(250)]
+
+
+def test_a_client_that_asks_between_two_samples_gets_complete_frames_only() -> None:
+    source = LiveSource()
+    play(source, 1, 3, fast_first=True)
+    source.scene.forget_frames()
+    client = source.client()
+    source.arrive(body(analog(40, 40_000)), FAST)
+    source.scene.forget_frames()
+    client.send("StreamFrames 3D Analog")
+    source.arrive(body(markers(4, 40_000)))
+    for step in range(1, 10):
+        source.arrive(body(analog(40 + step, 40_000 + 1000 * step)), FAST)
+    play(source, 5, 6, fast_first=True)
+    assert client.numbers() == [[5, 50], [6, 60]]
 
 
 def test_a_frame_waits_for_the_faster_stream_and_not_for_ever() -> None:
@@ -336,4 +353,3 @@ def test_little_is_kept_of_large_frames() -> None:
         source.arrive(large)
         client.bodies.clear()
     assert sum(arrival.num_bytes for arrival in source.scene._arrivals.frames.since(0)) < 10_000_000
-
