@@ -196,9 +196,10 @@ class ClientConnection(asyncio.Protocol):
         return self.session.answer(packet)
 
     def send_due_frames(self, elapsed_us: int) -> None:
-        """Send the frames that are due, or drop them if the client does not read or is leaving."""
+        """Send the frames that are due, or drop them if the client does not read."""
         if not self._can_send():
-            self.session.drop_due_frames(elapsed_us)
+            if not self.transport.is_closing():
+                self.session.drop_due_frames(elapsed_us)
             return
         for packet, components in self.session.due_frames(elapsed_us):
             self.send(packet)

@@ -20,7 +20,7 @@ from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredCon
 from gateway.rtc3d_server.server import RtServer
 from gateway.worker_thread import WorkerThread
 
-SLOW_CLIENT: Final = "client too slow"
+SLOW_CLIENT: Final = "slow client"
 """The cause of frames that a client did not get because it does not read fast enough."""
 
 _NO_FRAMES_S: Final = 2.0

@@ -256,7 +256,8 @@ class Rtc3dOutput(Output):
                 try:
                     await server.listen()
                 except Exception as error:  # noqa: BLE001 - the next try may succeed
-                    served.problem = str(error) if isinstance(error, GatewayError) else defect_text(error)
+                    reason = str(error) if isinstance(error, GatewayError) else defect_text(error)
+                    served.problem = f"RTC3D clients cannot connect: {reason}"
                     failures.failed(served.problem)
                     await asyncio.sleep(delay_s)
                     delay_s = min(2 * delay_s, _MAX_RETRY_S)

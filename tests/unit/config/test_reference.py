@@ -19,6 +19,7 @@ from gateway.config.settings import (
 from gateway.config.transform import RollPitchYaw, TransformSettings
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -37,6 +38,7 @@ SECTIONS: dict[str, type[Section]] = {
     "takes": TakesSettings,
     "vrpn": VrpnSettings,
     "foxglove": FoxgloveSettings,
+    "rtc3d": Rtc3dSettings,
     "spool": SpoolSettings,
     "metrics": MetricsSettings,
 }

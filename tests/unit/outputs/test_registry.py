@@ -5,6 +5,7 @@ from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.registry import OUTPUTS, build_outputs
+from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.zenoh.output import ZenohOutput
@@ -23,6 +24,7 @@ def test_every_output_has_its_section() -> None:
         "takes": TakesSettings,
         "vrpn": VrpnSettings,
         "foxglove": FoxgloveSettings,
+        "rtc3d": Rtc3dSettings,
     }
     assert list(OUTPUTS) == list(settings.outputs)
 
