@@ -57,6 +57,19 @@ class RawClient:
         async with asyncio.timeout(TIMEOUT_S):
             return await self.reader.read()
 
+    async def ask_while_streaming(self, text: str) -> bytes:
+        """Return the body of the reply to a command; discard the frames before it."""
+        self.send(command(text))
+        return (await self.reply())[1]
+
+    def pause(self) -> None:
+        """Read nothing more from the socket."""
+        self.writer.transport.pause_reading()  # type: ignore[attr-defined] # a StreamWriter's is a Transport
+
+    def resume(self) -> None:
+        """Read again."""
+        self.writer.transport.resume_reading()  # type: ignore[attr-defined] # as above
+
     def segments_received(self) -> int:
         """Return the number of TCP segments with data; at least one for each send, because Nagle is off."""
         data_segs_in = 152  # in struct tcp_info of linux/tcp.h

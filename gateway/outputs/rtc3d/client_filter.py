@@ -11,7 +11,7 @@ from typing import Any, BinaryIO, Final, Protocol
 from gateway.errors import CommandError, FrameError, QueryError
 from gateway.log import DefectLog
 from gateway.rtc3d import commands
-from gateway.rtc3d.packets import PACKET_HEADER, PACKET_HEADER_BYTES, Packet, PacketType
+from gateway.rtc3d.packets import PACKET_HEADER, PACKET_HEADER_BYTES, Packet, PacketType, decode_text
 from gateway.rtc3d_server.client_session import error_packet, recording_switch
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
 from gateway.worker_thread import WorkerThread
@@ -30,6 +30,8 @@ _MAX_FILES: Final = 4
 
 _MAX_HELD_PACKETS: Final = 16  # replies and No Data while a file is sent
 
+_LONGEST_NAME: Final = 32  # of a command, in bytes
+
 _KEEPALIVE: Final = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}  # in s, in s, probes
 
 _log = logging.getLogger(__name__)
@@ -43,6 +45,13 @@ class FilterOwner(Protocol):
 
     disk: WorkerThread
     """Reads C3D files."""
+
+    @property
+    def is_known(self) -> bool:
+        """Whether anything is known of the source."""
+
+    async def wait_until_known(self) -> None:
+        """Wait until ``is_known``, but not for long."""
 
     def apply_parameters(self) -> None:
         """Serve the newest parameters of the source."""
@@ -77,13 +86,21 @@ class ClientFilter(ConnectionFilter):
             self._held.append(packet)
 
     def answer(self, packet: Packet) -> list[bytes]:
-        """Return the replies to a packet; those to the control of a recording come later."""
+        """Return the replies to a packet.
+
+        Those to the control of a recording come later, and so do the parameters while the gateway connects.
+        """
         control = recording_control(packet)
         if control is not None:
             self._greet()
-            self.connection.hold_commands()
-            self._start(self._control(packet, control))
+            self._hold(self._control(packet, control))
             return []
+        if not self._owner.is_known and asks_for_parameters(packet):
+            self._hold(self._answer_when_known(packet))
+            return []
+        return self._answer_now(packet)
+
+    def _answer_now(self, packet: Packet) -> list[bytes]:
         self._owner.apply_parameters()
         replies = self.connection.answer(packet)
         if not self.has_greeted and any(reply[7] != PacketType.ERROR for reply in replies):
@@ -112,22 +129,33 @@ class ClientFilter(ConnectionFilter):
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
+    def _hold(self, work: Coroutine[Any, Any, list[bytes]]) -> None:
+        """Answer no further packet until this work is done, and has returned the replies to this one."""
+        self.connection.hold_commands()
+        self._start(self._send_result(work))
+
+    async def _send_result(self, work: Coroutine[Any, Any, list[bytes]]) -> None:
+        for reply in await work:
+            self.send(reply)
+        self.connection.continue_commands()
+
+    async def _answer_when_known(self, packet: Packet) -> list[bytes]:
+        await self._owner.wait_until_known()
+        return self._answer_now(packet)
+
     # Recordings -----------------------------------------------------------------------------
 
-    async def _control(self, packet: Packet, control: commands.ControlRecording) -> None:
+    async def _control(self, packet: Packet, control: commands.ControlRecording) -> list[bytes]:
         try:
             async with asyncio.timeout(_CONTROL_S):
                 await self._owner.control_recording(start=control.start, name=recording_name(control.options))
-            replies = self.connection.answer(packet)
+            return self.connection.answer(packet)
         except (QueryError, TimeoutError) as error:
             text = str(error) or f"no answer within {_CONTROL_S:g} s"
-            replies = [error_packet(f"The recording was not {_done(control)}: {text}")]
         except Exception as defect:  # noqa: BLE001 - a defect in the gateway must not stop the client
             self._defects.log(defect)
-            replies = [error_packet(f"The recording was not {_done(control)}: a defect in the gateway")]
-        for reply in replies:
-            self.send(reply)
-        self.connection.continue_commands()
+            text = "a defect in the gateway"
+        return [error_packet(f"The recording was not {_done(control)}: {text}")]
 
     # Files ----------------------------------------------------------------------------------
 
@@ -193,6 +221,12 @@ def recording_control(packet: Packet) -> commands.ControlRecording | None:
     except (CommandError, FrameError):
         pass  # the session refuses it in its own words
     return None
+
+
+def asks_for_parameters(packet: Packet) -> bool:
+    """Return whether a packet is SendParameters."""
+    words = decode_text(packet.body[:_LONGEST_NAME]).split() if packet.type == PacketType.COMMAND else []
+    return bool(words) and words[0].lower() == "sendparameters"
 
 
 def recording_name(options: str) -> str:

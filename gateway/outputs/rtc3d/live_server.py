@@ -1,6 +1,7 @@
 """The RT server of one live source. It runs in the event loop of the output's thread."""
 
 import asyncio
+import contextlib
 import logging
 import math
 from collections.abc import Callable, Coroutine
@@ -25,6 +26,9 @@ SLOW_CLIENT: Final = "slow client"
 
 _NO_FRAMES_S: Final = 2.0
 """How long a client waits for frames before it gets No Data, if it is unknown whether a measurement runs."""
+
+_PARAMETERS_S: Final = 1.0
+"""How long a client waits for the parameters while the gateway is connecting to the server."""
 
 _END_S: Final = 0.1
 """How long no frame must have come before a measurement ends."""
@@ -83,6 +87,7 @@ class LiveServer(RtServer):
         self._giving_up: asyncio.TimerHandle | None = None  # waits for frames, before No Data
         self._ending: asyncio.TimerHandle | None = None  # waits for the last frames, before No Data
         self._last_frame_s = -math.inf
+        self._heard = asyncio.Event()  # set once anything is known of the source
         self._num_counted: dict[ClientConnection, int] = {}  # dropped frames that are in the losses
         self.disk = WorkerThread(f"{state.source} files")
         """Reads C3D files."""
@@ -105,11 +110,14 @@ class LiveServer(RtServer):
             self.check_wanted()
 
     def apply_state(self) -> None:
-        """End the measurement if the source has no frames any more.
+        """Serve the newest parameters, and end the measurement if the source has no frames any more.
 
         Frames of a backlog may still come, so it ends when none has come for a moment.
         """
+        self.apply_parameters()
         state = self._state
+        if self.is_known:
+            self._heard.set()
         is_waiting = self._giving_up is not None and not state.has_no_measurement
         if self.elapsed_us() is None or state.is_streaming or is_waiting:
             return
@@ -130,6 +138,18 @@ class LiveServer(RtServer):
         if parameters is not self._applied_parameters:
             self._applied_parameters = parameters
             self._live_scene.set_parameters(parameters.xml, parameters.parsed)
+
+    @property
+    def is_known(self) -> bool:
+        """Whether anything is known of the source: parameters, frames, or that it has none."""
+        state = self._state
+        return state.parameters.version > 0 or state.is_streaming or state.is_measuring is not None
+
+    async def wait_until_known(self) -> None:
+        """Wait until ``is_known``, but not for long."""
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_PARAMETERS_S):
+                await self._heard.wait()
 
     def send_file(self, path: Path) -> None:
         """Send a C3D file to every client that has sent a command."""

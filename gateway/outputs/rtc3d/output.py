@@ -165,6 +165,7 @@ class Rtc3dOutput(Output):
     def publish_parameters(self, source: str, parameters: ServerParameters) -> None:
         """Serve these parameters to clients that ask for them."""
         self._state(source).parameters = parameters
+        self._call(self._maintain)
 
     def announce_file(self, source: str, file: ServerFile) -> None:
         """Pass a C3D file on to the clients."""

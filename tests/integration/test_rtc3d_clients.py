@@ -1,0 +1,406 @@
+"""RTC3D clients of a gateway: what they get, and what happens when something goes wrong."""
+
+import asyncio
+import logging
+import struct
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
+from gateway.outputs.contract import ServerFile
+from gateway.outputs.rtc3d import client_filter
+from gateway.outputs.rtc3d.live_server import SLOW_CLIENT
+from gateway.outputs.rtc3d.output import Rtc3dOutput
+from gateway.outputs.rtc3d.settings import Rtc3dSettings
+from gateway.rtc3d.parameters import Parameters
+from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.simulator.faults.server_faults import Rename
+from gateway.simulator.simulator import Simulator
+from gateway.simulator.synthetic import SyntheticScene
+from gateway.stream.state import StreamState
+from tests.integration.raw_client import TIMEOUT_S, connected, consecutive, numbers, until
+from tests.networks import free_port
+from tests.serving_gateway import ServingGateway, serving_gateway
+from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.unit.rtc3d_server.wire import (
+    COMMAND,
+    DATA,
+    ERROR,
+    EVENT,
+    NO_DATA,
+    XML,
+    command,
+    components_in,
+    packet,
+    packets_in,
+)
+
+C3D = 5
+START = struct.pack(">IIIiqI", 1, 48, EVENT, -1, 0, 1) + struct.pack(">iqiii", 1, 0, -1, -1, -1)
+STOP = struct.pack(">IIIiqI", 1, 48, EVENT, -1, 0, 1) + struct.pack(">iqiii", 0, 0, -1, -1, -1)
+
+
+@asynccontextmanager
+async def playing(scene: Any = None, **settings: Any) -> AsyncIterator[tuple[Simulator, ServingGateway]]:
+    """Run a simulator and a gateway in front of it."""
+    async with (
+        Simulator(scene or CountingScene()) as simulator,
+        serving_gateway(simulator, **settings) as gateway,
+    ):
+        yield simulator, gateway
+
+
+# Parameters ---------------------------------------------------------------------------------
+
+
+async def test_the_parameters_are_the_servers_own() -> None:
+    async with playing(SyntheticScene(rate_hz=100)) as (_, gateway), connected(gateway) as client:
+        xml = gateway.source.known_parameters.xml
+        assert await client.ask("SendParameters") == (XML, xml)
+        assert await client.ask("SendParameters All General") == (XML, xml)
+        packet_type, part = await client.ask("SendParameters 3D Events")
+    assert packet_type == XML
+    whole, cut = parse_parameters(xml).parameters, parse_parameters(part).parameters
+    assert cut == Parameters(markers=whole.markers, events=whole.events)
+
+
+async def test_clients_get_changed_parameters() -> None:
+    async with playing(parameters_interval_s=0.1) as (simulator, gateway), connected(gateway) as client:
+        assert b"<Label>m1</Label>" in (await client.ask("SendParameters 3D"))[1]
+        simulator.faults.begin(Rename(prefix="old "))
+        async with asyncio.timeout(TIMEOUT_S):
+            while b"<Label>m1</Label>" in (await client.ask("SendParameters 3D"))[1]:
+                pass
+
+
+async def test_a_client_that_comes_before_the_server_is_known_waits_for_the_parameters() -> None:
+    async with (
+        Simulator(CountingScene()) as simulator,
+        serving_gateway(simulator, is_streaming=False) as gateway,
+        connected(gateway) as client,
+    ):
+        assert (await client.ask("SendParameters"))[0] == XML
+
+
+async def test_without_parameters_a_client_gets_an_error_in_plain_words() -> None:
+    async with serving_gateway(Nothing(), is_streaming=False) as gateway, connected(gateway) as client:
+        reply = await client.ask("SendParameters")
+        assert reply == (ERROR, b"Error-The server of source lab has given no parameters")
+        assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
+
+
+class Nothing:
+    """An address where nothing listens."""
+
+    host = "127.0.0.1"
+
+    def __init__(self) -> None:
+        self.port = free_port()
+
+
+# No measurement, no connection --------------------------------------------------------------
+
+
+async def test_without_a_server_clients_get_no_data_and_frames_as_soon_as_it_is_there() -> None:
+    nothing = Nothing()
+    async with serving_gateway(nothing, is_streaming=False) as gateway, connected(gateway) as client:
+        assert await client.ask("StreamFrames 3D") == (COMMAND, b"OK-StreamFrames 3D")
+        assert await client.read() == (NO_DATA, b"")
+        async with Simulator(CountingScene(), port=nothing.port):
+            assert consecutive(await client.frames(10))
+
+
+async def test_clients_stay_connected_while_the_server_restarts() -> None:
+    async with playing() as (simulator, gateway), connected(gateway) as client:
+        await client.ask("StreamFrames 3D")
+        await client.frames(5)
+        simulator.crash()
+        assert await client.reply() == (NO_DATA, b"")
+        await simulator.start()
+        assert consecutive(await client.frames(10))
+
+
+async def test_time_stamps_that_start_again_do_not_disturb_the_stream() -> None:
+    async with playing() as (simulator, gateway), connected(gateway) as client:
+        await client.ask("StreamFrames 3D Analog")
+        await client.frames(5)
+        simulator.stop_measurement()
+        simulator.start_measurement()
+        frames = await client.frames(60)
+    first = numbers(frames).index(1)
+    assert consecutive(frames[first:])
+    for markers, analog in frames[first + 1 :]:
+        assert analog.frame_number == 10 * markers.frame_number - 9
+
+
+# On demand ----------------------------------------------------------------------------------
+
+
+async def test_the_server_sends_frames_only_while_a_client_asks_for_some() -> None:
+    streams = (StreamSettings(on_demand=True, idle_after_s=0.1),)
+    async with playing(streams=streams) as (_, gateway):
+        [status] = gateway.source.statuses
+        await until(lambda: status.state is StreamState.IDLE)
+        async with connected(gateway) as client:
+            await client.ask("Version 1.0")
+            await client.ask("StreamFrames 3D")
+            assert consecutive(await client.frames(30))
+            assert await client.ask_while_streaming("StreamFrames Stop") == b"OK-StreamFrames Stop"
+            await until(lambda: status.state is StreamState.IDLE)
+            frames = []
+            for _ in range(3):
+                assert await client.ask("SendCurrentFrame 3D") == (COMMAND, b"OK-SendCurrentFrame 3D")
+                frames += await client.frames(1)
+            assert numbers(frames) == sorted(set(numbers(frames)))
+            await until(lambda: status.state is StreamState.IDLE)
+
+
+async def test_frames_that_nobody_asks_for_are_not_counted_as_sent() -> None:
+    async with playing() as (_, gateway), connected(gateway) as client:
+        [(_, status)] = gateway.source.fan_out.outputs
+        assert not status.messages
+        await client.ask("StreamFrames 3D")
+        await client.frames(10)
+        [(_, status)] = gateway.source.fan_out.outputs
+        assert status.messages["frame"] >= 10
+
+
+async def test_a_hundred_clients_share_one_session_with_the_server() -> None:
+    async with playing() as (simulator, gateway):
+        num_connections = len(simulator.connections)
+
+        async def play(number: int) -> bool:
+            async with connected(gateway) as client:
+                await client.ask(f"StreamFrames {('3D', '6D', 'All')[number % 3]}")
+                frames = await client.frames(20)
+                return consecutive(frames)
+
+        assert all(await asyncio.gather(*(play(number) for number in range(100))))
+        assert len(simulator.connections) == num_connections
+        assert simulator._num_accepted == num_connections
+
+
+# Recordings ---------------------------------------------------------------------------------
+
+
+def is_recording(simulator: Simulator) -> bool:
+    return any(connection.session.is_recording for connection in simulator.connections)
+
+
+async def test_recordings_are_refused_in_plain_words_without_remote_control() -> None:
+    async with playing() as (simulator, gateway), connected(gateway) as client:
+        for sent in (
+            packet(DATA, START),
+            command("Recording Start,file=walk.c3d"),
+            command("Recording Stop"),
+        ):
+            client.send(sent)
+            packet_type, text = await client.read()
+            assert packet_type == ERROR
+            assert b"remote control is off for source 'lab'; to switch it on" in text
+        assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
+        assert not is_recording(simulator)
+
+
+async def test_recordings_are_passed_on_to_the_server_with_remote_control() -> None:
+    async with playing(remote_control=True) as (simulator, gateway), connected(gateway) as client:
+        client.send(packet(DATA, START))
+        assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
+        assert is_recording(simulator)
+        client.send(packet(DATA, STOP + b"\n"))
+        assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
+        assert not is_recording(simulator)
+        start = "Recording Start,file=walk.c3d"
+        assert await client.ask(start) == (COMMAND, f"OK-{start}".encode())
+        assert is_recording(simulator)
+        assert await client.ask("Recording Stop") == (COMMAND, b"OK-Recording Stop")
+        assert not is_recording(simulator)
+
+
+# Files --------------------------------------------------------------------------------------
+
+
+async def test_a_file_of_the_server_is_passed_on_whole_between_frames(tmp_path: Path) -> None:
+    content = bytes(range(256)) * 40_000  # longer than what waits in memory
+    path = tmp_path / "walk.c3d"
+    path.write_bytes(content)
+    async with (
+        playing() as (_, gateway),
+        connected(gateway) as client,
+        connected(gateway) as half_open,
+    ):
+        await client.ask("StreamFrames All")
+        await client.frames(3)
+        gateway.gateway._announce_file("lab", ServerFile(path, len(content)))
+        received = [await client.read()]
+        while received[-1][0] == DATA:
+            received.append(await client.read())
+        assert received[-1] == (C3D, content)
+        events = [each for _, body in received[:-1] for each in events_in(body)]
+        for _ in range(30):
+            packet_type, body = await client.read()
+            assert packet_type == DATA
+            events += events_in(body)
+        assert events == list(range(events[0], events[0] + len(events)))
+        half_open.send(command("Version 1.0"))
+        assert await half_open.read() == (COMMAND, b"OK-Version 1.0")  # and no file before it
+
+
+def events_in(body: bytes) -> list[int]:
+    return [int(item[0]) for each in components_in(body) if each.type == EVENT for item in each.items]
+
+
+async def test_a_file_that_is_gone_is_left_out(tmp_path: Path) -> None:
+    async with playing() as (_, gateway), connected(gateway) as client:
+        await client.ask("StreamFrames 3D")
+        gateway.gateway._announce_file("lab", ServerFile(tmp_path / "gone.c3d", 1000))
+        assert consecutive(await client.frames(30))
+
+
+# Limits -------------------------------------------------------------------------------------
+
+
+async def test_a_slow_client_loses_only_its_own_frames_and_no_event(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.WARNING)
+    scene = CountingScene(300.0, num_markers=3000)
+    async with playing(scene) as (_, gateway), connected(gateway) as slow, connected(gateway) as other:
+        slow.pause()
+        slow.send(command("StreamFrames 3D Events"))
+        await other.ask("StreamFrames 6D")
+        while "does not read" not in caplog.text:
+            assert consecutive(await other.frames(20))
+        [losses] = [status.losses for _, status in gateway.source.fan_out.outputs]
+        while not losses:
+            await other.frames(20)
+            [losses] = [status.losses for _, status in gateway.source.fan_out.outputs]
+        assert {loss.cause for loss in losses} == {SLOW_CLIENT}
+
+        slow.resume()
+        assert (await slow.read())[0] == COMMAND
+        events: list[int] = []
+        previous = 0
+        has_gap = False
+        while not has_gap or len(events) < 5:
+            packet_type, body = await slow.read()
+            assert packet_type == DATA
+            events += events_in(body)
+            number = struct.unpack_from(">i", body, 12)[0]
+            has_gap = has_gap or bool(previous and number > previous + 1)
+            previous = number
+        assert events == list(range(events[0], events[0] + len(events)))
+    assert caplog.text.count("does not read") == 1
+
+
+async def test_clients_that_are_too_many_are_turned_away() -> None:
+    async with playing(rtc3d={"max_clients": 2}) as (_, gateway):
+        async with connected(gateway) as first, connected(gateway) as second:
+            for client in (first, second):
+                await client.ask("StreamFrames 3D")
+            async with connected(gateway) as third:
+                [(packet_type, text)] = packets_in(await third.rest())
+                assert packet_type == ERROR
+                assert text == b"Error-This gateway serves 2 clients at most; closing"
+            assert consecutive(await first.frames(10))
+        await until(lambda: not gateway.server.connections)
+        async with connected(gateway) as client:
+            assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
+
+
+async def test_a_client_without_a_command_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client_filter, "FIRST_COMMAND_S", 0.05)
+    async with playing() as (_, gateway), connected(gateway) as good:
+        await good.ask("Version 1.0")
+        async with connected(gateway) as silent, connected(gateway) as wrong:
+            wrong.send(command("Fly"))
+            assert packets_in(await silent.rest()) == [(ERROR, b"Error-No command within 0.05 s; closing")]
+            assert [each[0] for each in packets_in(await wrong.rest())] == [ERROR, ERROR]
+        assert await good.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
+
+
+@pytest.mark.parametrize("sent", [b"GET / HTTP/1.1\r\n\r\n", b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"])
+async def test_a_client_of_another_protocol_is_disconnected(sent: bytes) -> None:
+    async with playing() as (_, gateway), connected(gateway) as client:
+        client.send(sent)
+        [(packet_type, text)] = packets_in(await client.rest())
+        assert packet_type == ERROR
+        assert b"out of bounds" in text
+
+
+async def test_a_flood_of_commands_is_answered_in_order_and_delays_nobody() -> None:
+    async with playing() as (_, gateway), connected(gateway) as flooding, connected(gateway) as other:
+        flooding.send(command("Version 1.0") * 3000)
+        await other.ask("StreamFrames 3D")
+        assert consecutive(await other.frames(30))
+        [connection] = [each for each in gateway.server.connections if each._inbox]
+        assert len(connection._inbox) <= 20_000
+        for _ in range(3000):
+            assert await flooding.read() == (COMMAND, b"OK-Version 1.0")
+
+
+# Ports and reloads --------------------------------------------------------------------------
+
+
+async def test_a_port_in_use_is_a_problem_until_it_is_free() -> None:
+    async with Simulator(CountingScene()) as simulator:
+        occupant = await asyncio.start_server(lambda *_: None, "127.0.0.1", 0)
+        port = occupant.sockets[0].getsockname()[1]
+        output = Rtc3dOutput(Rtc3dSettings(enabled=True, ports={"lab": port}))
+        output.watch_wanted("lab", lambda: None)
+        output.announce("lab")
+        output.start()
+        await until(lambda: f"port {port}" in output.health().problem and "cannot" in output.health().problem)
+        assert "choose an address of this machine and a free port" in output.health().problem
+        occupant.close()
+        await occupant.wait_closed()
+        await until(lambda: output.health().connected)
+        await asyncio.to_thread(output.close)
+        assert simulator.is_listening
+
+
+def source(name: str, server: Simulator) -> SourceSettings:
+    reconnect = ReconnectSettings(first_delay_s=0.01, max_delay_s=0.05)
+    return SourceSettings(name=name, host="127.0.0.1", port=server.port, reconnect=reconnect)
+
+
+async def test_a_reload_opens_and_closes_ports_and_the_other_clients_stay() -> None:
+    async with playing() as (simulator, gateway), Simulator(CountingScene()) as second:
+        await gateway.gateway.opened.wait()
+        async with connected(gateway) as client:
+            await client.ask("StreamFrames 3D")
+            hall = free_port()
+            await reload(gateway, {"lab": gateway.port, "hall": hall}, lab=simulator, hall=second)
+            async with connected(At(hall)) as other:
+                await other.ask("StreamFrames 3D")
+                assert consecutive(await other.frames(10))
+                await reload(gateway, {"lab": gateway.port}, lab=simulator, hall=second)
+                await other.rest()
+            await reload(gateway, {"lab": gateway.port}, lab=simulator)
+            assert consecutive(await client.frames(100))
+            await reload(gateway, {"lab": hall}, lab=simulator)
+            await client.rest()
+        async with connected(At(hall)) as client:
+            await client.ask("StreamFrames 3D")
+            assert consecutive(await client.frames(10))
+
+
+class At:
+    def __init__(self, port: int) -> None:
+        self.port = port
+
+
+async def reload(gateway: ServingGateway, ports: dict[str, int], **servers: Simulator) -> None:
+    """Reload with these sources and ports, as a configuration file would; wait until the ports are open."""
+    settings = gateway.gateway.settings.model_copy(
+        update={"sources": tuple(source(name, server) for name, server in servers.items())}
+    )
+    new = Rtc3dOutput(Rtc3dSettings(enabled=True, ports=ports))
+    gateway.gateway._given_outputs = [new]
+    await gateway.gateway.reload(settings)
+    assert gateway.gateway.outputs == [gateway.output]
+    await until(lambda: gateway.output.health().connected)
