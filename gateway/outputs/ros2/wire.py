@@ -1,0 +1,86 @@
+"""The wire format of rmw_zenoh: keys of data, liveliness tokens, attachments, quality of service.
+
+From the design document of rmw_zenoh (ros2/rmw_zenoh, docs/design.md) and its sources. The tokens make nodes
+and publishers visible: ``ros2 topic list`` shows what they say. ROS drops a message without an attachment.
+"""
+
+import hashlib
+import struct
+from typing import Final, NamedTuple
+
+from gateway.outputs.ros2.message_types import RosType
+
+_ADMIN_SPACE: Final = "@ros2_lv"
+_NODE: Final = "NN"
+_PUBLISHER: Final = "MP"
+_NO_ENCLAVE: Final = "%"
+
+NODE_ID: Final = 0
+"""The id of the gateway's node in its session. It has only one."""
+
+_GID_BYTES: Final = 16
+_ATTACHMENT: Final = struct.Struct(f"<qqB{_GID_BYTES}s")
+
+
+class QoS(NamedTuple):
+    """The quality of service of a publisher. All are volatile and keep the last ``depth`` messages."""
+
+    is_reliable: bool
+    depth: int
+
+    @property
+    def code(self) -> str:
+        """The text in tokens. An empty field stands for the default of ROS: here reliable and volatile.
+
+        The fields are reliability, durability, history and depth, deadline, lifespan and liveliness.
+        """
+        best_effort = "2"
+        return f"{'' if self.is_reliable else best_effort}::,{self.depth}:,:,:,,"
+
+
+class Node(NamedTuple):
+    """A node: its domain, the id of its Zenoh session, its namespace ("" or such as "mocap") and its name."""
+
+    domain_id: int
+    session_id: str
+    namespace: str
+    name: str
+
+    @property
+    def token(self) -> str:
+        """The key of its liveliness token."""
+        return "/".join((self._prefix(NODE_ID, _NODE), self.name))
+
+    def publisher_token(self, entity_id: int, topic: str, ros_type: RosType, type_hash: str, qos: QoS) -> str:
+        """Return the key of the liveliness token of a publisher. ``topic`` begins with a slash."""
+        prefix = self._prefix(entity_id, _PUBLISHER)
+        return "/".join((prefix, self.name, _mangled(topic), ros_type.dds_name, type_hash, qos.code))
+
+    def _prefix(self, entity_id: int, kind: str) -> str:
+        ids = f"{self.domain_id}/{self.session_id}/{NODE_ID}/{entity_id}"
+        return f"{_ADMIN_SPACE}/{ids}/{kind}/{_NO_ENCLAVE}/{_mangled(f'/{self.namespace}')}"
+
+
+def data_key(domain_id: int, topic: str, ros_type: RosType, type_hash: str) -> str:
+    """Return the key of a topic's messages. ``topic`` begins with a slash."""
+    return f"{domain_id}{topic}/{ros_type.dds_name}/{type_hash}"
+
+
+def gid_of(token: str) -> bytes:
+    """Return the global id of the publisher with this token. ROS needs it to differ from all others.
+
+    rmw_zenoh_cpp uses another hash (XXH3), but compares the id with nothing.
+    """
+    return hashlib.blake2b(token.encode(), digest_size=_GID_BYTES).digest()
+
+
+def attachment(sequence: int, source_time_ns: int, gid: bytes) -> bytes:
+    """Return the attachment of a message: ``sequence`` counts those of its publisher from 1.
+
+    ``source_time_ns`` is when it was published, in ns since the Unix epoch.
+    """
+    return _ATTACHMENT.pack(sequence, source_time_ns, _GID_BYTES, gid)
+
+
+def _mangled(name: str) -> str:
+    return name.replace("/", "%")

@@ -1,0 +1,59 @@
+"""Keys, tokens and attachments: those in the design document of rmw_zenoh, and hashes from rosbags."""
+
+import pytest
+from rosbags.typesys import Stores, get_typestore
+
+from gateway.outputs.ros2.message_types import HUMBLE, POSE_STAMPED, ROS_TYPES, TF_MESSAGE, RosType
+from gateway.outputs.ros2.wire import Node, QoS, attachment, data_key, gid_of
+
+STRING = RosType(
+    "std_msgs/msg/String", "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
+)
+SESSION = "8b20917502ee955ac4476e0266340d5c"
+
+
+def test_keys_of_the_design_document() -> None:
+    end = "chatter/std_msgs::msg::dds_::String_/" + STRING.type_hash
+    assert data_key(0, "/chatter", STRING, STRING.type_hash) == f"0/{end}"
+    assert data_key(0, "/robot1/chatter", STRING, STRING.type_hash) == f"0/robot1/{end}"
+
+
+def test_tokens_of_the_design_document() -> None:
+    node = Node(2, SESSION, "", "talker")
+    assert node.token == f"@ros2_lv/2/{SESSION}/0/0/NN/%/%/talker"
+    assert node.publisher_token(10, "/chatter", STRING, STRING.type_hash, QoS(True, 7)) == (
+        f"@ros2_lv/2/{SESSION}/0/10/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/"
+        f"{STRING.type_hash}/::,7:,:,:,,"
+    )
+
+
+def test_tokens_in_a_namespace() -> None:
+    node = Node(0, SESSION, "site/mocap", "rtc3d_gateway")
+    assert node.token == f"@ros2_lv/0/{SESSION}/0/0/NN/%/%site%mocap/rtc3d_gateway"
+    token = node.publisher_token(1, "/tf", TF_MESSAGE, TF_MESSAGE.type_hash, QoS(False, 10))
+    assert token == (
+        f"@ros2_lv/0/{SESSION}/0/1/MP/%/%site%mocap/rtc3d_gateway/%tf/tf2_msgs::msg::dds_::TFMessage_/"
+        f"{TF_MESSAGE.type_hash}/2::,10:,:,:,,"
+    )
+
+
+def test_an_attachment_by_hand() -> None:
+    gid = bytes(range(16))
+    by_hand = bytes.fromhex("0100000000000000 e803000000000000 10 000102030405060708090a0b0c0d0e0f")
+    assert attachment(1, 1000, gid) == by_hand
+
+
+def test_the_gid_differs_for_each_token() -> None:
+    assert len({gid_of(token) for token in ("a", "b", "c")}) == 3
+    assert len(gid_of("a")) == 16
+
+
+@pytest.mark.parametrize("ros_type", ROS_TYPES, ids=lambda ros_type: ros_type.name)
+@pytest.mark.parametrize("store", [Stores.ROS2_JAZZY, Stores.ROS2_KILTED, Stores.ROS2_LYRICAL])
+def test_hashes_are_those_of_rosbags(ros_type: RosType, store: Stores) -> None:
+    assert get_typestore(store).hash_rihs01(ros_type.name) == ros_type.type_hash
+    assert ros_type.hash_in("jazzy") == ros_type.type_hash
+
+
+def test_humble_has_no_hashes() -> None:
+    assert POSE_STAMPED.hash_in(HUMBLE) == "TypeHashNotSupported"
