@@ -16,7 +16,7 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 # What a wheel is built from.
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-integration test-commands test-takes test-hostile test-browser test-others test-compiled check lint types contracts generated docs lcm-types examples samples screenshots fuzz soak stops \
+.PHONY: demo lock test test-integration test-commands test-takes test-hostile test-browser test-others test-compiled check lint types contracts generated docs lcm-types examples samples screenshots fuzz soak stops hiroz \
     mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
 
 demo: .venv/runtime
@@ -227,6 +227,12 @@ STOPS ?= 500
 
 stops: .venv/installed
 	tests/with-netns $(BIN)/python -m tests.stops --count $(STOPS)
+
+# Receive what the output ros2 publishes with the Rust crate hiroz, another implementation of rmw_zenoh. It needs cargo,
+# and six minutes for the first build. Not part of the check.
+hiroz: .venv/installed
+	cargo build --quiet --manifest-path tests/ros2_hiroz/Cargo.toml
+	tests/with-netns $(BIN)/python -m tests.ros2_hiroz
 
 # Mutation tests: thousands of small changes to the code, each of which some test should notice; hours for all
 # packages. PACKAGES="rtc3d stream publish outputs" are all there are. SAMPLE=300 runs 300 random mutants of each, and

@@ -7,13 +7,14 @@ from gateway.outputs.contract import Output
 from gateway.outputs.foxglove.kind import FOXGLOVE
 from gateway.outputs.kind import OutputKind
 from gateway.outputs.lcm.kind import LCM
+from gateway.outputs.ros2.kind import ROS2
 from gateway.outputs.rtc3d.kind import RTC3D
 from gateway.outputs.takes.kind import TAKES
 from gateway.outputs.vrpn.kind import VRPN
 from gateway.outputs.zenoh.kind import ZENOH
 
 OUTPUTS: Final[dict[str, OutputKind]] = {
-    kind.name: kind for kind in (ZENOH, LCM, TAKES, RTC3D, VRPN, FOXGLOVE)
+    kind.name: kind for kind in (ZENOH, LCM, TAKES, ROS2, RTC3D, VRPN, FOXGLOVE)
 }
 
 

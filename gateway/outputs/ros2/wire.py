@@ -61,6 +61,11 @@ class Node(NamedTuple):
         return f"{_ADMIN_SPACE}/{ids}/{kind}/{_NO_ENCLAVE}/{_mangled(f'/{self.namespace}')}"
 
 
+def node_tokens(domain_id: int) -> str:
+    """Return the key expression that matches the tokens of all nodes in a domain."""
+    return f"{_ADMIN_SPACE}/{domain_id}/*/*/*/{_NODE}/**"
+
+
 def data_key(domain_id: int, topic: str, ros_type: RosType, type_hash: str) -> str:
     """Return the key of a topic's messages. ``topic`` begins with a slash."""
     return f"{domain_id}{topic}/{ros_type.dds_name}/{type_hash}"

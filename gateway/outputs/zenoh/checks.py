@@ -79,7 +79,12 @@ def leaves_host(settings: ZenohSettings) -> bool:
         return True  # as with the defaults
     used = endpoints(config, "connect") + ([] if mode_of(config) == "client" else endpoints(config, "listen"))
     is_scouting = json.loads(config.get_json("scouting/multicast/enabled")) is not False
-    return is_scouting or not all(_LOCAL.match(endpoint) for endpoint in used)
+    return is_scouting or not all(map(is_local, used))
+
+
+def is_local(endpoint: str) -> bool:
+    """Return whether an endpoint is on this computer."""
+    return _LOCAL.match(endpoint) is not None
 
 
 def _doctor_config(settings: ZenohSettings, seconds: float) -> zenoh.Config:

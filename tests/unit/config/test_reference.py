@@ -20,6 +20,7 @@ from gateway.config.transform import RollPitchYaw, TransformSettings
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
+from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -36,6 +37,7 @@ SECTIONS: dict[str, type[Section]] = {
     "zenoh": ZenohSettings,
     "lcm": LcmSettings,
     "takes": TakesSettings,
+    "ros2": Ros2Settings,
     "vrpn": VrpnSettings,
     "foxglove": FoxgloveSettings,
     "rtc3d": Rtc3dSettings,

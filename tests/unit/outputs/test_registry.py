@@ -6,6 +6,7 @@ from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.registry import OUTPUTS, build_outputs
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
+from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.zenoh.output import ZenohOutput
@@ -22,6 +23,7 @@ def test_every_output_has_its_section() -> None:
         "zenoh": ZenohSettings,
         "lcm": LcmSettings,
         "takes": TakesSettings,
+        "ros2": Ros2Settings,
         "vrpn": VrpnSettings,
         "foxglove": FoxgloveSettings,
         "rtc3d": Rtc3dSettings,

@@ -1,0 +1,103 @@
+"""The status of a source as diagnostics of ROS 2, as rqt_robot_monitor and ``ros2 topic echo`` show them."""
+
+import logging
+import time
+from collections.abc import Iterable
+from typing import Any, Final
+
+from gateway.errors import OutputError
+from gateway.log import DefectLog
+from gateway.messages.decode import decode
+from gateway.outputs.ros2 import cdr
+from gateway.outputs.ros2.messages import DiagnosticStatus, diagnostic_array
+from gateway.outputs.ros2.router import RouterSession
+from gateway.outputs.ros2.source import QUEUE_FULL, Sender
+from gateway.outputs.ros2.topic import RosTopic
+
+OK: Final = 0
+WARN: Final = 1
+ERROR: Final = 2
+
+_LEVELS: Final = {"streaming": OK, "idle": OK, "no measurement": WARN}
+"""By the state of a stream; all other states are errors."""
+
+
+logger = logging.getLogger(__name__)
+
+
+class DiagnosticsPublisher:
+    """Publishes each ``status_t`` of a source on /diagnostics."""
+
+    def __init__(self, topic: RosTopic, router: RouterSession, sender: Sender) -> None:
+        self._topic = topic
+        self._router = router
+        self._sender = sender
+        self._defects = DefectLog(logger, "ros2 diagnostics")
+        self._is_closed = False
+
+    @property
+    def wanted(self) -> bool:
+        """Whether somebody subscribes to the diagnostics."""
+        return self._topic.wanted and not self._is_closed
+
+    def publish(self, message: bytes) -> None:
+        """Queue a status for the sending thread. Raises OutputError if it cannot be sent."""
+        if self._is_closed:
+            raise OutputError("the diagnostics of this source are closed", cause="closed")
+        if self._router.is_cut_off:
+            raise self._router.refusal
+        if self.wanted and not self._sender.offer(lambda: self._send(message), len(message)):
+            raise OutputError(QUEUE_FULL, cause="queue full")
+
+    def _send(self, message: bytes) -> None:
+        try:
+            status = decode(message)
+            self._topic.put(diagnostic_array(cdr.stamp(status.utime), diagnostics_of(status)), time.time_ns())
+        except Exception as defect:  # noqa: BLE001 - the sending thread continues
+            self._defects.log(defect)
+
+    def close(self) -> None:
+        """Refuse further messages."""
+        self._is_closed = True
+
+
+def diagnostics_of(status: Any) -> list[DiagnosticStatus]:
+    """Return what a decoded ``status_t`` says: one status per stream, and one per output."""
+    name = f"rtc3d_gateway: {status.source}"
+    return [
+        *(_stream(name, status.server, stream) for stream in status.streams),
+        *(_output(name, status.server, output) for output in status.outputs),
+    ]
+
+
+def _stream(name: str, server: str, stream: Any) -> DiagnosticStatus:
+    level = _LEVELS.get(stream.state, ERROR)
+    message = stream.state
+    if level == ERROR and stream.last_error:
+        message += f": {stream.last_error}"
+    if level == OK and stream.problem:
+        level, message = ERROR, stream.problem
+    num_lost = sum(drop.messages for drop in stream.drops)
+    values = {
+        "rate (Hz)": f"{stream.frame_rate_hz:.1f}",
+        "lag (ms)": f"{stream.lag_ms:.1f}",
+        "frames": str(stream.frames_in),
+        "reconnects": str(stream.reconnects),
+        "session": str(stream.session),
+        "messages lost": str(num_lost),
+        **_drops(stream.drops),
+    }
+    return DiagnosticStatus(level, f"{name} {stream.components}", message, server, values)
+
+
+def _output(name: str, server: str, output: Any) -> DiagnosticStatus:
+    values = {
+        **{f"sent {count.name}": str(count.count) for count in output.messages},
+        **_drops(output.drops),
+    }
+    level, message = (OK, "connected") if output.connected else (ERROR, output.problem)
+    return DiagnosticStatus(level, f"{name} to {output.name}", message, server, values)
+
+
+def _drops(drops: Iterable[Any]) -> dict[str, str]:
+    return {f"lost: {drop.cause}": str(drop.messages) for drop in drops}

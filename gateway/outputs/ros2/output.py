@@ -1,0 +1,175 @@
+"""The output for ROS 2: a node with publishers, on the Zenoh router that ROS uses.
+
+All calls of Zenoh that can block are made in one thread, which also encodes the messages.
+"""
+
+import asyncio
+import contextlib
+import functools
+from collections.abc import Callable, Mapping
+from typing import Final
+
+import zenoh
+
+from gateway.losses import Losses
+from gateway.messages.topics import Topic, unique_name
+from gateway.outputs.contract import FramePublisher, Output, Publisher, ServerParameters
+from gateway.outputs.no_topics import IgnoringPublisher
+from gateway.outputs.ros2.diagnostics import DiagnosticsPublisher
+from gateway.outputs.ros2.message_types import DIAGNOSTIC_ARRAY, TF_MESSAGE
+from gateway.outputs.ros2.names import MAX_PART_CHARS, ros_name
+from gateway.outputs.ros2.router import RouterSession
+from gateway.outputs.ros2.settings import Ros2Settings
+from gateway.outputs.ros2.source import RosSource
+from gateway.outputs.ros2.topic import RosNode, RosTopic
+from gateway.outputs.send_thread import SendThread
+from gateway.outputs.status import OutputHealth
+
+_STATUS: Final = ("status",)
+
+
+class Ros2Output(Output):
+    """Publishes for ROS 2 in the wire format of rmw_zenoh."""
+
+    name = "ros2"
+    drop_causes = ("not open", "no router", "queue full", "unknown unit")
+
+    def __init__(self, settings: Ros2Settings) -> None:
+        self.settings = settings
+        self._router = RouterSession(settings.connect, self._on_open)
+        self._sender: SendThread | None = None  # from start to close
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._tf = RosTopic("/tf", TF_MESSAGE, self._on_tf_wanted)
+        self._diagnostics = RosTopic("/diagnostics", DIAGNOSTIC_ARRAY, self._on_diagnostics_wanted)
+        self._node: RosNode | None = None  # only in the sending thread
+        self._names: dict[str, str] = {}  # by source, also those that are gone
+        self._sources: dict[str, RosSource] = {}
+        self._is_checking = False
+
+    def start(self) -> None:
+        """Start the thread that sends, and the one that opens the session."""
+        with contextlib.suppress(RuntimeError):  # there is no loop: then nobody watches what is wanted
+            self._loop = asyncio.get_running_loop()
+        self._sender = SendThread("ros2-send")
+        self._router.start()
+
+    def _on_open(self, session: zenoh.Session) -> None:
+        self.submit(functools.partial(self._declare_all, session))
+
+    def _declare_all(self, session: zenoh.Session) -> None:
+        """Declare everything on the new session, in the sending thread."""
+        with contextlib.suppress(zenoh.ZError):  # the session has just been closed
+            self._node = node = RosNode(session, self.settings)
+            for topic in (self._tf, self._diagnostics):
+                topic.declare(node)
+            for source in list(self._sources.values()):
+                source.declare(node)
+
+    # The sending thread.
+
+    def offer(self, call: Callable[[], None], num_bytes: int = 0) -> bool:
+        """Queue a call for the sending thread; return False if its queue is full, or there is no thread."""
+        return self._sender is not None and self._sender.offer(call, num_bytes)
+
+    def submit(self, call: Callable[[], None]) -> None:
+        """Queue a call for the sending thread, before those that were offered."""
+        if self._sender is not None:
+            self._sender.submit(call)
+
+    def _check_subscribers(self) -> None:
+        self._is_checking = False
+        for topic in (self._tf, self._diagnostics):
+            topic.check_subscribers()
+        for source in list(self._sources.values()):
+            source.check_subscribers()
+
+    # Sources.
+
+    def frame_publisher(self, source: str) -> FramePublisher:
+        """Return the publisher of a source's frames. Its topics appear with the parameters or the frames."""
+        name = self._ros_name(source)
+        base = f"/{self.settings.namespace}/{name}" if self.settings.namespace else f"/{name}"
+        self._sources[source] = publisher = RosSource(source, base, self._tf, self._router, self)
+        self.submit(functools.partial(self._declare_source, publisher))
+        return publisher
+
+    def _declare_source(self, source: RosSource) -> None:
+        if self._node is not None:
+            source.declare(self._node)
+
+    def _ros_name(self, source: str) -> str:
+        if source not in self._names:
+            name = unique_name(ros_name(source, "source"), set(self._names.values()), MAX_PART_CHARS)
+            self._names[source] = name
+        return self._names[source]
+
+    def publisher(self, topic: Topic) -> Publisher:
+        """Return the publisher of diagnostics for the status; other topics have nothing for ROS."""
+        if topic.path == _STATUS:
+            return DiagnosticsPublisher(self._diagnostics, self._router, self)
+        return IgnoringPublisher()
+
+    def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
+        """Open the topics that belong to the parameters."""
+        publisher = self._sources.get(source)
+        if publisher is not None:
+            publisher.set_parameters(parameters)
+        return None
+
+    def topic_names(self, source: str) -> Mapping[str, Mapping[str, str]]:
+        """Return the parts of topics for tools and force plates whose labels differ from them."""
+        publisher = self._sources.get(source)
+        return {} if publisher is None else publisher.topics.names
+
+    def count_losses(self, source: str, losses: Losses) -> None:
+        """Count in ``losses`` the positions and items that cannot be published."""
+        self._sources[source].topics.losses = losses
+
+    def withdraw(self, source: str) -> None:
+        """Forget the source; its FramePublisher is closed."""
+        self._sources.pop(source, None)
+
+    # What is wanted.
+
+    def watch_wanted(self, source: str, on_change: Callable[[], None]) -> bool:
+        """Zenoh reports the subscribers of each topic."""
+        self._sources[source].on_wanted_changed = functools.partial(self._call_in_loop, on_change)
+        return True
+
+    def _on_tf_wanted(self) -> None:
+        for source in list(self._sources.values()):
+            source.update_wanted()
+
+    def _on_diagnostics_wanted(self) -> None:
+        for source in list(self._sources.values()):
+            source.on_wanted_changed()
+
+    def _call_in_loop(self, call: Callable[[], None]) -> None:
+        """Call ``call`` in the event loop, from one of Zenoh's threads."""
+        if self._loop is not None:
+            with contextlib.suppress(RuntimeError):  # the loop has just ended
+                self._loop.call_soon_threadsafe(call)
+
+    # Life cycle.
+
+    def health(self) -> OutputHealth:
+        """Return whether the router is connected."""
+        return self._router.health
+
+    def maintain(self) -> None:
+        """Log whether the router is connected, and check for subscribers."""
+        self._router.maintain()
+        if not self._is_checking and not self._router.is_cut_off:
+            self._is_checking = True
+            self.submit(self._check_subscribers)
+
+    def is_configured_like(self, other: Output) -> bool:
+        """Return whether the settings are the same."""
+        return isinstance(other, Ros2Output) and self.settings == other.settings
+
+    def close(self) -> None:
+        """Close the session. The node and its topics disappear from ROS."""
+        sender, self._sender = self._sender, None
+        if sender is not None:
+            sender.close()
+        self._router.close()

@@ -1,0 +1,155 @@
+"""One source on ROS 2: it takes frames in the event loop and hands them to the sending thread."""
+
+import functools
+import logging
+import threading
+from collections.abc import Callable, Mapping
+from typing import Final, Protocol
+
+from gateway.errors import OutputError
+from gateway.log import DefectLog
+from gateway.losses import Losses
+from gateway.messages.stamp import Stamp
+from gateway.outputs.contract import ServerParameters
+from gateway.outputs.ros2.router import RouterSession
+from gateway.outputs.ros2.source_topics import SourceTopics
+from gateway.outputs.ros2.topic import RosNode, RosTopic
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import Frame, FrameLayout
+
+_MAX_LAYOUTS: Final = 64
+"""How many layouts of frames are remembered. The server determines them."""
+
+QUEUE_FULL: Final = (
+    "too many frames wait for the Zenoh router, which does not keep up; check it and the network to it"
+)
+
+logger = logging.getLogger(__name__)
+
+
+class Sender(Protocol):
+    """The sending thread, which makes no calls before the output is started."""
+
+    def offer(self, call: Callable[[], None], num_bytes: int = 0) -> bool:
+        """Queue a call; return False if it cannot be made."""
+
+    def submit(self, call: Callable[[], None]) -> None:
+        """Queue a call that must be made, before those that were offered."""
+
+
+class RosSource:
+    """A FramePublisher: ``send`` of its topics runs in the sending thread, for each frame that is wanted.
+
+    Everything else runs in the event loop. ``name`` is the source's name in the configuration, ``base`` the
+    beginning of its topics.
+    """
+
+    def __init__(self, name: str, base: str, tf: RosTopic, router: RouterSession, sender: Sender) -> None:
+        self.name = name
+        self.wanted = False
+        """Whether somebody subscribes to anything that the frames are published on."""
+        self.on_wanted_changed: Callable[[], None] = lambda: None
+        """Called in any thread."""
+        self.topics = SourceTopics(name, base, tf, self.update_wanted)
+        self.topics.losses = Losses(logger, f"{name} to ros2")
+        self._lock = threading.Lock()  # of ``wanted``
+        self._router = router
+        self._sender = sender
+        self._parameters = ServerParameters(b"", 0, 0)
+        self._known_layouts: set[FrameLayout] = set()
+        self._refused: Mapping[ComponentType, int] = {}  # frames that found no place in the queue
+        self._skipped: Mapping[ComponentType, int] = {}  # those whose numbers the topics have used up
+        self._defects = DefectLog(logger, f"{name} to ros2")
+        self._is_closed = False
+
+    def update_wanted(self) -> None:
+        """Note that subscribers have come or gone, or topics. In any thread."""
+        with self._lock:  # or what one thread has seen could replace what another sees later
+            is_wanted = self.topics.is_wanted and not self._is_closed
+            if is_wanted is not self.wanted:
+                self.wanted = is_wanted
+                self.on_wanted_changed()
+
+    def set_parameters(self, parameters: ServerParameters) -> None:
+        """Open the topics of new parameters. The frames that follow belong to them."""
+        self._parameters = parameters
+        self._known_layouts.clear()
+        # If the queue is full, the next frame does it.
+        self._sender.offer(self._guarded(self.topics.use, parameters), len(parameters.xml))
+
+    def publish(
+        self,
+        frame: Frame,
+        stamp: Stamp,
+        sequence: int,  # noqa: ARG002 - of the contract; each topic has its own
+        components: frozenset[ComponentType],
+    ) -> None:
+        """Hand a frame to the sending thread if it is wanted. Raises OutputError if too many wait there."""
+        if self._router.is_cut_off or self._is_closed:
+            raise self._refusal()
+        if frame.layout not in self._known_layouts:
+            self._learn(frame.layout)
+        if not self.wanted:
+            return
+        send = self._guarded(self._send, frame, stamp, components, self._parameters, self._refused)
+        if not self._sender.offer(send, len(frame.body)):
+            # Replaced, not changed: frames in the queue refer to it.
+            self._refused = {**self._refused, **{each: self._refused.get(each, 0) + 1 for each in components}}
+            raise OutputError(QUEUE_FULL, cause="queue full")
+
+    def _refusal(self) -> OutputError:
+        if self._is_closed:
+            return OutputError(f"the topics of {self.name} are closed", cause="closed")
+        return self._router.refusal
+
+    def _learn(self, layout: FrameLayout) -> None:
+        """Open the topics of items that the parameters do not mention: nobody can subscribe to them yet."""
+        if len(self._known_layouts) >= _MAX_LAYOUTS:
+            self._known_layouts.clear()
+        if self._sender.offer(self._guarded(self.topics.open_for, layout, self._parameters)):
+            self._known_layouts.add(layout)
+
+    def _send(
+        self,
+        frame: Frame,
+        stamp: Stamp,
+        components: frozenset[ComponentType],
+        parameters: ServerParameters,
+        refused: Mapping[ComponentType, int],
+    ) -> None:
+        """Publish a frame; ``refused`` are the frames before it that found no place in the queue."""
+        skipped = self._skipped
+        if refused is not skipped:
+            self.topics.skip({each: count - skipped.get(each, 0) for each, count in refused.items()})
+            self._skipped = refused
+        self.topics.send(frame, stamp, components, parameters)
+
+    def declare(self, node: RosNode) -> None:
+        """Declare all topics on an open session. In the sending thread."""
+        self.topics.declare(node)
+        self.topics.use(self._parameters)
+
+    def check_subscribers(self) -> None:
+        """Check again for subscribers, in the sending thread."""
+        for topic in self.topics.topics:
+            topic.check_subscribers()
+        self.update_wanted()
+
+    def close(self) -> None:
+        """Remove the topics from ROS."""
+        self._is_closed = True
+        self.update_wanted()
+        self._sender.submit(self.topics.undeclare)
+
+    def _guarded(self, call: Callable[..., None], *arguments: object) -> Callable[[], None]:
+        return functools.partial(self._call, call, arguments)
+
+    def _call(self, call: Callable[..., None], arguments: tuple[object, ...]) -> None:
+        """Make a call in the sending thread, which must not end, whatever the frame has in it."""
+        if self._is_closed:
+            return
+        try:
+            call(*arguments)
+        except Exception as defect:  # noqa: BLE001 - the other sources continue
+            self._defects.log(defect)
+            self.topics.losses.lost(type(defect).__name__, f"a frame is not published for ROS 2: {defect}")
