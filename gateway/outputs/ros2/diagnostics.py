@@ -11,7 +11,7 @@ from gateway.messages.decode import decode
 from gateway.outputs.ros2 import cdr
 from gateway.outputs.ros2.messages import DiagnosticStatus, diagnostic_array
 from gateway.outputs.ros2.router import RouterSession
-from gateway.outputs.ros2.source import QUEUE_FULL, Sender
+from gateway.outputs.ros2.source import Sender
 from gateway.outputs.ros2.topic import RosTopic
 
 OK: Final = 0
@@ -47,7 +47,8 @@ class DiagnosticsPublisher:
         if self._router.is_cut_off:
             raise self._router.refusal
         if self.wanted and not self._sender.offer(lambda: self._send(message), len(message)):
-            raise OutputError(QUEUE_FULL, cause="queue full")
+            text = "too many messages wait for the Zenoh router; check it and the network to it"
+            raise OutputError(text, cause="queue full")
 
     def _send(self, message: bytes) -> None:
         try:

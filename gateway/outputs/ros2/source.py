@@ -20,10 +20,6 @@ from gateway.rtc3d.frames import Frame, FrameLayout
 _MAX_LAYOUTS: Final = 64
 """How many layouts of frames are remembered. The server determines them."""
 
-QUEUE_FULL: Final = (
-    "too many frames wait for the Zenoh router, which does not keep up; check it and the network to it"
-)
-
 logger = logging.getLogger(__name__)
 
 
@@ -95,7 +91,8 @@ class RosSource:
         if not self._sender.offer(send, len(frame.body)):
             # Replaced, not changed: frames in the queue refer to it.
             self._refused = {**self._refused, **{each: self._refused.get(each, 0) + 1 for each in components}}
-            raise OutputError(QUEUE_FULL, cause="queue full")
+            text = "too many frames wait for the Zenoh router; check it and the network to it"
+            raise OutputError(text, cause="queue full")
 
     def _refusal(self) -> OutputError:
         if self._is_closed:
