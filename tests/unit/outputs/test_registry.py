@@ -5,8 +5,8 @@ from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.registry import OUTPUTS, build_outputs
-from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.outputs.ros2.settings import Ros2Settings
+from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.zenoh.output import ZenohOutput
