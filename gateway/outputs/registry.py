@@ -7,6 +7,7 @@ from gateway.outputs.contract import Output
 from gateway.outputs.foxglove.kind import FOXGLOVE
 from gateway.outputs.kind import OutputKind
 from gateway.outputs.lcm.kind import LCM
+from gateway.outputs.lsl.kind import LSL
 from gateway.outputs.ros2.kind import ROS2
 from gateway.outputs.rtc3d.kind import RTC3D
 from gateway.outputs.takes.kind import TAKES
@@ -14,7 +15,7 @@ from gateway.outputs.vrpn.kind import VRPN
 from gateway.outputs.zenoh.kind import ZENOH
 
 OUTPUTS: Final[dict[str, OutputKind]] = {
-    kind.name: kind for kind in (ZENOH, LCM, TAKES, ROS2, RTC3D, VRPN, FOXGLOVE)
+    kind.name: kind for kind in (ZENOH, LCM, TAKES, ROS2, RTC3D, VRPN, LSL, FOXGLOVE)
 }
 
 

@@ -19,6 +19,7 @@ from gateway.config.settings import (
 from gateway.config.transform import RollPitchYaw, TransformSettings
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.outputs.takes.settings import TakesSettings
@@ -41,6 +42,7 @@ SECTIONS: dict[str, type[Section]] = {
     "vrpn": VrpnSettings,
     "foxglove": FoxgloveSettings,
     "rtc3d": Rtc3dSettings,
+    "lsl": LslSettings,
     "spool": SpoolSettings,
     "metrics": MetricsSettings,
 }

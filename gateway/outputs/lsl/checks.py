@@ -1,0 +1,122 @@
+"""The doctor's checks of LSL: is a stream found, and are those of a running gateway?"""
+
+import json
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any, Final
+
+from gateway.errors import ConfigError, OutputError
+from gateway.findings import Finding, MessageLoad, Subject
+from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.outputs.contract import ServerParameters
+from gateway.outputs.lsl.output import LslOutput
+from gateway.outputs.lsl.settings import LslSettings
+from gateway.outputs.lsl.supervisor import lsl_environment
+from gateway.rtc3d.parameters import Parameters, ParametersEvents
+from gateway.safe_text import safe_text
+
+CHECKS: Final = ("opens", "found", "gateway")
+
+_TEST_SOURCE: Final = "doctor"
+_POLL_S: Final = 0.05
+_MIN_SEARCH_S: Final = 2.0
+_START_S: Final = 10.0
+
+_lsl: Final = Subject("lsl")
+
+
+def check_lsl(
+    settings: LslSettings, sources: Sequence[str], _loads: Sequence[MessageLoad], seconds: float
+) -> list[Finding]:
+    """Open a stream and find it and those of ``sources``. Blocks for about ``seconds``."""
+    try:
+        output = LslOutput(settings)
+    except ConfigError as error:
+        found, _, remedy = str(error).partition("; ")
+        return _not_open(found, remedy)
+    try:
+        publisher = output.frame_publisher(_TEST_SOURCE)
+        output.start()
+        deadline_s = time.monotonic() + seconds
+        while not output.health().connected and time.monotonic() < deadline_s:
+            time.sleep(_POLL_S)
+        problem = output.health().problem
+        if problem:
+            found, _, remedy = problem.partition("; ")
+            return _not_open(found, remedy)
+        parameters = Parameters(events=ParametersEvents())
+        output.publish_parameters(
+            _TEST_SOURCE, ServerParameters(b"", 1, 1, parsed=parameters, frame=CoordinateFrame(_TEST_SOURCE))
+        )
+        opens = _lsl.passing("opens", f"liblsl {output.version} opens streams")
+        try:
+            streams = _find_streams(settings, max(seconds / 2, _MIN_SEARCH_S))
+        except OutputError as error:
+            failing = _lsl.failing("found", str(error), "Check lsl.config, or the file lsl_api.cfg.")
+            return [opens, failing, _lsl.not_tested("gateway", "it needs found, which failed")]
+        publisher.close()
+    finally:
+        output.close()
+    names = {(stream["computer"], stream["name"]) for stream in streams}
+    return [opens, _found(names), _gateway(names, sources)]
+
+
+def _find_streams(settings: LslSettings, seconds: float) -> list[dict[str, Any]]:
+    """Return the streams that can be found within ``seconds``, by another process. Raises OutputError.
+
+    See find.py for what each has.
+    """
+    command = [sys.executable, "-m", "gateway.outputs.lsl.find", str(seconds)]
+    try:
+        result = subprocess.run(  # noqa: S603 - our own module
+            command,
+            env=lsl_environment(settings),
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=seconds + _START_S,
+            check=True,
+        )
+    except subprocess.TimeoutExpired:
+        raise OutputError("liblsl does not finish its search for streams", cause="not open") from None
+    except subprocess.CalledProcessError as error:
+        last_line = error.stderr.decode(errors="replace").strip().rpartition("\n")[2]
+        raise OutputError(
+            f"liblsl cannot search for streams: {safe_text(last_line, 200)}", cause="not open"
+        ) from None
+    found: list[dict[str, Any]] = json.loads(result.stdout)
+    return found
+
+
+def _not_open(found: str, remedy: str) -> list[Finding]:
+    remedy = f"{remedy[:1].upper()}{remedy[1:]}." if remedy else "Correct lsl in the configuration."
+    others = [_lsl.not_tested(check, "it needs opens, which failed") for check in CHECKS[1:]]
+    return [_lsl.failing("opens", found, remedy), *others]
+
+
+def _found(names: set[tuple[str, str]]) -> Finding:
+    others = {computer for computer, _ in names} - {socket.gethostname()}
+    if (socket.gethostname(), f"{_TEST_SOURCE}_event") in names:
+        also = f", and streams of {len(others)} other computers" if others else ""
+        return _lsl.passing("found", f"another program on this computer finds a stream{also}")
+    return _lsl.failing(
+        "found",
+        "another program on this computer does not find a stream",
+        "Allow UDP port 16571 and the ports from 16572 in the firewall, and see docs/how-to/lsl.md.",
+    )
+
+
+def _gateway(names: set[tuple[str, str]], sources: Sequence[str]) -> Finding:
+    served = [source for source in sources if any(name.startswith(f"{source}_") for _, name in names)]
+    missing = [source for source in sources if source not in served]
+    if not served:
+        return _lsl.note("gateway", "no gateway offers streams of these sources now", "Start the gateway.")
+    if missing:
+        return _lsl.warning(
+            "gateway",
+            f"streams of {', '.join(served)} are offered, but none of {', '.join(missing)}",
+            "Streams appear when the server has sent its parameters or a frame.",
+        )
+    return _lsl.passing("gateway", f"streams of {', '.join(served)} are offered")

@@ -1,0 +1,202 @@
+"""The process for LSL: it has liblsl and its ports, and nothing else of the gateway.
+
+liblsl bounds neither the number of its clients nor what it reads from them before a line ends, so anyone on
+the network can exhaust the memory and the file descriptors of a process that uses it. Here that is only this
+process. It has limits of its own, and the gateway starts another one if it ends.
+
+    python -m gateway.outputs.lsl.process     with a connected socket as standard input
+"""
+
+import contextlib
+import ctypes
+import json
+import os
+import queue
+import resource
+import select
+import signal
+import socket
+import threading
+import time
+from typing import Any, Final
+
+from gateway.outputs.lsl.wire import Kind, Message, MessageReader, Report, decode_samples
+from gateway.safe_text import safe_text
+
+MAX_MEMORY_BYTES: Final = 768 * 1024 * 1024
+MAX_FILES: Final = 4096
+_STACK_BYTES: Final = 1024 * 1024
+"""The stack of each thread. liblsl has two threads for each stream and one for each receiver.
+
+Stacks count as memory, so MAX_MEMORY_BYTES also limits the number of threads: to about 700, which the service
+(TasksMax) allows besides those of the gateway.
+"""
+
+_POLL_S: Final = 0.1
+"""How often to ask liblsl whether anybody receives a stream."""
+
+_RETRY_S: Final = 1.0
+_READ_BYTES: Final = 1 << 20
+_READINGS: Final = 5
+
+
+class _LslProcess:
+    """Opens and closes streams, and pushes samples, as the gateway says."""
+
+    def __init__(self, gateway: socket.socket, pylsl: Any) -> None:
+        self._gateway = gateway
+        self._pylsl = pylsl
+        self._reader = MessageReader()
+        self._outlets: dict[int, Any] = {}
+        self._failed: dict[int, Any] = {}  # the descriptions of streams that could not be opened
+        self._retry_s = 0.0
+        self._report = Report()
+        self._closed: queue.SimpleQueue[list[Any]] = queue.SimpleQueue()
+        self._offset_s = _lsl_minus_monotonic_s(pylsl)
+        threading.Thread(target=self._destroy_closed, daemon=True).start()
+
+    def run(self) -> None:
+        """Work until the gateway closes its socket."""
+        self._send(Report(ready=str(self._pylsl.library_version())))
+        next_poll_s = 0.0
+        while True:
+            if select.select([self._gateway], [], [], _POLL_S)[0]:
+                data = self._gateway.recv(_READ_BYTES)
+                if not data:
+                    return
+                for message in self._reader.feed(data):
+                    self._handle(message)
+            if time.monotonic() >= next_poll_s:
+                next_poll_s = time.monotonic() + _POLL_S
+                self._poll()
+
+    def _handle(self, message: Message) -> None:
+        number = message.stream
+        match message.kind:
+            case Kind.OPEN:
+                self._failed[number] = json.loads(message.content)
+                self._retry_s = 0.0
+                self._open_failed()
+            case Kind.CLOSE:
+                self._failed.pop(number, None)
+                if number in self._outlets:
+                    self._closed.put([self._outlets.pop(number)])
+            case Kind.SAMPLES if number in self._outlets:
+                times_s, values = decode_samples(message.content)
+                self._outlets[number].push_chunk(values, list(times_s + self._offset_s))
+            case Kind.TEXTS if number in self._outlets:
+                times, texts = json.loads(message.content)
+                for time_s, text in zip(times, texts, strict=True):
+                    self._outlets[number].push_sample([text], time_s + self._offset_s)
+
+    def _open_failed(self) -> None:
+        """Open the streams that are not open yet. What fails is tried again every second."""
+        if time.monotonic() < self._retry_s:
+            return
+        self._retry_s = time.monotonic() + _RETRY_S
+        for number, description in list(self._failed.items()):
+            try:
+                self._outlets[number] = self._outlet(description)
+            except Exception as error:  # noqa: BLE001 - of any kind, from liblsl
+                self._change(not_opened=f"{description['name']}: {safe_text(str(error), 200)}")
+                return
+            del self._failed[number]
+        self._change(not_opened="")
+
+    def _outlet(self, description: dict[str, Any]) -> Any:
+        pylsl = self._pylsl
+        info = pylsl.StreamInfo(
+            description["name"],
+            description["type"],
+            description["num_channels"],
+            description["rate_hz"],
+            pylsl.cf_string if description["is_text"] else pylsl.cf_float32,
+            description["source_id"],
+        )
+        _append(info.desc(), description["tree"])
+        return pylsl.StreamOutlet(info, 0, description["buffer_s"])
+
+    def _poll(self) -> None:
+        if self._failed:
+            self._open_failed()
+        wanted = tuple(number for number, outlet in self._outlets.items() if outlet.have_consumers())
+        self._change(wanted=wanted)
+
+    def _change(self, **fields: Any) -> None:
+        report = self._report._replace(**fields)
+        if report != self._report:
+            self._report = report
+            self._send(report)
+
+    def _send(self, report: Report) -> None:
+        self._report = report
+        self._gateway.sendall(report.encode())
+
+    def _destroy_closed(self) -> None:
+        """Destroy outlets in a thread of its own: liblsl waits for its threads, up to some seconds."""
+        while True:
+            self._closed.get().clear()
+
+
+def _append(element: Any, children: Any) -> None:
+    for name, content in children:
+        if isinstance(content, str):
+            element.append_child_value(name, content)
+        else:
+            _append(element.append_child(name), content)
+
+
+def _lsl_minus_monotonic_s(pylsl: Any) -> float:
+    """Return LSL's clock minus the monotonic one, from the reading that was interrupted least.
+
+    In liblsl for Linux, both are the same clock.
+    """
+    best_s, difference_s = -1.0, 0.0
+    for _ in range(_READINGS):
+        before_s = time.monotonic()
+        lsl_s = pylsl.local_clock()
+        duration_s = time.monotonic() - before_s
+        if best_s < 0 or duration_s < best_s:
+            best_s, difference_s = duration_s, lsl_s - before_s
+    return 0.0 if abs(difference_s) < 1e-3 else difference_s
+
+
+def _limit(kind: int, most: int) -> None:
+    hard = resource.getrlimit(kind)[1]
+    limit = most if hard == resource.RLIM_INFINITY else min(most, hard)
+    with contextlib.suppress(OSError):  # a sandbox may forbid it
+        resource.setrlimit(kind, (limit, limit))
+
+
+def _limit_stacks() -> None:
+    """Have new threads use _STACK_BYTES, which count as memory of the process. Not every C library can."""
+    libc = ctypes.CDLL(None)
+    attributes = ctypes.create_string_buffer(256)  # glibc needs 56
+    with contextlib.suppress(AttributeError):
+        libc.pthread_attr_init(attributes)
+        libc.pthread_attr_setstacksize(attributes, ctypes.c_size_t(_STACK_BYTES))
+        libc.pthread_setattr_default_np(attributes)
+
+
+def main() -> None:
+    """Run until the gateway closes the socket. Only that ends the process, not a signal to the service."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _limit(resource.RLIMIT_DATA, MAX_MEMORY_BYTES)
+    _limit(resource.RLIMIT_NOFILE, MAX_FILES)
+    _limit_stacks()
+    gateway = socket.socket(fileno=0)
+    try:
+        import pylsl  # noqa: PLC0415 - it can fail, and the gateway is told why
+
+        _LslProcess(gateway, pylsl).run()
+    except Exception as error:  # noqa: BLE001 - the gateway reports it
+        text = safe_text(f"{type(error).__name__}: {error}", 300)
+        with contextlib.suppress(OSError):
+            gateway.sendall(Report(failure=text).encode())
+    # liblsl would wait for each of its threads. The connections end with the process.
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,36 @@
+"""The section ``lsl`` of the configuration."""
+
+from typing import Annotated
+
+from pydantic import AfterValidator, Field
+
+from gateway.config.section import expects
+from gateway.config.settings import OutputSettings
+from gateway.config.values import Switch
+
+
+def _absolute_path(text: str) -> str:
+    if not text.startswith("/") or not text.isprintable():
+        raise ValueError
+    return text
+
+
+ConfigFile = Annotated[
+    str, AfterValidator(_absolute_path), expects("the absolute path of a file lsl_api.cfg, or null")
+]
+BufferSeconds = Annotated[
+    int, Field(strict=True, ge=1, le=360), expects("a whole number of seconds from 1 to 360")
+]
+
+
+class LslSettings(OutputSettings):
+    """The settings of the output for Lab Streaming Layer."""
+
+    enabled: Switch = False
+    """Whether to offer one LSL stream per source and component. It needs the extra `lsl`."""
+
+    config: ConfigFile | None = None
+    """A file lsl_api.cfg for liblsl. null means where liblsl looks for one, else its defaults."""
+
+    buffer_s: BufferSeconds = 30
+    """How many seconds of samples liblsl keeps for a receiver that is too slow; it loses older ones."""

@@ -1,0 +1,294 @@
+"""The LSL streams of one source: which are open, and what is pushed to them.
+
+Everything here is called in the thread that sends, except where it says otherwise.
+"""
+
+import itertools
+import logging
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+
+from gateway.descriptions.event_texts import MAX_EVENT_AGE_US, event_text
+from gateway.descriptions.fitting_labels import printable
+from gateway.losses import Losses
+from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.stamp import Stamp
+from gateway.outputs.contract import ServerParameters
+from gateway.outputs.lsl.samples import samples
+from gateway.outputs.lsl.streams import (
+    MAX_CHANNELS,
+    DescribedSource,
+    LslStream,
+    channels_per_item,
+    lsl_stream,
+    num_labels,
+)
+from gateway.outputs.lsl.wire import Kind, Message, json_content, samples_content
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.parameters import Parameters
+
+MIN_LIFE_S: Final = 1.0
+"""Streams of one component open at least so far apart: to open and close one costs threads and sockets."""
+
+MAX_BUFFER_BYTES: Final = 64 * 1024 * 1024
+"""The most that liblsl keeps of one stream for slow receivers, which share the samples."""
+
+_IRREGULAR_SAMPLES: Final = 100
+"""For a stream without a rate, liblsl takes a second of buffer as so many samples."""
+
+NOT_OPEN: Final = "the process for LSL has ended; it is started again"
+
+_MAX_APART_US: Final = 1_000_000
+"""Components of one frame have time stamps as near as this, or these are not those of one clock."""
+
+_ITEMS_OFFSET: Final = 16  # of the items in a component's content
+_POSITIONS: Final = frozenset({ComponentType.MARKERS, ComponentType.TOOLS})
+
+logger = logging.getLogger(__name__)
+
+
+class CapturedFrame(NamedTuple):
+    """A frame, which of its components to push, and when it was captured, on the steady clock in µs."""
+
+    frame: Frame
+    stamp: Stamp
+    components: frozenset[ComponentType]
+    captured_us: int
+
+
+class _OpenStream:
+    """An open stream: its number, and how many items its channels are for, by which parameters."""
+
+    def __init__(self, number: int, stream: LslStream, num_items: int, version: int) -> None:
+        self.number = number
+        self.stream = stream
+        self.num_items = num_items
+        self.version = version
+
+    def opening(self, buffer_s: int) -> Message:
+        """Return the message that opens it."""
+        stream = self.stream
+        content = {
+            "name": stream.name,
+            "type": stream.type,
+            "rate_hz": stream.rate_hz,
+            "is_text": stream.is_text,
+            "source_id": stream.source_id,
+            "num_channels": len(stream.channels),
+            "tree": stream.tree,
+            "buffer_s": _limited_buffer_s(stream, buffer_s),
+        }
+        return Message(Kind.OPEN, self.number, json_content(content))
+
+
+class SourceStreams:
+    """Opens the streams of one source, and pushes the samples that somebody receives.
+
+    A stream opens with the parameters that describe its component, or else with its first frame. It stays
+    open while the channels are the same: items that a frame lacks are NaN. More items, or other labels, units
+    or axes, need another stream, because the channels of a stream are fixed.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        computer: str,
+        buffer_s: int,
+        numbers: Iterator[int],
+        send: Callable[[Message], bool],
+    ) -> None:
+        self.source = name
+        self.numbers: frozenset[int] = frozenset()
+        """The numbers of the open streams. Any thread may read it."""
+        self.waiting: dict[ComponentType, int] = {}
+        """The numbers of items of streams that could not open yet, because the last one was too young."""
+        self.losses = Losses(logger, f"{name} to lsl")
+        """What is lost in the thread that sends."""
+        self._computer = computer
+        self._buffer_s = buffer_s
+        self._next_numbers = numbers
+        self._send = send
+        self._described = DescribedSource(name, computer, Parameters(), CoordinateFrame(name))
+        self._version = 0  # counts the parameters
+        self._streams: dict[ComponentType, _OpenStream] = {}
+        self._opened_s: dict[ComponentType, float] = {}  # also of streams that are closed again
+
+    def set_parameters(self, parameters: ServerParameters) -> None:
+        """Open the streams that the parameters describe; close those of components without a section."""
+        parsed = parameters.parsed
+        self._described = DescribedSource(self.source, self._computer, parsed, parameters.frame)
+        self._version += 1
+        for component in WIRE_ORDER:
+            count = num_labels(component, parsed)
+            if count or (count is not None and component is ComponentType.EVENT):
+                self._stream(component, 0)
+            elif parsed != Parameters():
+                self._close(component)
+
+    def push(self, frames: Sequence[CapturedFrame], wanted: frozenset[int], suspended_us: int) -> None:
+        """Push the components whose streams are ``wanted``, oldest frame first.
+
+        ``suspended_us`` is what the steady clock is ahead of LSL's.
+        """
+
+        def alike(captured: CapturedFrame) -> tuple[int, frozenset[ComponentType]]:
+            return id(captured.frame.layout), captured.components
+
+        for (_, components), group in itertools.groupby(frames, alike):
+            together = list(group)
+            for index, component in enumerate(together[0].frame.layout.components):
+                if component.type not in components:
+                    continue
+                stream = self._stream(component.type, component.num_items)
+                if stream is None:
+                    self._count_refused(component.type, component.num_items, len(together))
+                elif stream.number in wanted:
+                    push = self._push_events if stream.stream.is_text else self._push_values
+                    push(stream, together, index, suspended_us)
+
+    def open_waiting(self) -> None:
+        """Open the streams that had to wait. Called about once a second."""
+        waiting, self.waiting = self.waiting, {}
+        for component, num_items in waiting.items():
+            self._stream(component, num_items)
+
+    def reopen(self) -> None:
+        """Open all streams again, because the process that had them has ended."""
+        for stream in self._streams.values():
+            self._send(stream.opening(self._buffer_s))
+
+    def close(self) -> None:
+        """Close all streams."""
+        self.waiting = {}
+        for component in list(self._streams):
+            self._close(component)
+
+    def _stream(self, component: ComponentType, num_items: int) -> _OpenStream | None:
+        """Return the stream for a component with ``num_items`` items; None if it has none now."""
+        is_event = component is ComponentType.EVENT
+        num_items = 1 if is_event else num_items
+        before = self._streams.get(component)
+        if before is not None and before.version == self._version and num_items <= before.num_items:
+            return before
+        if not is_event:
+            num_items = max(num_items, num_labels(component, self._described.parameters) or 0)
+        if before is not None and before.version == self._version:
+            num_items = max(num_items, before.num_items)
+        if not num_items or self._is_refused(component, num_items):
+            self._close(component)
+            return None
+        stream = lsl_stream(self._described, component, num_items)
+        if before is not None and before.stream == stream:
+            before.version = self._version
+            return before
+        self._close(component)
+        return self._open(component, stream, num_items)
+
+    def _open(self, component: ComponentType, stream: LslStream, num_items: int) -> _OpenStream | None:
+        now_s = time.monotonic()
+        if now_s - self._opened_s.get(component, float("-inf")) < MIN_LIFE_S:
+            self.waiting[component] = num_items
+            return None
+        self.waiting.pop(component, None)
+        self._opened_s[component] = now_s
+        opened = _OpenStream(next(self._next_numbers), stream, num_items, self._version)
+        self._streams[component] = opened
+        self.numbers |= {opened.number}
+        self._send(opened.opening(self._buffer_s))
+        return opened
+
+    def _close(self, component: ComponentType) -> None:
+        self.waiting.pop(component, None)
+        closed = self._streams.pop(component, None)
+        if closed is not None:
+            self.numbers -= {closed.number}
+            self._send(Message(Kind.CLOSE, closed.number))
+
+    def _is_refused(self, component: ComponentType, num_items: int) -> bool:
+        is_too_large = num_items * channels_per_item(component) > MAX_CHANNELS
+        return is_too_large or (component in _POSITIONS and self._described.frame.metres_per_unit is None)
+
+    def _count_refused(self, component: ComponentType, num_items: int, num_frames: int) -> None:
+        """Count frames whose component can have no stream."""
+        num_channels = num_items * channels_per_item(component)
+        if num_channels > MAX_CHANNELS:
+            self._count_loss(
+                "too many channels",
+                f"a {component.key} component with {num_items} {component.item_noun} needs {num_channels} "
+                f"channels, more than {MAX_CHANNELS}: it gets no LSL stream",
+                num_frames,
+            )
+        elif num_items and self._is_refused(component, num_items):
+            self._count_loss(
+                "unknown unit",
+                "the unit of length is unknown: no positions are sent to LSL; set it to mm or m in the "
+                "server, or set transform.units of the source",
+                num_frames,
+            )
+
+    def _push_values(
+        self, stream: _OpenStream, frames: Sequence[CapturedFrame], index: int, suspended_us: int
+    ) -> None:
+        layout = frames[0].frame.layout
+        component = layout.components[index]
+        start, end = layout.content_spans[index]
+        data = b"".join([captured.frame.body[start + _ITEMS_OFFSET : end] for captured in frames])
+        num_fields = component.item_bytes // 4
+        values = np.frombuffer(data, np.dtype("f4").newbyteorder(layout.byte_order))
+        items = values.reshape(len(frames), component.num_items, num_fields)
+        times_s = [_time_us(captured, index, suspended_us)[0] / 1e6 for captured in frames]
+        content = samples_content(
+            times_s, samples(component.type, items, self._described.frame, stream.num_items)
+        )
+        if not self._send(Message(Kind.SAMPLES, stream.number, content)):
+            self._count_loss("not open", NOT_OPEN, len(frames))
+
+    def _push_events(
+        self, stream: _OpenStream, frames: Sequence[CapturedFrame], index: int, suspended_us: int
+    ) -> None:
+        times_s: list[float] = []
+        texts: list[str] = []
+        for captured in frames:
+            component_us, timestamp_us = _time_us(captured, index, suspended_us)
+            for item in captured.frame.component(index).items():
+                texts.append(_event_marker(self._described.parameters, item))
+                times_s.append((component_us + _event_delay_us(item, timestamp_us)) / 1e6)
+        message = Message(Kind.TEXTS, stream.number, json_content((times_s, texts)))
+        if texts and not self._send(message):
+            self._count_loss("not open", NOT_OPEN, len(frames))
+
+    def _count_loss(self, cause: str, text: str, num_frames: int) -> None:
+        self.losses.lost(cause, text, messages=num_frames, frames=num_frames)
+
+
+def _limited_buffer_s(stream: LslStream, buffer_s: int) -> int:
+    bytes_per_s = 4 * len(stream.channels) * (stream.rate_hz or _IRREGULAR_SAMPLES)
+    return max(1, min(buffer_s, int(MAX_BUFFER_BYTES / bytes_per_s)))
+
+
+def _time_us(captured: CapturedFrame, index: int, suspended_us: int) -> tuple[int, int]:
+    """Return when a component was captured, on the monotonic clock, and its time stamp from the server."""
+    frame, layout = captured.frame, captured.frame.layout
+    _, timestamp_us = layout.unpack_number_and_timestamp(frame.body, layout.content_spans[index][0])
+    captured_us = captured.captured_us - suspended_us
+    if index:
+        apart_us = timestamp_us - frame.number_and_timestamp[1]
+        captured_us += apart_us if abs(apart_us) <= _MAX_APART_US else 0
+    return captured_us, timestamp_us
+
+
+def _event_delay_us(item: Any, timestamp_us: int) -> int:
+    """Return how much later than its component an event happened (field note 6); it may be negative."""
+    if "timestamp" not in item.dtype.names:
+        return 0
+    delay_us = int(item["timestamp"]) - timestamp_us
+    return delay_us if abs(delay_us) <= MAX_EVENT_AGE_US else 0
+
+
+def _event_marker(parameters: Parameters, item: Any) -> str:
+    label, description = event_text(parameters, item)
+    return printable(f"{label}: {description}" if description else label)

@@ -1,0 +1,191 @@
+"""Starts the process for LSL, sends to it, and starts it again if it ends."""
+
+import contextlib
+import logging
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Final
+
+from gateway.log import FailureLog
+from gateway.outputs.lsl.settings import LslSettings
+from gateway.outputs.lsl.wire import Message, Report
+
+SEND_TIMEOUT_S: Final = 5.0
+"""If the process takes nothing for so long, it is killed and another one started."""
+
+_FIRST_RETRY_S: Final = 1.0
+_MAX_RETRY_S: Final = 30.0
+_STEADY_S: Final = 60.0
+"""After a process that lived so long, the next one starts after _FIRST_RETRY_S."""
+
+_END_S: Final = 1.0
+_SOCKET_BYTES: Final = 1 << 20
+_NO_STREAMS: Final[frozenset[int]] = frozenset()
+
+logger = logging.getLogger(__name__)
+
+
+class LslProcesses:
+    """Has one process for LSL at a time. ``send``, ``restart`` and ``stop`` are for one thread.
+
+    ``wanted`` are the numbers of the streams that somebody receives.
+    """
+
+    def __init__(self, settings: LslSettings) -> None:
+        self.wanted = _NO_STREAMS
+        self.interrupted = False
+        """Whether somebody received streams from a process that has ended, and no other one is ready yet."""
+        self._settings = settings
+        self._report = Report()
+        self._problem = "the process for LSL has not started yet"
+        self._socket: socket.socket | None = None
+        self._process: subprocess.Popen[bytes] | None = None
+        self._started_s = 0.0
+        self._retry_s = 0.0
+        self._retry_delay_s = _FIRST_RETRY_S
+        self._is_stopped = False
+        self._failures = FailureLog(logger, "lsl")
+
+    @property
+    def problem(self) -> str:
+        """Why nothing can be sent now, and what to do; "" if it can."""
+        if self._socket is None:
+            return self._problem
+        if self._report.not_opened:
+            return _not_opened(self._report)
+        return "" if self._report.ready else "liblsl is not loaded yet"
+
+    @property
+    def version(self) -> str:
+        """The version of liblsl, as its number; "" if it is not loaded."""
+        return self._report.ready
+
+    @property
+    def is_due(self) -> bool:
+        """Whether ``restart`` should be called, because there is no process."""
+        return self._socket is None and not self._is_stopped and time.monotonic() >= self._retry_s
+
+    def restart(self, reopen: Callable[[], None]) -> None:
+        """Start a process if there is none; ``reopen`` sends it the streams."""
+        if not self.is_due:
+            return
+        ours, theirs = socket.socketpair()
+        self._report = Report()
+        self._started_s = time.monotonic()
+        self._retry_s = self._started_s + self._retry_delay_s
+        try:
+            with theirs:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", "gateway.outputs.lsl.process"],
+                    stdin=theirs.fileno(),
+                    stdout=subprocess.DEVNULL,
+                    stderr=subprocess.DEVNULL,  # liblsl writes a line for each mistake of a client
+                    env=lsl_environment(self._settings),
+                    start_new_session=True,  # Ctrl+C is for the gateway
+                )
+        except OSError as error:
+            ours.close()
+            self._failed(f"the process for LSL cannot be started: {error.strerror}")
+            return
+        ours.settimeout(SEND_TIMEOUT_S)
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SOCKET_BYTES)
+        self._socket = ours
+        threading.Thread(
+            target=self._read_reports, args=(ours, self._process), name="lsl-reports", daemon=True
+        ).start()
+        reopen()
+
+    def send(self, message: Message) -> bool:
+        """Send one message; return False if there is no process. The next process gets all streams."""
+        ours = self._socket
+        if ours is None:
+            return False
+        try:
+            ours.sendall(message.encode())
+        except OSError:
+            # A part of the message may have been sent, so the connection is of no use any more.
+            self._kill()
+            return False
+        return True
+
+    def stop(self) -> None:
+        """End the process."""
+        self._is_stopped = True
+        self._problem = "LSL is closed; start the gateway again"
+        ours, self._socket = self._socket, None
+        self.wanted = _NO_STREAMS
+        if ours is not None:
+            with contextlib.suppress(OSError):
+                ours.shutdown(socket.SHUT_RDWR)
+        if self._process is not None:
+            try:
+                self._process.wait(_END_S)
+            except subprocess.TimeoutExpired:
+                self._process.kill()
+                self._process.wait()
+        if ours is not None:
+            ours.close()
+
+    def _kill(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+
+    def _read_reports(self, ours: socket.socket, process: subprocess.Popen[bytes]) -> None:
+        """Read what the process reports until it ends, in a thread of its own."""
+        reader = socket.socket(fileno=os.dup(ours.fileno()))
+        reader.settimeout(None)
+        with reader, reader.makefile("rb") as lines, contextlib.suppress(OSError):
+            for line in lines:
+                self._take(Report.decode(line))
+        status = process.wait()
+        if self._is_stopped:
+            return
+        if self.wanted:
+            self.interrupted = True
+        self.wanted = _NO_STREAMS
+        self._socket = None
+        ours.close()
+        lived_s = time.monotonic() - self._started_s
+        if lived_s >= _STEADY_S:
+            self._retry_delay_s = _FIRST_RETRY_S
+        self._retry_s = time.monotonic() + self._retry_delay_s
+        self._retry_delay_s = min(2 * self._retry_delay_s, _MAX_RETRY_S)
+        failure = self._report.failure
+        self._failed(f"the process for LSL {f'failed: {failure}' if failure else f'ended {_reason(status)}'}")
+
+    def _take(self, report: Report) -> None:
+        before, self._report = self._report, report
+        self.wanted = frozenset(report.wanted)
+        if report.not_opened and report.not_opened != before.not_opened:
+            self._failures.failed(_not_opened(report))
+        elif report.ready and not report.not_opened and (before.not_opened or not before.ready):
+            self.interrupted = False
+            self._failures.succeeded(f"streams are offered by liblsl {report.ready}")
+
+    def _failed(self, text: str) -> None:
+        self._problem = f"{text}; it is started again"
+        self._failures.failed(self._problem)
+
+
+def lsl_environment(settings: LslSettings) -> dict[str, str]:
+    """Return the environment of a process that uses liblsl as the settings say."""
+    config = {"LSLAPICFG": settings.config} if settings.config else {}
+    return {**os.environ, "OPENBLAS_NUM_THREADS": "1", **config}
+
+
+def _not_opened(report: Report) -> str:
+    return f"liblsl cannot open the stream {report.not_opened}"
+
+
+def _reason(status: int) -> str:
+    if status >= 0:
+        return f"with status {status}"
+    with contextlib.suppress(ValueError):
+        return f"by {signal.Signals(-status).name}"
+    return f"by signal {-status}"

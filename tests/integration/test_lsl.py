@@ -1,0 +1,236 @@
+"""LSL as its users see it: pylsl's inlets in another process, and the file that LabRecorder writes."""
+
+import json
+import math
+import os
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pytest
+import pyxdf
+import yaml
+
+from tests.gateway_process import PROGRAM, program, simulator
+from tests.lsl_receiver import LslReceiver, lsl_config
+from tests.waiting import wait_until
+from tests.xdf import RecordedStream, write_xdf
+
+pytestmark = pytest.mark.netns
+
+NAMES: Final = ("lab_3d", "lab_6d", "lab_analog", "lab_force", "lab_event")
+RATE_HZ: Final = 100
+ANALOG_RATE_HZ: Final = 1000
+SCENE: Final = (
+    *("--rate", str(RATE_HZ), "--analog-rate", str(ANALOG_RATE_HZ)),
+    *("--markers", "4", "--tools", "2", "--analog", "3", "--plates", "1"),
+)
+TIMEOUT_S: Final = 30.0
+
+
+class Lab:
+    """A gateway with LSL and one source. ``config`` is the file of liblsl."""
+
+    def __init__(self, folder: Path, port: int, **source: Any) -> None:
+        self.config = lsl_config(folder)
+        self.file = folder / "gateway.yaml"
+        self.log_file = folder / "gateway.log"
+        self.configuration: dict[str, Any] = {
+            "sources": [{"name": "lab", "host": "127.0.0.1", "port": port, **source}],
+            "zenoh": {"enabled": False},
+            "lcm": {"enabled": False},
+            "metrics": {"enabled": False},
+            "lsl": {"enabled": True, "config": str(self.config)},
+        }
+        self.file.write_text(yaml.safe_dump(self.configuration))
+        self._exit = ExitStack()
+
+    def start(self, **environ: str) -> Any:
+        """Start the gateway; return its process."""
+        log = self._exit.enter_context(self.log_file.open("wb"))
+        return self._exit.enter_context(
+            program("run", "--config", str(self.file), stderr=log, environ=environ)
+        )
+
+    def receive(self, *names: str) -> LslReceiver:
+        """Connect a receiver, and wait until it has the streams."""
+        receiver = LslReceiver(self.config, *names)
+        self._exit.callback(receiver.close)
+        wait_until(lambda: set(names) <= set(receiver.xml), TIMEOUT_S)
+        return receiver
+
+    @property
+    def log(self) -> str:
+        return self.log_file.read_text()
+
+    def close(self) -> None:
+        self._exit.close()
+
+
+@contextmanager
+def running(folder: Path, *scene: str, **source: Any) -> Iterator[Lab]:
+    with simulator(*(scene or SCENE)) as (port, _):
+        lab = Lab(folder, port, **source)
+        lab.start()
+        try:
+            yield lab
+        finally:
+            lab.close()
+
+
+def has(receiver: LslReceiver, name: str, count: int) -> Callable[[], bool]:
+    return lambda: len(receiver.samples[name]) >= count
+
+
+def children(process_id: int) -> list[int]:
+    """Return the process for LSL of a gateway."""
+    listed = subprocess.run(["pgrep", "-P", str(process_id)], capture_output=True, text=True, check=False)
+    return [int(line) for line in listed.stdout.split()]
+
+
+def test_a_recording_has_labels_units_rates_and_capture_times(tmp_path: Path) -> None:
+    with running(tmp_path) as lab:
+        began_s = time.monotonic()
+        receiver = lab.receive(*NAMES)
+        wait_until(lambda: all(has(receiver, name, 4)() for name in NAMES), TIMEOUT_S)
+        wait_until(has(receiver, "lab_analog", 3 * ANALOG_RATE_HZ), TIMEOUT_S)
+        ended_s = time.monotonic()
+    file = tmp_path / "recording.xdf"
+    streams = [
+        RecordedStream(receiver.xml[name], [(began_s, receiver.offset_s[name])], receiver.samples[name])
+        for name in NAMES
+    ]
+    write_xdf(file, streams)
+    read, _ = pyxdf.load_xdf(str(file))
+    found = {stream["info"]["name"][0]: stream for stream in read}
+    assert {name: stream["info"]["type"][0] for name, stream in found.items()} == {
+        "lab_3d": "MoCap",
+        "lab_6d": "MoCap",
+        "lab_analog": "Analog",
+        "lab_force": "Force",
+        "lab_event": "Markers",
+    }
+    rates_hz = {name: float(stream["info"]["nominal_srate"][0]) for name, stream in found.items()}
+    assert rates_hz == {
+        "lab_3d": RATE_HZ,
+        "lab_6d": RATE_HZ,
+        "lab_analog": ANALOG_RATE_HZ,
+        "lab_force": ANALOG_RATE_HZ,
+        "lab_event": 0,
+    }
+    for name, rate_hz in rates_hz.items():
+        stream = found[name]
+        if rate_hz:
+            assert stream["info"]["effective_srate"] == pytest.approx(rate_hz, rel=0.01)
+        times_s = stream["time_stamps"]
+        # On one computer, LSL's clock is the monotonic one: samples were captured before they arrived.
+        assert began_s < times_s[0] <= times_s[-1] < ended_s
+        assert len(channels(stream)) == int(stream["info"]["channel_count"][0])
+    assert [channel["label"][0] for channel in channels(found["lab_3d"])][:4] == [
+        "Marker 1_X",
+        "Marker 1_Y",
+        "Marker 1_Z",
+        "Marker 1_reliability",
+    ]
+    tool = channels(found["lab_6d"])[:8]
+    assert [channel["type"][0] for channel in tool] == [
+        *("PositionX", "PositionY", "PositionZ"),
+        *("OrientationB", "OrientationC", "OrientationD", "OrientationA"),
+        "Error",
+    ]
+    assert {channel["unit"][0] for channel in tool} == {"meters", "quaternion"}
+    assert [channel["unit"][0] for channel in channels(found["lab_force"])] == ["N"] * 3 + ["Nm"] * 3
+    assert [channel["unit"][0] for channel in channels(found["lab_analog"])] == ["mV"] * 3
+    [markers] = found["lab_3d"]["info"]["desc"][0]["setup"][0]["markers"]
+    assert len(markers["marker"]) == 4
+    assert all(text.startswith("Button: ") for [text] in found["lab_event"]["time_series"])
+    positions = found["lab_3d"]["time_series"][:, :3]
+    assert np.nanmax(abs(positions)) < 5  # metres
+    quaternions = found["lab_6d"]["time_series"][:, 3:7]
+    lengths = np.linalg.norm(quaternions[~np.isnan(quaternions).any(axis=1)], axis=1)
+    assert lengths == pytest.approx(np.ones_like(lengths), abs=1e-3)
+
+
+def channels(stream: Any) -> list[Any]:
+    found: list[Any] = stream["info"]["desc"][0]["channels"][0]["channel"]
+    return found
+
+
+def test_events_have_their_own_time_between_the_frames(tmp_path: Path) -> None:
+    """The simulator's button is pressed for 0.3 s, whatever the rate of the frames is."""
+    with running(tmp_path, "--rate", "20", "--analog", "0", "--plates", "0") as lab:
+        receiver = lab.receive("lab_event")
+        wait_until(has(receiver, "lab_event", 6), TIMEOUT_S)
+    samples = receiver.samples["lab_event"]
+    pressed = [time_s for time_s, [text] in samples if text.endswith("ON")]
+    released = [time_s for time_s, [text] in samples if text.endswith("OFF")]
+    released = [time_s for time_s in released if time_s > pressed[0]]
+    assert [after - before for before, after in zip(pressed, released, strict=False)] == pytest.approx(
+        [0.3] * min(len(pressed), len(released)), abs=2e-3
+    )
+
+
+def test_positions_are_in_the_frame_of_the_source(tmp_path: Path) -> None:
+    transform = {"translation_m": [100.0, 0.0, 0.0]}
+    with running(tmp_path, transform=transform, frame_id="world") as lab:
+        receiver = lab.receive("lab_3d")
+        wait_until(has(receiver, "lab_3d", 10), TIMEOUT_S)
+    assert "<frame_id>world</frame_id>" in receiver.xml["lab_3d"]
+    xs = [values[0] for _, values in receiver.samples["lab_3d"] if not math.isnan(values[0])]
+    assert xs
+    assert all(90 < x < 110 for x in xs)
+
+
+def test_a_stream_on_demand_runs_only_while_somebody_receives(tmp_path: Path) -> None:
+    stream = {"on_demand": True, "idle_after_s": 0.2}
+    with running(tmp_path, streams=[stream]) as lab:
+        receiver = lab.receive("lab_3d")
+        wait_until(has(receiver, "lab_3d", 50), TIMEOUT_S)
+        receiver.close()
+        wait_until(lambda: "streaming → idle" in lab.log, TIMEOUT_S)
+        again = lab.receive("lab_3d")
+        wait_until(has(again, "lab_3d", 10), TIMEOUT_S)
+
+
+def test_a_receiver_continues_when_the_process_for_lsl_has_ended(tmp_path: Path) -> None:
+    with simulator(*SCENE) as (port, _):
+        lab = Lab(tmp_path, port)
+        gateway = lab.start()
+        receiver = lab.receive("lab_3d")
+        wait_until(has(receiver, "lab_3d", 10), TIMEOUT_S)
+        [process] = children(gateway.pid)
+        os.kill(process, 9)
+        wait_until(lambda: "the process for LSL ended by SIGKILL" in lab.log, TIMEOUT_S)
+        count = len(receiver.samples["lab_3d"])
+        wait_until(has(receiver, "lab_3d", count + 100), TIMEOUT_S)
+        lab.close()
+
+
+def test_the_process_for_lsl_ends_with_the_gateway(tmp_path: Path) -> None:
+    with simulator(*SCENE) as (port, _):
+        lab = Lab(tmp_path, port)
+        for end in ("terminate", "kill"):
+            gateway = lab.start()
+            lab.receive("lab_3d")
+            [process] = children(gateway.pid)
+            getattr(gateway, end)()
+            gateway.wait(5)
+            wait_until(lambda process=process: not Path(f"/proc/{process}/cmdline").exists(), 5)  # type: ignore[misc]
+        lab.close()
+
+
+def test_the_doctor_finds_the_streams_of_a_running_gateway(tmp_path: Path) -> None:
+    with running(tmp_path) as lab:
+        lab.receive("lab_3d")
+        command = [*PROGRAM, "doctor", "--config", str(lab.file), "--json"]
+        result = subprocess.run(command, capture_output=True, text=True, check=False)
+    found = {
+        finding["check"]: finding["result"]
+        for finding in json.loads(result.stdout)["findings"]
+        if finding["subject"] == "lsl"
+    }
+    assert found == {"opens": "green", "found": "green", "gateway": "green"}, result.stdout
