@@ -4,6 +4,7 @@ from gateway.config.settings import SourceSettings
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
+from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.registry import OUTPUTS, build_outputs
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
@@ -24,9 +25,10 @@ def test_every_output_has_its_section() -> None:
         "lcm": LcmSettings,
         "takes": TakesSettings,
         "ros2": Ros2Settings,
-        "vrpn": VrpnSettings,
-        "foxglove": FoxgloveSettings,
         "rtc3d": Rtc3dSettings,
+        "vrpn": VrpnSettings,
+        "lsl": LslSettings,
+        "foxglove": FoxgloveSettings,
     }
     assert list(OUTPUTS) == list(settings.outputs)
 
