@@ -35,8 +35,16 @@ public final class Subscriber {
             out.println("Arguments: [SOURCE [COUNT]], or --vectors < LINES");
             System.exit(arguments[0].equals("--help") ? 0 : 2);
         } else {
-            String source = arguments.length > 0 ? arguments[0] : "LAB";
-            subscribe(source, arguments.length > 1 ? Integer.parseInt(arguments[1]) : Integer.MAX_VALUE);
+            try {
+                String source = arguments.length > 0 ? arguments[0] : "LAB";
+                subscribe(source, arguments.length > 1 ? Integer.parseInt(arguments[1]) : Integer.MAX_VALUE);
+            } catch (NumberFormatException error) {
+                System.err.println("COUNT must be a number, not " + arguments[1]);
+                System.exit(1);
+            } catch (IOException error) {
+                System.err.println("Cannot open LCM; check $LCM_DEFAULT_URL and the multicast route: " + error);
+                System.exit(1);
+            }
         }
     }
 

@@ -324,5 +324,11 @@ int main(int argc, char **argv)
                argv[0], argv[0]);
         return strcmp(argv[1], "--help") == 0 ? 0 : 2;
     }
-    return subscribe(argc > 1 ? argv[1] : "LAB", argc > 2 ? atol(argv[2]) : 0);
+    char *end = "";
+    const long count = argc > 2 ? strtol(argv[2], &end, 10) : 0;
+    if (*end || count < 0) {
+        fprintf(stderr, "COUNT must be a number, not %s\n", argv[2]);
+        return 1;
+    }
+    return subscribe(argc > 1 ? argv[1] : "LAB", count);
 }

@@ -371,6 +371,11 @@ int main(int argc, char **argv)
                   << "       " << argv[0] << " --vectors < LINES\n";
         return arguments[0] == "--help" ? 0 : 2;
     }
-    return subscribe(arguments.empty() ? "LAB" : arguments[0],
-                     arguments.size() > 1 ? std::atol(arguments[1].c_str()) : 0);
+    char *end = nullptr;
+    const long count = arguments.size() > 1 ? std::strtol(arguments[1].c_str(), &end, 10) : 0;
+    if (count < 0 || (end && *end)) {
+        std::cerr << "COUNT must be a number, not " << arguments[1] << "\n";
+        return 1;
+    }
+    return subscribe(arguments.empty() ? "LAB" : arguments[0], count);
 }

@@ -33,8 +33,22 @@ static class Subscriber
             return arguments[0] == "--help" ? 0 : 2;
         }
         var source = arguments.Length > 0 ? arguments[0] : "LAB";
-        Subscribe("MOCAP_" + source + "_3D", arguments.Length > 1 ? long.Parse(arguments[1]) : long.MaxValue);
-        return 0;
+        var count = long.MaxValue;
+        if (arguments.Length > 1 && !long.TryParse(arguments[1], out count))
+        {
+            Console.Error.WriteLine("COUNT must be a number, not " + arguments[1]);
+            return 1;
+        }
+        try
+        {
+            Subscribe("MOCAP_" + source + "_3D", count);
+            return 0;
+        }
+        catch (Exception error) when (error is ArgumentException || error is SocketException)
+        {
+            Console.Error.WriteLine("Cannot receive from LCM: " + error.Message);
+            return 1;
+        }
     }
 
     static void Subscribe(string channel, long count)
@@ -147,19 +161,27 @@ static class Subscriber
     }
 }
 
-// Receives the messages of a multicast group. LCM sends a message of up to 64 kB as one UDP packet: "LC02", a number of
-// 4 bytes, the channel and a NUL, the message. It cuts up larger messages, which this class does not put together.
+// Receives the messages of a multicast group. docs/reference/messages.md describes LCM's packets.
 sealed class LcmReceiver : IDisposable
 {
+    const int MaxMessageBytes = 1 << 24;
+    const int MaxIncomplete = 16; // messages: anyone can send fragments that never become one
+
     readonly UdpClient client = new UdpClient();
+    readonly Dictionary<IPEndPoint, Incomplete> incomplete = new Dictionary<IPEndPoint, Incomplete>();
 
     public LcmReceiver(string url)
     {
-        var address = new Uri(string.IsNullOrEmpty(url) ? "udpm://239.255.76.67:7667" : url);
+        Uri address;
+        IPAddress group = null;
+        url = string.IsNullOrEmpty(url) ? "udpm://239.255.76.67:7667" : url;
+        if (!Uri.TryCreate(url, UriKind.Absolute, out address) || address.Scheme != "udpm"
+                || !IPAddress.TryParse(address.Host, out group) || address.Port <= 0)
+            throw new ArgumentException("give LCM_DEFAULT_URL as udpm://GROUP:PORT, not " + url);
         client.Client.SetSocketOption(SocketOptionLevel.Socket, SocketOptionName.ReuseAddress, true);
         client.Client.ReceiveBufferSize = 1 << 20;
         client.Client.Bind(new IPEndPoint(IPAddress.Any, address.Port));
-        client.JoinMulticastGroup(IPAddress.Parse(address.Host));
+        client.JoinMulticastGroup(group);
     }
 
     // Wait for a message on this channel, and return its bytes.
@@ -170,15 +192,59 @@ sealed class LcmReceiver : IDisposable
         {
             IPEndPoint sender = null;
             var packet = client.Receive(ref sender);
-            if (Encoding.ASCII.GetString(packet, 0, Math.Min(packet.Length, 4)) == "LC02"
-                    && packet.Skip(8).Take(start.Length).SequenceEqual(start))
-                return packet.Skip(8 + start.Length).ToArray();
+            var message = Message(sender, packet);
+            if (message != null && message.Take(start.Length).SequenceEqual(start))
+                return message.Skip(start.Length).ToArray();
         }
     }
 
     public void Dispose()
     {
         client.Close();
+    }
+
+    // Return the channel, a NUL and the message if this packet is one or completes one; otherwise null.
+    byte[] Message(IPEndPoint sender, byte[] packet)
+    {
+        var magic = Encoding.ASCII.GetString(packet, 0, Math.Min(packet.Length, 4));
+        if (magic == "LC02")
+            return packet.Skip(8).ToArray();
+        if (magic != "LC03" || packet.Length < 20)
+            return null;
+        var header = new LCM.LCM.LCMDataInputStream(packet.Skip(4).Take(16).ToArray());
+        int sequence = header.ReadInt32(), size = header.ReadInt32(), offset = header.ReadInt32();
+        var numbers = header.ReadInt32();
+        int number = numbers >> 16 & 0xFFFF, count = numbers & 0xFFFF;
+        // The channel is in fragment 0 only, and is not counted in sizes and offsets.
+        var nul = number == 0 ? Array.IndexOf(packet, (byte)0, 20) : 19;
+        if (size < 0 || size > MaxMessageBytes || number >= count || nul < 0 || offset < 0
+                || offset > size - (packet.Length - nul - 1))
+            return null;
+        Incomplete message;
+        if (!incomplete.TryGetValue(sender, out message) || message.Sequence != sequence
+                || message.Data.Length != size || message.Has.Length != count)
+        {
+            if (incomplete.Count >= MaxIncomplete)
+                incomplete.Clear();
+            message = new Incomplete { Sequence = sequence, Data = new byte[size], Has = new bool[count] };
+            incomplete[sender] = message;
+        }
+        Array.Copy(packet, nul + 1, message.Data, offset, packet.Length - nul - 1);
+        message.Has[number] = true;
+        if (number == 0)
+            message.Channel = packet.Skip(20).Take(nul + 1 - 20).ToArray();
+        if (message.Has.Contains(false))
+            return null;
+        incomplete.Remove(sender);
+        return message.Channel.Concat(message.Data).ToArray();
+    }
+
+    sealed class Incomplete
+    {
+        public int Sequence;
+        public byte[] Channel;
+        public byte[] Data;
+        public bool[] Has;
     }
 }
 
