@@ -21,8 +21,9 @@ pytestmark = pytest.mark.netns
 
 GROUP: Final = ("239.255.76.67", 7713)
 LCM_URL: Final = f"udpm://{GROUP[0]}:{GROUP[1]}?ttl=0"
+# What a test sends at once fits into a receive buffer of 400 kB, so a slow program loses nothing.
 CHANNEL, SMALL = markers(3, 1)
-_, LARGE = markers(20_000, 2)  # 320 kB: five fragments
+_, LARGE = markers(5000, 2)  # 80 kB: two fragments
 _NAMES: Final = {"Go, LCM", "Rust, LCM", "JavaScript, LCM"}
 each_program = pytest.mark.parametrize("program", [each for each in PROGRAMS if each.name in _NAMES], ids=str)
 
@@ -55,7 +56,7 @@ def whole(channel: bytes, data: bytes, sequence: int = 0) -> bytes:
     return struct.pack(">II", 0x4C433032, sequence) + channel + b"\0" + data
 
 
-def fragments(data: bytes, sequence: int = 0, size: int = 50_000) -> list[bytes]:
+def fragments(data: bytes, sequence: int = 0, size: int = 20_000) -> list[bytes]:
     """Return the packets of a message on CHANNEL."""
     places = range(0, len(data), size)
     return [
@@ -74,17 +75,17 @@ def test_fragments_are_joined(program: ExampleProgram) -> None:
             publisher.publish(CHANNEL, message)
         lines = process.communicate(timeout=30)[0].splitlines()
     assert [line.partition(":")[2].partition(" in view")[0] for line in lines] == [
-        " 3 of 3 markers", " 20000 of 20000 markers", " 3 of 3 markers",
+        " 3 of 3 markers", " 5000 of 5000 markers", " 3 of 3 markers",
     ]  # fmt: skip
     assert process.returncode == 0
 
 
 @each_program
-def test_fragments_of_two_senders_may_alternate_and_be_out_of_order_and_doubled(
+def test_fragments_of_two_senders_may_alternate_in_any_order(
     program: ExampleProgram,
 ) -> None:
-    other = markers(15_000, 7)[1]
-    packets = zip_longest(fragments(LARGE)[::-1], fragments(other, size=40_000))
+    other = markers(4500, 7)[1]
+    packets = zip_longest(fragments(LARGE)[::-1], fragments(other, size=15_000))
     with listening(program, 2) as process, multicast() as first, multicast() as second:
         for ours, theirs in packets:
             for sender, packet in ((first, ours), (second, theirs)):
@@ -92,7 +93,7 @@ def test_fragments_of_two_senders_may_alternate_and_be_out_of_order_and_doubled(
                     sender.send(packet)
                     sender.send(packet)
         text = process.communicate(timeout=30)[0]
-    assert set(re.findall(r"#(\d+) frame .* (\d+) markers", text)) == {("2", "20000"), ("7", "15000")}
+    assert set(re.findall(r"#(\d+) frame .* (\d+) markers", text)) == {("2", "5000"), ("7", "4500")}
 
 
 HOSTILE: Final = (
@@ -131,17 +132,17 @@ def data_kb(process: "subprocess.Popen[str]") -> int:
 @each_program
 def test_many_senders_of_incomplete_messages_do_not_fill_the_memory(program: ExampleProgram) -> None:
     [beginning, *_] = fragments(bytes(1_000_000), size=100)
-    with listening(program, 1) as process:
+    with listening(program, 1) as process, multicast() as other:
         before_kb = data_kb(process)
-        for _ in range(3000):
-            with multicast() as sender:
-                sender.send(beginning)
-        with multicast() as sender:
-            sender.send(whole(CHANNEL.encode(), b"x"))
+        for _ in range(10):
+            for _ in range(300):  # as many as the receive buffer holds, if the program is slow
+                with multicast() as sender:
+                    sender.send(beginning)
+            other.send(whole(CHANNEL.encode(), b"x"))
             assert process.stderr is not None
             assert process.stderr.readline().startswith("ignored a malformed message on ")
-            used_kb = data_kb(process) - before_kb
-            sender.send(whole(CHANNEL.encode(), SMALL))
+        used_kb = data_kb(process) - before_kb
+        other.send(whole(CHANNEL.encode(), SMALL))
         process.communicate(timeout=30)
     assert used_kb < 1_000_000
 
