@@ -21,6 +21,7 @@ from typing import Any, NamedTuple, Self
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
 _GUID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
@@ -252,8 +253,19 @@ def decode(channel: dict[str, Any], data: bytes) -> Any:
         assert channel["schemaEncoding"] == "jsonschema"
         assert json.loads(channel["schema"]) == {"type": "object"}
         return json.loads(data)
+    if channel["encoding"] == "cdr":
+        assert channel["schemaEncoding"] == "ros2msg"
+        store = _message_types(channel["schemaName"], channel["schema"])
+        return store.deserialize_cdr(data, channel["schemaName"])
     assert channel["encoding"] == channel["schemaEncoding"] == "protobuf"
     return _message_class(channel["schemaName"], channel["schema"]).FromString(data)
+
+
+@cache
+def _message_types(name: str, definition: str) -> Any:
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(definition, name))
+    return store
 
 
 @cache

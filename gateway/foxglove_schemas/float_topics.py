@@ -1,12 +1,13 @@
-"""Protobuf messages with one number per label: plots find each by its name.
+"""Messages with one number per label: plots find each by its name.
 
-With 69 channels, they need a fifth of the space of JSON, and a thirtieth of the time.
+They are protobuf. With 69 channels, they need a fifth of the space of JSON, and a thirtieth of the time.
+Live, they are CDR with the message definition of ROS 2 as well: PlotJuggler 3.17 takes nothing else.
 """
 
 import unicodedata
 from collections import Counter
 from collections.abc import Sequence
-from typing import Final
+from typing import Final, Protocol
 
 import numpy as np
 from google.protobuf.descriptor_pb2 import (
@@ -28,6 +29,8 @@ MAX_FIELDS: Final = 10_000
 _MAX_LIVE_RECORDS: Final = 20
 """How many a live output remembers. More can only come from labels that change all the time."""
 
+_CDR_LITTLE_ENDIAN: Final = b"\x00\x01\x00\x00"
+
 _FIXED_32_BITS: Final = 5
 """The wire type of float."""
 
@@ -36,37 +39,64 @@ class FloatTopics:
     """The topics of one source whose messages have a number for each label.
 
     Programs decode all messages of a topic in the same way, and look up the fields by the name of the schema.
-    So in a file, there is another topic for other labels, such as /lab/analog_2. With ``one_topic``, there is
-    only another schema: a live output withdraws the topic and announces it again.
+    So in a file, there is another topic for other labels, such as /lab/analog_2. If ``is_live``, there is
+    only another schema: a live output withdraws the topic and announces it again. It has a second topic,
+    /lab/analog/cdr.
     """
 
-    def __init__(self, source: str, *, one_topic: bool = False) -> None:
+    def __init__(self, source: str, *, is_live: bool = False) -> None:
         self.source = source
-        self._one_topic = one_topic
-        self._package = f"rtc3d.{field_names([source], 'source')[0]}"
-        self._records: dict[tuple[str, tuple[str, ...]], FloatRecord] = {}
+        self._is_live = is_live
+        self._name = field_names([source], "source")[0]
+        self._records: dict[tuple[str, tuple[str, ...]], tuple[FloatRecord, ...]] = {}
         self._numbers: Counter[str] = Counter()
 
-    def record(self, name: str, fields: tuple[str, ...]) -> "FloatRecord":
-        """Return the messages with these fields, which ``field_names`` has made.
+    def records(self, name: str, fields: tuple[str, ...]) -> "tuple[FloatRecord, ...]":
+        """Return the messages with these fields, which ``field_names`` has made, for each of the topics.
 
         ``name`` is the topic without the source, such as "analog".
         """
         found = self._records.get((name, fields))
         if found is None:
-            if self._one_topic and len(self._records) >= _MAX_LIVE_RECORDS:
+            if self._is_live and len(self._records) >= _MAX_LIVE_RECORDS:
                 self._records.clear()
             self._numbers[name] += 1
-            number = self._numbers[name]
-            suffix = f"_{number}" if number > 1 else ""
-            schema_name = f"{self._package}.{name.capitalize()}{suffix}"
-            topic_name = f"/{self.source}/{name}" + ("" if self._one_topic else suffix)
-            found = self._records[name, fields] = FloatRecord(topic_name, schema_name, fields)
+            suffix = f"_{self._numbers[name]}" if self._numbers[name] > 1 else ""
+            schema = f"{name.capitalize()}{suffix}"
+            topic = f"/{self.source}/{name}" + ("" if self._is_live else suffix)
+            found = (ProtobufRecord(topic, f"rtc3d.{self._name}.{schema}", fields),)
+            if self._is_live:
+                found += (CdrRecord(f"{topic}/cdr", f"rtc3d_{self._name}/msg/{schema}", fields),)
+            self._records[name, fields] = found
         return found
 
 
-class FloatRecord:
-    """The messages of a topic that have a field of type float for each name, at most MAX_FIELDS."""
+class FloatRecord(Protocol):
+    """The messages of a topic that have a field of 32 bits for each name, at most MAX_FIELDS."""
+
+    topic: Topic
+
+    def encode(self, values: Items) -> bytes:
+        """Return the message with these values, one per field, in the order of the names."""
+
+
+class CdrRecord:
+    """A FloatRecord in CDR, little-endian, described as a message of ROS 2."""
+
+    def __init__(self, topic_name: str, schema_name: str, names: Sequence[str]) -> None:
+        # PlotJuggler needs a letter at the beginning.
+        names = field_names([f"n{name}" if name.startswith("_") else name for name in names], "number")
+        schema = "".join(f"float32 {name}\n" for name in names).encode()
+        self.topic = Topic(topic_name, "cdr", schema_name, "ros2msg", schema)
+
+    def encode(self, values: Items) -> bytes:
+        """See FloatRecord."""
+        data: bytes = values.astype("<f4").tobytes()
+        return _CDR_LITTLE_ENDIAN + data
+
+
+class ProtobufRecord:
+    """A FloatRecord in protobuf."""
 
     def __init__(self, topic_name: str, schema_name: str, names: Sequence[str]) -> None:
         self.topic = Topic(topic_name, "protobuf", schema_name, "protobuf", _schema(schema_name, names))
@@ -80,7 +110,7 @@ class FloatRecord:
         self._places = np.array(places, np.intp)[:, np.newaxis] + np.arange(4)
 
     def encode(self, values: Items) -> bytes:
-        """Return the message with these values, one per field, in the order of the names."""
+        """See FloatRecord."""
         data = self._template.copy()
         data[self._places] = values.astype("<f4").view(np.uint8).reshape(-1, 4)
         return data.tobytes()

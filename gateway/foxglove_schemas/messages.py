@@ -58,8 +58,11 @@ _NO_POSE: Final = Pose(position=Vector3(), orientation=Quaternion(w=1.0))
 """Points without a pose are not valid in rerun."""
 
 _LOADS: Final = ("fx", "fy", "fz", "mx", "my", "mz")
-_NUMBERS: Final = {ComponentType.ANALOG: "channel", ComponentType.FORCE: "plate"}
-"""The components whose messages have a field for each number, and what fields without a name are called."""
+_NOUNS: Final = {ComponentType.ANALOG: "channel", ComponentType.FORCE: "plate"}
+"""What channels and plates without a name are called."""
+
+NUMBERS_PER_ITEM: Final = {ComponentType.ANALOG: 1, ComponentType.FORCE: len(_LOADS)}
+"""The components whose messages have a field for each number."""
 
 _MAX_LAYOUTS: Final = 100
 """How many different numbers of items of one component are remembered."""
@@ -97,7 +100,7 @@ class FoxgloveSource:
         self._frame = frame
         self._forces = ForceScene(source, parameters, frame)
         self._labels: dict[tuple[ComponentType, int], tuple[str, ...]] = {}
-        self._records: dict[tuple[ComponentType, int], FloatRecord] = {}
+        self._records: dict[tuple[ComponentType, int], dict[Topic, FloatRecord]] = {}
         self._markers = topic_of(f"/{source}/markers", PointCloud)
         self._tools = topic_of(f"/{source}/tools", FrameTransforms)
         self._events = topic_of(f"/{source}/events", Log)
@@ -119,7 +122,7 @@ class FoxgloveSource:
     def changed_names(self) -> dict[str, dict[str, str]]:
         """The names of fields that are not the labels of channels or plates, by component key and label."""
         found: dict[str, dict[str, str]] = {}
-        for component, noun in _NUMBERS.items():
+        for component, noun in _NOUNS.items():
             labels = self._labels_of(component, _announced(self._parameters).get(component, 0))
             names = zip(labels, field_names(labels, noun), strict=True)
             found[component.key] = {label: name for label, name in names if label != name}
@@ -133,12 +136,9 @@ class FoxgloveSource:
             case ComponentType.TOOLS:
                 return (self._tools,)
             case ComponentType.ANALOG:
-                return self._number_topics(component, num_items)
+                return tuple(self._number_records(component, num_items))
             case ComponentType.FORCE:
-                return (
-                    *self._number_topics(component, num_items * len(_LOADS)),
-                    self._forces.arrows_topic,
-                )
+                return (*self._number_records(component, num_items), self._forces.arrows_topic)
             case ComponentType.EVENT:
                 return (self._events,)
 
@@ -176,7 +176,8 @@ class FoxgloveSource:
             elif topic is self._forces.arrows_topic:
                 found.append(self._forces.arrows(items, capture_utime))
             else:
-                found.append(self._numbers(component, items.view(">f4"), capture_utime))
+                record = self._number_records(component, len(items))[topic]
+                found.append(FoxgloveMessage(topic, capture_utime, record.encode(items.view(">f4"))))
         return found
 
     def _cloud(self, items: Items, utime: int) -> bytes:
@@ -219,31 +220,24 @@ class FoxgloveSource:
                 )
         return FrameTransforms(transforms=transforms).encode() if transforms else b""
 
-    def _number_topics(self, component: ComponentType, num_values: int) -> tuple[Topic, ...]:
-        """Return the topic of the values of a component by their labels; () if there are none or too many."""
-        return (self._number_record(component, num_values).topic,) if 0 < num_values <= MAX_FIELDS else ()
-
-    def _numbers(self, component: ComponentType, values: Items, utime: int) -> FoxgloveMessage:
-        """Return the values of a component by their labels."""
-        record = self._number_record(component, len(values))
-        return FoxgloveMessage(record.topic, utime, record.encode(values))
-
-    def _number_record(self, component: ComponentType, num_values: int) -> FloatRecord:
-        found = self._records.get((component, num_values))
+    def _number_records(self, component: ComponentType, num_items: int) -> dict[Topic, FloatRecord]:
+        """Return the topics of a component's values by their labels; {} if there are none or too many."""
+        if not 0 < num_items * NUMBERS_PER_ITEM[component] <= MAX_FIELDS:
+            return {}
+        found = self._records.get((component, num_items))
         if found is None:
-            found = self._record(component, num_values)
+            found = {record.topic: record for record in self._new_records(component, num_items)}
             if len(self._records) >= _MAX_LAYOUTS:
                 self._records.clear()
-            self._records[component, num_values] = found
+            self._records[component, num_items] = found
         return found
 
-    def _record(self, component: ComponentType, num_values: int) -> FloatRecord:
+    def _new_records(self, component: ComponentType, num_items: int) -> tuple[FloatRecord, ...]:
+        names = field_names(self._labels_of(component, num_items), _NOUNS[component])
         if component is ComponentType.ANALOG:
-            names = field_names(self._labels_of(component, num_values), _NUMBERS[component])
-            return self._topics.record("analog", names)
-        plates = field_names(self._labels_of(component, num_values // len(_LOADS)), _NUMBERS[component])
-        labels = [f"{plate}_{load}" for plate in plates for load in _LOADS]
-        return self._topics.record("loads", field_names(labels, "load"))
+            return self._topics.records("analog", names)
+        labels = [f"{plate}_{load}" for plate in names for load in _LOADS]
+        return self._topics.records("loads", field_names(labels, "load"))
 
     def _log(self, item: Any, capture_utime: int, timestamp_us: int) -> FoxgloveMessage:
         """Return an event, at its own time stamp if that is plausible."""

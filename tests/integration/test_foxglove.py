@@ -20,6 +20,7 @@ from gateway.outputs.takes.settings import TakesSettings
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
+from gateway.stream.state import StreamState
 from tests.configurations import make_settings
 from tests.foxglove_viewer import viewing
 from tests.networks import free_port
@@ -74,7 +75,7 @@ async def test_viewers_get_the_same_bytes_that_a_take_exports(tmp_path: Path) ->
     export_take(job)
     assert job.notes == []
     exported = raw_messages(tmp_path / "take.mcap")
-    assert exported.keys() == schemas.keys()
+    assert exported.keys() | {"/lab/analog/cdr", "/lab/loads/cdr"} == schemas.keys()
     for name in FRAMES:
         live = [(log.time_ns, log.data) for log in viewer.received[f"/lab/{name}"]]
         first = live.index(exported[f"/lab/{name}"][0])
@@ -120,20 +121,25 @@ async def test_values_are_those_of_the_server_in_the_configured_frame() -> None:
 async def test_streams_on_demand_run_while_a_viewer_is_subscribed() -> None:
     viewers = FoxgloveOutput(FoxgloveSettings(enabled=True, port=free_port()))
     streams = [
-        {"components": ["3d", "6d"], "on_demand": True},
-        {"components": ["analog", "force"], "on_demand": True},
+        {"components": ["3d", "6d"], "on_demand": True, "idle_after_s": 0.1},
+        {"components": ["analog", "force"], "on_demand": True, "idle_after_s": 0.1},
     ]
     async with Simulator(SCENE) as server:
         gateway = Gateway(settings(server.port, streams=streams), [viewers])
         [source] = gateway.sources
+
+        def are_idle() -> bool:
+            return {status.state for status in source.statuses} == {StreamState.IDLE}
+
         async with running_gateway(gateway):
             await gateway.opened.wait()
             async with viewing(viewers.settings.port) as viewer:
                 await viewer.wait_until(lambda: "/lab/analog" in viewer.topics)
-                assert not any(source.fan_out.frames.values())
+                await wait_until_async(are_idle)
                 viewer.subscribe("/lab/analog")
-                await viewer.wait_for("/lab/analog")
+                await viewer.wait_for("/lab/analog", 50)
             await wait_until_async(lambda: not source.fan_out.has_subscribers(WIRE_ORDER))
+            await wait_until_async(are_idle)
 
 
 async def test_sources_come_and_go_on_reload_while_viewers_stay() -> None:

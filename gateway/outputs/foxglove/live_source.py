@@ -7,7 +7,7 @@ from typing import Final
 import numpy as np
 
 from gateway.foxglove_schemas.float_topics import MAX_FIELDS, FloatTopics
-from gateway.foxglove_schemas.messages import FoxgloveSource
+from gateway.foxglove_schemas.messages import NUMBERS_PER_ITEM, FoxgloveSource
 from gateway.foxglove_schemas.topics import MAX_UTIME, FoxgloveMessage, Topic
 from gateway.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
@@ -30,7 +30,6 @@ NO_TIME: Final = "time out of range"
 _RENAMING_S: Final = 1.0
 """How often a topic may get other fields. Each time, all viewers get its schema, which can have 500 kB."""
 
-_NUMBERS_PER_ITEM: Final = {ComponentType.ANALOG: 1, ComponentType.FORCE: 6}
 _POSITIONS: Final = (ComponentType.MARKERS, ComponentType.TOOLS)
 _CONTENT_HEADER_BYTES: Final = COMPONENT_HEADER_BYTES - 8  # without size and type
 
@@ -50,7 +49,7 @@ class LiveSource:
         self._server = server
         self._on_wanted = on_wanted
         self._is_wanted = False
-        self._topics = FloatTopics(name, one_topic=True)
+        self._topics = FloatTopics(name, is_live=True)
         self._channels: dict[str, Channel] = {}  # by the names of the topics
         self._renamed_s: dict[str, float] = {}  # when a topic got other fields, on the monotonic clock
         self._description: Mapping[str, FoxgloveMessage] = {}  # by the names of the topics
@@ -166,7 +165,7 @@ class LiveSource:
         return True
 
     def _check_number(self, layout: ComponentLayout, stamp: Stamp) -> None:
-        if layout.num_items * _NUMBERS_PER_ITEM.get(layout.type, 0) > MAX_FIELDS and self._is_wanted:
+        if layout.num_items * NUMBERS_PER_ITEM.get(layout.type, 0) > MAX_FIELDS and self._is_wanted:
             text = f"a frame has more than {MAX_FIELDS} numbers in {layout.type.key}; they are not published"
             self._count_loss(TOO_MANY, text, stamp)
 

@@ -45,7 +45,7 @@ def server_info(name: str, session: str) -> str:
 
 def channel_text(number: int, topic: Topic) -> str:
     """Return a channel for ``advertise``."""
-    is_text = topic.schema_encoding == "jsonschema"
+    is_text = topic.schema_encoding in {"jsonschema", "ros2msg"}
     return json_text(
         {
             "id": number,
