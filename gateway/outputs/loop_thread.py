@@ -17,6 +17,9 @@ MAX_CALLS: Final = 4096
 MAX_BYTES: Final = 64 * 1024 * 1024
 """The limits of the queue of a LoopThread."""
 
+_FINISH_S: Final = 0.2
+"""How long ``close`` waits for tasks that are running, and again after it has cancelled them."""
+
 
 class LoopThread:
     """Runs coroutines and calls in an event loop in its own thread. The program does not wait for it at exit.
@@ -70,6 +73,7 @@ class LoopThread:
     async def _end(self, last: Callable[[], Awaitable[None]]) -> None:
         try:
             await last()
+            await _finish(asyncio.all_tasks() - {asyncio.current_task()})
         finally:
             self._loop.stop()
 
@@ -85,3 +89,16 @@ class LoopThread:
             self._num_calls -= 1
             self._num_bytes -= num_bytes
         call()
+
+
+async def _finish(tasks: "set[asyncio.Task[Any]]") -> None:
+    """Wait for tasks, such as those that close the port of a source that was withdrawn before; cancel others.
+
+    A task that were still pending at the end of the loop would never run its ``finally``.
+    """
+    if tasks:
+        _, pending = await asyncio.wait(tasks, timeout=_FINISH_S)
+        for task in pending:
+            task.cancel()
+        if pending:
+            await asyncio.wait(pending, timeout=_FINISH_S)

@@ -5,8 +5,6 @@ test_frame_outputs.py then run with it. Every number that the tests send is the 
 in view, so a rig has to recognise nothing else in what its peer receives.
 """
 
-import importlib
-import importlib.util
 import math
 import time
 from abc import ABC, abstractmethod
@@ -21,7 +19,6 @@ from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import Answer, KeyPath, Output, ServerParameters
 from gateway.outputs.kind import SubscriptionRequest
-from gateway.outputs.registry import OUTPUTS
 from gateway.rtc3d.components import (
     ITEM_DTYPES,
     MISSING,
@@ -309,15 +306,3 @@ class ExampleRig(FrameRig):
 
     def close(self) -> None:
         self.unsubscribe()
-
-
-def _rig_of(name: str) -> type[FrameRig] | None:
-    module = f"tests.contract.{name}_rig"
-    if importlib.util.find_spec(module) is None:
-        return None
-    rig: type[FrameRig] = importlib.import_module(module).Rig
-    return rig
-
-
-RIGS: Final = {"example": ExampleRig} | {name: rig for name in OUTPUTS if (rig := _rig_of(name)) is not None}
-"""The rig of each output that takes whole frames."""

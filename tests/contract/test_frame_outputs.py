@@ -5,6 +5,8 @@ A test that finds the rigs too slow or too different belongs to the tests of one
 """
 
 import asyncio
+import importlib
+import importlib.util
 import itertools
 import os
 import socket
@@ -22,6 +24,7 @@ from gateway.errors import OutputError
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import FramePublisher, Output
+from gateway.outputs.registry import OUTPUTS
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import Frame
@@ -31,8 +34,8 @@ from tests.contract.frame_rigs import (
     ALL,
     HALL,
     LAB,
-    RIGS,
     SOURCES,
+    ExampleRig,
     FrameRig,
     NoQueries,
     component,
@@ -96,6 +99,18 @@ GARBAGE: Final = {
     "text": "à la carte\r\n".encode() * 10_000,
 }
 """What programs send that speak another protocol, or none."""
+
+
+def _rig_of(name: str) -> type[FrameRig] | None:
+    module = f"tests.contract.{name}_rig"
+    if importlib.util.find_spec(module) is None:
+        return None
+    rig: type[FrameRig] = importlib.import_module(module).Rig
+    return rig
+
+
+RIGS: Final = {"example": ExampleRig} | {name: rig for name in OUTPUTS if (rig := _rig_of(name)) is not None}
+"""The rig of each output that takes whole frames."""
 
 
 def rigs(is_chosen: Callable[[type[FrameRig]], bool] = lambda _: True) -> pytest.MarkDecorator:
@@ -320,6 +335,7 @@ async def test_each_change_of_what_is_wanted_is_reported_in_the_event_loop(lab: 
     is_exact = lab.output.watch_wanted(LAB, lambda: threads.append(threading.current_thread().name))
     lab.output.announce(LAB)
     lab.set_parameters(LAB, labelled())
+    lab.serve(HALL)
     await lab.open()
     await asyncio.to_thread(lab.rig.subscribe)
     await wait_until_async(lambda: publisher.wanted, TIMEOUT_S)
@@ -364,8 +380,9 @@ async def test_only_the_components_that_the_gateway_publishes_are_sent(lab: Lab)
 
 @every_rig
 async def test_a_source_may_have_no_parameters(lab: Lab) -> None:
-    lab.fan_outs[LAB] = FanOut(LAB, [lab.output])
-    lab.set_parameters(LAB, Parameters())
+    for source in SOURCES:
+        lab.fan_outs[source] = FanOut(source, [lab.output])
+        lab.set_parameters(source, Parameters())
     await lab.open()
     await lab.subscribe()
     assert lab.lost() == {}

@@ -86,3 +86,25 @@ def test_closing_waits_no_longer_than_it_may() -> None:
     thread.offer(wait)
     thread.close(nothing, 0.01)
     go_on.set()
+
+
+def test_closing_lets_tasks_finish_and_cancels_those_that_do_not() -> None:
+    thread = LoopThread("test")
+    finished: list[str] = []
+
+    async def quick() -> None:
+        await asyncio.sleep(0.01)
+        finished.append("quick")
+
+    async def endless() -> None:
+        try:
+            await asyncio.Event().wait()
+        finally:
+            await asyncio.sleep(0)
+            finished.append("endless")
+
+    thread.run(quick())
+    cancelled = thread.run(endless())
+    thread.close(nothing, 5)
+    assert finished == ["quick", "endless"]
+    assert cancelled.cancelled()
