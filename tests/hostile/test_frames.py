@@ -19,6 +19,7 @@ pytestmark = pytest.mark.netns
 ATTACK_S: Final = 3.0
 
 MARKERS: Final = 1
+EVENT: Final = 5
 EXTREME_TIMES: Final = (-(2**63), 2**63 - 1, 0, -1, 1, 2**62, -(2**62), 2**32, 2**53)
 
 

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import itertools
 import signal
 import sys
 from asyncio.subprocess import DEVNULL, PIPE, Process
@@ -12,9 +13,14 @@ import pytest
 
 from tests.gateway_process import simulator
 from tests.hostile.gateway_under_attack import GatewayUnderAttack
+from tests.hostile.servers import streaming
+from tests.hostile.test_frames import EVENT, MARKERS, component, frame
 from tests.proxy import FuzzingProxy
+from tests.servers import Client, ScriptedServer
 
 pytestmark = pytest.mark.netns
+
+NUM_MARKERS = 60_000
 
 NUM_STALLED = 120
 """So many that they would be noticed if a message waited 20 ms for each of them."""
@@ -117,6 +123,29 @@ async def test_subscribers_behind_a_slow_link(
             slow.to_client.bytes_per_s = 2_000_000
             slower.to_client.bytes_per_s = 10_000
             await asyncio.sleep(3)
+    gateway.report.check()
+
+
+async def huge_frames(client: Client) -> None:
+    """Send frames with as many markers as can be converted to JSON, and bursts of events."""
+    items = bytes(16 * NUM_MARKERS)
+    for number in itertools.count(100):
+        client.send(frame(component(MARKERS, number, 50_000 * number, NUM_MARKERS, items)))
+        for event in range(20):
+            client.send(frame(component(EVENT, number, 50_000 * number + event, 500, bytes(24 * 500))))
+        await client.drain()
+        await asyncio.sleep(0.05)
+
+
+async def test_json_of_huge_frames(gateway_under_attack: GatewayUnderAttack) -> None:
+    """Converting all of it would take several processor cores."""
+    async with (
+        ScriptedServer(streaming(huge_frames)) as server,
+        gateway_under_attack({"huge": server.port}) as gateway,
+        zenoh_peer("json", gateway.zenoh_endpoint, 3) as peer,
+    ):
+        await done(peer)
+        await asyncio.sleep(4)
     gateway.report.check()
 
 

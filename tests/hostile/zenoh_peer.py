@@ -86,6 +86,13 @@ def _puts(endpoint: str, count: int) -> Iterator[Any]:
         yield session
 
 
+def _json(endpoint: str, count: int) -> Iterator[Any]:
+    """``count`` subscribers to everything as JSON, with a session each."""
+    for _ in range(count):
+        session = _open(endpoint)
+        yield session, session.declare_subscriber("mocap/**/json", _ignore)
+
+
 KINDS: Final[dict[str, Callable[[str, int], Iterator[Any]]]] = {
     "routers": _routers,
     "subscribers": _subscribers,
@@ -94,6 +101,7 @@ KINDS: Final[dict[str, Callable[[str, int], Iterator[Any]]]] = {
     "patterns": _patterns,
     "tokens": _tokens,
     "puts": _puts,
+    "json": _json,
 }
 
 
