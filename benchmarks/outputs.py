@@ -179,7 +179,7 @@ class _Bench:
 
 def _plan(quick: bool) -> tuple[int, int]:
     """Return the number of rounds, and of frames in each."""
-    return (2, 300) if quick else (9, 2000)
+    return (2, 300) if quick else (7, 1000)
 
 
 def expected_s(quick: bool) -> float:
