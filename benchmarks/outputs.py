@@ -81,7 +81,7 @@ def _zenoh_peer(endpoint: str, keys: str) -> Worker:
     return Worker(output_peers.zenoh_peer, config, keys)
 
 
-_CASES: Final = {
+CASES: Final = {
     "zenoh": _Case(
         lambda at: {"config": zenoh_session_config("peer", listen=[_endpoint(at.port)])},
         lambda at: _zenoh_peer(_endpoint(at.port), f"mocap/{_SOURCE}/*"),
@@ -118,10 +118,10 @@ _CASES: Final = {
 
 
 def _names() -> list[str]:
-    return [name for name in OUTPUTS if name in _CASES]
+    return [name for name in OUTPUTS if name in CASES]
 
 
-class _Bench:
+class Bench:
     """A context in which a gateway for each output runs, and the relay. ``connect_peers`` comes later."""
 
     def __enter__(self) -> Self:
@@ -136,6 +136,8 @@ class _Bench:
             for name in (RELAY, *_names()):
                 program = self._program(name, folder / name)
                 self.programs[name] = stack.enter_context(program)
+            for name in self.programs:
+                self.cost_us(name, _FIRST_FRAMES)  # once they are ready
             self._stack = stack.pop_all()
         return self
 
@@ -154,14 +156,14 @@ class _Bench:
             "sources": [processes.source(_SOURCE, port)],
             "metrics": {"port": free_port()},
             **{each: {"enabled": False} for each in OUTPUTS},
-            name: {"enabled": True, **_CASES[name].settings(at)},
+            name: {"enabled": True, **CASES[name].settings(at)},
         }
         return processes.gateway(folder / "gateway.yaml", settings)
 
     def connect_peers(self) -> None:
         """Connect one peer to each output, and wait until it receives every topic."""
         for name in self.programs:
-            case = _CASES["zenoh" if name == RELAY else name]
+            case = CASES["zenoh" if name == RELAY else name]
             self.peers[name] = self._stack.enter_context(case.peer(self._endpoints[name]))
             processes.wait_until(partial(self._receives, name, case.num_topics), f"{name}'s peer receives")
 
@@ -192,13 +194,11 @@ def measure(quick: bool, progress: Progress) -> dict[str, Any]:
     """Return the CPU times per frame of each output, without and with a peer, in µs."""
     rounds, frames = _plan(quick)
     costs: dict[str, dict[str, list[float]]] = {}
-    with _Bench() as bench:
+    with Bench() as bench:
         for number, peers in enumerate(("nobody", "one peer")):
             progress.step("connecting peers" if number else "starting", number / 2)
             if number:
                 bench.connect_peers()
-            for name in bench.programs:
-                bench.cost_us(name, _FIRST_FRAMES)  # warms up
             costs[peers] = {name: [] for name in bench.programs}
             for each in range(rounds):
                 progress.step(f"{peers}, round {each + 1} of {rounds}", (number + each / rounds) / 2)

@@ -265,6 +265,12 @@ def names_remedy(lab: Lab) -> bool:
     return not health.connected and any(remedy in health.problem for remedy in lab.rig.remedies)
 
 
+def test_every_output_of_whole_frames_has_a_rig() -> None:
+    for name, kind in OUTPUTS.items():
+        if name not in RIGS:
+            assert kind.create(kind.settings()).frame_publisher(LAB) is None, name
+
+
 # Sending -------------------------------------------------------------------------------------
 
 

@@ -5,10 +5,12 @@ import re
 
 import pytest
 
+from benchmarks import outputs
 from benchmarks.subscribers import Received
 from benchmarks.workbench import GATEWAY, RELAY, Workbench
 from benchmarks.workloads import DENSE, Frames, cuts
 from gateway.messages.encode import CONTENT_OFFSET
+from gateway.outputs.registry import OUTPUTS
 from gateway.rtc3d.components import ComponentType
 
 FRAMES = 200
@@ -38,6 +40,13 @@ def test_the_gateway_and_the_relay_publish_the_same_number_of_messages_and_bytes
     for received in subscribers:
         assert published(received, GATEWAY) == expected
         assert published(received, RELAY) == expected
+
+
+@pytest.mark.netns
+def test_the_peer_of_each_output_receives_everything() -> None:
+    with outputs.Bench() as bench:
+        bench.connect_peers()
+    assert set(bench.peers) == {outputs.RELAY, *OUTPUTS} - {"takes"}
 
 
 def test_frames_are_numbered_and_stamped_in_every_component() -> None:

@@ -1,0 +1,86 @@
+"""The gateway as an RT server, and RTC3D clients that are sockets with a thread each."""
+
+import contextlib
+import math
+import socket
+import struct
+import threading
+from typing import ClassVar, Final
+
+from gateway.outputs.contract import Output
+from gateway.outputs.rtc3d.output import Rtc3dOutput
+from gateway.outputs.rtc3d.settings import Rtc3dSettings
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import split_frame
+from tests.contract.frame_rigs import HALL, LAB, FrameRig, Received
+from tests.networks import free_port
+from tests.unit.rtc3d_server.wire import DATA, command
+
+HEADER: Final = struct.Struct(">II")
+
+
+class Rig(FrameRig):
+    """Clients of both ports. They get what the server sent, in its unit: the tests send mm."""
+
+    remedies: ClassVar[tuple[str, ...]] = ("rtc3d.ports",)
+    listens: ClassVar[bool] = True
+    converts: ClassVar[bool] = False
+
+    def __init__(self) -> None:
+        self._ports = {LAB: free_port(), HALL: free_port()}
+        self.tcp_port = self._ports[LAB]
+        self._received: list[Received] = []
+        self._clients: list[socket.socket] = []
+        self._other_program: socket.socket | None = None
+        self.output = self.create()
+
+    def create(self) -> Output:
+        return Rtc3dOutput(Rtc3dSettings(enabled=True, ports=self._ports))
+
+    @property
+    def received(self) -> list[Received]:
+        return self._received
+
+    def subscribe(self) -> None:
+        for source in self._ports:
+            threading.Thread(target=self._read, args=(source, self._connect(source)), daemon=True).start()
+
+    def _connect(self, source: str) -> socket.socket:
+        client = socket.create_connection(("127.0.0.1", self._ports[source]))
+        self._clients.append(client)
+        client.sendall(command("SetByteOrder BigEndian") + command("StreamFrames AllFrames"))
+        return client
+
+    def _read(self, source: str, client: socket.socket) -> None:
+        with contextlib.suppress(OSError):
+            stream = client.makefile("rb")
+            while header := stream.read(HEADER.size):
+                size, packet_type = HEADER.unpack(header)
+                body = stream.read(size - HEADER.size)
+                for component in split_frame(body, "big").components if packet_type == DATA else ():
+                    if component.type is ComponentType.TOOLS:
+                        xs = component.items()["x"].tolist()
+                        self._received += [(source, x / 1000) for x in xs if not math.isnan(x)]
+
+    def unsubscribe(self) -> None:
+        while self._clients:
+            client = self._clients.pop()
+            with contextlib.suppress(OSError):
+                client.shutdown(socket.SHUT_RDWR)
+            client.close()
+
+    def stall(self) -> None:
+        for source in self._ports:
+            self._connect(source)
+
+    def cut(self) -> None:
+        self._other_program = socket.create_server(("127.0.0.1", self._ports[HALL]))
+
+    def restore(self) -> None:
+        assert self._other_program is not None
+        self._other_program.close()
+
+    def close(self) -> None:
+        self.unsubscribe()
+        if self._other_program is not None:
+            self._other_program.close()
