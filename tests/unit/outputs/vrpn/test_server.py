@@ -14,6 +14,7 @@ from gateway.outputs.vrpn import server as server_module
 from gateway.outputs.vrpn.protocol import encode_pose
 from gateway.outputs.vrpn.server import MAX_CLIENTS, MAX_HANDSHAKES, VrpnServer
 from gateway.outputs.vrpn.sockets import bind
+from gateway.token_bucket import TokenBucket
 from tests.networks import free_port
 from tests.vrpn_client import COOKIE, Pose, VrpnClient, description, message, send_datagram
 from tests.waiting import wait_until_async
@@ -327,12 +328,19 @@ async def test_connections_are_accepted_at_a_limited_rate(
     running: Running, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     server, port = running
-    monkeypatch.setattr(server._accepts, "_left", 3.0)
-    monkeypatch.setattr(server._accepts, "_capacity", 3.0)
-    clients = [await VrpnClient.connect(port) for _ in range(10)]
-    await wait_until_async(lambda: clients[0].trackers)
-    assert len(server._clients) < 10
-    await wait_until_async(lambda: all(client.trackers for client in clients))
+    async with await VrpnClient.connect(port) as first:
+        await wait_until_async(lambda: first.trackers)
+        # The server waits for a connection already, then only two more are allowed.
+        monkeypatch.setattr(server, "_accepts", TokenBucket(0.0, 2.0))
+        clients = [await VrpnClient.connect(port) for _ in range(10)]
+        await wait_until_async(lambda: clients[2].trackers)
+        first.describe("wand")
+        for count in range(1, 20):
+            first.ping(0)
+            await wait_until_async(lambda count=count: len(first.pongs) == count)  # type: ignore[misc]
+        assert len(server._clients) == 1 + 3
+        monkeypatch.setattr(server, "_accepts", TokenBucket(1000.0))
+        await wait_until_async(lambda: all(client.trackers for client in clients))
     for client in clients:
         await client.close()
 
