@@ -1,0 +1,63 @@
+"""The doctor's checks for ROS 2, with a router, without one, and with nodes."""
+
+from collections.abc import Iterator
+
+import pytest
+
+from gateway.findings import Result
+from gateway.outputs.ros2.checks import CHECKS, check_ros2, leaves_host
+from gateway.outputs.ros2.settings import Ros2Settings
+from tests.networks import free_endpoint
+from tests.ros_lab import RosLab, ros_lab
+from tests.waiting import wait_until
+
+
+@pytest.fixture
+def lab() -> Iterator[RosLab]:
+    with ros_lab(domain_id=3) as lab:
+        yield lab
+
+
+def findings(settings: Ros2Settings, seconds: float = 1.0) -> dict[str, tuple[Result, str]]:
+    found = check_ros2(settings, ["lab"], [], seconds)
+    assert [each.check for each in found] == list(CHECKS)
+    return {each.check: (each.result, each.found) for each in found}
+
+
+def test_without_a_router_the_remedy_is_to_start_it() -> None:
+    endpoint = free_endpoint()
+    [router, gateway, nodes] = check_ros2(Ros2Settings(connect=endpoint), ["lab"], [], 0.5)
+    assert router.result is Result.FAILING
+    assert endpoint in router.found
+    assert "rmw_zenohd" in router.remedy
+    assert {gateway.result, nodes.result} == {Result.NOT_TESTED}
+
+
+def test_a_router_without_nodes(lab: RosLab) -> None:
+    found = findings(lab.settings)
+    assert found["router"][0] is Result.PASSING
+    assert found["gateway"] == (Result.NOT_TESTED, "no gateway publishes in domain 3 on this router now")
+    assert found["nodes"] == (Result.NOTE, "no ROS node is visible in domain 3")
+
+
+def test_a_gateway_and_nodes(lab: RosLab) -> None:
+    lab.open()
+    lab.source()
+    keys = [f"@ros2_lv/3/abc/{number}/{number}/NN/%/%/node_{number}" for number in range(10)]
+    keys.append("@ros2_lv/4/abc/0/0/NN/%/%/elsewhere")
+    tokens = [lab.peer.liveliness().declare_token(key) for key in keys]
+    wait_until(lambda: len(lab.tokens()) == 14)
+    found = findings(lab.settings)
+    assert found["gateway"] == (Result.PASSING, "the node rtc3d_gateway is visible in domain 3")
+    named = ", ".join(f"node_{number}" for number in range(8))
+    for token in tokens:
+        token.undeclare()
+    assert found["nodes"] == (Result.PASSING, f"visible in domain 3: {named} and 2 more")
+
+
+@pytest.mark.parametrize(
+    ("connect", "leaves"),
+    [("tcp/127.0.0.1:7447", False), ("tcp/localhost:7447", False), ("tcp/192.0.2.5:7447", True)],
+)
+def test_a_router_on_another_computer_means_that_messages_leave_this_one(connect: str, leaves: bool) -> None:
+    assert leaves_host(Ros2Settings(connect=connect)) is leaves
