@@ -60,7 +60,7 @@ class RouterSession:
         self._num_transports = 0
         self._closing = threading.Event()
         self._opener = threading.Thread(target=self._open, name="ros2-open", daemon=True)
-        self._problem = f"the Zenoh session to {endpoint} is not open yet; is the router running? {REMEDY}"
+        self._problem = f"the Zenoh session to {endpoint} is not open yet; if there is no router, {REMEDY}"
         self._failures = FailureLog(logger, "ros2")
 
     def start(self) -> None:
@@ -73,9 +73,7 @@ class RouterSession:
             try:
                 session = zenoh.open(client_config(self._endpoint))
             except zenoh.ZError as error:
-                self._problem = (
-                    f"no Zenoh router at {self._endpoint}: {zenoh_reason(error)}; is it running? {REMEDY}"
-                )
+                self._problem = f"no Zenoh router at {self._endpoint}: {zenoh_reason(error)}; {REMEDY}"
                 self._failures.failed(self._problem)
                 self._closing.wait(_RETRY_S)
                 continue

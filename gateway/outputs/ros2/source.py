@@ -12,7 +12,7 @@ from gateway.losses import Losses
 from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.ros2.router import RouterSession
-from gateway.outputs.ros2.source_topics import SourceTopics
+from gateway.outputs.ros2.source_topics import NOT_YET, SourceTopics
 from gateway.outputs.ros2.topic import RosNode, RosTopic
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
@@ -51,7 +51,7 @@ class RosSource:
         self._lock = threading.Lock()  # of ``wanted``
         self._router = router
         self._sender = sender
-        self._parameters = ServerParameters(b"", 0, 0)
+        self._parameters = NOT_YET
         self._known_layouts: set[FrameLayout] = set()
         self._refused: Mapping[ComponentType, int] = {}  # frames that found no place in the queue
         self._skipped: Mapping[ComponentType, int] = {}  # those whose numbers the topics have used up
