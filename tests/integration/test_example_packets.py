@@ -24,7 +24,7 @@ LCM_URL: Final = f"udpm://{GROUP[0]}:{GROUP[1]}?ttl=0"
 # What a test sends at once fits into a receive buffer of 400 kB, so a slow program loses nothing.
 CHANNEL, SMALL = markers(3, 1)
 _, LARGE = markers(5000, 2)  # 80 kB: two fragments
-_NAMES: Final = {"Go, LCM", "Rust, LCM", "JavaScript, LCM"}
+_NAMES: Final = {"C#, LCM", "Go, LCM", "Rust, LCM", "JavaScript, LCM"}
 each_program = pytest.mark.parametrize("program", [each for each in PROGRAMS if each.name in _NAMES], ids=str)
 
 
