@@ -1,6 +1,7 @@
 """One client's TCP connection."""
 
 import asyncio
+import contextlib
 import socket
 from typing import Final, Protocol, cast
 
@@ -99,10 +100,11 @@ class Client(asyncio.BufferedProtocol):
             self._transport.abort()
             return
         connection = cast(socket.socket, transport.get_extra_info("socket"))
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for name, value in _KEEPALIVE.items():
-            if hasattr(socket, name):
-                connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+        with contextlib.suppress(OSError):  # the connection has ended already
+            connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            for name, value in _KEEPALIVE.items():
+                if hasattr(socket, name):
+                    connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
         self._transport.set_write_buffer_limits(high=MAX_UNREAD_BYTES)
         self._transport.write(COOKIE)
         self._set_timeout(

@@ -1,6 +1,6 @@
 """The publisher of one source: hands frames to the server's thread, and makes messages of them there."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from typing import Final
 
@@ -11,12 +11,12 @@ from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.vrpn.protocol import encode_pose
 from gateway.outputs.vrpn.server import VrpnServer
-from gateway.outputs.vrpn.trackers import MAX_TRACKERS
+from gateway.outputs.vrpn.trackers import MAX_TRACKERS, Tracker
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 
 MAX_TOOLS: Final = 256
-"""How many tools of a source can be trackers. The server determines the number of tools in a frame."""
+"""How many tools of a source can be trackers, and how many poses of a frame are sent, at most."""
 
 _MAX_VERSIONS: Final = 8
 """How many versions of the parameters are kept: frames of a backlog may belong to an earlier one."""
@@ -103,34 +103,39 @@ class VrpnPublisher:
         self._shown = parameters
 
     def _send(self, parameters: ServerParameters, frame: Frame, indices: Sequence[int], stamp: Stamp) -> None:
-        trackers = self._server.trackers
-        for index in indices:
+        num_items = num_with_tracker = num_poses = 0
+        messages: list[bytes] = []
+        for index in indices:  # usually one
             items = frame.component(index).items()
-            if self._shown is not parameters or len(items) > len(trackers.of_source(self._source)):
+            num_items += len(items)
+            if self._shown is not parameters or min(len(items), MAX_TOOLS) > len(self._trackers):
                 self._show(parameters, len(items))
-            poses = parameters.frame.poses(items[:MAX_TOOLS])
-            pairs = list(zip(trackers.of_source(self._source).values(), poses, strict=False))
-            messages = [
-                encode_pose(tracker.number, stamp.capture_utime, pose)
-                for tracker, pose in pairs
-                if tracker is not None and pose is not None
-            ]
-            num_without_tracker = len(items) - sum(tracker is not None for tracker, _ in pairs)
-            if num_without_tracker:
-                self._count_loss(
-                    "too many tools",
-                    f"{num_without_tracker} tools have no tracker: there can be {MAX_TOOLS} of a source and "
-                    f"{MAX_TRACKERS} of all; remove tools that are not used from the server",
-                    num_without_tracker,
-                )
-            slow = self._server.send(b"".join(messages)) if messages else []
-            if slow:
-                self._count_loss(
-                    "slow client",
-                    f"poses for {slow[0]} are lost, because it does not read them fast enough; look at that "
-                    "program",
-                    len(messages) * len(slow),
-                )
+            poses = parameters.frame.poses(items[: MAX_TOOLS - num_poses])
+            num_poses += len(poses)
+            for tracker, pose in zip(self._trackers, poses, strict=False):
+                num_with_tracker += tracker is not None
+                if tracker is not None and pose is not None:
+                    messages.append(encode_pose(tracker.number, stamp.capture_utime, pose))
+        if num_with_tracker < num_items:
+            num_lost = num_items - num_with_tracker
+            self._count_loss(
+                "too many tools",
+                f"{num_lost} tools have no tracker: there can be {MAX_TOOLS} of a source and {MAX_TRACKERS} "
+                "of all; remove tools that are not used from the server",
+                num_lost,
+            )
+        slow = self._server.send(b"".join(messages)) if messages else []
+        if slow:
+            self._count_loss(
+                "slow client",
+                f"poses for {slow[0]} are lost, because it does not read them fast enough; look at that "
+                "program",
+                len(messages) * len(slow),
+            )
+
+    @property
+    def _trackers(self) -> Collection[Tracker | None]:
+        return self._server.trackers.of_source(self._source).values()
 
     def _count_loss(self, cause: str, text: str, num_poses: int) -> None:
         if self.losses is not None:

@@ -147,6 +147,14 @@ async def test_tools_without_a_tracker_are_counted() -> None:
         assert amounts(here.losses.report()) == {"too many tools": (4, 1)}
 
 
+async def test_poses_of_a_frame_are_bounded_over_all_its_components() -> None:
+    async with lab() as here:
+        components = [tools_component([1000.0] * 100) for _ in range(5)]
+        here.publisher.publish(split_frame(encode_frame(components), "big"), stamp(10), 0, ALL)
+        await here.poses(256)
+        assert amounts(here.losses.report()) == {"too many tools": (244, 1)}
+
+
 async def test_gateway_is_told_when_the_first_client_comes_and_the_last_one_goes() -> None:
     settings = VrpnSettings(enabled=True, port=free_port())
     output = VrpnOutput(settings)
