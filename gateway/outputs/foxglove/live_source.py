@@ -72,13 +72,6 @@ class LiveSource:
             for viewer in list(self._channels[message.topic.name].subscribers):
                 self._send_description(viewer, message)
 
-    def announce_numbers(self, layouts: Iterable[ComponentLayout]) -> None:
-        """Open the channels of components that have numbers, if the parameters did not describe them."""
-        for layout in layouts:
-            for topic in self._converter.topics(layout.type, layout.num_items):
-                if topic.name not in self._channels:
-                    self._open_channel(topic)
-
     def send_frame(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         """Send the components of a frame to the viewers that subscribe to them."""
         for index, layout in enumerate(frame.layout.components):

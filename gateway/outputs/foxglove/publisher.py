@@ -13,11 +13,9 @@ from gateway.outputs.contract import ServerParameters
 from gateway.outputs.foxglove.live_source import LiveSource
 from gateway.outputs.foxglove.server import FoxgloveServer
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame, FrameLayout
+from gateway.rtc3d.frames import Frame
 
 QUEUE_FULL: Final = "queue full"
-
-_MAX_LAYOUTS: Final = 64
 
 
 class ServedSource:
@@ -60,10 +58,6 @@ class ServedSource:
         """Convert the next frames with these parameters."""
         self._call(partial(self._set_parameters, parameters))
 
-    def announce_numbers(self, layout: FrameLayout) -> None:
-        """Advertise the channels whose schemas depend on the number of items in frames."""
-        self._call_in_time(partial(self._announce_numbers, layout), 0)
-
     def offer(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> bool:
         """Have the components of a frame sent; return False if too many frames wait."""
         return self._call_in_time(partial(self._send, frame, stamp, components), len(frame.body))
@@ -89,10 +83,6 @@ class ServedSource:
     def _set_parameters(self, parameters: ServerParameters) -> None:
         if self._source is not None:
             self._source.set_parameters(parameters)
-
-    def _announce_numbers(self, layout: FrameLayout) -> None:
-        if self._source is not None:
-            self._source.announce_numbers(layout.components)
 
     def _send(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         if self._source is not None:
@@ -122,7 +112,6 @@ class FoxglovePublisher:
     def __init__(self, name: str, source: ServedSource) -> None:
         self._name = name
         self._source = source
-        self._layouts: set[FrameLayout] = set()
         self._is_closed = False
 
     @property
@@ -140,20 +129,12 @@ class FoxglovePublisher:
         """Hand over a frame if a viewer wants it; see FramePublisher."""
         if self._is_closed:
             raise OutputError(f"foxglove: {self._name} is closed; ask for a new publisher", cause="closed")
-        if frame.layout not in self._layouts:
-            self._note_layout(frame.layout)
         if self._source.wanted and not self._source.offer(frame, stamp, components):
             raise OutputError(
                 f"foxglove: the frames of {self._name} come faster than they can be converted; show fewer "
                 "topics in the viewers",
                 cause=QUEUE_FULL,
             )
-
-    def _note_layout(self, layout: FrameLayout) -> None:
-        if len(self._layouts) >= _MAX_LAYOUTS:
-            self._layouts.clear()
-        self._layouts.add(layout)
-        self._source.announce_numbers(layout)
 
     def close(self) -> None:
         """Refuse all frames from now on."""

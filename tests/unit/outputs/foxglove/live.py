@@ -1,8 +1,8 @@
 """An output with viewers, and a source that publishes on it as in the gateway."""
 
-from collections.abc import AsyncIterator, Iterable, Mapping
+from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import asynccontextmanager
-from typing import Any, Final
+from typing import Any, Final, TypeVar
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from gateway.rtc3d.parameters import AnalogChannel, Parameters, ParametersAnalog
 from tests.losses import amounts
 from tests.networks import free_port
 from tests.waiting import wait_until_async
+
+_Result = TypeVar("_Result")
 
 UTIME: Final = 1_700_000_000_000_000
 
@@ -61,6 +63,16 @@ class LiveSource:
 
     def publish_items(self, kind: ComponentType, items: Iterable[Any], utime: int = UTIME) -> None:
         self.publish(frame_of({kind: items}), utime)
+
+    async def publish_until(self, frame: Frame, condition: Callable[[], _Result]) -> _Result:
+        """Publish a frame again and again until a condition holds; return its result."""
+
+        def is_true() -> bool:
+            self.publish(frame)
+            return bool(condition())
+
+        await wait_until_async(is_true)
+        return condition()
 
     @property
     def wanted(self) -> bool:

@@ -75,15 +75,15 @@ async def test_the_channels_of_each_source_are_advertised_before_it_has_frames()
 
 
 async def test_channels_of_numbers_appear_with_the_first_frame_if_the_parameters_are_unknown() -> None:
-    async with serving("lab") as (port, [lab]), viewing(port) as viewer:
+    async with serving("lab") as (port, [lab]), viewing(port, "/lab/events") as viewer:
+        await lab.wait_until_wanted()
         lab.publish(frame_of({ANALOG: [1, 2], FORCE: [(1, 2, 3, 4, 5, 6)]}))
         await viewer.wait_until(lambda: {"/lab/analog", "/lab/loads"} <= viewer.topics.keys())
         viewer.subscribe("/lab/analog", "/lab/loads")
-        await lab.wait_until_wanted()
-        lab.publish(frame_of({ANALOG: [1, 2], FORCE: [(1, 2, 3, 4, 5, 6)]}))
-        [analog] = await viewer.wait_for("/lab/analog")
+        frame = frame_of({ANALOG: [1, 2], FORCE: [(1, 2, 3, 4, 5, 6)]})
+        [analog] = (await lab.publish_until(frame, lambda: viewer.received["/lab/analog"]))[:1]
         assert floats_of(analog.content) == {"channel_1": 1, "channel_2": 2}
-        [loads] = await viewer.wait_for("/lab/loads")
+        [loads] = (await viewer.wait_for("/lab/loads"))[:1]
         assert floats_of(loads.content) == {
             f"plate_1_{load}": number for number, load in enumerate(("fx", "fy", "fz", "mx", "my", "mz"), 1)
         }
@@ -189,7 +189,7 @@ async def test_nothing_is_converted_but_what_somebody_subscribes_to(monkeypatch:
         EVENT: [(7, 0, 1, 2, 3)],
     }
     async with serving("lab") as (port, [lab]), viewing(port) as viewer:
-        lab.publish(frame_of(everything))
+        lab.set_parameters(Parameters(force=ParametersForce((PLATE,))))
         await viewer.wait_until(lambda: "/lab/loads" in viewer.topics)
         viewer.subscribe("/lab/loads")
         await lab.wait_until_wanted()
