@@ -38,7 +38,8 @@ class LiveSource:
     """The channels of one source, from its announcement until ``close``.
 
     All methods are called in the loop of ``server``. ``on_wanted`` is called when the first viewer subscribes
-    to a channel that needs frames, and when the last one unsubscribes.
+    to a channel that needs frames, and when the last one unsubscribes. If the server gives no parameters, a
+    frame is wanted, too, because it shows which channels to open.
     """
 
     def __init__(self, name: str, server: FoxgloveServer, on_wanted: Callable[[bool], None]) -> None:
@@ -49,6 +50,7 @@ class LiveSource:
         self._server = server
         self._on_wanted = on_wanted
         self._is_wanted = False
+        self._needs_frame = False  # to know which channels to open
         self._topics = FloatTopics(name, is_live=True)
         self._channels: dict[str, Channel] = {}  # by the names of the topics
         self._renamed_s: dict[str, float] = {}  # when a topic got other fields, on the monotonic clock
@@ -66,6 +68,8 @@ class LiveSource:
         self._converter = FoxgloveSource(self._topics, parsed, parameters.version, self._frame)
         self.field_names = self._converter.changed_names
         self._open_channels(self._converter.known_topics)
+        self._needs_frame = parsed == Parameters()
+        self._check_wanted()
         found = self._converter.describe(now_utime())
         self._description = {message.topic.name: message for message in found}
         for message in found:
@@ -82,11 +86,15 @@ class LiveSource:
             wanted = [topic for topic in topics if self._has_subscribers(topic, stamp)]
             if wanted and self._can_convert(layout.type, stamp):
                 self._send_component(frame.component(index), stamp, wanted)
+        if self._needs_frame:
+            self._needs_frame = False
+            self._check_wanted()
 
     def close(self) -> None:
         """Withdraw all channels."""
         self._server.close_channels(list(self._channels.values()))
         self._channels.clear()
+        self._needs_frame = False
         self._check_wanted()
 
     # Channels.
@@ -129,7 +137,7 @@ class LiveSource:
 
     def _check_wanted(self) -> None:
         descriptions = {topic.name for topic in self._converter.description_topics}
-        is_wanted = any(
+        is_wanted = self._needs_frame or any(
             channel.subscribers for name, channel in self._channels.items() if name not in descriptions
         )
         if is_wanted is not self._is_wanted:

@@ -74,11 +74,13 @@ async def test_the_channels_of_each_source_are_advertised_before_it_has_frames()
         assert again.info["sessionId"] != viewer.info["sessionId"]
 
 
-async def test_channels_of_numbers_appear_with_the_first_frame_if_the_parameters_are_unknown() -> None:
-    async with serving("lab") as (port, [lab]), viewing(port, "/lab/events") as viewer:
-        await lab.wait_until_wanted()
+async def test_channels_of_numbers_appear_with_the_first_frame_if_there_are_no_parameters() -> None:
+    async with serving("lab") as (port, [lab]), viewing(port) as viewer:
+        lab.set_parameters(Parameters())
+        await lab.wait_until_wanted()  # the gateway publishes nothing that is not wanted
         lab.publish(frame_of({ANALOG: [1, 2], FORCE: [(1, 2, 3, 4, 5, 6)]}))
         await viewer.wait_until(lambda: {"/lab/analog", "/lab/loads"} <= viewer.topics.keys())
+        await lab.wait_until_wanted(False)
         viewer.subscribe("/lab/analog", "/lab/loads")
         frame = frame_of({ANALOG: [1, 2], FORCE: [(1, 2, 3, 4, 5, 6)]})
         [analog] = (await lab.publish_until(frame, lambda: viewer.received["/lab/analog"]))[:1]
@@ -278,7 +280,8 @@ async def test_parameters_and_plates_are_sent_to_each_viewer_that_subscribes_and
             await viewer.wait_for("/lab/plates", 2)
             assert [log.content["version"] for log in viewer.received["/lab/parameters"]] == [3, 4]
             assert not viewer.received["/lab/plates"][1].content.entities
-        assert not lab.wanted
+            lab.publish(frame_of({MARKERS: []}))  # without parameters, a frame shows which channels there are
+            await lab.wait_until_wanted(False)
 
 
 async def test_names_of_fields_that_are_not_the_labels_can_be_queried() -> None:
