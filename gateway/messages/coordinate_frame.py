@@ -87,7 +87,8 @@ class CoordinateFrame:
         a robot must never get a pose that is not complete. So does a quaternion of zeros, which is no
         rotation, unless ``accept_zeros``.
         """
-        return [self._pose(tool, accept_zeros) for tool in tools.tolist()]
+        metres = self._metres
+        return [self._pose(tool, metres, accept_zeros) for tool in tools.tolist()]
 
     @property
     def _metres(self) -> float:
@@ -95,16 +96,13 @@ class CoordinateFrame:
             raise ValueError("the unit of length is unknown")
         return self.metres_per_unit
 
-    def _pose(self, tool: tuple[float, ...], accept_zeros: bool) -> Pose | None:
+    def _pose(self, tool: tuple[float, ...], metres: float, accept_zeros: bool) -> Pose | None:
         q0, qx, qy, qz, x, y, z, error = tool
-        metres = self._metres
         pose = (x * metres, y * metres, z * metres, qx, qy, qz, q0, error * metres)
         if not self.only_scales:
             pose = self._moved(pose)
-        # Comparisons with NaN are false.
-        if not all(-MAX_FLOAT <= value <= MAX_FLOAT for value in pose):
-            return None
-        return pose if accept_zeros or any(tool[:4]) else None
+        is_rotation = q0 or qx or qy or qz or accept_zeros
+        return pose if is_rotation and _fits_float(pose) else None
 
     def _moved(self, pose: Pose) -> Pose:
         x, y, z, qx, qy, qz, qw, error_m = pose
@@ -122,6 +120,24 @@ class CoordinateFrame:
     def _rows(self) -> list[list[float]]:
         rows: list[list[float]] = self.matrix.tolist()  # plain numbers are faster than an array, one by one
         return rows
+
+
+def _fits_float(pose: Pose) -> bool:
+    """Return whether a 32-bit float can hold each value, and none is NaN: comparisons with NaN are false.
+
+    Without a loop, which takes longer, for every tool of every frame (benchmarks/ros2_poses.py).
+    """
+    x, y, z, qx, qy, qz, qw, error_m = pose
+    return (
+        -MAX_FLOAT <= x <= MAX_FLOAT
+        and -MAX_FLOAT <= y <= MAX_FLOAT
+        and -MAX_FLOAT <= z <= MAX_FLOAT
+        and -MAX_FLOAT <= qx <= MAX_FLOAT
+        and -MAX_FLOAT <= qy <= MAX_FLOAT
+        and -MAX_FLOAT <= qz <= MAX_FLOAT
+        and -MAX_FLOAT <= qw <= MAX_FLOAT
+        and -MAX_FLOAT <= error_m <= MAX_FLOAT
+    )
 
 
 def product(first: Quaternion, second: Quaternion) -> Quaternion:

@@ -5,7 +5,7 @@ import rtc3d
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.coordinate_frame import MAX_FLOAT, CoordinateFrame
 from gateway.messages.stamp import Stamp
 from gateway.messages.tool_pose import tool_poses
 from gateway.rtc3d.components import ComponentType
@@ -30,7 +30,8 @@ def test_a_pose_is_whole_or_missing(tools: list[tuple[float, ...]], stamp: Stamp
         pose = rtc3d.tool_pose_t.decode(message)
         assert pose.sequence == sequence
         numbers = (*pose.position_m, *pose.orientation_xyzw, pose.error_m)
-        assert pose.visible == (not any(map(math.isnan, tool)))
+        sent = (*tool[:4], *(value * metres for value in tool[4:]))
+        assert pose.visible == all(abs(value) <= MAX_FLOAT for value in sent)
         if pose.visible:
             assert not any(map(math.isnan, numbers))
             assert pose.orientation_xyzw == (*tool[1:4], tool[0])
