@@ -14,6 +14,7 @@ from gateway.messages.encode import CONTENT_OFFSET, lcm_type_name
 from gateway.messages.parameters_text import xml_bytes
 from gateway.messages.topics import Topic, lcm_channel, unique_name
 from gateway.outputs.contract import Output, ServerParameters
+from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
 
 _PARAMETERS_S: Final = 1.0
@@ -138,10 +139,14 @@ class Publication:
         if source is None:
             self.num_surplus += 1
             return
+        before, xml = source.parameters, xml_bytes(recorded.xml)
         parameters = ServerParameters(
-            xml_bytes(recorded.xml), recorded.session, recorded.parameters_version, message=message
+            xml,
+            recorded.session,
+            recorded.parameters_version,
+            message=message,
+            parsed=before.parsed if before is not None and before.xml == xml else _parsed(xml),
         )
-        before = source.parameters
         source.parameters, source.published_s = parameters, time.monotonic()
         is_new = before is None or before[:3] != parameters[:3]
         self._in_loop(self._send_parameters(source.name, parameters, wait=is_new))
@@ -171,12 +176,17 @@ class Publication:
                 output.show_streaming(source, is_streaming)
 
 
+def _parsed(xml: bytes) -> Parameters:
+    """Return the parameters in recorded XML; none if it cannot be read."""
+    try:
+        return parse_parameters(xml).parameters
+    except ParametersError:
+        return Parameters()
+
+
 def _recorded_label(label: str, parameters: ServerParameters | None) -> str:
     """Return the label of a tool from the parameters; ``label`` is what the channel has of it."""
-    try:
-        tools = parse_parameters(b"" if parameters is None else parameters.xml).parameters.tools
-    except ParametersError:
-        tools = None
+    tools = None if parameters is None else parameters.parsed.tools
     for tool in () if tools is None else tools.tools:
         if lcm_channel("", tool.label) == lcm_channel("", label):
             return tool.label.strip()

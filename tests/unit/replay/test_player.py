@@ -32,6 +32,7 @@ class RecordingOutput(ToyOutput):
     def __init__(self, name: str = "toy") -> None:
         super().__init__(name)
         self.keys: list[tuple[str, bytes]] = []
+        self.parsed: list[Parameters] = []
         self.on_parameters: asyncio.Future[None] | None = None
 
     def publisher(self, topic: Any) -> Any:
@@ -48,6 +49,7 @@ class RecordingOutput(ToyOutput):
 
     def publish_parameters(self, source: str, content: ServerParameters) -> asyncio.Future[None] | None:
         self.keys.append((f"{source}/parameters", content.message))
+        self.parsed.append(content.parsed)
         return self.on_parameters
 
 
@@ -260,6 +262,16 @@ async def test_poses_are_published_under_the_labels_of_the_tools(tmp_path: Path)
     assert isinstance(output, RecordingOutput)
     assert [topic.path for topic in output.declared] == [("6d", "Left/hand 1"), ("6d", "OTHER")]
     assert replayed.publication.num_messages == {"parameters": 1, "6d/tool": 2}
+
+
+async def test_outputs_get_what_the_recorded_parameters_say(tmp_path: Path) -> None:
+    """Zenoh needs the labels for JSON."""
+    output = RecordingOutput()
+    given = Parameters(tools=Parameters6D(tools=(Tool("1", "Probe"),)))
+    messages = [description(), parameters(given), parameters(given), parameters(b"<no XML", 2)]
+    messages += [markers(1, number) for number in range(3)]
+    await Replayed(output).play(write_take(tmp_path / "take.lcmlog", messages))
+    assert [parsed.tools for parsed in output.parsed] == [given.tools, given.tools, None]
 
 
 async def test_sources_get_names_that_are_possible_in_keys(tmp_path: Path) -> None:
