@@ -20,9 +20,11 @@ from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
+from gateway.stream.state import StreamState
 from tests.configurations import make_settings
 from tests.networks import free_endpoint, open_zenoh, zenoh_keys
 from tests.running_gateway import running_gateway
+from tests.servers import Client, ScriptedServer, error, markers_frame, ok
 from tests.unit.outputs.ros2 import ros_messages as ros
 from tests.waiting import wait_until_async
 
@@ -167,11 +169,29 @@ async def test_frames_are_requested_only_while_ros_wants_them(router: str) -> No
     received: list[zenoh.Sample] = []
     async with simulated() as server:
         settings = settings_of(router, {"lab": server})
-        stream = StreamSettings(on_demand=True)
+        stream = StreamSettings(on_demand=True, idle_after_s=0.1)
         source = settings.sources[0].model_copy(update={"streams": (stream,)})
         async with gateway_of(settings.model_copy(update={"sources": (source,)})) as gateway:
+            [running] = gateway._sources["lab"]._streams.streams
             with open_zenoh("client", connect=router) as node:
-                await wait_until_async(lambda: "/mocap/lab/markers" in topics_on(node))
-                assert not any(gateway._sources["lab"].fan_out.frames.values())
-                node.declare_subscriber("0/mocap/lab/markers/**", received.append)
-                await wait_until_async(lambda: received)
+                for _ in range(2):
+                    await wait_until_async(lambda: running.status.state is StreamState.IDLE)
+                    received.clear()
+                    subscriber = node.declare_subscriber("0/mocap/lab/markers/**", received.append)
+                    await wait_until_async(lambda: received)
+                    subscriber.undeclare()
+
+
+async def test_a_server_that_gives_no_parameters_has_topics_by_position(router: str) -> None:
+    async def refuse(client: Client) -> None:
+        def answer(command: str) -> bytes:
+            if command.startswith("SendParameters"):
+                return error("err-unknown command")
+            return ok(f"OK-{command}") + (frames if command.startswith("StreamFrames") else b"")
+
+        await client.commands(answer)
+
+    frames = b"".join(markers_frame(number, (1.0, 2.0, 3.0)) for number in range(1, 4))
+    async with ScriptedServer(refuse) as server, gateway_of(settings_of(router, {"lab": server.port})):
+        with open_zenoh("client", connect=router) as node:
+            await wait_until_async(lambda: "/mocap/lab/markers" in topics_on(node))

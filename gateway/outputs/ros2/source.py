@@ -57,11 +57,19 @@ class RosSource:
         self._skipped: Mapping[ComponentType, int] = {}  # those whose numbers the topics have used up
         self._defects = DefectLog(logger, f"{name} to ros2")
         self._is_closed = False
+        self._is_streaming = False
+
+    def show_streaming(self, is_streaming: bool) -> None:
+        """Take note whether frames arrive."""
+        self._is_streaming = is_streaming
+        self.update_wanted()
 
     def update_wanted(self) -> None:
         """Note that subscribers have come or gone, or topics. In any thread."""
         with self._lock:  # or what one thread has seen could replace what another sees later
-            is_wanted = self.topics.is_wanted and not self._is_closed
+            # If a server gives no parameters, a frame shows which topics to open.
+            lacks_topics = self._is_streaming and not self.topics.topics
+            is_wanted = (lacks_topics or self.topics.is_wanted) and not self._is_closed
             if is_wanted is not self.wanted:
                 self.wanted = is_wanted
                 self.on_wanted_changed()

@@ -77,7 +77,6 @@ class SourceTopics:
         self._source = source
         self._tf = tf
         self._on_wanted_changed = on_wanted_changed
-        self._lacks_topics = False
         self._node: RosNode | None = None
         self._by_name: dict[str, RosTopic] = {}
         self._former: dict[str, RosTopic] = {}  # those that the newest parameters may need again
@@ -85,11 +84,8 @@ class SourceTopics:
 
     @property
     def is_wanted(self) -> bool:
-        """Whether somebody subscribes to a topic that the source's frames are published on. In any thread.
-
-        If the server's parameters list nothing, a frame is wanted, too, because it shows what topics to open.
-        """
-        return self._lacks_topics or self._tf.wanted or any(topic.wanted for topic in self.topics)
+        """Whether somebody subscribes to a topic that the source's frames are published on. In any thread."""
+        return self._tf.wanted or any(topic.wanted for topic in self.topics)
 
     # Topics.
 
@@ -103,8 +99,6 @@ class SourceTopics:
         for topic in self._former.values():
             topic.undeclare()
         self._former = {}
-        self._lacks_topics = not self.topics
-        self._on_wanted_changed()
 
     def _use(self, parameters: ServerParameters) -> None:
         self._parameters = parameters
@@ -125,8 +119,6 @@ class SourceTopics:
         for component in layout.components:
             counts[component.type] = max(component.num_items, counts.get(component.type, 0))
         self._open(counts)
-        self._lacks_topics = not self.topics
-        self._on_wanted_changed()
 
     def _open(self, counts: Mapping[ComponentType, int]) -> None:
         if counts.get(ComponentType.MARKERS):
@@ -140,6 +132,7 @@ class SourceTopics:
         if num_plates > len(self._plates):
             self._open_plates(num_plates)
         self.topics = tuple(self._by_name.values())
+        self._on_wanted_changed()  # a subscriber may have come before a topic was among them
 
     def _open_tools(self, num_tools: int) -> None:
         labels = describe(ComponentType.TOOLS, self._parameters.parsed, num_tools).labels

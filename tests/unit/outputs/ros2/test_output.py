@@ -62,7 +62,8 @@ def test_topics_follow_from_the_parameters(lab: RosLab) -> None:
 
 
 def test_a_server_without_parameters_has_topics_with_its_first_frame(lab: RosLab) -> None:
-    publisher = lab.source(given=parameters())
+    publisher = lab.source()
+    lab.output.show_streaming("lab", True)
     wait_until(lambda: publisher.wanted)  # the gateway publishes nothing that is not wanted
     publisher.publish(tools_frame((0, 0, 0), (0, 0, 0)), stamp(), 0, ALL)
     wait_until(lambda: {"/mocap/lab/tool_1/pose", "/mocap/lab/tool_2/pose"} <= lab.topics())
