@@ -88,21 +88,19 @@ class CoordinateFrame:
         rotation, unless ``accept_zeros``.
         """
         metres = self._metres
-        return [self._pose(tool, metres, accept_zeros) for tool in tools.tolist()]
+        poses = [
+            (x * metres, y * metres, z * metres, qx, qy, qz, q0, error * metres)
+            for q0, qx, qy, qz, x, y, z, error in tools.tolist()
+        ]
+        if not self.only_scales:
+            poses = list(map(self._moved, poses))
+        return [pose if _is_complete(pose, accept_zeros) else None for pose in poses]
 
     @property
     def _metres(self) -> float:
         if self.metres_per_unit is None:
             raise ValueError("the unit of length is unknown")
         return self.metres_per_unit
-
-    def _pose(self, tool: tuple[float, ...], metres: float, accept_zeros: bool) -> Pose | None:
-        q0, qx, qy, qz, x, y, z, error = tool
-        pose = (x * metres, y * metres, z * metres, qx, qy, qz, q0, error * metres)
-        if not self.only_scales:
-            pose = self._moved(pose)
-        is_rotation = q0 or qx or qy or qz or accept_zeros
-        return pose if is_rotation and _fits_float(pose) else None
 
     def _moved(self, pose: Pose) -> Pose:
         x, y, z, qx, qy, qz, qw, error_m = pose
@@ -122,22 +120,12 @@ class CoordinateFrame:
         return rows
 
 
-def _fits_float(pose: Pose) -> bool:
-    """Return whether a 32-bit float can hold each value, and none is NaN: comparisons with NaN are false.
-
-    Without a loop, which takes longer, for every tool of every frame (benchmarks/ros2_poses.py).
-    """
-    x, y, z, qx, qy, qz, qw, error_m = pose
-    return (
-        -MAX_FLOAT <= x <= MAX_FLOAT
-        and -MAX_FLOAT <= y <= MAX_FLOAT
-        and -MAX_FLOAT <= z <= MAX_FLOAT
-        and -MAX_FLOAT <= qx <= MAX_FLOAT
-        and -MAX_FLOAT <= qy <= MAX_FLOAT
-        and -MAX_FLOAT <= qz <= MAX_FLOAT
-        and -MAX_FLOAT <= qw <= MAX_FLOAT
-        and -MAX_FLOAT <= error_m <= MAX_FLOAT
-    )
+def _is_complete(pose: Pose, accept_zeros: bool) -> bool:
+    """Return whether 32-bit floats can hold a pose, and its quaternion is a rotation."""
+    # The sum decides nearly always, and is three times as fast. Comparisons with NaN are false.
+    if not (sum(map(abs, pose)) <= MAX_FLOAT or all(-MAX_FLOAT <= value <= MAX_FLOAT for value in pose)):
+        return False
+    return accept_zeros or any(pose[3:7])
 
 
 def product(first: Quaternion, second: Quaternion) -> Quaternion:

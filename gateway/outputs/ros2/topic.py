@@ -97,11 +97,10 @@ class RosTopic:
 
     def put(self, cdr: bytes, now_ns: int) -> None:
         """Publish a message. Nobody gets it if the topic is not declared."""
-        self._sequence += 1
-        if self._declared is not None:
-            self._declared.publisher.put(
-                cdr, attachment=attachment(self._sequence, now_ns, self._declared.gid)
-            )
+        self._sequence = sequence = self._sequence + 1
+        declared = self._declared
+        if declared is not None:
+            declared.publisher.put(cdr, attachment=attachment(sequence, now_ns, declared.gid))
 
     def skip(self, num_messages: int) -> None:
         """Use up the numbers of lost messages, so that ROS notices that they are missing."""
