@@ -243,6 +243,16 @@ class RtServer:
 
     # For subclasses -------------------------------------------------------------------------
 
+    def next_frame_us(self) -> int | None:
+        """Return when the next frame is due for any client; None if that is unknown."""
+        due_us = (connection.due_us for connection in self.connections)
+        return min((time_us for time_us in due_us if time_us is not None), default=None)
+
+    def send_frames(self, elapsed_us: int) -> None:
+        """Send every client the frames that are due at this time."""
+        for connection in list(self.connections):
+            connection.send_due_frames(elapsed_us)
+
     def log_opened(self, connection: ClientConnection) -> None:
         """Log a new connection, which may be closed here."""
         _log.info("%s: connected, number %d", connection.name, self._num_accepted)
@@ -272,12 +282,7 @@ class RtServer:
         elapsed_us = self.elapsed_us()
         if elapsed_us is None:
             return
-        measurement = self._measurement
-        due_us = [
-            measurement.last_us,
-            measurement.advance_us,
-            *(connection.due_us for connection in self.connections),
-        ]
+        due_us = (self._measurement.last_us, self._measurement.advance_us, self.next_frame_us())
         next_us = min((time_us for time_us in due_us if time_us is not None), default=None)
         if next_us is not None:
             self._timer = call_after_us(next_us - elapsed_us, self.send_due_frames)
@@ -288,8 +293,7 @@ class RtServer:
         elapsed_us = self.elapsed_us()
         if elapsed_us is None:
             return
-        for connection in list(self.connections):
-            connection.send_due_frames(elapsed_us)
+        self.send_frames(elapsed_us)
         if elapsed_us == self._measurement.last_us:
             self.stop_measurement()
         else:

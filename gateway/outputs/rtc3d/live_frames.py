@@ -4,7 +4,6 @@ from bisect import bisect_left, bisect_right
 from collections import deque
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
-from functools import lru_cache
 from operator import attrgetter
 from typing import Final, NamedTuple
 
@@ -87,8 +86,6 @@ class LiveFrames:
         self.measured = tuple(
             each for each in WIRE_ORDER if each in self.chosen and each is not ComponentType.EVENT
         )
-        self.is_used = False
-        """Whether a client has asked for frames since the scene last set this to False."""
         self._takes_all = not requested or self.chosen == frozenset(WIRE_ORDER)
         self._measured = frozenset(self.measured)
         self._arrivals = arrivals
@@ -101,7 +98,8 @@ class LiveFrames:
         self._waiting: deque[Arrival] = deque()
         self._samples: dict[int, Kept[Arrival]] = {}  # of faster streams, by the stream's number
         self._joined: set[int] = set()  # the faster streams that have had a sample in a frame
-        self._packet = lru_cache(_CACHED_PACKETS)(self._build_packet)
+        self._packets: dict[tuple[ByteOrder, int, int, int], DataPacket] = {}  # the newest
+        self.update(arrivals.newest_us)
 
     # FrameSource ----------------------------------------------------------------------------
 
@@ -117,14 +115,12 @@ class LiveFrames:
 
     def time_us(self, tick: int) -> int:
         """See FrameSource."""
-        self._use()
         if tick >= self._frames.end:
             return NOT_YET_US
         return self._frames[tick].time_us if tick >= self._frames.first else _FORGOTTEN_US
 
     def tick_after(self, elapsed_us: int) -> int:
         """See FrameSource."""
-        self._use()
         frames = self._frames
         if not frames or frames.newest.time_us <= elapsed_us:
             return frames.end
@@ -142,6 +138,15 @@ class LiveFrames:
         first = bisect_left(kept, events_from_us, key=_time_us)
         end = bisect_right(kept, self._frames[tick].time_us, key=_time_us)
         return self._packet(byte_order, tick, self._events.first + first, self._events.first + end)
+
+    def _packet(self, byte_order: ByteOrder, tick: int, first_event: int, end_event: int) -> DataPacket:
+        key = (byte_order, tick, first_event, end_event)
+        packet = self._packets.get(key)
+        if packet is None:
+            if len(self._packets) >= _CACHED_PACKETS:
+                del self._packets[next(iter(self._packets))]
+            packet = self._packets[key] = self._build_packet(*key)
+        return packet
 
     def _build_packet(self, byte_order: ByteOrder, tick: int, first_event: int, end_event: int) -> DataPacket:
         frame = self._frames[tick]
@@ -172,6 +177,11 @@ class LiveFrames:
 
     # For the scene --------------------------------------------------------------------------
 
+    @property
+    def next_frame(self) -> int:
+        """The number of the next frame."""
+        return self._frames.end
+
     def update(self, elapsed_us: int) -> int | None:
         """Take the frames that have arrived; return when a frame that waits is to be sent anyway."""
         arrived = self._arrivals.frames
@@ -195,6 +205,7 @@ class LiveFrames:
     def forget(self) -> None:
         """Forget all frames so far."""
         self._frames.clear()
+        self._packets.clear()
         self._events.clear()
         self._waiting.clear()
         self._samples.clear()
@@ -202,11 +213,6 @@ class LiveFrames:
         if self._undecided is not None:
             self._undecided.clear()
         self._next_arrival = self._arrivals.frames.end
-
-    def _use(self) -> None:
-        if not self.is_used:
-            self.is_used = True
-            self.update(self._arrivals.newest_us)
 
     # Which arrivals become frames -----------------------------------------------------------
 

@@ -1,8 +1,10 @@
 """A live source as a scene: the frames that its server sends now, and its own parameters."""
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from typing import Final
+from weakref import WeakValueDictionary
 
 from gateway.errors import CommandError
 from gateway.outputs.rtc3d.arrivals import Arrivals
@@ -13,6 +15,7 @@ from gateway.rtc3d.parameters import SECTIONS, General, Parameters, only_section
 from gateway.rtc3d.parameters_xml import encode_parameters, extract_sections
 from gateway.rtc3d.server_description import described_rate_hz, num_described_items
 
+_KEPT_CHOICES: Final = 2
 _CACHED_SECTIONS: Final = 16  # clients can ask for 63 different choices
 
 
@@ -24,7 +27,12 @@ class LiveScene:
     def __init__(self, source: str) -> None:
         self._source = source
         self._arrivals = Arrivals()
-        self._frames: list[LiveFrames] = []  # of the choices of clients in this measurement
+        # What clients ask for, by its components. It is there while any client asks for it, and a bit longer,
+        # because a client can ask for one frame after the other.
+        self._frames: WeakValueDictionary[frozenset[ComponentType], LiveFrames] = WeakValueDictionary()
+        self._recent: deque[LiveFrames] = deque(maxlen=_KEPT_CHOICES)
+        self.has_new_frames = False
+        """Whether there are frames for clients that were not there when this was set to False."""
         self.set_parameters(b"", Parameters())
 
     # For the output -------------------------------------------------------------------------
@@ -48,7 +56,8 @@ class LiveScene:
     def forget_frames(self) -> None:
         """Forget the frames so far, because none are added any more while no client asks for any."""
         self._arrivals.frames.clear()
-        for frames in self._frames:
+        self._recent.clear()
+        for frames in list(self._frames.values()):
             frames.forget()
 
     @property
@@ -83,23 +92,27 @@ class LiveScene:
         self.stop()
 
     def advance(self, elapsed_us: int) -> int | None:
-        """See Scene. It takes new frames for all choices that clients use."""
+        """See Scene. It takes new frames for all that clients ask for."""
         due_us: int | None = None
-        for frames in self._frames:
-            if frames.is_used:
-                frames.is_used = False
-                its_due_us = frames.update(elapsed_us)
-                if its_due_us is not None and (due_us is None or its_due_us < due_us):
-                    due_us = its_due_us
+        for frames in list(self._frames.values()):
+            next_frame = frames.next_frame
+            its_due_us = frames.update(elapsed_us)
+            self.has_new_frames = self.has_new_frames or frames.next_frame != next_frame
+            if its_due_us is not None and (due_us is None or its_due_us < due_us):
+                due_us = its_due_us
         return due_us
 
     def stop(self) -> None:
         """See Scene."""
         self._arrivals.restart()
-        self._frames = []
+        self._frames.clear()
+        self._recent.clear()
 
-    def frames(self, components: Sequence[ComponentType], event_bytes: int) -> LiveFrames:  # noqa: ARG002
+    def frames(self, components: Sequence[ComponentType], event_bytes: int = 24) -> LiveFrames:  # noqa: ARG002
         """See Scene. Events have the size in which they arrive."""
-        frames = LiveFrames(components, self._arrivals, self._announced_hz)
-        self._frames.append(frames)
+        choice = frozenset(components)
+        frames = self._frames.get(choice)
+        if frames is None:
+            frames = self._frames[choice] = LiveFrames(components, self._arrivals, self._announced_hz)
+            self._recent.append(frames)
         return frames

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import logging
 import math
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable, Coroutine, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,6 +18,7 @@ from gateway.rtc3d.frames import Frame
 from gateway.rtc3d_server.client_connection import MAX_UNREAD_BYTES, ClientConnection
 from gateway.rtc3d_server.client_session import error_packet
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
+from gateway.rtc3d_server.scene import FrameSource
 from gateway.rtc3d_server.server import RtServer
 from gateway.worker_thread import WorkerThread
 
@@ -158,7 +159,7 @@ class LiveServer(RtServer):
             if isinstance(client, ClientFilter) and client.has_greeted:
                 client.send_file(path)
 
-    def count_losses(self) -> None:
+    def maintain(self) -> None:
         """Count the frames that slow clients have lost. Call it once a second."""
         for connection in self.connections:
             self._count_dropped(connection)
@@ -169,6 +170,20 @@ class LiveServer(RtServer):
         """See RtServer. The newest frame is never in the future."""
         elapsed_us = super().elapsed_us()
         return None if elapsed_us is None else max(elapsed_us, self._live_scene.newest_us)
+
+    def frames(self, components: Sequence[ComponentType]) -> FrameSource:
+        """See ConnectionOwner. Frames that no client asks for are not made."""
+        return self._live_scene.frames(components)
+
+    def next_frame_us(self) -> int | None:
+        """See RtServer. Frames are sent when they arrive."""
+        return None
+
+    def send_frames(self, elapsed_us: int) -> None:
+        """See RtServer. Most frames of a fast stream are none for clients that want a slower one, too."""
+        if self._live_scene.has_new_frames:
+            self._live_scene.has_new_frames = False
+            super().send_frames(elapsed_us)
 
     def frames_requested(self) -> int | None:
         """See ConnectionOwner."""

@@ -113,7 +113,7 @@ class Rtc3dOutput(Output):
         for served in list(self._served.values()):
             if served.server is not None:
                 served.server.apply_state()
-                served.server.count_losses()
+                served.server.maintain()
 
     def is_configured_like(self, other: Output) -> bool:
         """Any settings can be taken over."""

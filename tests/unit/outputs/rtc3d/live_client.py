@@ -89,17 +89,9 @@ class LiveClient:
 
     def __init__(self, source: LiveSource) -> None:
         self.bodies: list[bytes] = []
-        choices: dict[frozenset[object], object] = {}
-
-        def frames(components):  # type: ignore[no-untyped-def] # as Measurement does
-            choice = frozenset(components)
-            if choice not in choices:
-                choices[choice] = source.scene.frames(components, 24)
-            return choices[choice]
-
         self.session = ClientSession(
             SessionCallbacks(
-                frames,
+                source.scene.frames,
                 lambda sections: source.scene.parameters_xml(sections, General()),
                 lambda: max(source.now_us, source.scene.newest_us),
             )
