@@ -22,6 +22,7 @@ import zenoh
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm
 from tests.hostile.foxglove_viewers import ATTACKS as VIEWERS
+from tests.hostile.rtc3d_clients import ATTACKS as RTC3D_CLIENTS
 from tests.hostile.servers import SERVERS, streaming
 from tests.hostile.test_parameters import ATTACKS as PARAMETERS
 from tests.hostile.test_parameters import giving
@@ -164,6 +165,7 @@ ATTACKS: Final[dict[str, Attack]] = {
     "sender: LCM": _lcm_garbage,
     "Zenoh peer: stalled subscribers": _stalled_subscribers,
     **{f"Zenoh peer: {kind}": _zenoh_peer(kind) for kind in KINDS},
+    **{f"RTC3D client: {name}": _on_port_of("rtc3d", attack) for name, attack in RTC3D_CLIENTS.items()},
     **{f"VRPN client: {name}": _on_port_of("vrpn", attack) for name, attack in VRPN_CLIENTS.items()},
     **{f"viewer: {name}": _on_port_of("foxglove", attack) for name, attack in VIEWERS.items()},
     "host: HTTP connections": _held_http_connections,

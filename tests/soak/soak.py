@@ -129,7 +129,7 @@ class Soak:
             markers=20, tools=3, analog=8, plates=1, rate_hz=RATE_HZ, analog_rate_hz=RATE_HZ
         )
         ports = {name: free_port() for name in HOSTILE}
-        output_ports = {name: free_port() for name in ("vrpn", "foxglove")}
+        output_ports = {name: free_port() for name in ("rtc3d", "vrpn", "foxglove")}
         with tempfile.TemporaryDirectory() as folder, simulator_process(*HEALTHY_SCENE) as (healthy_port, _):
             async with Simulator(scene, port=free_port()) as simulator:
                 sources: dict[str, Source] = {
@@ -148,7 +148,9 @@ class Soak:
                         healthy_port,
                         sources,
                         settings={
-                            name: {"enabled": True, "port": port} for name, port in output_ports.items()
+                            name: {"enabled": True}
+                            | ({"ports": {"healthy": port}} if name == "rtc3d" else {"port": port})
+                            for name, port in output_ports.items()
                         },
                         before_command=before_command,
                     ) as gateway:

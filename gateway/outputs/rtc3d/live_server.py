@@ -37,6 +37,10 @@ _END_S: Final = 0.1
 _log = logging.getLogger(__name__)
 
 
+def _number(connection: ClientConnection) -> int:
+    return connection.number
+
+
 class SourceState:
     """What the gateway knows about a source, and whether its clients ask for frames.
 
@@ -223,7 +227,7 @@ class LiveServer(RtServer):
     def log_opened(self, connection: ClientConnection) -> None:
         """Log a new client, and turn away one that is too many."""
         num_clients = len(self.connections)
-        if num_clients <= self.max_clients:
+        if num_clients <= self.max_clients or self._close_silent_client(connection):
             text = f"client {connection.name} connected ({num_clients} now)"
             self._events.log(logging.INFO, text, "connected")
             return
@@ -235,6 +239,20 @@ class LiveServer(RtServer):
         )
         connection.write(error_packet(f"This gateway serves {self.max_clients} clients at most; closing"))
         connection.close()
+
+    def _close_silent_client(self, newest: ClientConnection) -> bool:
+        """Close the oldest connection that has sent no command yet; return whether there is one."""
+        silent = [
+            connection
+            for connection in self.connections
+            if isinstance(connection.filter, ClientFilter)
+            and not connection.filter.has_greeted
+            and connection is not newest
+            and not connection.transport.is_closing()
+        ]
+        if silent:
+            min(silent, key=_number).transport.abort()
+        return bool(silent)
 
     def log_closed(self, connection: ClientConnection, error: Exception | None) -> None:
         """Log that a client has gone, and count what it lost."""
