@@ -25,7 +25,7 @@ def test_by_default_it_is_off_and_listens_on_this_computer_only() -> None:
 
 @pytest.mark.parametrize(
     ("host", "leaves"),
-    [("127.0.0.1", False), ("::1", False), ("localhost", False), ("0.0.0.0", True), ("lab-pc", True)],
+    [("127.0.0.1", False), ("::1", False), ("localhost", False), ("::", True), ("lab-pc", True)],
 )
 def test_frames_leave_this_computer_if_others_can_connect(host: str, leaves: bool) -> None:
     assert RTC3D.leaves_host(Rtc3dSettings(host=host)) is leaves
