@@ -140,22 +140,23 @@ class LslProcesses:
         """Read what the process reports until it ends, in a thread of its own."""
         reader = socket.socket(fileno=os.dup(ours.fileno()))
         reader.settimeout(None)
-        with reader, reader.makefile("rb") as lines, contextlib.suppress(OSError):
+        with reader, reader.makefile("rb") as lines, contextlib.suppress(OSError, ValueError):
             for line in lines:
                 self._take(Report.decode(line))
+        process.kill()  # if its last report cannot be read, it may still run
         status = process.wait()
         if self._is_stopped:
             return
         if self.wanted:
             self.interrupted = True
         self.wanted = _NO_STREAMS
-        self._socket = None
-        ours.close()
         lived_s = time.monotonic() - self._started_s
         if lived_s >= _STEADY_S:
             self._retry_delay_s = _FIRST_RETRY_S
         self._retry_s = time.monotonic() + self._retry_delay_s
         self._retry_delay_s = min(2 * self._retry_delay_s, _MAX_RETRY_S)
+        self._socket = None  # after the delay is known, because is_due needs both
+        ours.close()
         failure = self._report.failure
         self._failed(f"the process for LSL {f'failed: {failure}' if failure else f'ended {_reason(status)}'}")
 

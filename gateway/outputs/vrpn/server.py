@@ -29,6 +29,7 @@ _READ_BYTES_PER_S: Final = 128 * 1024.0
 _READ_BURST_BYTES: Final = 1024 * 1024.0
 _RETRY_S: Final = 1.0
 _ACCEPT_PAUSE_S: Final = 0.1
+_CLOSE_S: Final = 1.0
 
 logger = logging.getLogger(__name__)
 
@@ -135,7 +136,13 @@ class VrpnServer:
             await asyncio.sleep(_ACCEPT_PAUSE_S)
 
     async def _call_back(self, host: str, port: int) -> None:
-        await asyncio.get_running_loop().create_connection(lambda: Client(self), host, port)
+        client = Client(self)
+        try:
+            await asyncio.get_running_loop().create_connection(lambda: client, host, port)
+        except asyncio.CancelledError:
+            # uvloop does not call connection_lost if this comes just after connection_made.
+            self.client_closed(client)
+            raise
 
     def _call_failed(self, host: str, port: int, reason: str) -> None:
         text = (
@@ -149,8 +156,7 @@ class VrpnServer:
     def client_opened(self, client: Client) -> bool:
         """See ClientOwner."""
         if len(self._ready) >= MAX_CLIENTS:
-            text = f"{client.name} is refused: {MAX_CLIENTS} clients are connected"
-            self._events.log(logging.WARNING, text, "refused")
+            self._refuse(client)
             return False
         waiting = [other for other in self._clients if not other.is_ready]
         if len(waiting) >= MAX_HANDSHAKES:
@@ -160,9 +166,17 @@ class VrpnServer:
 
     def client_ready(self, client: Client) -> None:
         """See ClientOwner."""
+        if len(self._ready) >= MAX_CLIENTS:
+            self._refuse(client)
+            client.abort()
+            return
         self._set_ready((*self._ready, client))
         text = f"{client.name} is connected; clients now: {len(self._ready)}"
         self._events.log(logging.INFO, text, "connected")
+
+    def _refuse(self, client: Client) -> None:
+        text = f"{client.name} is refused: {MAX_CLIENTS} clients are connected"
+        self._events.log(logging.WARNING, text, "refused")
 
     def client_failed(self, client: Client, text: str) -> None:
         """See ClientOwner."""
@@ -189,5 +203,7 @@ class VrpnServer:
             await asyncio.wait([self._serving])
         for client in list(self._clients):
             client.abort()
-        while self._clients:  # noqa: ASYNC110 - until the loop has closed their sockets
-            await asyncio.sleep(0)
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_CLOSE_S):
+                while self._clients:  # noqa: ASYNC110 - until the loop has closed their sockets
+                    await asyncio.sleep(0)
