@@ -5,9 +5,10 @@ import errno
 import logging
 import os
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Final
 
-from gateway.log import FailureLog
+from gateway.log import DefectLog, FailureLog
 from gateway.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic
@@ -37,6 +38,7 @@ class FoxgloveOutput(Output):
         self._address = address_text(settings.host, settings.port)
         self._problem = f"not listening on {self._address} yet"
         self._failures = FailureLog(logger, self.name)
+        self._defects = DefectLog(logger, self.name)
         self._server = FoxgloveServer(settings.host, settings.port, str(now_utime()))
         self._sources: dict[str, ServedSource] = {}
         self._thread: LoopThread | None = None
@@ -50,17 +52,23 @@ class FoxgloveOutput(Output):
 
     async def _listen(self) -> None:
         """Listen as soon as the address can be bound."""
-        while not self._is_closed:
-            try:
-                await self._server.open()
-            except OSError as error:
-                self._problem = f"cannot listen on {self._address}: {_bind_problem(error)}"
-                self._failures.failed(self._problem)
-                await asyncio.sleep(_RETRY_S)
-            else:
-                self._problem = ""
-                self._failures.succeeded(f"viewers can connect to ws://{self._address}")
+        while True:
+            if await self._has_opened():
                 return
+            await asyncio.sleep(_RETRY_S)
+
+    async def _has_opened(self) -> bool:
+        try:
+            await self._server.open()
+        except OSError as error:
+            problem = f"cannot listen on {self._address}: {_bind_problem(error)}"
+            self._failures.failed(problem)
+        else:
+            problem = ""
+            self._failures.succeeded(f"viewers can connect to ws://{self._address}")
+        if not self._is_closed:
+            self._problem = problem
+        return not problem
 
     def publisher(self, topic: Topic) -> Publisher:  # noqa: ARG002 - the signature is that of Output
         """Return a publisher that does nothing: viewers get whole frames."""
@@ -125,17 +133,22 @@ class FoxgloveOutput(Output):
     def _call(self, call: Callable[[], None]) -> None:
         """Have the thread make a call that must not be left out."""
         if self._thread is None:
-            call()
-        elif not self._thread.offer(call):
-            self._thread.run(_async(call))
+            self._make(call)
+        elif not self._thread.offer(partial(self._make, call)):
+            self._thread.run(self._make_later(call))
 
     def _call_in_time(self, call: Callable[[], None], num_bytes: int) -> bool:
         """Have the thread make a call; return False if too many wait already."""
-        return self._thread is not None and self._thread.offer(call, num_bytes)
+        return self._thread is not None and self._thread.offer(partial(self._make, call), num_bytes)
 
+    def _make(self, call: Callable[[], None]) -> None:
+        try:
+            call()
+        except Exception as defect:  # noqa: BLE001 - other sources and frames are served
+            self._defects.log(defect)
 
-async def _async(call: Callable[[], None]) -> None:
-    call()
+    async def _make_later(self, call: Callable[[], None]) -> None:
+        self._make(call)
 
 
 def address_text(host: str, port: int) -> str:

@@ -5,6 +5,7 @@ handshakes, ends for ever when the process has too many open files, and waits in
 does not read. docs/design.md has more about this.
 """
 
+import asyncio
 import logging
 from collections.abc import Callable
 from functools import partial
@@ -68,20 +69,19 @@ class FoxgloveServer:
         self._viewers: set[Viewer] = set()
         self._admission = Admission()
         self._server: Server | None = None
+        self._opening = asyncio.Lock()
+        self._is_closed = False
         self._defects = DefectLog(logger, "foxglove")
 
-    @property
-    def port(self) -> int:
-        """The port on which it listens; 0 if it does not."""
-        if self._server is None or not self._server.sockets:
-            return 0
-        port: int = self._server.sockets[0].getsockname()[1]
-        return port
-
     async def open(self) -> None:
-        """Listen. Raises OSError."""
+        """Listen, unless ``close`` was called. Raises OSError."""
+        async with self._opening:
+            if not self._is_closed:
+                self._server = await self._listen()
+
+    async def _listen(self) -> Server:
         create: Any = partial(Connection, self._admission)
-        self._server = await serve(
+        return await serve(
             self._serve,
             self._host,
             self._port,
@@ -99,9 +99,11 @@ class FoxgloveServer:
 
     async def close(self) -> None:
         """Stop listening, and disconnect all viewers."""
-        if self._server is not None:
-            self._server.close()
-            await self._server.wait_closed()
+        self._is_closed = True
+        async with self._opening:
+            if self._server is not None:
+                self._server.close()
+                await self._server.wait_closed()
 
     # Channels.
 

@@ -386,6 +386,20 @@ async def test_thousands_of_channels_have_a_field_each() -> None:
             assert list(floats_of(analog.content).values()) == list(range(5000))
 
 
+async def test_a_defect_in_one_message_is_logged_once_and_others_are_sent(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(messages.FoxgloveSource, "_cloud", lambda *_: 1 / 0)
+    async with serving("lab") as (port, [lab]), viewing(port, "/lab/markers", "/lab/events") as viewer:
+        await lab.wait_until_wanted()
+        for _ in range(5):
+            lab.publish_items(MARKERS, [(1, 2, 3, 0)])
+            lab.publish_items(EVENT, [(7, 0, 1, 2, 3)])
+        await viewer.wait_for("/lab/events", 5)
+    [error] = [record for record in caplog.records if record.levelname == "ERROR"]
+    assert "defect in the gateway: ZeroDivisionError" in error.getMessage()
+
+
 # The port ------------------------------------------------------------------------------------------
 
 
@@ -404,6 +418,16 @@ async def test_a_port_that_is_taken_is_a_problem_until_it_is_free(caplog: pytest
         output.close()
     warnings = [record for record in caplog.records if record.levelname == "WARNING"]
     assert len(warnings) == 1
+
+
+async def test_an_output_that_is_closed_while_it_opens_releases_the_port() -> None:
+    for _ in range(10):
+        output = FoxgloveOutput(FoxgloveSettings(enabled=True, host="localhost", port=free_port()))
+        output.start()
+        await asyncio.to_thread(output.close)
+        assert not output.health().connected
+        with socket.create_server(("127.0.0.1", output.settings.port)):
+            pass
 
 
 async def test_an_address_of_another_computer_is_a_problem() -> None:
