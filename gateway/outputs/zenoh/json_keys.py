@@ -27,9 +27,13 @@ from gateway.outputs.send_thread import SendThread
 from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
+from gateway.token_bucket import TokenBucket
 
 MAX_LABELS_CHARACTERS: Final = 256 * 1024
 """Longer lists of labels are left out: they come from the server, and are in every text."""
+
+_BURST_S: Final = 0.25
+"""The messages of this time may come at once, as after a delay on the network."""
 
 _REST: Final = 4
 """How many times as long as a conversion the thread pauses after it."""
@@ -57,8 +61,8 @@ class JsonKeys:
         if self._max_rate_hz == 0 or topic.path[0] not in COMPONENTS_BY_KEY:
             return None
         is_event = topic.path == (ComponentType.EVENT.key,)
-        pacer = None if is_event else Pacer(self._max_rate_hz)
-        return JsonPublisher(self, topic, f"{key}/{JSON_NAME}", pacer, on_wanted)
+        pace = None if is_event else JsonPace(self._max_rate_hz)
+        return JsonPublisher(self, topic, f"{key}/{JSON_NAME}", pace, on_wanted)
 
     def set_parameters(self, source: str, parameters: ServerParameters) -> None:
         """Take the labels from these parameters from now on."""
@@ -99,22 +103,40 @@ class JsonKeys:
                 self._thread.close()
 
 
+class JsonPace:
+    """Picks ``max_rate_hz`` messages of one key per second, at even intervals of their capture.
+
+    A replay may be faster than the capture was, so the messages per second are limited besides.
+    """
+
+    def __init__(self, max_rate_hz: float) -> None:
+        self._pacer = Pacer(max_rate_hz)
+        self._bucket = TokenBucket(max_rate_hz, max(_BURST_S * max_rate_hz, 1.0))
+
+    def due(self, message: bytes) -> bool:
+        """Return whether to send this message. Call it for every message."""
+        utime = int.from_bytes(message[_UTIME], "big", signed=True)
+        capture_utime = int.from_bytes(message[_CAPTURE_UTIME], "big", signed=True)
+        is_due = self._pacer.due(None if capture_utime == utime else capture_utime, utime)
+        return is_due and self._bucket.try_take()
+
+
 class JsonPublisher:
     """Sends the messages of one topic as JSON on ``key``, while a subscriber matches it.
 
-    Without a ``pacer``, it sends all of them. Otherwise it leaves messages out, also those that are replaced
+    Without a ``pace``, it sends all of them. Otherwise it leaves messages out, also those that are replaced
     by newer ones while they wait.
     """
 
     def __init__(
-        self, keys: JsonKeys, topic: Topic, key: str, pacer: Pacer | None, on_wanted: Callable[[], None]
+        self, keys: JsonKeys, topic: Topic, key: str, pace: JsonPace | None, on_wanted: Callable[[], None]
     ) -> None:
         self.wanted = False
         """Whether a subscriber matches the key now."""
         self._keys = keys
         self._topic = topic
         self._key = key
-        self._pacer = pacer
+        self._pace = pace
         self._on_wanted = on_wanted
         self._publisher: zenoh.Publisher | None = None
         self._lock = threading.Lock()
@@ -142,7 +164,7 @@ class JsonPublisher:
 
     def offer(self, message: bytes) -> None:
         """Send a message as JSON soon, unless it is left out. Never raises; what is refused is counted."""
-        if self._pacer is not None and not self._is_due(self._pacer, message):
+        if self._pace is not None and not self._pace.due(message):
             return
         if len(message) > MAX_JSON_SOURCE_BYTES:
             self._count_loss(
@@ -150,18 +172,13 @@ class JsonPublisher:
                 f"a message of {len(message)} bytes is too long for {self._key}; subscribe to the key "
                 f"without /{JSON_NAME}",
             )
-        elif self._pacer is None:
+        elif self._pace is None:
             self._offer(functools.partial(self._send, message), message)
         else:
             with self._lock:
                 is_waiting, self._newest = self._newest is not None, message
             if not is_waiting and not self._offer(self._send_newest, message):
                 self._newest = None
-
-    def _is_due(self, pacer: Pacer, message: bytes) -> bool:
-        utime = int.from_bytes(message[_UTIME], "big", signed=True)
-        capture_utime = int.from_bytes(message[_CAPTURE_UTIME], "big", signed=True)
-        return pacer.due(None if capture_utime == utime else capture_utime, utime)
 
     def _offer(self, convert: Callable[[], None], message: bytes) -> bool:
         if self._keys.offer(convert, len(message)):
