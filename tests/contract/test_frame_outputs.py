@@ -1,7 +1,7 @@
 """What ``gateway.outputs.contract`` promises, for every output that takes whole frames, with a real peer.
 
 The sources are published by the gateway's own FanOut, so what an output refuses is counted as in the gateway.
-A test that finds the rigs too slow or too different belongs to the tests of one output.
+What only one output promises is tested with that output.
 """
 
 import asyncio
@@ -134,8 +134,6 @@ class Lab:
         self.rig = rig
         self.output = rig.output
         self.fan_outs: dict[str, FanOut] = {}
-        self.changes: list[str] = []
-        """The names of the threads in which the output has reported that ``wanted`` changed."""
         self._numbers = itertools.count(1)
         self._outputs = [self.output]
         self.output.serve_queries(NoQueries())
