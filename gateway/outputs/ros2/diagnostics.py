@@ -5,6 +5,8 @@ import time
 from collections.abc import Iterable
 from typing import Any, Final
 
+import zenoh
+
 from gateway.errors import OutputError
 from gateway.log import DefectLog
 from gateway.messages.decode import decode
@@ -13,6 +15,7 @@ from gateway.outputs.ros2.messages import DiagnosticStatus, diagnostic_array
 from gateway.outputs.ros2.router import RouterSession
 from gateway.outputs.ros2.source import Sender
 from gateway.outputs.ros2.topic import RosTopic
+from gateway.outputs.zenoh.config import zenoh_reason
 
 OK: Final = 0
 WARN: Final = 1
@@ -54,6 +57,8 @@ class DiagnosticsPublisher:
         try:
             status = decode(message)
             self._topic.put(diagnostic_array(cdr.stamp(status.utime), diagnostics_of(status)), time.time_ns())
+        except zenoh.ZError as error:
+            logger.debug("ros2: publishing diagnostics: %s", zenoh_reason(error))
         except Exception as defect:  # noqa: BLE001 - the sending thread continues
             self._defects.log(defect)
 

@@ -32,7 +32,7 @@ class Ros2Output(Output):
     """Publishes for ROS 2 in the wire format of rmw_zenoh."""
 
     name = "ros2"
-    drop_causes = ("not open", "no router", "queue full", "unknown unit")
+    drop_causes = ("not open", "no router", "queue full", "put failed", "unknown unit")
 
     def __init__(self, settings: Ros2Settings) -> None:
         self.settings = settings

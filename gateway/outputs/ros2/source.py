@@ -6,6 +6,8 @@ import threading
 from collections.abc import Callable, Mapping
 from typing import Final, Protocol
 
+import zenoh
+
 from gateway.errors import OutputError
 from gateway.log import DefectLog
 from gateway.losses import Losses
@@ -14,6 +16,7 @@ from gateway.outputs.contract import ServerParameters
 from gateway.outputs.ros2.router import RouterSession
 from gateway.outputs.ros2.source_topics import NOT_YET, SourceTopics
 from gateway.outputs.ros2.topic import RosNode, RosTopic
+from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
 
@@ -155,6 +158,10 @@ class RosSource:
             return
         try:
             call(*arguments)
+        except zenoh.ZError as error:
+            if not self._router.is_cut_off:  # as it is when the gateway stops
+                text = f"Zenoh did not take a message for ROS 2: {zenoh_reason(error)}"
+                self.topics.losses.lost("put failed", text)
         except Exception as defect:  # noqa: BLE001 - the other sources continue
             self._defects.log(defect)
             self.topics.losses.lost(type(defect).__name__, f"a frame is not published for ROS 2: {defect}")

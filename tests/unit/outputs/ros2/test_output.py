@@ -10,6 +10,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import rtc3d
+import zenoh
 
 from gateway.errors import OutputError
 from gateway.messages.coordinate_frame import CoordinateFrame
@@ -444,6 +445,20 @@ def test_a_defect_is_logged_once_and_counted_and_the_next_frame_is_published(
     errors = [each.message for each in caplog.records if each.levelno == logging.ERROR]
     assert len(errors) == 1
     assert "ZeroDivisionError" in errors[0]
+
+
+def test_what_zenoh_refuses_is_counted_and_no_defect(
+    lab: RosLab, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def refuse(_cdr: bytes, _now_ns: int) -> None:
+        raise zenoh.ZError("no")
+
+    publisher = lab.source(given=parameters(("wand",)))
+    lab.hear_all()
+    monkeypatch.setattr(lab.output._tf, "put", refuse)
+    publisher.publish(tools_frame((1, 2, 3)), stamp(), 0, ALL)
+    wait_until(lambda: lab.lost() == {"put failed": 1})
+    assert not [each for each in caplog.records if each.levelno >= logging.ERROR]
 
 
 # Life cycle ----------------------------------------------------------------------------------
