@@ -205,6 +205,8 @@ class Gateway:
             parameters = source.known_parameters
             if parameters.version:
                 output.publish_parameters(name, parameters)
+            else:
+                source.fan_out.begin(parameters)
 
     async def _change_sources(self, wanted_sources: Sequence[SourceSettings]) -> list[str]:
         wanted = {settings.name: settings for settings in wanted_sources}

@@ -132,6 +132,8 @@ class Source:
         again, because the state of this one can no longer be trusted.
         """
         self._failure = asyncio.get_running_loop().create_future()
+        if not self.known_parameters.version:
+            self.fan_out.begin(self.known_parameters)
         if self._has_new_server:
             await self.queries.parameters.known.make_void("the configuration names another server")
         try:

@@ -280,3 +280,14 @@ class FanOut:
     def set_parameters(self, parameters: ServerParameters) -> None:
         """Set the labels (§6.3) and the coordinate frame for the poses per tool."""
         self._tool_poses.set_parameters(parameters)
+
+    def begin(self, parameters: ServerParameters) -> None:
+        """Set the coordinate frame before the server has given any parameters, because some never do.
+
+        Outputs of whole frames get these empty parameters; those of messages have nothing to publish yet.
+        """
+        self.set_parameters(parameters)
+        for route in self._routes:
+            if route.frame_route is not None:
+                publish = partial(route.output.publish_parameters, self._source, parameters)
+                guarded(route.output, publish, None)
