@@ -14,15 +14,16 @@ from gateway.rtc3d.packets import PacketType, encode_packet
 from gateway.rtc3d_server.frame_builder import exact_rate
 from gateway.rtc3d_server.scene import NOT_YET_US, DataPacket
 
-WAIT_US: Final = 50_000
-"""How long a frame waits for the samples of faster components at its time stamp."""
+WAIT_US: Final = 250_000
+"""How long a frame waits for the samples of faster components at its time stamp. They come on another
+connection, which can stand still for a moment."""
 
 _ALIVE_US: Final = 1_000_000
 _ALIVE_PERIODS: Final = 3
 """A stream counts as long as its newest frame is not older than this, whichever is longer."""
 
-_FASTER_ALIVE_US: Final = 500_000
-"""How long frames wait for a faster stream without frames."""
+_FASTER_ALIVE_US: Final = 250_000
+"""Frames do not wait for a faster stream that has had no frames for this long when they arrive."""
 
 _LEARN_US: Final = 100_000
 _LEARN_ANNOUNCED_US: Final = 300_000
@@ -295,11 +296,11 @@ class LiveFrames:
     def _release(self, now_us: int) -> None:
         while self._waiting:
             arrival = self._waiting[0]
-            if now_us - arrival.time_us < WAIT_US and not self._has_all_samples(arrival, now_us):
+            if now_us - arrival.time_us < WAIT_US and not self._has_all_samples(arrival):
                 return
             self._add_joined(self._waiting.popleft())
 
-    def _has_all_samples(self, arrival: Arrival, now_us: int) -> bool:
+    def _has_all_samples(self, arrival: Arrival) -> bool:
         """Return whether all other streams have reached the frame's time stamp, or have no frames now."""
         for stream in self._streams:
             rate = self._arrivals.rates[stream]
@@ -308,7 +309,7 @@ class LiveFrames:
                 stream != arrival.stream
                 and rate.has_times
                 and _ROUNDING_US < behind_us < _OTHER_CLOCK_US
-                and now_us - rate.time_us < _FASTER_ALIVE_US
+                and arrival.time_us - rate.time_us < _FASTER_ALIVE_US
             ):
                 return False
         return True
