@@ -3,7 +3,7 @@
 import asyncio
 import logging
 import struct
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
+from gateway.losses import Loss
 from gateway.outputs.contract import ServerFile
 from gateway.outputs.rtc3d import client_filter
 from gateway.outputs.rtc3d.live_server import SLOW_CLIENT
@@ -254,11 +255,21 @@ def events_in(body: bytes) -> list[int]:
     return [int(item[0]) for each in components_in(body) if each.type == EVENT for item in each.items]
 
 
+def losses_of(gateway: ServingGateway) -> Sequence[Loss]:
+    [(_, status)] = gateway.source.fan_out.outputs
+    losses: Sequence[Loss] = status.losses
+    return losses
+
+
 async def test_a_file_that_is_gone_is_left_out(tmp_path: Path) -> None:
     async with playing() as (_, gateway), connected(gateway) as client:
         await client.ask("StreamFrames 3D")
         gateway.gateway._announce_file("lab", ServerFile(tmp_path / "gone.c3d", 1000))
         assert consecutive(await client.frames(30))
+        await until(lambda: bool(losses_of(gateway)))
+        [loss] = losses_of(gateway)
+    assert (loss.cause, loss.messages) == ("C3D file", 1)
+    assert "does not get gone.c3d: No such file or directory; " in loss.text
 
 
 # Limits -------------------------------------------------------------------------------------
@@ -275,11 +286,9 @@ async def test_a_slow_client_loses_only_its_own_frames_and_no_event(
         await other.ask("StreamFrames 6D")
         while "does not read" not in caplog.text:
             assert consecutive(await other.frames(20))
-        [losses] = [status.losses for _, status in gateway.source.fan_out.outputs]
-        while not losses:
+        while not losses_of(gateway):
             await other.frames(20)
-            [losses] = [status.losses for _, status in gateway.source.fan_out.outputs]
-        assert {loss.cause for loss in losses} == {SLOW_CLIENT}
+        assert {loss.cause for loss in losses_of(gateway)} == {SLOW_CLIENT}
 
         slow.resume()
         assert (await slow.read())[0] == COMMAND

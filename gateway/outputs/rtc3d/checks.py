@@ -1,5 +1,6 @@
 """The doctor's checks of the output for RTC3D clients: the names of the sources, and their ports."""
 
+import os
 import socket
 from collections.abc import Sequence
 from typing import Final
@@ -55,7 +56,7 @@ def _check_port(host: str, source: str, port: int, seconds: float) -> Finding:
         with socket.create_server((host, port), family=_family(host)):
             return _rtc3d.passing("ports", f"{place} is free")
     except OSError as error:
-        problem = error.strerror or str(error)
+        problem = os.strerror(error.errno) if error.errno else str(error)
     if _is_rt_server(host, port, seconds):
         return _rtc3d.passing("ports", f"an RT server answers on {place}: the gateway, if it runs")
     return _rtc3d.failing(

@@ -32,7 +32,14 @@ _MAX_HELD_PACKETS: Final = 16  # replies and No Data while a file is sent
 
 _LONGEST_NAME: Final = 32  # of a command, in bytes
 
-_KEEPALIVE: Final = {"TCP_KEEPIDLE": 10, "TCP_KEEPINTVL": 5, "TCP_KEEPCNT": 3}  # in s, in s, probes
+_VANISHED: Final = {
+    "TCP_KEEPIDLE": 10,  # s
+    "TCP_KEEPINTVL": 5,  # s
+    "TCP_KEEPCNT": 3,
+    "TCP_USER_TIMEOUT": 300_000,  # ms
+}
+"""The options of sockets by which the system notices that a client's computer has vanished. The last one is
+for a client to which data is being sent. It also ends connections on which nothing is read for so long."""
 
 _log = logging.getLogger(__name__)
 
@@ -58,6 +65,9 @@ class FilterOwner(Protocol):
 
     def control_recording(self, *, start: bool, name: str) -> Coroutine[Any, Any, None]:
         """Start or stop a recording on the source's server. Raises QueryError."""
+
+    def file_lost(self, client: str, path: Path, reason: str) -> None:
+        """Count and log a C3D file that a client does not get."""
 
     def check_wanted(self) -> None:
         """Note whether any client asks for frames now."""
@@ -161,17 +171,19 @@ class ClientFilter(ConnectionFilter):
 
     def send_file(self, path: Path) -> None:
         """Send a C3D file after those that wait. Frames are dropped meanwhile; events and replies wait."""
-        if len(self._files) < _MAX_FILES:
-            self._files.append(path)
-            if len(self._files) == 1:
-                self._start(self._send_files())
+        if len(self._files) >= _MAX_FILES:
+            self._owner.file_lost(self.connection.name, path, f"{_MAX_FILES} files wait for it already")
+            return
+        self._files.append(path)
+        if len(self._files) == 1:
+            self._start(self._send_files())
 
     async def _send_files(self) -> None:
         while self._files:
             try:
                 await self._send_file(self._files[0])
             except OSError as error:
-                _log.debug("%s does not get %s: %s", self.connection.name, self._files[0], error)
+                self._owner.file_lost(self.connection.name, self._files[0], error.strerror or str(error))
             self._files.pop(0)
 
     async def _send_file(self, path: Path) -> None:
@@ -243,5 +255,5 @@ def _keep_alive(tcp: socket.socket) -> None:
     """Let the system find out when the client's computer has vanished."""
     with contextlib.suppress(OSError):
         tcp.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-        for name, value in _KEEPALIVE.items():
+        for name, value in _VANISHED.items():
             tcp.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)

@@ -5,6 +5,7 @@ import contextlib
 import logging
 import math
 from collections.abc import Callable, Coroutine, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, Final
 
@@ -25,6 +26,9 @@ from gateway.worker_thread import WorkerThread
 SLOW_CLIENT: Final = "slow client"
 """The cause of frames that a client did not get because it does not read fast enough."""
 
+FILE: Final = "C3D file"
+"""The cause of C3D files that a client did not get."""
+
 _NO_FRAMES_S: Final = 2.0
 """How long a client waits for frames before it gets No Data, if it is unknown whether a measurement runs."""
 
@@ -35,10 +39,6 @@ _END_S: Final = 0.1
 """How long no frame must have come before a measurement ends."""
 
 _log = logging.getLogger(__name__)
-
-
-def _number(connection: ClientConnection) -> int:
-    return connection.number
 
 
 class SourceState:
@@ -167,6 +167,7 @@ class LiveServer(RtServer):
         """Count the frames that slow clients have lost. Call it once a second."""
         for connection in self.connections:
             self._count_dropped(connection)
+        self.check_wanted()  # after a change of the port, the former server has said that nothing is wanted
 
     # RtServer -------------------------------------------------------------------------------
 
@@ -215,6 +216,12 @@ class LiveServer(RtServer):
         """Start or stop a recording on the source's server. Raises QueryError."""
         return self._control(self._state.source, start, name)
 
+    def file_lost(self, client: str, path: Path, reason: str) -> None:
+        """Count and log a C3D file that a client does not get."""
+        if self._state.losses is not None:
+            text = f"client {client} does not get {path.name}: {reason}; the gateway keeps files in its spool"
+            self._state.losses.lost(FILE, text, frames=0)
+
     def check_wanted(self) -> None:
         """Note whether any client asks for frames now."""
         wanted = any(connection.session.wants_frames for connection in self.connections)
@@ -251,7 +258,7 @@ class LiveServer(RtServer):
             and not connection.transport.is_closing()
         ]
         if silent:
-            min(silent, key=_number).transport.abort()
+            min(silent, key=attrgetter("number")).transport.abort()
         return bool(silent)
 
     def log_closed(self, connection: ClientConnection, error: Exception | None) -> None:

@@ -2,9 +2,9 @@
 
 import asyncio
 import logging
-from collections.abc import Callable, Coroutine
+from collections.abc import Callable
 from functools import partial
-from typing import Any, Final
+from typing import Final
 
 from gateway.errors import GatewayError
 from gateway.log import DefectLog, FailureLog, defect_text, log_fields
@@ -21,7 +21,7 @@ from gateway.outputs.contract import (
 )
 from gateway.outputs.loop_thread import LoopThread
 from gateway.outputs.no_topics import IgnoringPublisher
-from gateway.outputs.rtc3d.live_server import SLOW_CLIENT, LiveServer, SourceState
+from gateway.outputs.rtc3d.live_server import FILE, SLOW_CLIENT, LiveServer, SourceState
 from gateway.outputs.rtc3d.publisher import QUEUE_FULL, Rtc3dPublisher
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.outputs.status import OutputHealth
@@ -53,7 +53,7 @@ class Rtc3dOutput(Output):
     """Serves RTC3D clients in a thread of its own. They share the gateway's session with each server."""
 
     name = "rtc3d"
-    drop_causes = (SLOW_CLIENT, QUEUE_FULL)
+    drop_causes = (SLOW_CLIENT, QUEUE_FULL, FILE)
 
     def __init__(self, settings: Rtc3dSettings) -> None:
         self._settings = settings
@@ -194,9 +194,6 @@ class Rtc3dOutput(Output):
         """Use ``service`` for clients that start and stop recordings."""
         self._queries = service
 
-    def _control(self, source: str, start: bool, name: str) -> Coroutine[Any, Any, None]:
-        return self._control_recording(source, start, name)
-
     async def _control_recording(self, source: str, start: bool, name: str) -> None:
         """Ask the gateway's event loop. Called in the thread. Raises QueryError."""
         assert self._loop is not None  # noqa: S101 - there is a source, so watch_wanted was called
@@ -204,8 +201,8 @@ class Rtc3dOutput(Output):
         options = {CONTROL_OPTION: "start" if start else "stop"}
         if start and name:
             options["name"] = name
-        answer = asyncio.run_coroutine_threadsafe(_awaited(self._queries, source, options), self._loop)
-        await asyncio.wrap_future(answer)
+        answer = self._queries.answer(source, _RECORDING, options)
+        await asyncio.wrap_future(asyncio.run_coroutine_threadsafe(answer, self._loop))
 
     # Ports ----------------------------------------------------------------------------------
 
@@ -252,7 +249,7 @@ class Rtc3dOutput(Output):
                     port,
                     self._settings.max_clients,
                     partial(self._wanted_changed, state.source),
-                    self._control,
+                    self._control_recording,
                 )
                 try:
                     await server.listen()
@@ -276,10 +273,6 @@ class Rtc3dOutput(Output):
         on_change = self._on_wanted.get(source)
         if on_change is not None and self._loop is not None and not self._loop.is_closed():
             self._loop.call_soon_threadsafe(on_change)
-
-
-async def _awaited(service: QueryService, source: str, options: dict[str, str]) -> None:
-    await service.answer(source, _RECORDING, options)
 
 
 async def _stop(served: _Served) -> None:
