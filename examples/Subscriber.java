@@ -1,8 +1,7 @@
 // Print the markers that a gateway publishes on LCM.
 //
-//   make -C examples java && java -Xmx256m -jar examples/build/subscriber.jar [SOURCE [COUNT]]     for example: LAB 100
+//   make -C examples java && java -jar examples/build/subscriber.jar [SOURCE [COUNT]]     for example: LAB 100
 //
-// With -Xmx256m, a damaged message cannot fill the memory: the classes of lcm-gen allocate as many items as it claims.
 // Building needs a JDK (11 or newer), make, and the Python package lcm, which has lcm.jar and lcm-gen. SOURCE is the
 // name of the source in upper case. The program stops after COUNT frames. The environment variable LCM_DEFAULT_URL sets
 // the LCM URL. With --vectors, the program decodes messages from standard input instead (lcm_types/vectors/README.md).
@@ -18,6 +17,8 @@ import java.io.PrintStream;
 import java.lang.reflect.Array;
 import java.lang.reflect.Field;
 import java.lang.reflect.Modifier;
+import java.nio.BufferUnderflowException;
+import java.nio.ByteBuffer;
 import java.util.Locale;
 import java.util.StringJoiner;
 import java.util.concurrent.CountDownLatch;
@@ -96,15 +97,51 @@ public final class Subscriber {
     /** Return the message as an object of its class. */
     private static Object decode(String typeName, byte[] data) throws IOException {
         try {
-            LCMDataInputStream input = new LCMDataInputStream(data);
-            Object message = Class.forName("rtc3d." + typeName).getConstructor(DataInput.class).newInstance(input);
-            if (input.available() == 0) {
-                return message;
+            Class<?> type = Class.forName("rtc3d." + typeName);
+            ByteBuffer content = ByteBuffer.wrap(data).position(Math.min(data.length, Long.BYTES));
+            skip(type, content);
+            if (!content.hasRemaining()) {
+                return type.getConstructor(DataInput.class).newInstance(new LCMDataInputStream(data));
             }
-        } catch (ReflectiveOperationException error) {
-            // An unknown type; a wrong fingerprint, a message that ends too early, or an impossible number of items.
+        } catch (ReflectiveOperationException | BufferUnderflowException | IllegalArgumentException error) {
+            // An unknown type, a wrong fingerprint, a message that ends too early, or an impossible number of items.
         }
         throw new IOException(data.length + " bytes are not a whole " + typeName);
+    }
+
+    /**
+     * Move behind a value, or throw BufferUnderflowException or IllegalArgumentException.
+     *
+     * <p>The classes of lcm-gen allocate as many items as a message says that it has. So that a damaged message does not
+     * fill the memory, this looks first whether there are as many.
+     */
+    private static void skip(Class<?> type, ByteBuffer data) throws ReflectiveOperationException {
+        if (type == long.class || type == double.class) {
+            data.getLong();
+        } else if (type == int.class || type == float.class) {
+            data.getInt();
+        } else if (type == boolean.class) {
+            data.get();
+        } else if (type == String.class) {
+            int size = data.getInt();
+            data.position(data.position() + Math.max(size, 1));
+        } else {
+            Object empty = type.getConstructor().newInstance();
+            int numItems = 0;
+            for (Field field : type.getFields()) {
+                if (field.getType().isArray()) {
+                    Object fixed = field.get(empty);
+                    int count = fixed == null ? numItems : Array.getLength(fixed);
+                    for (int i = 0; i < count; i++) {
+                        skip(field.getType().getComponentType(), data);
+                    }
+                } else if (field.getType() == int.class) {
+                    numItems = data.getInt();
+                } else if (!Modifier.isStatic(field.getModifiers())) {
+                    skip(field.getType(), data);
+                }
+            }
+        }
     }
 
     /** Read lines TYPE HEX, and print the values of each message, or what is wrong, as a line of JSON. */

@@ -176,7 +176,7 @@ int main(int argc, char **argv)
     lcm.subscribe("MOCAP_" + source + "_3D", &Receiver<rtc3d::markers_t>::on_message, &markers)->setQueueCapacity(1000);
     lcm.subscribe("MOCAP_" + source + "_ANALOG", &Receiver<rtc3d::analog_t>::on_message, &analog)
         ->setQueueCapacity(10000);
-    std::cerr << "listening\n";
+    std::cout << "listening" << std::endl;
     while ((count == 0 || num_shown < count) && lcm.handle() == 0) {
     }
     return 0;

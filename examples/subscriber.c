@@ -187,7 +187,8 @@ static int subscribe(const char *source, long count)
     lcm_subscription_set_queue_capacity(lcm_subscribe(lcm, channel, on_markers, NULL), 1000);
     snprintf(channel, sizeof channel, "MOCAP_%s_EVENT", source);
     lcm_subscription_set_queue_capacity(lcm_subscribe(lcm, channel, on_events, NULL), 1000);
-    fprintf(stderr, "listening\n");
+    printf("listening\n");
+    fflush(stdout);
     frames_left = count;
     while ((count == 0 || frames_left > 0) && lcm_handle(lcm) == 0)
         ;

@@ -103,7 +103,7 @@ int subscribe(const std::string &source, long count)
     Subscriber subscriber;
     lcm.subscribe("MOCAP_" + source + "_3D", &Subscriber::on_markers, &subscriber)
         ->setQueueCapacity(1000); // the default of 30 loses frames whenever this program pauses
-    std::cerr << "listening\n";
+    std::cout << "listening" << std::endl;
     while ((count == 0 || subscriber.num_frames < count) && lcm.handle() == 0) {
     }
     return 0;

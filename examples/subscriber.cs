@@ -167,8 +167,9 @@ sealed class LcmReceiver : IDisposable
     const int MaxMessageBytes = 1 << 24;
     const int MaxIncomplete = 16; // messages: anyone can send fragments that never become one
 
-    readonly UdpClient client = new UdpClient();
-    readonly Dictionary<IPEndPoint, Incomplete> incomplete = new Dictionary<IPEndPoint, Incomplete>();
+    readonly Socket socket = new Socket(AddressFamily.InterNetwork, SocketType.Dgram, ProtocolType.Udp);
+    readonly byte[] packet = new byte[65536];
+    readonly Dictionary<EndPoint, Incomplete> incomplete = new Dictionary<EndPoint, Incomplete>();
 
     public LcmReceiver(string url)
     {
@@ -178,73 +179,92 @@ sealed class LcmReceiver : IDisposable
         if (!Uri.TryCreate(url, UriKind.Absolute, out address) || address.Scheme != "udpm"
                 || !IPAddress.TryParse(address.Host, out group) || address.Port <= 0)
             throw new ArgumentException("give LCM_DEFAULT_URL as udpm://GROUP:PORT, not " + url);
-        client.Client.SetSocketOption(SocketOptionLevel.Socket, SocketOptionName.ReuseAddress, true);
-        client.Client.ReceiveBufferSize = 1 << 20;
-        client.Client.Bind(new IPEndPoint(IPAddress.Any, address.Port));
-        client.JoinMulticastGroup(group);
+        socket.SetSocketOption(SocketOptionLevel.Socket, SocketOptionName.ReuseAddress, true);
+        socket.ReceiveBufferSize = 2000000; // Linux allows at most net.core.rmem_max
+        socket.Bind(new IPEndPoint(IPAddress.Any, address.Port));
+        socket.SetSocketOption(SocketOptionLevel.IP, SocketOptionName.AddMembership, new MulticastOption(group));
     }
 
     // Wait for a message on this channel, and return its bytes.
     public byte[] Receive(string channel)
     {
-        var start = Encoding.ASCII.GetBytes(channel + "\0");
         while (true)
         {
-            IPEndPoint sender = null;
-            var packet = client.Receive(ref sender);
-            var message = Message(sender, packet);
-            if (message != null && message.Take(start.Length).SequenceEqual(start))
-                return message.Skip(start.Length).ToArray();
+            EndPoint sender = new IPEndPoint(IPAddress.Any, 0);
+            var size = socket.ReceiveFrom(packet, ref sender);
+            var magic = Encoding.ASCII.GetString(packet, 0, Math.Min(size, 4));
+            byte[] message = null;
+            if (magic == "LC02" && size > 8 && ChannelAt(8, size) == channel)
+                message = Part(8 + channel.Length + 1, size);
+            else if (magic == "LC03" && size >= 20)
+                message = AddFragment(sender, size, channel);
+            if (message != null)
+                return message;
         }
     }
 
     public void Dispose()
     {
-        client.Close();
+        socket.Close();
     }
 
-    // Return the channel, a NUL and the message if this packet is one or completes one; otherwise null.
-    byte[] Message(IPEndPoint sender, byte[] packet)
+    // Return the text up to a NUL, and null if there is none.
+    string ChannelAt(int start, int stop)
     {
-        var magic = Encoding.ASCII.GetString(packet, 0, Math.Min(packet.Length, 4));
-        if (magic == "LC02")
-            return packet.Skip(8).ToArray();
-        if (magic != "LC03" || packet.Length < 20)
-            return null;
-        var header = new LCM.LCM.LCMDataInputStream(packet.Skip(4).Take(16).ToArray());
+        var end = Array.IndexOf(packet, (byte)0, start, stop - start);
+        return end < 0 ? null : Encoding.ASCII.GetString(packet, start, end - start);
+    }
+
+    byte[] Part(int start, int stop)
+    {
+        var part = new byte[stop - start];
+        Array.Copy(packet, start, part, 0, part.Length);
+        return part;
+    }
+
+    // Return the message if the fragment in the packet is the last one that it lacks, and if it is on this channel.
+    byte[] AddFragment(EndPoint sender, int packetSize, string wantedChannel)
+    {
+        var header = new LCM.LCM.LCMDataInputStream(Part(4, 20));
         int sequence = header.ReadInt32(), size = header.ReadInt32(), offset = header.ReadInt32();
-        var numbers = header.ReadInt32();
-        int number = numbers >> 16 & 0xFFFF, count = numbers & 0xFFFF;
-        // The channel is in fragment 0 only, and is not counted in sizes and offsets.
-        var nul = number == 0 ? Array.IndexOf(packet, (byte)0, 20) : 19;
-        if (size < 0 || size > MaxMessageBytes || number >= count || nul < 0 || offset < 0
-                || offset > size - (packet.Length - nul - 1))
+        int numbers = header.ReadInt32(), number = numbers >> 16 & 0xFFFF, count = numbers & 0xFFFF;
+        // The channel is in fragment 0, and does not count in sizes and offsets.
+        var channel = number == 0 ? ChannelAt(20, packetSize) : null;
+        var start = number == 0 && channel != null ? 20 + channel.Length + 1 : 20;
+        if (number >= count || number == 0 && channel == null || size < 0 || size > MaxMessageBytes || offset < 0
+                || offset > size - (packetSize - start))
             return null;
         Incomplete message;
-        if (!incomplete.TryGetValue(sender, out message) || message.Sequence != sequence
-                || message.Data.Length != size || message.Has.Length != count)
+        if (!incomplete.TryGetValue(sender, out message) || message.Sequence != sequence || message.Size != size)
         {
             if (incomplete.Count >= MaxIncomplete)
                 incomplete.Clear();
-            message = new Incomplete { Sequence = sequence, Data = new byte[size], Has = new bool[count] };
-            incomplete[sender] = message;
+            incomplete[sender] = message = new Incomplete { Sequence = sequence, Size = size };
         }
-        Array.Copy(packet, nul + 1, message.Data, offset, packet.Length - nul - 1);
-        message.Has[number] = true;
-        if (number == 0)
-            message.Channel = packet.Skip(20).Take(nul + 1 - 20).ToArray();
-        if (message.Has.Contains(false))
+        message.Channel = channel ?? message.Channel;
+        message.Fragments[number] = new KeyValuePair<int, byte[]>(offset, Part(start, packetSize));
+        if (message.Fragments.Count < count)
             return null;
         incomplete.Remove(sender);
-        return message.Channel.Concat(message.Data).ToArray();
+        return message.Channel == wantedChannel ? message.Joined() : null;
     }
 
     sealed class Incomplete
     {
         public int Sequence;
-        public byte[] Channel;
-        public byte[] Data;
-        public bool[] Has;
+        public int Size;
+        public string Channel;
+        // By number: where the bytes belong in the message, and the bytes.
+        public readonly Dictionary<int, KeyValuePair<int, byte[]>> Fragments =
+            new Dictionary<int, KeyValuePair<int, byte[]>>();
+
+        public byte[] Joined()
+        {
+            var joined = new byte[Size];
+            foreach (var fragment in Fragments.Values)
+                fragment.Value.CopyTo(joined, fragment.Key);
+            return joined;
+        }
     }
 }
 

@@ -40,7 +40,7 @@ _ON_ZENOH: Final = ("--connect", "{endpoint}", "--source", "lab", "--count", str
 
 
 _CSHARP: Final = ("mono", "build/subscriber.exe")
-_JAVA: Final = ("java", "-Xmx256m", "-jar", "build/subscriber.jar")
+_JAVA: Final = ("java", "-jar", "build/subscriber.jar")
 _RUST: Final = ("build/rust/release/subscriber",)
 _OCTAVE: Final = ("sh", "-c", "exec octave-cli --quiet --no-init-file --eval \"read_take('$0')\"")
 
