@@ -277,4 +277,4 @@ clone-url:
 	sed -i 's|$(OLD_URL)|$(URL)|g' pyproject.toml README.md docs/tutorial.md docs/how-to/service.md
 
 clean:
-	rm -rf .venv build dist mutants
+	rm -rf .venv build dist mutants examples/build
