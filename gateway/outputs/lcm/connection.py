@@ -199,7 +199,14 @@ def _open_files() -> set[int]:
 
 def _set_up_to_send(number: int) -> None:
     """Let a UDP socket never wait. Raises OSError if ``number`` is no socket."""
-    with socket.socket(fileno=os.dup(number)) as same:
+    duplicate = os.dup(number)
+    try:
+        same = socket.socket(fileno=duplicate)
+    except OSError:
+        # It may be one end of another thread's pipe, whose other end waits until every copy is closed.
+        os.close(duplicate)
+        raise
+    with same:
         if same.type == socket.SOCK_DGRAM:
             same.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_BYTES)
             same.setblocking(False)

@@ -1,5 +1,6 @@
 """URLs of LCM: the receive buffer of subscribers, and host names."""
 
+import os
 from pathlib import Path
 
 import pytest
@@ -58,3 +59,16 @@ def test_a_name_that_is_not_known_does_not_mean_this_computer() -> None:
 def test_without_a_known_limit_the_kernel_decides(rmem_max: Path) -> None:
     assert not rmem_max.exists()
     assert receiving_url("udpm://") == "udpm://"
+
+
+def test_a_pipe_of_another_thread_is_not_kept_open() -> None:
+    """Whoever reads it waits until every copy of the other end is closed, as subprocess does."""
+    reading, writing = os.pipe()
+    try:
+        with pytest.raises(OSError, match="non-socket"):
+            connection._set_up_to_send(writing)
+        os.close(writing)
+        os.set_blocking(reading, False)
+        assert os.read(reading, 1) == b""
+    finally:
+        os.close(reading)
