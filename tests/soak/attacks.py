@@ -22,6 +22,7 @@ import zenoh
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm
 from tests.hostile.foxglove_viewers import ATTACKS as VIEWERS
+from tests.hostile.lsl_attacks import LSL_ATTACKS, LslAttack
 from tests.hostile.rtc3d_clients import ATTACKS as RTC3D_CLIENTS
 from tests.hostile.servers import SERVERS, streaming
 from tests.hostile.test_parameters import ATTACKS as PARAMETERS
@@ -146,6 +147,13 @@ def _on_port_of(output: str, attack: Callable[[int], Awaitable[None]]) -> Attack
     return lambda target: attack(target.output_ports[output])
 
 
+def _lsl(attack: LslAttack) -> Attack:
+    async def run(_target: Target) -> None:
+        await attack()
+
+    return run
+
+
 async def _reloads(target: Target) -> None:
     while True:
         os.kill(target.pid, signal.SIGHUP)
@@ -168,6 +176,7 @@ ATTACKS: Final[dict[str, Attack]] = {
     **{f"RTC3D client: {name}": _on_port_of("rtc3d", attack) for name, attack in RTC3D_CLIENTS.items()},
     **{f"VRPN client: {name}": _on_port_of("vrpn", attack) for name, attack in VRPN_CLIENTS.items()},
     **{f"viewer: {name}": _on_port_of("foxglove", attack) for name, attack in VIEWERS.items()},
+    **{f"LSL: {name}": _lsl(attack) for name, attack in LSL_ATTACKS.items()},
     "host: HTTP connections": _held_http_connections,
     "host: reloads": _reloads,
 }

@@ -40,6 +40,7 @@ from tests.hostile.gateway_under_attack import (
     num_missing,
     run_gateway,
 )
+from tests.lsl_receiver import lsl_config
 from tests.name_server import dead_name_server
 from tests.networks import free_port
 from tests.soak.attacks import ATTACKS, Target
@@ -142,16 +143,18 @@ class Soak:
                     "dead-name": {"host": "dead.example.org"},
                     "nobody": free_port(),
                 }
+                settings: dict[str, dict[str, Any]] = {
+                    name: {"enabled": True}
+                    | ({"ports": {"healthy": port}} if name == "rtc3d" else {"port": port})
+                    for name, port in output_ports.items()
+                }
+                settings["lsl"] = {"enabled": True, "config": str(lsl_config(Path(folder)))}
                 with dead_name_server(Path(folder)) as before_command:
                     async with run_gateway(
                         Path(folder),
                         healthy_port,
                         sources,
-                        settings={
-                            name: {"enabled": True}
-                            | ({"ports": {"healthy": port}} if name == "rtc3d" else {"port": port})
-                            for name, port in output_ports.items()
-                        },
+                        settings,
                         before_command=before_command,
                     ) as gateway:
                         await self._run(simulator, gateway, output_ports, tuple(ports.values()), console)

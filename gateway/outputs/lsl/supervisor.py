@@ -26,6 +26,7 @@ _STEADY_S: Final = 60.0
 
 _END_S: Final = 1.0
 _SOCKET_BYTES: Final = 1 << 20
+_READ_BYTES: Final = 1 << 16
 _NO_STREAMS: Final[frozenset[int]] = frozenset()
 
 logger = logging.getLogger(__name__)
@@ -138,11 +139,12 @@ class LslProcesses:
 
     def _read_reports(self, ours: socket.socket, process: subprocess.Popen[bytes]) -> None:
         """Read what the process reports until it ends, in a thread of its own."""
-        reader = socket.socket(fileno=os.dup(ours.fileno()))
-        reader.settimeout(None)
-        with reader, reader.makefile("rb") as lines, contextlib.suppress(OSError, ValueError):
-            for line in lines:
-                self._take(Report.decode(line))
+        unread = b""
+        with contextlib.suppress(OSError, ValueError):  # ``stop`` has closed it, or it is no report
+            while (data := _received(ours)) != b"":
+                *lines, unread = (unread + data).split(b"\n")
+                for line in lines:
+                    self._take(Report.decode(line))
         process.kill()  # if its last report cannot be read, it may still run
         status = process.wait()
         if self._is_stopped:
@@ -172,6 +174,13 @@ class LslProcesses:
     def _failed(self, text: str) -> None:
         self._problem = f"{text}; it is started again"
         self._failures.failed(self._problem)
+
+
+def _received(ours: socket.socket) -> bytes:
+    """Return what the process has sent; b"" at its end."""
+    while True:
+        with contextlib.suppress(TimeoutError):  # it has nothing to report
+            return ours.recv(_READ_BYTES)
 
 
 def lsl_environment(settings: LslSettings) -> dict[str, str]:
