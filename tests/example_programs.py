@@ -95,6 +95,7 @@ PROGRAMS: Final = (
     ExampleProgram("C++, LCM", ("build/subscriber_cpp",), _ON_LCM, ALL_TYPES, "cpp", ("c++", "make")),
     ExampleProgram("Java, LCM", _JAVA, _ON_LCM, ALL_TYPES, "java", ("javac", "java", "make")),
     ExampleProgram("C#, LCM", _CSHARP, _ON_LCM, ALL_TYPES, "csharp", ("mcs", "mono", "make")),
+    ExampleProgram("Lua, takes", ("lua5.4", "read_take.lua"), None, ALL_TYPES, "lua", ("lua5.4", "make")),
     ExampleProgram("Go, LCM", ("build/subscriber_go",), _ON_LCM, target="go", tools=("go", "make")),
     ExampleProgram("Rust, LCM", _RUST, _ON_LCM, target="rust", tools=("cargo", "make")),
     ExampleProgram(

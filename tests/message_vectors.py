@@ -57,7 +57,7 @@ def difference(lcm_type: Any, expected: dict[str, Any], found: Any, where: str =
 
     Floats are equal if their 32 or 64 bits are, except that a NaN has any bits and 0 any sign.
     """
-    if not isinstance(found, dict) or list(found) != list(lcm_type.__slots__):
+    if not isinstance(found, dict) or sorted(found) != sorted(lcm_type.__slots__):
         return f"{where or lcm_type.__name__} has the fields {found!r}"
     for field, type_name, dimensions in zip(
         lcm_type.__slots__, lcm_type.__typenames__, lcm_type.__dimensions__, strict=True

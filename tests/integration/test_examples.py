@@ -83,7 +83,7 @@ def test_make_builds_and_runs_each_program(program: ExampleProgram) -> None:
     arguments = "ARGS=--help" if program.arguments else "ARGS="
     make = ["make", "-C", str(EXAMPLES), f"PYTHON={sys.executable}", f"run-{program.target}", arguments]
     text = subprocess.check_output(make, text=True, stderr=subprocess.STDOUT)
-    assert "Print the markers" in text or "MOCAP_LAB_3D sequence 0 at" in text
+    assert re.search("Print the markers|MOCAP_LAB_3D sequence 0 at|#0 frame 1 at", text)
 
 
 @pytest.mark.parametrize("name", ["subscriber_lcm.py", "subscriber_zenoh.py"])
