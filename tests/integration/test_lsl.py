@@ -16,6 +16,7 @@ import pyxdf
 import yaml
 
 from tests.gateway_process import PROGRAM, program, simulator
+from tests.integration.test_host_clock import WallClock
 from tests.lsl_receiver import LslReceiver, lsl_config
 from tests.waiting import wait_until
 from tests.xdf import RecordedStream, write_xdf
@@ -170,7 +171,7 @@ def test_events_have_their_own_time_between_the_frames(tmp_path: Path) -> None:
     released = [time_s for time_s, [text] in samples if text.endswith("OFF")]
     released = [time_s for time_s in released if time_s > pressed[0]]
     assert [after - before for before, after in zip(pressed, released, strict=False)] == pytest.approx(
-        [0.3] * min(len(pressed), len(released)), abs=2e-3
+        [0.3] * min(len(pressed), len(released)), abs=0.015
     )
 
 
@@ -221,6 +222,22 @@ def test_the_process_for_lsl_ends_with_the_gateway(tmp_path: Path) -> None:
             gateway.wait(5)
             wait_until(lambda process=process: not Path(f"/proc/{process}/cmdline").exists(), 5)  # type: ignore[misc]
         lab.close()
+
+
+@pytest.mark.parametrize("step_s", [3600.0, -3600.0])
+def test_a_step_of_the_wall_clock_does_not_disturb_time_stamps(tmp_path: Path, step_s: float) -> None:
+    clock = WallClock(tmp_path)
+    with simulator("--rate", str(RATE_HZ), "--analog", "0", "--plates", "0") as (port, _):
+        lab = Lab(tmp_path, port)
+        lab.start(**clock.environ)
+        receiver = lab.receive("lab_3d")
+        wait_until(has(receiver, "lab_3d", 100), TIMEOUT_S)
+        clock.set(step_s)
+        wait_until(lambda: "the clock of this computer was set" in lab.log, TIMEOUT_S)
+        wait_until(has(receiver, "lab_3d", len(receiver.samples["lab_3d"]) + 100), TIMEOUT_S)
+        lab.close()
+    times_s = [time_s for time_s, _ in receiver.samples["lab_3d"]]
+    assert np.diff(times_s).tolist() == pytest.approx([1 / RATE_HZ] * (len(times_s) - 1), abs=5e-3)
 
 
 def test_the_doctor_finds_the_streams_of_a_running_gateway(tmp_path: Path) -> None:

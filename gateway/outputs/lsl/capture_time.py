@@ -18,13 +18,14 @@ class CaptureTimes:
     """Finds the capture time of frames on the steady clock (host_time), whatever happens to the wall clock.
 
     The times in a stamp are the steady clock plus the offset of the wall clock when the frame arrived. If
-    somebody has set the wall clock since then, the former offset counts.
+    somebody has set the wall clock since then, the former offset counts. The stamp does not say which one
+    that was, but the frame has arrived a moment ago: the other offset gives another time.
     """
 
     def __init__(self, clock: HostClock = host_clock) -> None:
         self._clock = clock
         self._offset_us = self._former_offset_us = clock.offset_us
-        self._changed_us = 0  # when the offset changed, on the steady clock
+        self._changed_us = 0  # when the change was noticed, on the steady clock
 
     def steady_us(self, stamp: Stamp) -> int:
         """Return when the frame of ``stamp``, which has just arrived, was captured."""
@@ -33,7 +34,10 @@ class CaptureTimes:
         if offset_us != self._offset_us:
             self._former_offset_us, self._offset_us, self._changed_us = self._offset_us, offset_us, now_us
         if not self._changed_us <= stamp.utime - offset_us <= now_us:
-            offset_us = self._former_offset_us  # the frame arrived before the change
+            ages_us = [
+                (now_us + offset - stamp.utime, offset) for offset in (offset_us, self._former_offset_us)
+            ]
+            offset_us = min((each for each in ages_us if each[0] >= 0), default=ages_us[0])[1]
         return stamp.capture_utime - offset_us
 
 

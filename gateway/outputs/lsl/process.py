@@ -79,6 +79,8 @@ class _LslProcess:
                 self._open_failed()
             case Kind.CLOSE:
                 self._failed.pop(number, None)
+                if not self._failed:
+                    self._change(not_opened="")
                 if number in self._outlets:
                     self._closed.put([self._outlets.pop(number)])
             case Kind.SAMPLES if number in self._outlets:
@@ -94,14 +96,15 @@ class _LslProcess:
         if time.monotonic() < self._retry_s:
             return
         self._retry_s = time.monotonic() + _RETRY_S
+        problem = ""
         for number, description in list(self._failed.items()):
             try:
                 self._outlets[number] = self._outlet(description)
             except Exception as error:  # noqa: BLE001 - of any kind, from liblsl
-                self._change(not_opened=f"{description['name']}: {safe_text(str(error), 200)}")
-                return
-            del self._failed[number]
-        self._change(not_opened="")
+                problem = f"{description['name']}: {safe_text(str(error), 200)}"
+            else:
+                del self._failed[number]
+        self._change(not_opened=problem)
 
     def _outlet(self, description: dict[str, Any]) -> Any:
         pylsl = self._pylsl

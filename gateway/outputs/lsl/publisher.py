@@ -99,6 +99,8 @@ class LslFramePublisher:
         """Send what waits. Called in the thread that sends."""
         with self._lock:
             entries, self._waiting, self._num_bytes = self._waiting, [], 0
+        if self._processes.interrupted:
+            self.streams.count_interrupted(sum(isinstance(entry, CapturedFrame) for entry in entries))
         frames: list[CapturedFrame] = []
         push = functools.partial(self.streams.push, suspended_us=suspended_us)
         for entry in entries:

@@ -150,6 +150,11 @@ class SourceStreams:
                     push = self._push_events if stream.stream.is_text else self._push_values
                     push(stream, together, index, suspended_us)
 
+    def count_interrupted(self, num_frames: int) -> None:
+        """Count frames that waited for a process that has ended."""
+        if num_frames:
+            self._count_loss("not open", NOT_OPEN, num_frames)
+
     def open_waiting(self) -> None:
         """Open the streams that had to wait. Called about once a second."""
         waiting, self.waiting = self.waiting, {}

@@ -30,6 +30,8 @@ def test_a_step_of_the_wall_clock_does_not_move_capture_times(step_s: float) -> 
     times = CaptureTimes(clock)
     waiting, waiting_us = arriving(clock, age_us=2_000)  # arrived before the step, and is published after it
     clock.offset_us += int(step_s * 1e6)
+    revealing, revealing_us = arriving(clock)  # its arrival has revealed the step
+    assert times.steady_us(revealing) == revealing_us - DELAY_US
     assert times.steady_us(waiting) == waiting_us - DELAY_US
     later, later_us = arriving(clock)
     assert times.steady_us(later) == later_us - DELAY_US
