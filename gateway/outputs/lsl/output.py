@@ -8,7 +8,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from gateway.errors import ConfigError
@@ -93,6 +93,12 @@ class LslOutput(Output):
         """Describe the streams of ``source`` by other parameters."""
         if source in self._publishers:
             self._publishers[source].set_parameters(parameters)
+
+    def topic_names(self, source: str) -> Mapping[str, Mapping[str, str]]:
+        """Return the names of items whose labels are not printable, too long, or those of others, too."""
+        publisher = self._publishers.get(source)
+        names = {} if publisher is None else publisher.streams.names
+        return {key: changed for key, changed in names.items() if changed}
 
     def is_configured_like(self, other: Output) -> bool:
         """Return whether the settings are the same; there is nothing to take over."""

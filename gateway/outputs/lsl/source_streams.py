@@ -6,7 +6,7 @@ Everything here is called in the thread that sends, except where it says otherwi
 import itertools
 import logging
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from gateway.outputs.lsl.streams import (
     MAX_CHANNELS,
     DescribedSource,
     LslStream,
+    changed_labels,
     channels_per_item,
     lsl_stream,
     num_labels,
@@ -104,6 +105,8 @@ class SourceStreams:
         self.source = name
         self.numbers: frozenset[int] = frozenset()
         """The numbers of the open streams. Any thread may read it."""
+        self.names: Mapping[str, Mapping[str, str]] = {}
+        """By component key, the names of items whose labels the streams cannot use as they are."""
         self.waiting: dict[ComponentType, int] = {}
         """The numbers of items of streams that could not open yet, because the last one was too young."""
         self.losses = Losses(logger, f"{name} to lsl")
@@ -203,6 +206,8 @@ class SourceStreams:
         opened = _OpenStream(next(self._next_numbers), stream, num_items, self._version)
         self._streams[component] = opened
         self.numbers |= {opened.number}
+        names = changed_labels(self._described, component, num_items)
+        self.names = {**self.names, component.key: names}
         self._send(opened.opening(self._buffer_s))
         return opened
 
@@ -211,6 +216,7 @@ class SourceStreams:
         closed = self._streams.pop(component, None)
         if closed is not None:
             self.numbers -= {closed.number}
+            self.names = {key: names for key, names in self.names.items() if key != component.key}
             self._send(Message(Kind.CLOSE, closed.number))
 
     def _is_refused(self, component: ComponentType, num_items: int) -> bool:

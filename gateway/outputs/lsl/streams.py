@@ -7,7 +7,7 @@ The structure follows the meta-data recommendations of XDF, the file format of L
 import hashlib
 import re
 from collections.abc import Callable, Mapping
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 from gateway.descriptions.fitting_labels import fitting_labels, printable
 from gateway.descriptions.labels import Description, describe
@@ -91,17 +91,31 @@ class _Content(NamedTuple):
 
 def num_labels(component: ComponentType, parameters: Parameters) -> int | None:
     """Return how many items of a component the parameters describe; None if they lack its section."""
+    items = _described_items(component, parameters)
+    return None if items is None else len(items)
+
+
+def _described_items(component: ComponentType, parameters: Parameters) -> tuple[Any, ...] | None:
     section = SECTIONS["events" if component is ComponentType.EVENT else component.key].of(parameters)
     if section is None:
         return None
-    lists: Mapping[ComponentType, str] = {
-        ComponentType.MARKERS: "markers",
-        ComponentType.TOOLS: "tools",
-        ComponentType.ANALOG: "channels",
-        ComponentType.FORCE: "plates",
-        ComponentType.EVENT: "events",
-    }
-    return len(getattr(section, lists[component]))
+    items: tuple[Any, ...] = getattr(section, _LISTS[component])
+    return items
+
+
+def changed_labels(source: DescribedSource, component: ComponentType, num_items: int) -> dict[str, str]:
+    """Return the names in the stream of items whose labels it cannot use as they are, by their labels."""
+    if component is ComponentType.EVENT:
+        return {}
+    items = _described_items(component, source.parameters) or ()
+    names = _labels(describe(component, source.parameters, num_items), component)
+    pairs = zip((item.label for item in items), names, strict=False)
+    return {label: name for label, name in pairs if label.strip() and label != name}
+
+
+def _labels(description: Description, component: ComponentType) -> tuple[str, ...]:
+    noun = component.item_noun.removesuffix("s")
+    return fitting_labels(description.labels, printable, _MAX_LABEL_BYTES, noun)
 
 
 def channels_per_item(component: ComponentType) -> int:
@@ -112,9 +126,7 @@ def channels_per_item(component: ComponentType) -> int:
 def lsl_stream(source: DescribedSource, component: ComponentType, num_items: int) -> LslStream:
     """Return the description of the stream of a component with ``num_items`` items."""
     description = describe(component, source.parameters, num_items)
-    noun = component.item_noun.removesuffix("s")
-    labels = fitting_labels(description.labels, printable, _MAX_LABEL_BYTES, noun)
-    content = _CONTENTS[component](labels, description)
+    content = _CONTENTS[component](_labels(description, component), description)
     rate_hz = _announced_rate_hz(description.rate_hz, len(content.channels))
     setup: tuple[Tree, ...] = (("name", source.name), *content.items)
     if component not in {ComponentType.ANALOG, ComponentType.EVENT}:
@@ -209,6 +221,15 @@ def _acquisition(parameters: Parameters) -> tuple[Tree, ...]:
     )
     return tuple((name, printable(text)[:_MAX_LABEL_BYTES]) for name, text in facts if text)
 
+
+_LISTS: Final[Mapping[ComponentType, str]] = {
+    ComponentType.MARKERS: "markers",
+    ComponentType.TOOLS: "tools",
+    ComponentType.ANALOG: "channels",
+    ComponentType.FORCE: "plates",
+    ComponentType.EVENT: "events",
+}
+"""The lists of items in the sections of the parameters."""
 
 _CONTENTS: Final[Mapping[ComponentType, Callable[[tuple[str, ...], Description], _Content]]] = {
     ComponentType.MARKERS: _markers,

@@ -11,6 +11,7 @@ from gateway.outputs.lsl.streams import (
     Channel,
     DescribedSource,
     LslStream,
+    changed_labels,
     channels_per_item,
     lsl_stream,
     num_labels,
@@ -162,6 +163,13 @@ def test_labels_are_printable_unique_and_short() -> None:
     assert len(set(found)) == len(found)
     assert all(label.isprintable() and 0 < len(label.encode()) < 150 for label in found)
     assert found[0] == "marker 1_X"
+
+
+def test_labels_that_a_stream_cannot_use_are_known() -> None:
+    tools = Parameters6D(50.0, tuple(Tool("1", label) for label in ("Wand", "Wand", "a\x00b", "Probe")))
+    source = DescribedSource("lab", "lab-pc", Parameters(tools=tools), FRAME)
+    assert changed_labels(source, ComponentType.TOOLS, 4) == {"Wand": "Wand_2", "a\x00b": "a_b"}
+    assert changed_labels(source, ComponentType.EVENT, 1) == {}
 
 
 def test_the_source_id_is_stable_and_differs_for_other_channels() -> None:
