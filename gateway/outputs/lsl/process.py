@@ -74,7 +74,8 @@ class _LslProcess:
         number = message.stream
         match message.kind:
             case Kind.OPEN:
-                self._failed[number] = json.loads(message.content)
+                facts, tree = json.loads(message.content)
+                self._failed[number] = facts | {"tree": tree}
                 self._retry_s = 0.0
                 self._open_failed()
             case Kind.CLOSE:

@@ -27,7 +27,7 @@ from gateway.outputs.lsl.streams import (
     lsl_stream,
     num_labels,
 )
-from gateway.outputs.lsl.wire import Kind, Message, json_content, samples_content
+from gateway.outputs.lsl.wire import Kind, Message, json_content, opening_content, samples_content
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import Parameters
@@ -42,6 +42,9 @@ _IRREGULAR_SAMPLES: Final = 100
 """For a stream without a rate, liblsl takes a second of buffer as so many samples."""
 
 NOT_OPEN: Final = "the process for LSL has ended; it is started again"
+
+_MAX_VALUES: Final = 1_000_000
+"""How many values are pushed at once. A frame of a few items may belong to a stream of many channels."""
 
 _MAX_APART_US: Final = 1_000_000
 """Components of one frame have time stamps as near as this, or these are not those of one clock."""
@@ -73,17 +76,16 @@ class _OpenStream:
     def opening(self, buffer_s: int) -> Message:
         """Return the message that opens it."""
         stream = self.stream
-        content = {
+        facts = {
             "name": stream.name,
             "type": stream.type,
             "rate_hz": stream.rate_hz,
             "is_text": stream.is_text,
             "source_id": stream.source_id,
             "num_channels": len(stream.channels),
-            "tree": stream.tree,
             "buffer_s": _limited_buffer_s(stream, buffer_s),
         }
-        return Message(Kind.OPEN, self.number, json_content(content))
+        return Message(Kind.OPEN, self.number, opening_content(facts, stream.tree))
 
 
 class SourceStreams:
@@ -247,16 +249,18 @@ class SourceStreams:
         layout = frames[0].frame.layout
         component = layout.components[index]
         start, end = layout.content_spans[index]
-        data = b"".join([captured.frame.body[start + _ITEMS_OFFSET : end] for captured in frames])
-        num_fields = component.item_bytes // 4
-        values = np.frombuffer(data, np.dtype("f4").newbyteorder(layout.byte_order))
-        items = values.reshape(len(frames), component.num_items, num_fields)
-        times_s = [_time_us(captured, index, suspended_us)[0] / 1e6 for captured in frames]
-        content = samples_content(
-            times_s, samples(component.type, items, self._described.frame, stream.num_items)
-        )
-        if not self._send(Message(Kind.SAMPLES, stream.number, content)):
-            self._count_loss("not open", NOT_OPEN, len(frames))
+        dtype = np.dtype("f4").newbyteorder(layout.byte_order)
+        num_together = max(1, _MAX_VALUES // len(stream.stream.channels))
+        for first in range(0, len(frames), num_together):
+            together = frames[first : first + num_together]
+            data = b"".join([captured.frame.body[start + _ITEMS_OFFSET : end] for captured in together])
+            shape = (len(together), component.num_items, component.item_bytes // 4)
+            items = np.frombuffer(data, dtype).reshape(shape)
+            times_s = [_time_us(captured, index, suspended_us)[0] / 1e6 for captured in together]
+            values = samples(component.type, items, self._described.frame, stream.num_items)
+            message = Message(Kind.SAMPLES, stream.number, samples_content(times_s, values))
+            if not self._send(message):
+                self._count_loss("not open", NOT_OPEN, len(together))
 
     def _push_events(
         self, stream: _OpenStream, frames: Sequence[CapturedFrame], index: int, suspended_us: int

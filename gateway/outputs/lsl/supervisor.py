@@ -16,7 +16,7 @@ from gateway.log import FailureLog
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.wire import Message, Report
 
-SEND_TIMEOUT_S: Final = 5.0
+SEND_TIMEOUT_S: Final = 10.0
 """If the process takes nothing for so long, it is killed and another one started."""
 
 _FIRST_RETRY_S: Final = 1.0

@@ -6,7 +6,7 @@ of JSON, see ``Report``.
 
 import json
 import struct
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
@@ -21,7 +21,7 @@ class Kind(IntEnum):
     """The kind of a message to the process."""
 
     OPEN = 1
-    """Open a stream; the content is JSON."""
+    """Open a stream; the content is JSON: its facts, and its tree as [name, text or children]."""
     CLOSE = 2
     """Close a stream; no content."""
     SAMPLES = 3
@@ -80,8 +80,21 @@ def decode_samples(content: bytes) -> tuple[npt.NDArray[np.float64], npt.NDArray
 
 
 def json_content(value: Any) -> bytes:
-    """Return the content of OPEN or TEXTS."""
+    """Return the content of TEXTS."""
     return json.dumps(value).encode()
+
+
+def opening_content(facts: Mapping[str, Any], tree: Sequence[Any]) -> bytes:
+    """Return the content of OPEN."""
+    return f"[{json.dumps(facts)}, [{', '.join(map(_tree_json, tree))}]]".encode()
+
+
+def _tree_json(element: tuple[str, Any]) -> str:
+    # One call of json.dumps for thousands of channels would keep all other threads waiting.
+    name, content = element
+    if isinstance(content, str):
+        return json.dumps(element)
+    return f'["{name}", [{", ".join(map(_tree_json, content))}]]'
 
 
 class MessageReader:

@@ -77,7 +77,8 @@ class Streams:
 
     @property
     def opened(self) -> list[dict[str, Any]]:
-        return [json.loads(message.content) for message in self.sent if message.kind is Kind.OPEN]
+        contents = [json.loads(message.content) for message in self.sent if message.kind is Kind.OPEN]
+        return [facts | {"tree": tree} for facts, tree in contents]
 
     @property
     def kinds(self) -> list[tuple[Kind, int]]:
@@ -253,6 +254,14 @@ def test_equal_frames_are_pushed_together_with_their_capture_times(lab: Streams)
     [samples] = lab.push(analog(1, 2), count=3)
     assert times_of(samples) == [CAPTURED_S, CAPTURED_S + 0.01, CAPTURED_S + 0.02]
     assert values_of(samples) == [[1, 2]] * 3
+
+
+def test_many_frames_of_few_items_are_not_pushed_at_once_in_a_stream_of_many_channels(lab: Streams) -> None:
+    """A server could so make the gateway fill its memory with NaN."""
+    lab.push(markers(10_000))
+    messages = lab.push(markers(1), count=60)
+    assert [len(times_of(message)) for message in messages] == [25, 25, 10]
+    assert len({time_s for message in messages for time_s in times_of(message)}) == 60
 
 
 def test_only_wanted_streams_and_components_are_pushed(lab: Streams) -> None:

@@ -108,7 +108,7 @@ def test_why_liblsl_cannot_be_loaded_is_said(
 
 def test_a_stream_that_cannot_open_is_reported_and_tried_again(processes: LslProcesses) -> None:
     start(processes)
-    processes.send(Message(Kind.OPEN, 1, b'{"name": "lab_3d"}'))
+    processes.send(Message(Kind.OPEN, 1, b'[{"name": "lab_3d"}, []]'))
     wait_until(lambda: processes.problem, TIMEOUT_S)
     assert processes.problem.startswith("liblsl cannot open the stream lab_3d: ")
     processes.send(Message(Kind.CLOSE, 1))

@@ -1,5 +1,7 @@
 """The messages between the gateway and its process for LSL."""
 
+import json
+
 import numpy as np
 
 from gateway.outputs.lsl.wire import (
@@ -9,6 +11,7 @@ from gateway.outputs.lsl.wire import (
     Report,
     decode_samples,
     json_content,
+    opening_content,
     samples_content,
 )
 
@@ -42,6 +45,13 @@ def test_reports_are_lines() -> None:
     line = report.encode()
     assert line.count(b"\n") == 1
     assert Report.decode(line) == report
+
+
+def test_a_tree_is_json_as_if_it_was_encoded_at_once() -> None:
+    tree = (("channels", (("channel", (("label", 'a "b" \\ é'), ("type", "X"))),)), ("setup", ()))
+    assert json.loads(opening_content({"name": "lab_3d"}, tree)) == json.loads(
+        json.dumps([{"name": "lab_3d"}, tree])
+    )
 
 
 def test_texts_are_json() -> None:
