@@ -82,6 +82,7 @@ class CloudEncoder:
     def __init__(self, frame_id: str, num_markers: int) -> None:
         self._points = np.zeros(num_markers, POINT)
         self._points["marker"] = np.arange(num_markers)
+        self._floats = self._points.view("<f4").reshape(num_markers, len(_POINT_TYPES))  # the same memory
         writer = CdrWriter(_STAMP_BYTES).string(frame_id).uint32(1, num_markers)  # height, width
         writer.uint32(len(_POINT_TYPES))
         for name, datatype in _POINT_TYPES.items():
@@ -98,15 +99,14 @@ class CloudEncoder:
 
     def encode(self, stamp: bytes, positions: Array, reliabilities: Array) -> bytes:
         """Return a message with ``positions``, shape (n, 3), in m. A point with any NaN is missing."""
-        points = self._points
-        is_missing = np.isnan(positions).any(axis=1)
-        is_dense = not is_missing.any()
+        is_nan = np.isnan(positions)
+        is_dense = not is_nan.any()
         if not is_dense:
-            positions[is_missing] = np.nan
+            positions[is_nan.any(axis=1)] = np.nan
         with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
-            points["x"], points["y"], points["z"] = positions.T
-        points["reliability"] = reliabilities
-        return b"".join((ENCAPSULATION, stamp, self._layout, points.tobytes(), bytes([is_dense])))
+            self._floats[:, :3] = positions
+        self._floats[:, 3] = reliabilities
+        return b"".join((ENCAPSULATION, stamp, self._layout, self._points.tobytes(), bytes([is_dense])))
 
 
 class AnalogEncoder:

@@ -3,11 +3,10 @@
 The sending thread calls everything here, except where another thread is named.
 """
 
+import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Final, NamedTuple
-
-import numpy as np
 
 from gateway.descriptions.labels import describe
 from gateway.descriptions.plate_forces import units_of
@@ -244,10 +243,12 @@ class SourceTopics:
             self._count_too_many("force plates", component.num_items, MAX_PLATES)
         items = component.items()[: len(self._plates)]
         vectors = self._frame.vectors(items.view(items.dtype["fx"]).reshape(-1, 3))
-        for plate, load in zip(self._plates, vectors.reshape(-1, 2, 3), strict=False):
-            if plate.topic.wanted and not np.isnan(load).any():
-                force, torque = load[0] * plate.newtons, load[1] * plate.newton_metres
-                plate.topic.put(self._stamped.encode(stamp, pack_wrench(*force, *torque)), now_ns)
+        for plate, load in zip(self._plates, vectors.reshape(-1, 6).tolist(), strict=False):
+            if plate.topic.wanted and not any(map(math.isnan, load)):
+                fx, fy, fz, mx, my, mz = load
+                n, nm = plate.newtons, plate.newton_metres
+                wrench = pack_wrench(fx * n, fy * n, fz * n, mx * nm, my * nm, mz * nm)
+                plate.topic.put(self._stamped.encode(stamp, wrench), now_ns)
 
     def _send_analog(self, topic: RosTopic, component: Component, now_ns: int) -> None:
         if self._channels.num_channels != component.num_items:
