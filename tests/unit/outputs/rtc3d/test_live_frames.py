@@ -311,13 +311,14 @@ def test_while_the_slower_stream_has_no_frames_the_faster_one_sets_the_rate() ->
     assert client.numbers()[-4:] == [[number, 10 * number] for number in range(301, 305)]
 
 
-def test_a_new_measurement_is_joined_from_its_first_frames() -> None:
+@pytest.mark.parametrize("fast_first", [False, True])
+def test_a_new_measurement_is_joined_from_its_first_frames(fast_first: bool) -> None:
     source = LiveSource()
     client = source.client()
     client.send("StreamFrames 3D Analog")
     play(source, 1000, 1010, fast_first=False)
     client.take()
-    play(source, 1, 5, fast_first=True)
+    play(source, 1, 5, fast_first=fast_first)
     assert client.numbers()[1:] == [[number, 10 * number] for number in range(2, 6)]
 
 
