@@ -119,8 +119,8 @@ class StreamRate:
         """When the newest frame arrived."""
         self.timestamp_us = 0
         """The newest time stamp."""
-        self.has_times = False
-        """Whether the time stamps increase."""
+        self.has_times = True
+        """Whether the time stamps increase, as far as is known."""
         self._num_frames = 0
         self._intervals_us: deque[int] = deque(maxlen=_INTERVALS)
         self._period_us = 0

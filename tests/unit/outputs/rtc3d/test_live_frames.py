@@ -254,6 +254,19 @@ def test_at_first_frames_wait_until_the_rates_are_known() -> None:
     assert client.numbers() == [[number, 10 * number] for number in range(1, 21)]
 
 
+def test_the_second_frame_of_a_new_source_waits_for_its_sample() -> None:
+    source = LiveSource(is_new=True)
+    source.scene._announced_hz = {ComponentType.MARKERS: 100.0, ComponentType.ANALOG: 100.0}
+    client = source.client()
+    client.send("StreamFrames 3D Analog")
+    for number in range(1, 4):
+        source.arrive(body(markers(number, 10_000 * number)))
+        source.wait(1000)
+        source.arrive(body(analog(number, 10_000 * number)), FAST)
+        source.wait(9000)
+    assert client.numbers() == [[1, 1], [2, 2], [3, 3]]
+
+
 def test_components_that_are_announced_and_never_come_are_not_waited_for_long() -> None:
     source = LiveSource(is_new=True)
     source.scene._announced_hz = {ComponentType.MARKERS: 100.0, ComponentType.ANALOG: 1000.0}
