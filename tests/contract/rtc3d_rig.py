@@ -15,6 +15,7 @@ from gateway.rtc3d.frames import split_frame
 from tests.contract.frame_rigs import HALL, LAB, FrameRig, Received
 from tests.networks import free_port
 from tests.unit.rtc3d_server.wire import DATA, command
+from tests.waiting import wait_until
 
 HEADER: Final = struct.Struct(">II")
 
@@ -46,10 +47,23 @@ class Rig(FrameRig):
             threading.Thread(target=self._read, args=(source, self._connect(source)), daemon=True).start()
 
     def _connect(self, source: str) -> socket.socket:
-        client = socket.create_connection(("127.0.0.1", self._ports[source]))
+        client = self._connection(self._ports[source])
         self._clients.append(client)
         client.sendall(command("SetByteOrder BigEndian") + command("StreamFrames AllFrames"))
         return client
+
+    @staticmethod
+    def _connection(port: int) -> socket.socket:
+        """Connect, as soon as the port is open again."""
+        found: list[socket.socket] = []
+
+        def connects() -> bool:
+            with contextlib.suppress(ConnectionRefusedError):
+                found.append(socket.create_connection(("127.0.0.1", port)))
+            return bool(found)
+
+        wait_until(connects)
+        return found[0]
 
     def _read(self, source: str, client: socket.socket) -> None:
         with contextlib.suppress(OSError):

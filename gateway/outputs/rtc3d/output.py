@@ -2,7 +2,7 @@
 
 import asyncio
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Final
 
@@ -47,6 +47,7 @@ class _Served:
         self.problem = f"port {port} is not open yet"
         self.task: asyncio.Task[None] | None = None
         self.is_stopped = False
+        self.closed = asyncio.Event()
 
 
 class Rtc3dOutput(Output):
@@ -60,6 +61,7 @@ class Rtc3dOutput(Output):
         self._states: dict[str, SourceState] = {}
         self._announced: set[str] = set()
         self._served: dict[str, _Served] = {}  # by source; replaced when the settings change
+        self._closing: list[_Served] = []  # former ones, which may still have a port that is wanted again
         self._on_wanted: dict[str, Callable[[], None]] = {}
         self._queries: QueryService | None = None
         self._loop: asyncio.AbstractEventLoop | None = None  # of the gateway
@@ -217,7 +219,8 @@ class Rtc3dOutput(Output):
         for source, port in ports.items():
             if source not in self._served:
                 served = self._served[source] = _Served(port)
-                self._thread.run(self._keep_open(self._state(source), served))
+                self._closing = [former for former in self._closing if not former.closed.is_set()]
+                self._thread.run(self._keep_open(self._state(source), served, self._closing))
             self._call(partial(self._set_max_clients, source, self._settings.max_clients))
 
     def _set_max_clients(self, source: str, max_clients: int) -> None:
@@ -230,14 +233,20 @@ class Rtc3dOutput(Output):
             served = self._served.pop(source)
             served.is_stopped = True
             if self._thread is not None:
+                self._closing.append(served)
                 self._thread.run(_stop(served))
 
     async def _stop_all(self) -> None:
         await asyncio.gather(*(_stop(served) for served in self._served.values()))
 
-    async def _keep_open(self, state: SourceState, served: _Served) -> None:
-        """Listen on the port until stopped; try again while that is not possible."""
+    async def _keep_open(self, state: SourceState, served: _Served, closing: Sequence[_Served]) -> None:
+        """Listen on the port until stopped; try again while that is not possible.
+
+        Wait for those that are ``closing`` first.
+        """
         served.task = asyncio.current_task()
+        for former in closing:
+            await former.closed.wait()
         host, port = self._settings.host, served.port
         failures = FailureLog(_log, f"{state.source} to rtc3d")
         delay_s = _FIRST_RETRY_S
@@ -280,3 +289,4 @@ async def _stop(served: _Served) -> None:
     if served.task is not None:
         served.task.cancel()
         await asyncio.wait([served.task])
+    served.closed.set()
