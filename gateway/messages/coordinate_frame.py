@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Final
+from typing import Any, Final, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,7 @@ Vector = tuple[float, float, float]
 Pose = tuple[float, float, float, float, float, float, float, float]
 """Position in metres (x, y, z), orientation (x, y, z, w), error in metres."""
 
-Coordinates = npt.NDArray[np.float64]
+Coordinates: TypeAlias = npt.NDArray[np.float64]
 """Shape (n, 3)."""
 
 NO_ROTATION: Final[Quaternion] = (0.0, 0.0, 0.0, 1.0)

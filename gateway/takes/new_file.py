@@ -54,8 +54,8 @@ class NewFiles:
             raise _exists(path)
         temporary = path.with_name(f".{secrets.token_hex(8)}.part{path.suffix}")
         self.paths.append(path)
+        self._temporary.append(temporary)  # first: a signal can end the block as soon as the file exists
         descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o644)
-        self._temporary.append(temporary)
         file = os.fdopen(descriptor, "w+b", buffering=_BUFFER_BYTES)
         self._open.append(file)
         return file
