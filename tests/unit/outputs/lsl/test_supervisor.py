@@ -75,8 +75,9 @@ def test_the_signals_that_stop_a_gateway_do_not_end_the_process(processes: LslPr
     number = start(processes)
     os.kill(number, signal.SIGTERM)
     os.kill(number, signal.SIGINT)
-    assert processes.send(Message(Kind.CLOSE, 1))
-    assert not processes.problem
+    processes.send(Message(Kind.OPEN, 1, b'[{"name": "lab_3d"}, []]'))  # which it reports, if it lives
+    wait_until(lambda: processes.problem, TIMEOUT_S)
+    assert processes.problem.startswith("liblsl cannot open the stream lab_3d: ")
 
 
 def test_a_process_that_hangs_is_killed_and_replaced(
