@@ -39,8 +39,10 @@ test-integration test-commands test-takes test-hostile test-browser test-others:
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.
-COMPILED_TESTS := tests/packaging/test_compiled.py tests/contract tests/property tests/unit/test_log.py \
-    $(addprefix tests/unit/,messages outputs publish queries recorder rtc3d stream subscriber takes) \
+COMPILED_TESTS := tests/packaging/test_compiled.py tests/property tests/unit/test_log.py \
+    $(addprefix tests/contract/test_,outputs.py back_pressure.py stalled_peers.py) $(wildcard tests/unit/outputs/test_*.py) \
+    $(addprefix tests/unit/,messages outputs/zenoh outputs/lcm outputs/takes publish queries recorder rtc3d stream) \
+    $(addprefix tests/unit/,subscriber takes) \
     tests/integration/test_gateway.py tests/integration/test_streams.py \
     tests/integration/test_faults.py::test_data_flows_again_after_several_faults_at_once
 
