@@ -28,6 +28,9 @@ from gateway.rtc3d_server.scene import NOT_YET_US, DataPacket, FrameSource
 VERSION: Final = "1.0"
 NO_DATA: Final = encode_packet(PacketType.NO_DATA)
 
+MAX_FRAME_REQUESTS: Final = 1000
+"""How many SendCurrentFrame of a client wait at most. They may wait for components that never come."""
+
 _log = logging.getLogger(__name__)
 
 
@@ -162,6 +165,8 @@ class ClientSession:
                 self.byte_order = byte_order
             case SendParameters(sections):
                 return [encode_packet(PacketType.XML, self._callbacks.parameters_xml(sections))]
+            case SendCurrentFrame() if len(self._frame_requests) >= MAX_FRAME_REQUESTS:
+                return [error_packet(f"{MAX_FRAME_REQUESTS} requests for the current frame wait already")]
             case SendCurrentFrame() | StreamFrames():
                 return [acknowledgement, *self._request_frames(command)]
             case StopStreaming():

@@ -6,6 +6,7 @@ import pytest
 
 from gateway.outputs.rtc3d.live_frames import WAIT_US
 from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS
 from tests.unit.outputs.rtc3d.live_client import (
     FAST,
     SLOW,
@@ -16,7 +17,7 @@ from tests.unit.outputs.rtc3d.live_client import (
     event,
     markers,
 )
-from tests.unit.rtc3d_server.wire import EVENT, MARKERS
+from tests.unit.rtc3d_server.wire import COMMAND, ERROR, EVENT, MARKERS
 
 TOOL_OUT_OF_VIEW = bytes.fromhex("00000038 00000004 00000007 0000000000002710 00000001" + "ff" * 32)
 
@@ -117,6 +118,16 @@ def test_the_current_frame_is_the_newest_and_each_is_sent_once() -> None:
     source.arrive(body(markers(3, 30_000)))
     source.arrive(body(markers(4, 40_000)))
     assert client.numbers() == [[3]]
+
+
+def test_requests_for_components_that_never_come_are_bounded() -> None:
+    source = LiveSource()
+    client = source.client()
+    for _ in range(MAX_FRAME_REQUESTS):
+        assert client.send("SendCurrentFrame Force")[0][0] == COMMAND
+    ((kind, text),) = client.send("SendCurrentFrame Force")
+    assert (kind, text) == (ERROR, b"Error-1000 requests for the current frame wait already")
+    assert len(client.session.measurement_stopped()) == MAX_FRAME_REQUESTS
 
 
 def test_what_was_before_a_pause_is_not_the_current_frame() -> None:
