@@ -213,7 +213,7 @@ class SourceTopics:
         is_tf_wanted = self._tf.wanted
         if not (is_tf_wanted or any(tool.topic.wanted for tool in self._tools)):
             return
-        if component.num_items > len(self._tools):
+        if component.num_items > MAX_TOOLS:
             self._count_too_many("tools", component.num_items, MAX_TOOLS)
         encode = self._stamped.encode
         transforms = []
@@ -239,7 +239,7 @@ class SourceTopics:
     def _send_forces(self, component: Component, stamp: bytes, now_ns: int) -> None:
         if not any(plate.topic.wanted for plate in self._plates):
             return
-        if component.num_items > len(self._plates):
+        if component.num_items > MAX_PLATES:
             self._count_too_many("force plates", component.num_items, MAX_PLATES)
         items = component.items()[: len(self._plates)]
         vectors = self._frame.vectors(items.view(items.dtype["fx"]).reshape(-1, 3))

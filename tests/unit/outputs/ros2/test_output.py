@@ -13,11 +13,14 @@ import rtc3d
 import zenoh
 
 from gateway.errors import OutputError
+from gateway.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.topics import Topic
+from gateway.outputs.ros2.message_types import TF_MESSAGE
 from gateway.outputs.ros2.output import Ros2Output
 from gateway.outputs.ros2.settings import Ros2Settings
-from gateway.outputs.ros2.source_topics import MAX_PLATES, MAX_TOOLS
+from gateway.outputs.ros2.source_topics import MAX_PLATES, MAX_TOOLS, SourceTopics
+from gateway.outputs.ros2.topic import RosTopic
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Plate
 from tests import statuses
@@ -403,6 +406,15 @@ def test_thousands_of_labels_and_plates_are_bounded_and_counted(lab: RosLab) -> 
     wait_until(lambda: len(lab.received) == 1 + MAX_TOOLS + MAX_PLATES)
     assert len(lab.received["/tf"][0].message.transforms) == MAX_TOOLS
     assert lab.lost() == {"too many tools": 3000 - MAX_TOOLS, "too many force plates": 1000 - MAX_PLATES}
+
+
+def test_items_whose_topics_are_not_open_yet_are_not_too_many() -> None:
+    tf = RosTopic("/tf", TF_MESSAGE, lambda: None)
+    topics = SourceTopics("lab", "/mocap/lab", tf, lambda: None)
+    topics.losses = Losses(logging.getLogger("tests"), "lab to ros2")
+    tf.wanted = True
+    topics.send(tools_frame((1, 2, 3), (4, 5, 6)), stamp(), ALL, parameters(("wand",)))
+    assert topics.losses.report() == []
 
 
 def test_frames_beyond_the_queue_are_refused_and_ros_sees_the_gap(lab: RosLab) -> None:
