@@ -5,11 +5,14 @@ What a peer does costs this thread time, not the gateway's event loop.
 
 import asyncio
 import concurrent.futures
+import logging
 import threading
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any, Final, TypeVar
 
 import uvloop
+
+from gateway.log import DefectLog
 
 _Result = TypeVar("_Result")
 
@@ -20,6 +23,8 @@ MAX_BYTES: Final = 64 * 1024 * 1024
 _FINISH_S: Final = 0.2
 """How long ``close`` waits for tasks that are running, and again after it has cancelled them."""
 
+logger = logging.getLogger(__name__)
+
 
 class LoopThread:
     """Runs coroutines and calls in an event loop in its own thread. The program does not wait for it at exit.
@@ -29,6 +34,7 @@ class LoopThread:
 
     def __init__(self, name: str) -> None:
         self._loop = uvloop.new_event_loop()
+        self._defects = DefectLog(logger, name)
         self._lock = threading.Lock()
         self._num_calls = 0  # that wait
         self._num_bytes = 0  # that they hold
@@ -39,8 +45,7 @@ class LoopThread:
     def offer(self, call: Callable[[], None], num_bytes: int = 0) -> bool:
         """Have the loop make ``call``, which holds ``num_bytes``; return False if too many wait.
 
-        A call of any size finds a place in an empty queue. The loop logs what
-        ``call`` raises.
+        A call of any size finds a place in an empty queue. The loop logs what ``call`` raises.
         """
         with self._lock:
             is_full = self._num_calls >= MAX_CALLS or self._num_bytes + num_bytes > MAX_BYTES
@@ -52,10 +57,15 @@ class LoopThread:
         return True
 
     def run(self, coroutine: Coroutine[Any, Any, _Result]) -> "concurrent.futures.Future[_Result]":
-        """Run ``coroutine`` in the loop. If the thread is closed, the future is cancelled."""
+        """Run ``coroutine`` in the loop. If the thread is closed, the future is cancelled.
+
+        What it raises is logged, because few callers look at the future.
+        """
         with self._lock:
             if not self._is_closed:
-                return asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+                future = asyncio.run_coroutine_threadsafe(coroutine, self._loop)
+                future.add_done_callback(self._log_defect)
+                return future
         coroutine.close()
         cancelled: concurrent.futures.Future[_Result] = concurrent.futures.Future()
         cancelled.cancel()
@@ -70,10 +80,16 @@ class LoopThread:
             asyncio.run_coroutine_threadsafe(self._end(last), self._loop)
         self._thread.join(timeout_s)
 
+    def _log_defect(self, future: "concurrent.futures.Future[Any]") -> None:
+        if not future.cancelled() and (defect := future.exception()) is not None:
+            self._defects.log(defect)
+
     async def _end(self, last: Callable[[], Awaitable[None]]) -> None:
         try:
             await last()
             await _finish(asyncio.all_tasks() - {asyncio.current_task()})
+        except Exception as defect:  # noqa: BLE001 - nobody waits for the result
+            self._defects.log(defect)
         finally:
             self._loop.stop()
 

@@ -1,7 +1,5 @@
 """The way of one source's frames from the gateway's event loop to the thread that serves viewers."""
 
-import asyncio
-import contextlib
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final
@@ -10,6 +8,7 @@ from gateway.errors import OutputError
 from gateway.losses import Losses
 from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import ServerParameters
+from gateway.outputs.event_loop import in_this_loop
 from gateway.outputs.foxglove.live_source import LiveSource
 from gateway.outputs.foxglove.server import FoxgloveServer
 from gateway.rtc3d.components import ComponentType
@@ -40,7 +39,7 @@ class ServedSource:
         self._server = server
         self._call = call
         self._call_in_time = call_in_time
-        self._loop: asyncio.AbstractEventLoop | None = None
+        self._report_wanted: Callable[[bool], None] = lambda _wanted: None
         self._on_change: Callable[[], None] = lambda: None
         self._source: LiveSource | None = None  # assigned in the thread only
         self._is_closed = False
@@ -48,7 +47,7 @@ class ServedSource:
     def watch_wanted(self, on_change: Callable[[], None]) -> None:
         """Call ``on_change`` in this event loop when ``wanted`` has changed."""
         self._on_change = on_change
-        self._loop = asyncio.get_running_loop()
+        self._report_wanted = in_this_loop(self._set_wanted)
 
     def open(self) -> None:
         """Advertise the channels of the source."""
@@ -92,11 +91,6 @@ class ServedSource:
         if self._source is not None:
             self._source.close()
             self._source = None
-
-    def _report_wanted(self, wanted: bool) -> None:
-        if self._loop is not None:
-            with contextlib.suppress(RuntimeError):  # the gateway's loop has ended
-                self._loop.call_soon_threadsafe(self._set_wanted, wanted)
 
     # In the gateway's loop.
 

@@ -14,6 +14,7 @@ import zenoh
 from gateway.losses import Losses
 from gateway.messages.topics import Topic, unique_name
 from gateway.outputs.contract import FramePublisher, Output, Publisher, ServerParameters
+from gateway.outputs.event_loop import in_this_loop
 from gateway.outputs.no_topics import IgnoringPublisher
 from gateway.outputs.ros2.diagnostics import DiagnosticsPublisher
 from gateway.outputs.ros2.message_types import DIAGNOSTIC_ARRAY, TF_MESSAGE
@@ -38,7 +39,6 @@ class Ros2Output(Output):
         self.settings = settings
         self._router = RouterSession(settings.connect, self._on_open)
         self._sender: SendThread | None = None  # from start to close
-        self._loop: asyncio.AbstractEventLoop | None = None
         self._tf = RosTopic("/tf", TF_MESSAGE, self._on_tf_wanted)
         self._diagnostics = RosTopic("/diagnostics", DIAGNOSTIC_ARRAY, self._on_diagnostics_wanted)
         self._node: RosNode | None = None  # only in the sending thread
@@ -48,8 +48,6 @@ class Ros2Output(Output):
 
     def start(self) -> None:
         """Start the thread that sends, and the one that opens the session."""
-        with contextlib.suppress(RuntimeError):  # there is no loop: then nobody watches what is wanted
-            self._loop = asyncio.get_running_loop()
         self._sender = SendThread("ros2-send")
         self._router.start()
 
@@ -139,7 +137,7 @@ class Ros2Output(Output):
 
     def watch_wanted(self, source: str, on_change: Callable[[], None]) -> bool:
         """Zenoh reports the subscribers of each topic."""
-        self._sources[source].on_wanted_changed = functools.partial(self._call_in_loop, on_change)
+        self._sources[source].on_wanted_changed = in_this_loop(on_change)
         return True
 
     def _on_tf_wanted(self) -> None:
@@ -149,12 +147,6 @@ class Ros2Output(Output):
     def _on_diagnostics_wanted(self) -> None:
         for source in list(self._sources.values()):
             source.on_wanted_changed()
-
-    def _call_in_loop(self, call: Callable[[], None]) -> None:
-        """Call ``call`` in the event loop, from one of Zenoh's threads."""
-        if self._loop is not None:
-            with contextlib.suppress(RuntimeError):  # the loop has just ended
-                self._loop.call_soon_threadsafe(call)
 
     # Life cycle.
 

@@ -19,6 +19,7 @@ from gateway.outputs.contract import (
     ServerFile,
     ServerParameters,
 )
+from gateway.outputs.event_loop import in_this_loop
 from gateway.outputs.loop_thread import LoopThread
 from gateway.outputs.no_topics import IgnoringPublisher
 from gateway.outputs.rtc3d.live_server import FILE, SLOW_CLIENT, LiveServer, SourceState
@@ -139,7 +140,7 @@ class Rtc3dOutput(Output):
     def watch_wanted(self, source: str, on_change: Callable[[], None]) -> bool:
         """Frames are wanted while any client asks for them."""
         self._loop = asyncio.get_running_loop()
-        self._on_wanted[source] = on_change
+        self._on_wanted[source] = in_this_loop(on_change)
         return True
 
     # Sources --------------------------------------------------------------------------------
@@ -171,9 +172,10 @@ class Rtc3dOutput(Output):
 
     def announce_file(self, source: str, file: ServerFile) -> None:
         """Pass a C3D file on to the clients."""
-        self._call(lambda: self._send_file(source, file))
+        if self._thread is not None:
+            self._thread.run(self._send_file(source, file))  # not _call, which can be refused
 
-    def _send_file(self, source: str, file: ServerFile) -> None:
+    async def _send_file(self, source: str, file: ServerFile) -> None:
         served = self._served.get(source)
         if served is not None and served.server is not None:
             served.server.send_file(file.path)
@@ -220,7 +222,7 @@ class Rtc3dOutput(Output):
             if source not in self._served:
                 served = self._served[source] = _Served(port)
                 self._closing = [former for former in self._closing if not former.closed.is_set()]
-                self._thread.run(self._keep_open(self._state(source), served, self._closing))
+                self._thread.run(self._keep_open(self._state(source), served, tuple(self._closing)))
             self._call(partial(self._set_max_clients, source, self._settings.max_clients))
 
     def _set_max_clients(self, source: str, max_clients: int) -> None:
@@ -257,7 +259,7 @@ class Rtc3dOutput(Output):
                     host,
                     port,
                     self._settings.max_clients,
-                    partial(self._wanted_changed, state.source),
+                    self._on_wanted.get(state.source, lambda: None),
                     self._control_recording,
                 )
                 try:
@@ -277,11 +279,6 @@ class Rtc3dOutput(Output):
                 finally:
                     served.server = None
                     await server.close()
-
-    def _wanted_changed(self, source: str) -> None:
-        on_change = self._on_wanted.get(source)
-        if on_change is not None and self._loop is not None and not self._loop.is_closed():
-            self._loop.call_soon_threadsafe(on_change)
 
 
 async def _stop(served: _Served) -> None:

@@ -1,7 +1,6 @@
 """The output that serves tools as VRPN trackers."""
 
 import asyncio
-import contextlib
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final
@@ -9,6 +8,7 @@ from typing import Final
 from gateway.losses import Losses
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import FramePublisher, Output, Publisher, ServerParameters
+from gateway.outputs.event_loop import in_this_loop
 from gateway.outputs.guard import guarded
 from gateway.outputs.loop_thread import LoopThread
 from gateway.outputs.no_topics import IgnoringPublisher
@@ -32,7 +32,6 @@ class VrpnOutput(Output):
         self._server = VrpnServer(settings.host, settings.port, settings.tracker_names, self._wanted_changed)
         self._publishers: dict[str, VrpnPublisher] = {}  # by source
         self._thread: LoopThread | None = None
-        self._gateway_loop: asyncio.AbstractEventLoop | None = None
         self._on_wanted: dict[str, Callable[[], None]] = {}  # by source
 
     def start(self) -> None:
@@ -59,17 +58,11 @@ class VrpnOutput(Output):
 
     def watch_wanted(self, source: str, on_change: Callable[[], None]) -> bool:
         """Frames are wanted while a client is connected."""
-        self._gateway_loop = asyncio.get_running_loop()
-        self._on_wanted[source] = on_change
+        self._on_wanted[source] = in_this_loop(on_change)
         return True
 
     def _wanted_changed(self) -> None:
-        """Tell the gateway's event loop; called in the server's thread."""
-        if self._gateway_loop is not None:
-            with contextlib.suppress(RuntimeError):  # the loop is closed: the gateway has ended
-                self._gateway_loop.call_soon_threadsafe(self._tell_sources)
-
-    def _tell_sources(self) -> None:
+        """Report a change for every source; called in the server's thread."""
         for on_change in list(self._on_wanted.values()):
             on_change()
 

@@ -60,6 +60,20 @@ def test_a_call_that_raises_is_logged_and_the_next_one_is_made(caplog: pytest.Lo
     assert record.levelno == logging.ERROR
 
 
+def test_a_coroutine_that_raises_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    thread = LoopThread("test")
+
+    async def fail() -> None:
+        raise ValueError("a defect")
+
+    async def fail_at_the_end() -> None:
+        raise ValueError("another defect")
+
+    assert isinstance(thread.run(fail()).exception(5), ValueError)
+    thread.close(fail_at_the_end, 5)
+    assert [record.levelno for record in caplog.records] == [logging.ERROR] * 2
+
+
 def test_closing_awaits_the_last_coroutine_and_refuses_what_comes_later() -> None:
     thread = LoopThread("test")
     ended: list[str] = []
