@@ -21,6 +21,7 @@ from gateway.cli.options import (
     checked_host,
 )
 from gateway.cli.stop_signals import StopSignals
+from gateway.outputs.listen_address import is_loopback
 from gateway.safe_text import safe_text
 
 if TYPE_CHECKING:
@@ -137,7 +138,7 @@ def _open_server(host: str, port: int) -> "ViewServer":
 
 def _announce(host: str, port: int, *, opens_browser: bool) -> None:
     """Print where the page is, and open it. A computer without a browser is no error."""
-    from gateway.view.server import address_of, is_loopback
+    from gateway.view.server import address_of
 
     address = address_of(host, port)
     print(f"{address} shows the data; press Ctrl-C to stop", flush=True)

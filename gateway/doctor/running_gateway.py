@@ -9,12 +9,12 @@ from pydantic import BaseModel, ValidationError
 
 from gateway.config.settings import MetricsSettings
 from gateway.losses import counts_text, route_name
+from gateway.outputs.listen_address import from_this_computer, host_in_url
 from gateway.stream.state import StreamState
 from gateway.worker_thread import WorkerThread
 
 _TIMEOUT_S: Final = 3.0
 _MAX_PAGE_BYTES: Final = 4 << 20
-_THIS_COMPUTER: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104 - it connects, it does not listen
 _DISCONNECTED: Final = {StreamState.WAITING.value, StreamState.CONNECTING.value}
 
 
@@ -92,12 +92,7 @@ class NoReport(NamedTuple):
 
 def address_text(metrics: MetricsSettings) -> str:
     """Return where a gateway with these settings serves its health page, for example "127.0.0.1:9464"."""
-    host = _host(metrics)
-    return f"[{host}]:{metrics.port}" if ":" in host else f"{host}:{metrics.port}"
-
-
-def _host(metrics: MetricsSettings) -> str:
-    return _THIS_COMPUTER.get(metrics.address, metrics.address)
+    return f"{host_in_url(from_this_computer(metrics.address))}:{metrics.port}"
 
 
 async def read_health(metrics: MetricsSettings) -> HealthReport | NoReport:
@@ -107,7 +102,9 @@ async def read_health(metrics: MetricsSettings) -> HealthReport | NoReport:
     where = address_text(metrics)
     try:
         async with asyncio.timeout(2 * _TIMEOUT_S):  # includes looking up a host name
-            page = await WorkerThread("health page").run(lambda: _get(_host(metrics), metrics.port))
+            page = await WorkerThread("health page").run(
+                lambda: _get(from_this_computer(metrics.address), metrics.port)
+            )
     except ConnectionRefusedError:
         return NoReport(f"no gateway runs here: nothing listens on {where}", False)
     except TimeoutError:

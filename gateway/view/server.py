@@ -1,7 +1,6 @@
 """The web server of the live view."""
 
 import errno
-import ipaddress
 import logging
 import socket
 import warnings
@@ -40,14 +39,6 @@ def address_of(host: str, port: int) -> str:
     if host in {"", "0.0.0.0", "::"}:  # noqa: S104 - compared only
         host = "localhost"
     return f"http://[{host}]:{port}" if ":" in host else f"http://{host}:{port}"
-
-
-def is_loopback(host: str) -> bool:
-    """Whether only this computer can reach an address."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def _check_address(host: str, port: int) -> None:

@@ -1,6 +1,5 @@
 """The doctor's checks of the output for viewers: its packages, and its port."""
 
-import ipaddress
 import json
 import socket
 from collections.abc import Sequence
@@ -9,6 +8,7 @@ from typing import Any, Final
 
 from gateway.findings import Finding, MessageLoad, Subject
 from gateway.outputs.foxglove.settings import FoxgloveSettings
+from gateway.outputs.listen_address import family_of, from_this_computer, host_in_url, is_loopback
 
 CHECKS: Final = ("package", "port")
 
@@ -42,18 +42,13 @@ def check_foxglove(
 
 def leaves_host(settings: FoxgloveSettings) -> bool:
     """Return whether messages may leave this computer: whether others can connect."""
-    if settings.host == "localhost":
-        return False
-    try:
-        return not ipaddress.ip_address(settings.host).is_loopback
-    except ValueError:
-        return True
+    return not is_loopback(settings.host)
 
 
 def _check_port(settings: FoxgloveSettings, sources: Sequence[str]) -> Finding:
-    address = f"ws://{_in_url(settings.host)}:{settings.port}"
+    address = f"ws://{host_in_url(settings.host)}:{settings.port}"
     try:
-        with socket.create_server((settings.host, settings.port), family=_family(settings.host), backlog=1):
+        with socket.create_server((settings.host, settings.port), family=family_of(settings.host), backlog=1):
             return _foxglove.passing("port", f"viewers will be able to connect to {address}")
     except OSError as error:
         problem = error.strerror or str(error)
@@ -83,11 +78,11 @@ def _advertised_topics(settings: FoxgloveSettings) -> list[str] | None:
 
     from gateway.outputs.foxglove.protocol import SUBPROTOCOLS  # noqa: PLC0415
 
-    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(settings.host, settings.host)  # noqa: S104 - no bind
+    host = host_in_url(from_this_computer(settings.host))
     names = [Subprotocol(name) for name in SUBPROTOCOLS]
     try:
         with connect(
-            f"ws://{_in_url(host)}:{settings.port}",
+            f"ws://{host}:{settings.port}",
             subprotocols=names,
             open_timeout=_TIMEOUT_S,
             close_timeout=_TIMEOUT_S,
@@ -101,11 +96,3 @@ def _advertised_topics(settings: FoxgloveSettings) -> list[str] | None:
     except (OSError, WebSocketException, ValueError, AttributeError, KeyError, TypeError):
         return None
     return None
-
-
-def _family(host: str) -> socket.AddressFamily:
-    return socket.AF_INET6 if ":" in host else socket.AF_INET
-
-
-def _in_url(host: str) -> str:
-    return f"[{host}]" if ":" in host else host

@@ -17,6 +17,7 @@ from gateway.outputs.foxglove.live_source import SLOW
 from gateway.outputs.foxglove.publisher import QUEUE_FULL, FoxglovePublisher, ServedSource
 from gateway.outputs.foxglove.server import FoxgloveServer
 from gateway.outputs.foxglove.settings import FoxgloveSettings
+from gateway.outputs.listen_address import host_in_url
 from gateway.outputs.loop_thread import LoopThread
 from gateway.outputs.no_topics import IgnoringPublisher
 from gateway.outputs.status import OutputHealth
@@ -35,7 +36,7 @@ class FoxgloveOutput(Output):
 
     def __init__(self, settings: FoxgloveSettings) -> None:
         self.settings = settings
-        self._address = address_text(settings.host, settings.port)
+        self._address = f"{host_in_url(settings.host)}:{settings.port}"
         self._problem = f"not listening on {self._address} yet"
         self._failures = FailureLog(logger, self.name)
         self._defects = DefectLog(logger, self.name)
@@ -149,11 +150,6 @@ class FoxgloveOutput(Output):
 
     async def _make_later(self, call: Callable[[], None]) -> None:
         self._make(call)
-
-
-def address_text(host: str, port: int) -> str:
-    """Return HOST:PORT, with brackets around an IPv6 address."""
-    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def _bind_problem(error: OSError) -> str:

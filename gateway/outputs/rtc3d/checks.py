@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from gateway.findings import Finding, MessageLoad, Subject
+from gateway.outputs.listen_address import family_of, from_this_computer
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.rtc3d.commands import Version, encode_command
 from gateway.rtc3d.packets import PACKET_HEADER, PACKET_HEADER_BYTES, PacketType, encode_packet
@@ -13,8 +14,6 @@ from gateway.rtc3d.packets import PACKET_HEADER, PACKET_HEADER_BYTES, PacketType
 CHECKS: Final = ("sources", "ports")
 
 _MAX_REPLY_BYTES: Final = 64 * 1024
-
-_THIS_COMPUTER: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104 - it connects, it does not listen
 
 _rtc3d: Final = Subject("rtc3d")
 
@@ -53,7 +52,7 @@ def _check_ports(settings: Rtc3dSettings, seconds: float) -> list[Finding]:
 def _check_port(host: str, source: str, port: int, seconds: float) -> Finding:
     place = f"{host}, port {port} (for {source})"
     try:
-        with socket.create_server((host, port), family=_family(host)):
+        with socket.create_server((host, port), family=family_of(host)):
             return _rtc3d.passing("ports", f"{place} is free")
     except OSError as error:
         problem = os.strerror(error.errno) if error.errno else str(error)
@@ -66,15 +65,11 @@ def _check_port(host: str, source: str, port: int, seconds: float) -> Finding:
     )
 
 
-def _family(host: str) -> socket.AddressFamily:
-    return socket.AF_INET6 if ":" in host else socket.AF_INET
-
-
 def _is_rt_server(host: str, port: int, seconds: float) -> bool:
     """Return whether a server on this port answers a command of the protocol."""
     command = encode_packet(PacketType.COMMAND, encode_command(Version()))
     try:
-        with socket.create_connection((_THIS_COMPUTER.get(host, host), port), timeout=seconds) as tcp:
+        with socket.create_connection((from_this_computer(host), port), timeout=seconds) as tcp:
             tcp.sendall(command)
             header = tcp.recv(PACKET_HEADER_BYTES, socket.MSG_WAITALL)
     except OSError:

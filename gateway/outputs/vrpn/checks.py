@@ -1,11 +1,11 @@
 """The doctor's checks of VRPN: the port, and who can connect."""
 
-import ipaddress
 import socket
 from collections.abc import Sequence
 from typing import Final
 
 from gateway.findings import Finding, MessageLoad, Subject
+from gateway.outputs.listen_address import from_this_computer, is_loopback
 from gateway.outputs.vrpn.protocol import COOKIE_BYTES, COOKIE_START
 from gateway.outputs.vrpn.settings import VrpnSettings
 from gateway.outputs.vrpn.sockets import bind
@@ -26,12 +26,7 @@ def check_vrpn(
 
 def leaves_host(settings: VrpnSettings) -> bool:
     """Return whether other computers can connect."""
-    if settings.host == "localhost":
-        return False
-    try:
-        return not ipaddress.ip_address(settings.host).is_loopback
-    except ValueError:  # a name
-        return True
+    return not is_loopback(settings.host)
 
 
 def _check_port(settings: VrpnSettings) -> Finding:
@@ -52,9 +47,10 @@ def _check_port(settings: VrpnSettings) -> Finding:
 
 
 def _is_served(settings: VrpnSettings) -> bool:
-    """Return whether a VRPN server answers on the port. Every address of this host reaches 0.0.0.0 and ::."""
+    """Return whether a VRPN server answers on the port."""
+    address = (from_this_computer(settings.host), settings.port)
     try:
-        with socket.create_connection((settings.host, settings.port), _TIMEOUT_S) as connection:
+        with socket.create_connection(address, _TIMEOUT_S) as connection:
             connection.settimeout(_TIMEOUT_S)
             cookie = connection.recv(COOKIE_BYTES, socket.MSG_WAITALL)
     except OSError:
