@@ -191,20 +191,26 @@ class SourceStreams:
         if not num_items or self._is_refused(component, num_items):
             self._close(component)
             return None
+        # While a stream waits, its channels, which can be thousands, are not described for every frame.
+        if before is None and self._must_wait(component, num_items):
+            return None
         stream = lsl_stream(self._described, component, num_items)
         if before is not None and before.stream == stream:
             before.version = self._version
             return before
         self._close(component)
-        return self._open(component, stream, num_items)
+        return None if self._must_wait(component, num_items) else self._open(component, stream, num_items)
 
-    def _open(self, component: ComponentType, stream: LslStream, num_items: int) -> _OpenStream | None:
-        now_s = time.monotonic()
-        if now_s - self._opened_s.get(component, float("-inf")) < MIN_LIFE_S:
-            self.waiting[component] = num_items
-            return None
+    def _must_wait(self, component: ComponentType, num_items: int) -> bool:
+        """Return whether the last stream of a component is too young for another one, which then waits."""
+        if time.monotonic() - self._opened_s.get(component, float("-inf")) >= MIN_LIFE_S:
+            return False
+        self.waiting[component] = num_items
+        return True
+
+    def _open(self, component: ComponentType, stream: LslStream, num_items: int) -> _OpenStream:
         self.waiting.pop(component, None)
-        self._opened_s[component] = now_s
+        self._opened_s[component] = time.monotonic()
         opened = _OpenStream(next(self._next_numbers), stream, num_items, self._version)
         self._streams[component] = opened
         self.numbers |= {opened.number}

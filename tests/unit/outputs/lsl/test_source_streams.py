@@ -13,6 +13,7 @@ from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.lsl.source_streams import MAX_BUFFER_BYTES, CapturedFrame, SourceStreams
+from gateway.outputs.lsl.streams import DescribedSource, LslStream, lsl_stream
 from gateway.outputs.lsl.wire import Kind, Message, decode_samples
 from gateway.rtc3d.components import (
     ITEM_DTYPES,
@@ -208,6 +209,26 @@ def test_streams_do_not_pile_up_however_often_labels_change(lab: Streams) -> Non
     assert lab.opened[-1]["tree"][0][1][0][1][0] == ["label", "Tool 999_X"]
     assert lab.streams.waiting == {}
     assert lab.lost == {}
+
+
+def test_a_stream_that_waits_is_not_described_for_every_frame(
+    lab: Streams, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    described = []
+
+    def counting(source: DescribedSource, component: ComponentType, num_items: int) -> LslStream:
+        described.append(num_items)
+        return lsl_stream(source, component, num_items)
+
+    monkeypatch.setattr("gateway.outputs.lsl.source_streams.lsl_stream", counting)
+    lab.push(analog(1, 2))
+    for _ in range(100):
+        lab.push(analog(1, 2, 3))
+    assert described == [2, 3]
+    lab.now_s += 10
+    lab.streams.open_waiting()
+    assert [opened["num_channels"] for opened in lab.opened] == [2, 3]
+    assert described == [2, 3, 3]
 
 
 def test_the_stream_of_a_component_that_the_server_no_longer_has_closes(lab: Streams) -> None:
