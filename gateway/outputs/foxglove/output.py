@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final
 
-from gateway.log import DefectLog, FailureLog
+from gateway.log import DefectLog, FailureLog, defect_text
 from gateway.losses import Losses
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic
@@ -64,6 +64,9 @@ class FoxgloveOutput(Output):
         except OSError as error:
             problem = f"cannot listen on {self._address}: {_bind_problem(error)}"
             self._failures.failed(problem)
+        except Exception as defect:  # noqa: BLE001 - the task would end, and nothing would try again
+            problem = f"{defect_text(defect)}; report this with the log"
+            self._defects.log(defect)
         else:
             problem = ""
             self._failures.succeeded(f"viewers can connect to ws://{self._address}")

@@ -11,6 +11,7 @@ import pytest
 from gateway.foxglove_schemas import float_topics, forces, messages
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.foxglove.output import FoxgloveOutput
+from gateway.outputs.foxglove.server import FoxgloveServer
 from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.rtc3d.components import MISSING, ByteOrder, ComponentType
 from gateway.rtc3d.parameters import (
@@ -428,6 +429,25 @@ async def test_an_output_that_is_closed_while_it_opens_releases_the_port() -> No
         assert not output.health().connected
         with socket.create_server(("127.0.0.1", output.settings.port)):
             pass
+
+
+async def test_a_defect_does_not_end_the_attempts_to_listen(monkeypatch: pytest.MonkeyPatch) -> None:
+    defects = iter([KeyError("x")])
+    opened = FoxgloveServer.open
+
+    async def open_or_fail(server: FoxgloveServer) -> None:
+        for defect in defects:
+            raise defect
+        await opened(server)
+
+    monkeypatch.setattr(FoxgloveServer, "open", open_or_fail)
+    output = FoxgloveOutput(FoxgloveSettings(enabled=True, port=free_port()))
+    output.start()
+    try:
+        await wait_until_async(lambda: "defect in the gateway: KeyError" in output.health().problem)
+        await wait_until_async(lambda: output.health().connected)
+    finally:
+        output.close()
 
 
 async def test_an_address_of_another_computer_is_a_problem() -> None:
