@@ -1,11 +1,13 @@
 """The connections of viewers, with limits on what they can use up: clients are not trusted."""
 
+import logging
 import time
 from typing import Any, Final
 
 from websockets.asyncio.server import ServerConnection, broadcast
 from websockets.http11 import Request, Response
 
+from gateway.log import EventLog
 from gateway.outputs.foxglove import protocol
 from gateway.token_bucket import TokenBucket
 
@@ -36,11 +38,14 @@ MAX_STALL_S: Final = 30.0
 _SLOW: Final = "Send buffer limit reached"
 """The words of Foxglove's own bridge. Lichtblick adds an explanation to them."""
 
+logger = logging.getLogger(__name__)
+
 
 class Admission:
-    """Decides which connections may stay open."""
+    """Decides which connections may stay open, and logs why others end."""
 
     def __init__(self) -> None:
+        self._events = EventLog(logger, "foxglove")
         self.num_clients = 0
         """How many viewers have completed the handshake."""
         self._handshakes: dict[ServerConnection, None] = {}  # oldest first
@@ -61,7 +66,16 @@ class Admission:
         """Return the response to a viewer that is one too many; None to accept it."""
         if self.num_clients < MAX_CLIENTS:
             return None
+        text = f"{_address(connection)} is refused: {MAX_CLIENTS} viewers are connected; close one of them"
+        self._events.log(logging.WARNING, text, "refused")
         return connection.respond(503, f"{MAX_CLIENTS} viewers are connected already; close one of them.\n")
+
+    def disconnect(self, connection: ServerConnection, reason: str) -> None:
+        """End a connection at once, without waiting for the peer."""
+        if not connection.transport.is_closing():
+            text = f"{_address(connection)} is disconnected: {reason}"
+            self._events.log(logging.INFO, text, "disconnected")
+            connection.transport.abort()
 
 
 class Connection(ServerConnection):
@@ -87,24 +101,30 @@ class Connection(ServerConnection):
         if self._received.try_take(len(data)):
             super().data_received(data)
         else:
-            self.transport.abort()
+            self._admission.disconnect(self, "it sends more than a viewer does")
+
+
+def _address(connection: ServerConnection) -> str:
+    """Return the address of a peer for messages, such as 192.0.2.7:40512."""
+    host, port, *_ = connection.remote_address or ("?", 0)
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 class Viewer:
     """A connected viewer."""
 
-    def __init__(self, connection: ServerConnection) -> None:
+    def __init__(self, connection: ServerConnection, admission: Admission) -> None:
         self.subscriptions: dict[int, int] = {}
         """The numbers of channels by those of subscriptions."""
         self._connection = connection
+        self._admission = admission
         self._was_slow = False
         self._stalled_s: float | None = None  # since when too much waits, on the monotonic clock
 
     @property
     def address(self) -> str:
         """Its address for messages, such as 192.0.2.7:40512."""
-        host, port, *_ = self._connection.remote_address or ("?", 0)
-        return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+        return _address(self._connection)
 
     def send_data(self, subscription: int, utime: int, data: bytes) -> bool:
         """Send a message of a channel, or return False if too much waits already: then it is lost."""
@@ -121,7 +141,8 @@ class Viewer:
         if self._stalled_s is None:
             self._stalled_s = now_s
         elif now_s - self._stalled_s > MAX_STALL_S:
-            self._connection.transport.abort()  # a ping of websockets would wait until it is sent
+            # A ping of websockets would wait until it is sent.
+            self._disconnect(f"it has not read what waits for it for {MAX_STALL_S:g} s")
         if not self._was_slow:
             self._was_slow = True
             self.send_control(protocol.warning(_SLOW))
@@ -129,9 +150,12 @@ class Viewer:
     def send_control(self, message: str) -> None:
         """Send a message about channels, which the viewer must not miss."""
         if self._waiting_bytes > MAX_CONTROL_BYTES:
-            self._connection.transport.abort()
+            self._disconnect("it does not read what it must know about the topics")
         else:
             broadcast((self._connection,), message)
+
+    def _disconnect(self, reason: str) -> None:
+        self._admission.disconnect(self._connection, reason)
 
     @property
     def _waiting_bytes(self) -> int:

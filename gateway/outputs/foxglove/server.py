@@ -133,7 +133,7 @@ class FoxgloveServer:
     async def _serve(self, connection: ServerConnection) -> None:
         """Serve a viewer until it disconnects."""
         self._admission.end(connection)
-        viewer = Viewer(connection)
+        viewer = Viewer(connection, self._admission)
         logger.debug("foxglove: %s connected", viewer.address)
         self._admission.num_clients += 1
         self._viewers.add(viewer)

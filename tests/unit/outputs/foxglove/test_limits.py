@@ -4,6 +4,7 @@ import asyncio
 import json
 import logging
 import os
+import re
 import socket
 import time
 from collections.abc import Iterator
@@ -81,7 +82,10 @@ async def test_a_slow_viewer_is_told_once_and_gets_the_messages_that_found_a_pla
         assert lab.losses["slow client"][0] == lost
 
 
-async def test_a_viewer_that_reads_nothing_for_long_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_viewer_that_reads_nothing_for_long_is_disconnected(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO)
     monkeypatch.setattr(connections, "MAX_STALL_S", 0.1)
     async with serving("lab") as (port, [lab]):
         with stalled_viewer(port):
@@ -92,6 +96,21 @@ async def test_a_viewer_that_reads_nothing_for_long_is_disconnected(monkeypatch:
                 return not lab.wanted
 
             await wait_until_async(is_unwanted)
+    assert num_logged(caplog, "is disconnected: it has not read what waits for it for 0.1 s") == 1
+
+
+async def test_a_flood_of_requests_ends_the_connection_and_the_log_says_why(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    async with serving("lab") as (port, _), viewing(port) as hostile:
+        hostile.send_bytes(client_frame(b"ping" * 10, 9) * 50_000)
+        await hostile.wait_until(lambda: hostile.is_closed)
+    assert num_logged(caplog, "is disconnected: it sends more than a viewer does") == 1
+
+
+def num_logged(caplog: pytest.LogCaptureFixture, text: str) -> int:
+    return sum(text in record.getMessage() for record in caplog.records)
 
 
 async def test_the_output_closes_at_once_although_a_viewer_reads_nothing() -> None:
@@ -105,7 +124,9 @@ async def test_the_output_closes_at_once_although_a_viewer_reads_nothing() -> No
             assert not lab.output.health().connected
 
 
-async def test_one_viewer_too_many_is_refused_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_one_viewer_too_many_is_refused_with_a_reason(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     monkeypatch.setattr(connections, "MAX_CLIENTS", 3)
     async with serving("lab") as (port, _):
         async with AsyncExitStack() as stack:
@@ -115,6 +136,8 @@ async def test_one_viewer_too_many_is_refused_with_a_reason(monkeypatch: pytest.
                 await Viewer.open(port)
         async with viewing(port):
             pass
+    [warning] = [record.getMessage() for record in caplog.records if record.levelno >= logging.WARNING]
+    assert re.fullmatch(r"foxglove: 127\.0\.0\.1:\d+ is refused: 3 viewers are connected; .*", warning)
 
 
 async def test_handshakes_that_are_not_completed_end_in_favour_of_others() -> None:
