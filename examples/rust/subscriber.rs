@@ -398,8 +398,9 @@ fn bind_shared(port: u16) -> io::Result<UdpSocket> {
         port_and_host: [high, low, 0, 0, 0, 0],
         zero: [0; 8],
     };
-    let options = [(SO_REUSEADDR, 1), (SO_RCVBUF, 2_000_000)]; // at most net.core.rmem_max
-                                                               // SAFETY: the pointers are valid during each call, with these lengths; `socket` owns the new file descriptor.
+    // Linux allows at most net.core.rmem_max for the buffer.
+    let options = [(SO_REUSEADDR, 1), (SO_RCVBUF, 2_000_000)];
+    // SAFETY: the pointers are valid during each call, with these lengths; `socket` owns the new file descriptor.
     unsafe {
         let fd = socket(AF_INET, SOCK_DGRAM, 0);
         if fd < 0 {
