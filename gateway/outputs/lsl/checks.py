@@ -109,7 +109,8 @@ def _found(names: set[tuple[str, str]]) -> Finding:
 
 
 def _gateway(names: set[tuple[str, str]], sources: Sequence[str]) -> Finding:
-    served = [source for source in sources if any(name.startswith(f"{source}_") for _, name in names)]
+    found = {name.rpartition("_")[0] for _, name in names}  # names are SOURCE_COMPONENT
+    served = [source for source in sources if source in found]
     missing = [source for source in sources if source not in served]
     if not served:
         return _lsl.note("gateway", "no gateway offers streams of these sources now", "Start the gateway.")
