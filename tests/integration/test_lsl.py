@@ -1,5 +1,6 @@
 """LSL as its users see it: pylsl's inlets in another process, and the file that LabRecorder writes."""
 
+import itertools
 import json
 import math
 import os
@@ -154,6 +155,21 @@ def test_a_recording_has_labels_units_rates_and_capture_times(tmp_path: Path) ->
     quaternions = found["lab_6d"]["time_series"][:, 3:7]
     lengths = np.linalg.norm(quaternions[~np.isnan(quaternions).any(axis=1)], axis=1)
     assert lengths == pytest.approx(np.ones_like(lengths), abs=1e-3)
+
+
+def test_a_reader_of_a_recording_keeps_the_time_stamps_around_a_gap(tmp_path: Path) -> None:
+    with running(tmp_path) as lab:
+        began_s = time.monotonic()
+        receiver = lab.receive("lab_3d")
+        wait_until(has(receiver, "lab_3d", 2 * RATE_HZ), TIMEOUT_S)
+    samples = list(receiver.samples["lab_3d"])
+    del samples[RATE_HZ // 2 : RATE_HZ]
+    file = tmp_path / "recording.xdf"
+    offsets_s = [(began_s, receiver.offset_s["lab_3d"])]
+    write_xdf(file, [RecordedStream(receiver.xml["lab_3d"], offsets_s, samples)])
+    [stream], _ = pyxdf.load_xdf(str(file))
+    distances_s = [later - earlier for (earlier, _), (later, _) in itertools.pairwise(samples)]
+    assert np.diff(stream["time_stamps"]).tolist() == pytest.approx(distances_s, abs=1e-6)
 
 
 def channels(stream: Any) -> list[Any]:

@@ -27,6 +27,14 @@ MAX_VALUES_PER_S: Final = 2_500_000.0
 
 _MAX_LABEL_BYTES: Final = 120
 _METRES: Final = "meters"  # XDF's word
+
+_SYNCHRONIZATION: Final[Tree] = ("synchronization", (("can_drop_samples", "true"),))
+"""Has readers of XDF keep the time stamps.
+
+Otherwise they take small gaps for jitter and space the samples evenly, which shifts them by up to half of
+each gap. (https://github.com/sccn/xdf/wiki/Synchronization)
+"""
+
 _XYZ: Final = ("X", "Y", "Z")
 _EMG: Final = re.compile(r"\bEMG", re.IGNORECASE)
 
@@ -69,6 +77,7 @@ class LslStream(NamedTuple):
             ("channels", tuple(channel.tree for channel in self.channels)),
             ("setup", self.setup),
             ("acquisition", self.acquisition),
+            _SYNCHRONIZATION,
         )
 
 

@@ -153,6 +153,7 @@ def test_the_xml_has_channels_setup_and_acquisition() -> None:
     assert frame["frame_id"] == "world"
     assert frame["translation_from_server"] == (("x", "1.0"), ("y", "2.0"), ("z", "3.0"))
     assert dict(tree["acquisition"])["model"] == "First Principles"
+    assert tree["synchronization"] == (("can_drop_samples", "true"),)
 
 
 def test_labels_are_printable_unique_and_short() -> None:
