@@ -33,6 +33,11 @@ class Finding(NamedTuple):
     remedy: str = ""
     stream: str = ""
 
+    @property
+    def is_of_disabled_output(self) -> bool:
+        """Whether the check was not made because the configuration does not enable the output."""
+        return self.result is Result.NOT_TESTED and self.found == f"{self.subject}.enabled is false"
+
 
 class Subject(NamedTuple):
     """Something that is checked: a source, one of its streams, an output or this computer.
@@ -62,6 +67,10 @@ class Subject(NamedTuple):
     def not_tested(self, check: str, reason: str) -> Finding:
         """Return a finding for a check that could not be made."""
         return Finding(self.name, check, Result.NOT_TESTED, reason, "", self.stream)
+
+    def disabled(self, check: str) -> Finding:
+        """Return a finding for a check of an output that the configuration does not enable."""
+        return self.not_tested(check, f"{self.name}.enabled is false")
 
 
 class MessageLoad(NamedTuple):

@@ -29,14 +29,15 @@ async def run_checks(
     """Run all checks, and yield each finding as soon as it is known.
 
     The running gateway is asked first. Then the sources are watched one after the other, each for
-    ``seconds``, unless ``connects`` is False: then no connection to their servers is opened.
+    ``seconds``, unless ``connects`` is False: then no connection to their servers is opened. Outputs that
+    are not enabled come after the others.
 
     ``origin`` says where the settings come from, for example a file name. ``output_sections`` replace those
     of the settings where an output is checked.
     """
     enabled = [name for name, section in settings.outputs.items() if section.enabled]
     names = [source.name for source in settings.sources]
-    yield _configuration.passing("file", f"{origin}: {', '.join(names)} to {' and '.join(enabled)}")
+    yield _configuration.passing("file", f"{origin}: {', '.join(names)} to {', '.join(enabled)}")
     report = await read_health(settings.metrics)
     for finding in check_gateway(report, address_text(settings.metrics), names, connects=connects):
         yield finding
@@ -46,7 +47,8 @@ async def run_checks(
         async for finding in checks.run() if connects else checks.run_without_connecting():
             yield finding
         loads += checks.message_loads
-    for name, section in {**settings.outputs, **(output_sections or {})}.items():
+    sections = {**settings.outputs, **(output_sections or {})}
+    for name, section in sorted(sections.items(), key=lambda item: not item[1].enabled):
         check = partial(check_output, OUTPUTS[name], section, names, loads, seconds)
         for finding in await WorkerThread(name).run(check):
             yield finding

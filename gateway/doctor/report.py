@@ -22,17 +22,22 @@ _INDENT: Final = " " * 20
 
 _MAX_WIDTH: Final = 100
 
+_DISABLED: Final = "outputs that are not enabled"
+"""The subject under which these outputs are listed."""
+
 
 class Report:
     """Prints each finding when it is added, under the name of its subject.
 
-    If it is ``quiet``, it prints only warnings and failures.
+    An output that is not enabled gets one line for all of its checks. If the report is ``quiet``, it prints
+    only warnings and failures.
     """
 
     def __init__(self, console: Console, *, quiet: bool = False) -> None:
         self._console = console
         self._quiet = quiet
         self._subject = ""
+        self._disabled: set[str] = set()
         self.findings: list[Finding] = []
 
     def add(self, finding: Finding) -> None:
@@ -41,11 +46,17 @@ class Report:
         if self._quiet and finding.result not in {Result.WARNING, Result.FAILING}:
             return
         subject = f"{finding.subject} ({finding.stream})" if finding.stream else finding.subject
+        check = finding.check
+        if finding.is_of_disabled_output:
+            if finding.subject in self._disabled:
+                return
+            self._disabled.add(finding.subject)
+            subject, check = _DISABLED, finding.subject
         if subject != self._subject:
             self._subject = subject
             self._print(Text(subject, "bold"))
         mark, style = _MARKS[finding.result]
-        columns = Text.assemble("  ", (f"{mark:<4}", style), f"  {finding.check:<12}")
+        columns = Text.assemble("  ", (f"{mark:<4}", style), f"  {check:<12}")
         text = "not tested: " if finding.result is Result.NOT_TESTED else ""
         first, *others = self._wrapped(text + finding.found)
         self._print(columns + Text(first))
@@ -55,10 +66,14 @@ class Report:
             self._print(Text(_INDENT + ("→ " if number == 0 else "  ") + line, "bold"))
 
     def end(self) -> None:
-        """Print how many checks passed, failed and were not tested, and how many warnings and notes."""
+        """Print how many checks passed, failed and were not tested, and how many warnings and notes.
+
+        Checks of outputs that are not enabled are not counted.
+        """
         if self._quiet:
             return
-        counts = {result: sum(each.result is result for each in self.findings) for result in Result}
+        counted = [each for each in self.findings if not each.is_of_disabled_output]
+        counts = {result: sum(each.result is result for each in counted) for result in Result}
         text = (
             f"{counts[Result.PASSING]} ok, {counts[Result.FAILING]} failed, "
             f"{counts[Result.NOT_TESTED]} not tested"

@@ -138,6 +138,35 @@ def test_a_check_that_was_not_made_does_not_fail() -> None:
     assert report.findings == [Finding("lab", "name", Result.NOT_TESTED, "no frames")]
 
 
+def test_an_output_that_is_not_enabled_has_one_line() -> None:
+    findings = (
+        Subject("zenoh").passing("link", "open"),
+        *(Subject("lcm").disabled(check) for check in ("route", "requests", "buffers")),
+        *(Subject("takes").disabled(check) for check in ("folder", "space")),
+        Subject("this computer").passing("clock", "synchronised"),
+    )
+    assert shown(*findings) == (
+        "zenoh\n"
+        "  ok    link        open\n"
+        "outputs that are not enabled\n"
+        "  skip  lcm         not tested: lcm.enabled is false\n"
+        "  skip  takes       not tested: takes.enabled is false\n"
+        "this computer\n"
+        "  ok    clock       synchronised\n"
+        "2 ok, 0 failed, 0 not tested\n"
+    )
+    report = Report(Console(quiet=True))
+    for finding in findings:
+        report.add(finding)
+    assert [
+        each["check"] for each in json.loads(report.as_json())["findings"] if each["subject"] == "lcm"
+    ] == [
+        "route",
+        "requests",
+        "buffers",
+    ]
+
+
 def test_a_quiet_report_has_only_warnings_and_failures() -> None:
     out = io.StringIO()
     report = Report(Console(file=out, width=60), quiet=True)
