@@ -39,10 +39,10 @@ SECTIONS: dict[str, type[Section]] = {
     "lcm": LcmSettings,
     "takes": TakesSettings,
     "ros2": Ros2Settings,
-    "vrpn": VrpnSettings,
-    "foxglove": FoxgloveSettings,
     "rtc3d": Rtc3dSettings,
+    "vrpn": VrpnSettings,
     "lsl": LslSettings,
+    "foxglove": FoxgloveSettings,
     "spool": SpoolSettings,
     "metrics": MetricsSettings,
 }
