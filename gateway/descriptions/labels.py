@@ -47,12 +47,12 @@ def describe(component: ComponentType, parameters: Parameters | None, num_items:
     moment_unit, default_unit = "", ""
     match component:
         case ComponentType.MARKERS:
-            default_unit = _length_unit(parameters)
+            default_unit = parameters.length_unit
             if parameters.markers is not None:
                 labels = (marker.label for marker in parameters.markers.markers)
                 rates = (parameters.markers.frequency_hz,)
         case ComponentType.TOOLS:
-            default_unit = _length_unit(parameters)
+            default_unit = parameters.length_unit
             if parameters.tools is not None:
                 labels = (tool.label for tool in parameters.tools.tools)
                 rates = (parameters.tools.frequency_hz,)
@@ -103,11 +103,6 @@ def common(values: Iterable[_Value]) -> _Value | None:
     """Return the value that all ``values`` have; None if they differ, or if there are none."""
     different = set(values)
     return different.pop() if len(different) == 1 else None
-
-
-def _length_unit(parameters: Parameters) -> str:
-    """Return the unit of positions, also of tools: that of the 3D parameters (§6.2)."""
-    return "mm" if parameters.markers is None else parameters.markers.unit
 
 
 def _unique_labels(labels: Iterable[str], noun: str, num_items: int) -> tuple[str, ...]:

@@ -16,7 +16,7 @@ _Y_UP_TO_Z_UP: Final[Quaternion] = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
 def source_frame(settings: SourceSettings, parameters: Parameters) -> CoordinateFrame:
     """Return the frame in which poses of a source are published; the unit is that of §6.2 if none is set."""
     transform = settings.transform
-    unit = transform.units or ("mm" if parameters.markers is None else parameters.markers.unit)
+    unit = transform.units or parameters.length_unit
     metres = metres_per_unit(unit)
     rotation = transform.rotation_xyzw or _quaternion(transform.rotation_deg)
     if transform.up == "y":
@@ -26,6 +26,14 @@ def source_frame(settings: SourceSettings, parameters: Parameters) -> Coordinate
         None if metres is None else metres * transform.scale,
         rotation,
         transform.translation_m,
+    )
+
+
+def unknown_unit_text(parameters: Parameters, what: str = "positions") -> str:
+    """Return why no positions are published while the unit of length is unknown, and what to do."""
+    return (
+        f"unit of length {parameters.length_unit[:40]!r} is unknown: no {what} are published; set it to mm "
+        "or m in the server, or set transform.units of the source in the configuration"
     )
 
 

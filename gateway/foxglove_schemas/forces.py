@@ -89,7 +89,7 @@ class ForceScene:
 
 def _frame_of_metres(frame: CoordinateFrame, parameters: Parameters) -> CoordinateFrame:
     """Return the same frame for plates, which are in metres already: they are scaled like the markers."""
-    unit_m = metres_per_unit("mm" if parameters.markers is None else parameters.markers.unit)
+    unit_m = metres_per_unit(parameters.length_unit)
     scale = frame.metres_per_unit / unit_m if frame.metres_per_unit and unit_m else 1.0
     return replace(frame, metres_per_unit=scale)
 

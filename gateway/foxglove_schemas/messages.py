@@ -92,7 +92,7 @@ class FoxgloveSource:
         self._version = version
         self._facts = {} if frame is None else {"frame": frame.facts}
         if frame is None:
-            unit = "mm" if parameters.markers is None else parameters.markers.unit
+            unit = parameters.length_unit
             metres = metres_per_unit(unit)
             if metres is None:
                 self.problem = f"the unit of length {unit!r} is unknown; positions are shown as if it were mm"

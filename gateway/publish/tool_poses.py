@@ -5,6 +5,7 @@ from typing import Final
 
 import rtc3d
 
+from gateway.descriptions.source_frame import unknown_unit_text
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.stamp import Stamp
 from gateway.messages.tool_pose import tool_poses
@@ -13,6 +14,7 @@ from gateway.outputs.contract import ServerParameters
 from gateway.publish.routes import OutputRoute, TopicRoute
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.parameters import Parameters
 
 _MAX_REMEMBERED_NAMES: Final = 1024
 """How many names of tools keep their sequence numbers. The server determines the names."""
@@ -49,7 +51,7 @@ class ToolPoses:
     def __init__(self) -> None:
         self._output_routes: Sequence[OutputRoute] = ()
         self._labels: tuple[str, ...] = ()
-        self._unit = ""
+        self._parameters = Parameters()
         self._frame = CoordinateFrame("")
         self._tools: list[_Tool] = []
         self._sequences: dict[str, int] = {}  # by the tools' names, also former ones
@@ -72,7 +74,7 @@ class ToolPoses:
         if labels != self._labels:
             self._labels = labels
             self._close_topics()
-        self._unit = "mm" if parsed.markers is None else parsed.markers.unit
+        self._parameters = parsed
         self._frame = parameters.frame
 
     def publish(self, frame: Frame, indices: Sequence[int], stamp: Stamp) -> None:
@@ -83,12 +85,8 @@ class ToolPoses:
         num_tools = _num_tools(frame, indices)
         if self._frame.metres_per_unit is None:
             # Publish nothing: a robot that waits is better than one that moves by a guessed unit.
-            self._count_loss(
-                "unknown unit",
-                f"unit of length {self._unit[:40]!r} is unknown: no tool poses are published; "
-                "set it to mm or m in the server, or set transform.units of the source in the configuration",
-                num_tools,
-            )
+            text = unknown_unit_text(self._parameters, "tool poses")
+            self._count_loss("unknown unit", text, num_tools)
             self.skip(frame, indices)
             return
         if num_tools > _MAX_TOOLS:

@@ -172,6 +172,11 @@ class Parameters:
     force: ParametersForce | None = None
     events: ParametersEvents | None = None
 
+    @property
+    def length_unit(self) -> str:
+        """The unit of all positions, also of tools: that of the 3D section, and its default without one."""
+        return (self.markers or Parameters3D()).unit
+
 
 class Section(NamedTuple):
     """The names of one section of the parameters."""

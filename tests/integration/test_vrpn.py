@@ -258,7 +258,7 @@ async def test_unknown_unit_sends_nothing_and_is_counted(caplog: pytest.LogCaptu
         await wait_until_async(lambda: gateway.losses().get("unknown unit", 0) > 10)
         assert client.trackers == {0: "wand"}
         assert client.poses == []
-    assert caplog.text.count("the unit of length is unknown") == 1
+    assert caplog.text.count("unit of length 'furlong' is unknown") == 1
 
 
 async def test_tools_beyond_the_limit_are_counted() -> None:

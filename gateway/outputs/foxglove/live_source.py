@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 
+from gateway.descriptions.source_frame import unknown_unit_text
 from gateway.foxglove_schemas.float_topics import MAX_FIELDS, FloatTopics
 from gateway.foxglove_schemas.messages import NUMBERS_PER_ITEM, FoxgloveSource
 from gateway.foxglove_schemas.topics import MAX_UTIME, FoxgloveMessage, Topic
@@ -55,7 +56,7 @@ class LiveSource:
         self._channels: dict[str, Channel] = {}  # by the names of the topics
         self._renamed_s: dict[str, float] = {}  # when a topic got other fields, on the monotonic clock
         self._description: Mapping[str, FoxgloveMessage] = {}  # by the names of the topics
-        self._unit = ""
+        self._parameters = Parameters()
         self._frame = CoordinateFrame(name)
         self._converter = FoxgloveSource(self._topics, Parameters(), 0, self._frame)
         self._open_channels(self._converter.known_topics)
@@ -63,7 +64,7 @@ class LiveSource:
     def set_parameters(self, parameters: ServerParameters) -> None:
         """Use other labels, units or another coordinate frame from now on, and tell the viewers."""
         parsed = parameters.parsed
-        self._unit = "mm" if parsed.markers is None else parsed.markers.unit
+        self._parameters = parsed
         self._frame = parameters.frame
         self._converter = FoxgloveSource(self._topics, parsed, parameters.version, self._frame)
         self.field_names = self._converter.changed_names
@@ -156,12 +157,7 @@ class LiveSource:
             self._count_loss(NO_TIME, "the time of capture is before 1970 or after 2106", stamp)
             return False
         if component in _POSITIONS and self._frame.metres_per_unit is None:
-            self._count_loss(
-                UNKNOWN_UNIT,
-                f"unit of length {self._unit[:40]!r} is unknown: no positions are published; set it to mm or "
-                "m in the server, or set transform.units of the source in the configuration",
-                stamp,
-            )
+            self._count_loss(UNKNOWN_UNIT, unknown_unit_text(self._parameters), stamp)
             return False
         return True
 

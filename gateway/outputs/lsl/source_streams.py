@@ -13,6 +13,7 @@ import numpy as np
 
 from gateway.descriptions.event_texts import MAX_EVENT_AGE_US, event_text
 from gateway.descriptions.fitting_labels import printable
+from gateway.descriptions.source_frame import unknown_unit_text
 from gateway.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.stamp import Stamp
@@ -242,12 +243,8 @@ class SourceStreams:
                 num_frames,
             )
         elif num_items and self._is_refused(component, num_items):
-            self._count_loss(
-                "unknown unit",
-                "the unit of length is unknown: no positions are sent to LSL; set it to mm or m in the "
-                "server, or set transform.units of the source",
-                num_frames,
-            )
+            text = unknown_unit_text(self._described.parameters)
+            self._count_loss("unknown unit", text, num_frames)
 
     def _push_values(
         self, stream: _OpenStream, frames: Sequence[CapturedFrame], index: int, suspended_us: int

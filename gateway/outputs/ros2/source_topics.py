@@ -10,6 +10,7 @@ from typing import Final, NamedTuple
 
 from gateway.descriptions.labels import describe
 from gateway.descriptions.plate_forces import units_of
+from gateway.descriptions.source_frame import unknown_unit_text
 from gateway.losses import Losses
 from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import ServerParameters
@@ -280,14 +281,8 @@ class SourceTopics:
     def _count_unknown_unit(self, kind: ComponentType) -> None:
         num_messages = sum(topic.wanted for topic in self._topics_of(kind))
         if num_messages:
-            markers = self._parameters.parsed.markers
-            unit = "" if markers is None else markers.unit[:40]
-            self.losses.lost(
-                "unknown unit",
-                f"unit of length {unit!r} is unknown: no positions are published; set it to mm or m in the "
-                "server, or set transform.units of the source in the configuration",
-                messages=num_messages,
-            )
+            text = unknown_unit_text(self._parameters.parsed)
+            self.losses.lost("unknown unit", text, messages=num_messages)
 
     def _count_too_many(self, noun: str, count: int, most: int) -> None:
         self.losses.lost(

@@ -5,6 +5,7 @@ from functools import partial
 from typing import Final
 
 from gateway.descriptions.labels import describe
+from gateway.descriptions.source_frame import unknown_unit_text
 from gateway.errors import OutputError
 from gateway.losses import Losses
 from gateway.messages.stamp import Stamp
@@ -79,11 +80,7 @@ class VrpnPublisher:
             return
         parameters = self._parameters.get(stamp.parameters_version, self._newest)
         if parameters.frame.metres_per_unit is None:
-            raise OutputError(
-                "the unit of length is unknown: no poses are published; set it to mm or m in the server, or "
-                "set transform.units of the source in the configuration",
-                cause="unknown unit",
-            )
+            raise OutputError(unknown_unit_text(parameters.parsed), cause="unknown unit")
         call = partial(self._send, parameters, frame, indices, stamp)
         if not self._offer(call, len(frame.body)):
             raise OutputError("frames arrive faster than they can be sent", cause="queue full")

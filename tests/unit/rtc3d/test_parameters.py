@@ -1,6 +1,6 @@
 """The table of the parameters' sections."""
 
-from gateway.rtc3d.parameters import SECTIONS, Parameters, sections_of
+from gateway.rtc3d.parameters import SECTIONS, Parameters, Parameters3D, sections_of
 from tests.spec_parameters import ALL, BY_SECTION
 
 
@@ -24,6 +24,11 @@ def test_a_section_of_the_parameters_is_found_by_its_key() -> None:
         assert SECTIONS[key].of(parameters) == SECTIONS[key].of(ALL)
         assert SECTIONS[key].of(parameters) is not None
         assert SECTIONS[key].of(Parameters()) is None
+
+
+def test_the_unit_of_length_is_that_of_the_markers_and_mm_by_default() -> None:
+    assert Parameters().length_unit == "mm"
+    assert Parameters(markers=Parameters3D(unit="m")).length_unit == "m"
 
 
 def test_the_sections_that_a_server_sent_are_found() -> None:

@@ -122,7 +122,7 @@ async def test_frame_with_more_tools_than_the_parameters() -> None:
 
 async def test_unknown_unit_is_refused() -> None:
     async with lab(unit_m=None) as here:
-        with pytest.raises(OutputError, match="unit of length is unknown") as refused:
+        with pytest.raises(OutputError, match="unit of length 'mm' is unknown") as refused:
             here.publisher.publish(tools_frame(1.0), stamp(10), 0, ALL)
         assert refused.value.cause == "unknown unit"
 
