@@ -186,7 +186,8 @@ class FoxgloveSource:
         visible = np.flatnonzero(np.isfinite(values[:, :3]).all(axis=1))
         points = np.empty((len(visible), 5), "<f4")
         points[:, :4] = values[visible]
-        points[:, :3] = self._frame.points(points[:, :3])
+        with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
+            points[:, :3] = self._frame.points(points[:, :3])
         points.view("<u4")[:, 4] = visible
         return PointCloud(
             timestamp=timestamp(utime),

@@ -71,13 +71,15 @@ class CoordinateFrame:
 
         ``positions`` has the shape (n, 3). The unit must be known.
         """
-        points: Coordinates = positions.astype(np.float64) * self._metres
-        return points if self.only_scales else points @ self.matrix.T + self.translation_m
+        with np.errstate(invalid="ignore"):  # servers may send infinity, and any bits that are a NaN
+            points: Coordinates = positions.astype(np.float64) * self._metres
+            return points if self.only_scales else points @ self.matrix.T + self.translation_m
 
     def vectors(self, vectors: npt.NDArray[Any]) -> Coordinates:
         """Return vectors such as forces, shape (n, 3), with the axes of this frame and in their own unit."""
-        rotated: Coordinates = vectors.astype(np.float64)
-        return rotated if self.rotation_xyzw == NO_ROTATION else rotated @ self.matrix.T
+        with np.errstate(invalid="ignore"):  # as in ``points``
+            rotated: Coordinates = vectors.astype(np.float64)
+            return rotated if self.rotation_xyzw == NO_ROTATION else rotated @ self.matrix.T
 
     def poses(self, tools: npt.NDArray[Any], *, accept_zeros: bool = False) -> list[Pose | None]:
         """Return the pose of each tool; None for one out of view. The unit must be known.

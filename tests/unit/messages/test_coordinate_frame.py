@@ -37,6 +37,14 @@ def test_vectors_are_only_rotated() -> None:
     np.testing.assert_allclose(frame.vectors(np.array([[100.0, 0, 5]])), [[0, 100, 5]], atol=1e-12)
 
 
+@pytest.mark.parametrize("bits", ["7f800000", "ff800000", "7f800001", "7f7fffff", "ffffffff"])
+def test_any_bits_are_converted_without_a_warning(bits: str) -> None:
+    """Infinity, a signalling NaN, the largest number, and out of view; warnings are errors in tests."""
+    values = np.frombuffer(bytes.fromhex(bits * 3), ">f4").reshape(1, 3)
+    for frame in (CoordinateFrame("lab"), CoordinateFrame("hall", 1e6, QUARTER_ABOUT_Z, (1.0, 2.0, 3.0))):
+        assert frame.points(values).shape == frame.vectors(values).shape == (1, 3)
+
+
 def test_a_frame_without_a_transform_keeps_every_digit() -> None:
     items = tools((0.5, 0.5, -0.5, 0.5, 1.1, -2.2, 3.3, 0.25))
     (x, y, z) = items[["x", "y", "z"]][0].item()

@@ -1,0 +1,22 @@
+"""Messages of the Foxglove schemas from items of frames."""
+
+import numpy as np
+import pytest
+
+from gateway.foxglove_schemas.float_topics import FloatTopics
+from gateway.foxglove_schemas.messages import FoxgloveSource
+from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
+from tests.spec_parameters import ALL
+
+
+@pytest.mark.parametrize("bits", ["7f800000", "7f800001", "7f7fffff", "ffffffff"])
+@pytest.mark.parametrize("component", [each for each in ITEM_DTYPES if each is not ComponentType.EVENT])
+def test_any_bits_are_converted_without_a_warning(component: ComponentType, bits: str) -> None:
+    """Infinity, a signalling NaN, the largest number, and out of view; warnings are errors in tests."""
+    source = FoxgloveSource(FloatTopics("lab", is_live=True), ALL, 1, CoordinateFrame("lab", 1e6))
+    dtype = ITEM_DTYPES[component]
+    items = np.frombuffer(bytes.fromhex(bits) * (2 * dtype.itemsize // 4), dtype)
+    topics = source.topics(component, len(items))
+    messages = source.convert(component, items, 1_700_000_000_000_000, 1000, topics)
+    assert {message.topic for message in messages} <= set(topics)  # none for tools out of view
