@@ -16,7 +16,7 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 # What a wheel is built from.
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-integration test-commands test-takes test-hostile test-browser test-others test-compiled check lint types contracts generated docs lcm-types examples samples screenshots fuzz soak stops hiroz \
+.PHONY: demo lock test test-integration test-commands test-takes test-hostile test-contract test-browser test-others test-compiled check lint types contracts generated docs lcm-types examples samples screenshots fuzz soak stops hiroz \
     mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
 
 demo: .venv/runtime
@@ -32,9 +32,10 @@ test-integration: ARGS := 'tests/integration --ignore=tests/integration/takes --
 test-commands: ARGS := tests/integration/commands
 test-takes: ARGS := tests/integration/takes
 test-hostile: ARGS := tests/hostile
+test-contract: ARGS := tests/contract
 test-browser: ARGS := '$(BROWSER_TESTS)'
-test-others: ARGS := '$(addprefix --ignore=,tests/integration tests/hostile $(BROWSER_TESTS))'
-test-integration test-commands test-takes test-hostile test-browser test-others: .venv/installed
+test-others: ARGS := '$(addprefix --ignore=,tests/integration tests/hostile tests/contract $(BROWSER_TESTS))'
+test-integration test-commands test-takes test-hostile test-contract test-browser test-others: .venv/installed
 	$(MAKE) --no-print-directory test ARGS=$(ARGS)
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
@@ -56,7 +57,7 @@ PARTS_AT_ONCE = $(MAKE) --keep-going --output-sync=target --no-print-directory
 check: .venv/installed
 	$(PARTS_AT_ONCE) --jobs=3 lint types contracts generated docs wheelhouse compiled
 	$(PARTS_AT_ONCE) --jobs=4 test-others test-integration test-commands test-takes
-	$(PARTS_AT_ONCE) --jobs=2 test-hostile test-browser test-compiled
+	$(PARTS_AT_ONCE) --jobs=2 test-hostile test-browser test-compiled test-contract
 
 lint: .venv/installed
 	$(BIN)/ruff format --check

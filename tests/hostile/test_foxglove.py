@@ -13,7 +13,7 @@ from tests.networks import free_port
 
 pytestmark = pytest.mark.netns
 
-ATTACK_S = 3.0
+ATTACK_S = 1.5
 MAX_GROWTH_KIB = 100 * 1024
 
 

@@ -13,7 +13,7 @@ from tests.unit.rtc3d_server.wire import COMMAND
 
 pytestmark = pytest.mark.netns
 
-ATTACK_S = 3.0
+ATTACK_S = 1.5
 MAX_GROWTH_KIB = 60 * 1024
 """How much memory an attack may leave behind."""
 

@@ -13,7 +13,7 @@ from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 
-ATTACK_S = 3.0
+ATTACK_S = 1.5
 MAX_GROWTH_KIB = 30 * 1024
 """How much memory an attack may leave behind."""
 
