@@ -70,8 +70,9 @@ class RosSource:
     def update_wanted(self) -> None:
         """Note that subscribers have come or gone, or topics. In any thread."""
         with self._lock:  # or what one thread has seen could replace what another sees later
-            # If a server gives no parameters, a frame shows which topics to open.
-            lacks_topics = self._is_streaming and not self.topics.topics
+            # If a server gives no parameters, a frame shows which topics to open. Not without a router, or
+            # the first frames after a reload would count as lost.
+            lacks_topics = self._is_streaming and not self.topics.topics and not self._router.is_cut_off
             is_wanted = (lacks_topics or self.topics.is_wanted) and not self._is_closed
             if is_wanted is not self.wanted:
                 self.wanted = is_wanted
@@ -136,6 +137,7 @@ class RosSource:
         """Declare all topics on an open session. In the sending thread."""
         self.topics.declare(node)
         self.topics.use(self._parameters)
+        self.update_wanted()
 
     def check_subscribers(self) -> None:
         """Check again for subscribers, in the sending thread."""

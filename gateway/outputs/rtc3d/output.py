@@ -30,7 +30,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
 
 _FIRST_RETRY_S: Final = 0.2
-_MAX_RETRY_S: Final = 5.0
+_MAX_RETRY_S: Final = 1.0
 """How long to wait before a port that was in use is tried again: longer each time, up to this."""
 
 _CLOSING_S: Final = 3.0
