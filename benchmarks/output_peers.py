@@ -87,9 +87,10 @@ def foxglove_peer(port: int) -> Peer:
     from websockets.typing import Subprotocol  # noqa: PLC0415
     from websockets.uri import parse_uri  # noqa: PLC0415
 
+    uri = parse_uri(f"ws://127.0.0.1:{port}")
+    protocol = ClientProtocol(uri, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None)
+
     def connected() -> socket.socket:
-        uri = parse_uri(f"ws://127.0.0.1:{port}")
-        protocol = ClientProtocol(uri, subprotocols=[Subprotocol("foxglove.sdk.v1")], max_size=None)
         connection = _connect(port)
         protocol.send_request(protocol.connect())
         channels: list[int] = []
@@ -105,7 +106,13 @@ def foxglove_peer(port: int) -> Peer:
         connection.sendall(b"".join(protocol.data_to_send()))
         return connection
 
-    return _reading(connected)
+    def answer(data: bytes) -> bytes:
+        """Answer pings: a viewer that does not is disconnected."""
+        protocol.receive_data(data)
+        protocol.events_received()
+        return b"".join(protocol.data_to_send())
+
+    return _reading(connected, answer)
 
 
 def lsl_peer(config: Path, streams: int) -> Peer:
@@ -144,14 +151,18 @@ def _connect(port: int) -> socket.socket:
             time.sleep(_POLL_S)
 
 
-def _reading(connected: Callable[[], socket.socket]) -> Peer:
-    """Read and count the bytes of a connection."""
+def _reading(
+    connected: Callable[[], socket.socket], answer: Callable[[bytes], bytes] = lambda _: b""
+) -> Peer:
+    """Read and count the bytes of a connection, and send what ``answer`` returns for them."""
     received: Counter[str] = Counter()
     connection = connected()
 
     def receive() -> None:
         while data := connection.recv(_READ_BYTES):
             received["bytes"] += len(data)
+            if reply := answer(data):
+                connection.sendall(reply)
 
     threading.Thread(target=receive, daemon=True).start()
     yield None
