@@ -10,13 +10,13 @@ import zenoh
 from gateway.errors import OutputError
 from gateway.log import FailureLog
 from gateway.outputs.status import OutputHealth
+from gateway.outputs.zenoh.closing import close_session
 from gateway.outputs.zenoh.config import prepare_threads, zenoh_config, zenoh_reason
 
 REMEDY: Final = "start it with `ros2 run rmw_zenoh_cpp rmw_zenohd`, or correct ros2.connect"
 
 _RETRY_S: Final = 1.0
 _JOIN_S: Final = 0.5
-_CLOSE_S: Final = 0.5
 """How long to wait for the session to close. The thread then continues without the gateway."""
 
 _WAIT_BEFORE_DROP_US: Final = 20_000
@@ -133,13 +133,4 @@ class RouterSession:
             self._problem = "the Zenoh session is closed; start the gateway again"
             self._update()
         if session is not None:
-            closer = threading.Thread(target=_close, args=(session,), name="ros2-close", daemon=True)
-            closer.start()
-            closer.join(_CLOSE_S)
-
-
-def _close(session: zenoh.Session) -> None:
-    try:
-        session.close()
-    except zenoh.ZError as error:
-        logger.debug("ros2: closing the session: %s", zenoh_reason(error))
+            close_session(session, "ros2")

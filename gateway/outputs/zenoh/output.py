@@ -18,6 +18,7 @@ from gateway.losses import Losses
 from gateway.messages.topics import Topic, zenoh_key
 from gateway.outputs.contract import Output, QueryService, ServerFile, ServerParameters
 from gateway.outputs.status import OutputHealth
+from gateway.outputs.zenoh.closing import close_session
 from gateway.outputs.zenoh.config import prepare_threads, zenoh_config, zenoh_reason
 from gateway.outputs.zenoh.json_keys import JsonKeys
 from gateway.outputs.zenoh.publisher import ZenohLink, ZenohPublisher
@@ -31,7 +32,6 @@ _NO_ROUTER: Final = OutputHealth(
 _HEALTHY: Final = OutputHealth(True)
 _RETRY_S: Final = 1.0
 _JOIN_S: Final = 0.5
-_CLOSE_S: Final = 0.5
 """How long to wait for the session to close.
 
 A peer that does not read delays this by 10 s; the thread then continues without the gateway.
@@ -258,13 +258,4 @@ class ZenohOutput(Output):
             self._streaming.clear()
             self._problem = "the Zenoh session is closed; start the gateway again"
         if session is not None:
-            closer = threading.Thread(target=_close, args=(session,), name="zenoh-close", daemon=True)
-            closer.start()
-            closer.join(_CLOSE_S)
-
-
-def _close(session: zenoh.Session) -> None:
-    try:
-        session.close()
-    except zenoh.ZError as error:
-        logger.debug("zenoh: closing the session: %s", zenoh_reason(error))
+            close_session(session, "zenoh")
