@@ -9,6 +9,7 @@ import struct
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Final
 
+from tests.hostile.endless_sender import send_endlessly
 from tests.unit.rtc3d_server.wire import DATA, EVENT, command, packet
 
 NUM_STALLED: Final = 60
@@ -56,30 +57,8 @@ async def _short(port: int) -> None:
             writer.close()
 
 
-async def _endless(port: int, sent: bytes, *, reads: bool) -> None:
-    """Send the same without end, and connect again."""
-    while True:
-        with contextlib.suppress(OSError):
-            reader, writer = await asyncio.open_connection("127.0.0.1", port)
-            reading = asyncio.create_task(_discard(reader) if reads else asyncio.Event().wait())
-            try:
-                while not reading.done():
-                    writer.write(sent)
-                    await writer.drain()
-            finally:
-                reading.cancel()
-                writer.close()
-        await asyncio.sleep(0.01)
-
-
-async def _discard(reader: asyncio.StreamReader) -> None:
-    with contextlib.suppress(OSError):
-        while await reader.read(65536):
-            pass
-
-
 def _sending(sent: bytes, *, reads: bool = True) -> "Attack":
-    return lambda port: _endless(port, sent, reads=reads)
+    return lambda port: send_endlessly(port, b"", sent, reads=reads)
 
 
 Attack = Callable[[int], Awaitable[None]]

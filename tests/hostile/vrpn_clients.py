@@ -7,6 +7,7 @@ import socket
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Final
 
+from tests.hostile.endless_sender import send_endlessly
 from tests.networks import free_port
 from tests.vrpn_client import COOKIE, PING_TYPE, description, message
 
@@ -41,31 +42,8 @@ async def _silent(port: int) -> None:
         await asyncio.Event().wait()
 
 
-async def _endless(port: int, begin: bytes, repeated: bytes) -> None:
-    """Send ``begin``, then ``repeated`` without end; read as well, and connect again."""
-    while True:
-        with contextlib.suppress(OSError):
-            reader, writer = await asyncio.open_connection("127.0.0.1", port)
-            reading = asyncio.create_task(_discard(reader))
-            try:
-                writer.write(begin)
-                while not reading.done():
-                    writer.write(repeated)
-                    await writer.drain()
-            finally:
-                reading.cancel()
-                writer.close()
-        await asyncio.sleep(0.01)
-
-
-async def _discard(reader: asyncio.StreamReader) -> None:
-    with contextlib.suppress(OSError):
-        while await reader.read(65536):
-            pass
-
-
 def _sending(begin: bytes, repeated: bytes) -> "Attack":
-    return lambda port: _endless(port, begin, repeated)
+    return lambda port: send_endlessly(port, begin, repeated)
 
 
 async def _garbage(port: int) -> None:
