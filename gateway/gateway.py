@@ -157,7 +157,8 @@ class Gateway:
         """Apply ``settings`` and return a text for each change. Call it after ``opened`` is set.
 
         Sources and outputs with unchanged settings keep running. A source that differs sends Bye and connects
-        again; an output that differs is closed and opened again, unless it can take over the new settings.
+        again, unless only its frame of poses differs; an output that differs is closed and opened again,
+        unless it can take over the new settings.
         Session and sequence numbers continue.
         Raises ConfigError, and changes nothing, if an output refuses its configuration.
         """
@@ -210,6 +211,15 @@ class Gateway:
 
     async def _change_sources(self, wanted_sources: Sequence[SourceSettings]) -> list[str]:
         wanted = {settings.name: settings for settings in wanted_sources}
+        other_frames = [
+            source
+            for name, source in self._sources.items()
+            if name in wanted
+            and wanted[name] != source.settings
+            and wanted[name].connects_like(source.settings)
+        ]
+        for source in other_frames:
+            await source.change_frame(wanted[source.name])
         stopped = {
             name: source for name, source in self._sources.items() if source.settings != wanted.get(name)
         }
@@ -223,7 +233,8 @@ class Gateway:
             self._add_source(settings, stopped.get(settings.name) or self._reopened(settings.name))
             self._start_source(settings.name)
         self._sources = {name: self._sources[name] for name in wanted}
-        return _changes("source", stopped, [settings.name for settings in new])
+        changes = [f"coordinate frame of source {source.name} changed" for source in other_frames]
+        return changes + _changes("source", stopped, [settings.name for settings in new])
 
     def _reopened(self, name: str) -> Source | None:
         """Return the source of this name that was removed earlier, with the present outputs; None if new."""

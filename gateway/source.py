@@ -147,6 +147,15 @@ class Source:
             for stream in self._streams.known:
                 stream.status.losses.close()
 
+    async def change_frame(self, settings: SourceSettings) -> None:
+        """Use ``settings``, which differ only in the frame of poses, and tell every output. Streams go on."""
+        self.settings = self.queries.settings = settings
+        known = self.queries.parameters.known
+        if known.version:
+            await self._announce_parameters(known.newest, known.version)
+        else:
+            self.fan_out.begin(self.known_parameters)
+
     # Status.
 
     def fail(self, defect: Exception) -> None:

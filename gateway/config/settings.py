@@ -180,6 +180,10 @@ class SourceSettings(Section):
         """See Section."""
         return {} if self.frame_id is not None else {"frame_id": Effective(self.name)}
 
+    def connects_like(self, other: "SourceSettings") -> bool:
+        """Return whether these settings differ from ``other`` at most in the frame of poses."""
+        return self == other.model_copy(update={"frame_id": self.frame_id, "transform": self.transform})
+
     @field_validator("streams")
     @classmethod
     def _check_components_are_in_one_stream(

@@ -55,7 +55,8 @@ class SourceQueries:
         announce_parameters: Announce,
         before: "SourceQueries | None" = None,
     ) -> None:
-        self._settings = settings
+        self.settings = settings
+        """A reload can replace them by others that differ only in the frame of poses."""
         self._streams = streams
         self._newest_message = newest_message
         self._status_message = status_message
@@ -74,7 +75,7 @@ class SourceQueries:
     @property
     def server(self) -> str:
         """HOST:PORT of the server."""
-        return f"{self._settings.host}:{self._settings.port}"
+        return f"{self.settings.host}:{self.settings.port}"
 
     @property
     def components(self) -> frozenset[ComponentType]:
@@ -95,12 +96,12 @@ class SourceQueries:
     def frame(self) -> CoordinateFrame:
         """The coordinate frame of the source's poses."""
         newest = self.parameters.known.newest
-        return source_frame(self._settings, Parameters() if newest is None else newest.parsed.parameters)
+        return source_frame(self.settings, Parameters() if newest is None else newest.parsed.parameters)
 
     def check_control(self) -> None:
         """Raise QueryError unless peers may now start, stop or change something of this source."""
-        name = self._settings.name
-        if not self._settings.remote_control:
+        name = self.settings.name
+        if not self.settings.remote_control:
             raise QueryError(
                 f"remote control is off for source {name!r}; to switch it on, set remote_control: true "
                 "for it in the gateway's configuration",
@@ -166,7 +167,7 @@ class SourceQueries:
             message = self._newest_message(component, output)
             if message is None or prefix_of(message).session != session:
                 raise QueryError(
-                    f"no {component.key} has arrived from source {self._settings.name!r} in this session",
+                    f"no {component.key} has arrived from source {self.settings.name!r} in this session",
                     code="nothing-yet",
                 )
         else:
@@ -199,9 +200,9 @@ class SourceQueries:
             SendCurrentFrame((component,)), fallback=SendCurrentFrame(), connection=stream.connection
         )
         if packet.type == PacketType.NO_DATA:
-            raise QueryError(f"source {self._settings.name!r}: no measurement runs", code="nothing-yet")
+            raise QueryError(f"source {self.settings.name!r}: no measurement runs", code="nothing-yet")
         try:
-            frame = split_frame(packet.body, detect_byte_order(packet.body, self._settings.byte_order))
+            frame = split_frame(packet.body, detect_byte_order(packet.body, self.settings.byte_order))
         except FrameError as error:
             raise QueryError(f"the current frame cannot be read: {error}", code="unreadable") from error
         for found in frame.components:

@@ -1,11 +1,14 @@
 """Poses in the coordinate frame of a source, and how receivers learn of it."""
 
 import json
+from typing import Any
 
 import numpy as np
 import pytest
 import rtc3d
+import zenoh
 
+from gateway.config.transform import TransformSettings
 from gateway.messages.decode import decode
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.subscriber import LcmSubscriber
@@ -29,14 +32,36 @@ def scene() -> SyntheticScene:
     return SyntheticScene(markers=24, tools=4, analog=0, plates=0, rate_hz=100)
 
 
+def collect(peer: zenoh.Session, key: str, messages: dict[int, Any]) -> None:
+    """Collect the messages of a key by their frame numbers; of tool poses, only those in view."""
+
+    def receive(sample: zenoh.Sample) -> None:
+        message = decode(sample.payload.to_bytes())
+        if getattr(message, "visible", True):
+            messages[message.frame_number] = message
+
+    peer.declare_subscriber(f"mocap/lab/{key}", receive)
+
+
+def attachment_of(sample: zenoh.Sample) -> Any:
+    assert sample.attachment is not None
+    return json.loads(sample.attachment.to_bytes())
+
+
+def plain(tool: Any) -> list[float]:
+    """Return the position of a tool in metres."""
+    return [tool.x * 0.001, tool.y * 0.001, tool.z * 0.001]
+
+
+def y_up(tool: Any) -> list[float]:
+    """Return the position of a tool after Y_UP: 2 mm for each mm, y up to z up, 10 m along x and 1 m up."""
+    return [tool.x * 0.002 + 10, -tool.z * 0.002, tool.y * 0.002 + 1]
+
+
 async def test_poses_are_transformed_and_component_messages_are_not() -> None:
     endpoint = free_endpoint()
     poses: dict[int, rtc3d.tool_pose_t] = {}
     tools: dict[int, rtc3d.tools_t] = {}
-
-    def visible_in_both() -> list[int]:
-        return [number for number in poses.keys() & tools.keys() if poses[number].visible]
-
     async with (
         Simulator(scene()) as simulator,
         run_gateway(
@@ -45,30 +70,48 @@ async def test_poses_are_transformed_and_component_messages_are_not() -> None:
     ):
         await wait_until_cached(gateway)
         with zenoh_peer(endpoint) as peer:
-
-            def on_pose(message: bytes) -> None:
-                pose = decode(message)
-                poses[pose.frame_number] = pose
-
-            def on_tools(message: bytes) -> None:
-                each = decode(message)
-                tools[each.frame_number] = each
-
-            peer.declare_subscriber(
-                "mocap/lab/6d/Tool%201", lambda sample: on_pose(sample.payload.to_bytes())
-            )
-            peer.declare_subscriber("mocap/lab/6d", lambda sample: on_tools(sample.payload.to_bytes()))
-            await wait_until_async(visible_in_both)
-    number = visible_in_both()[0]
+            collect(peer, "6d/Tool%201", poses)
+            collect(peer, "6d", tools)
+            await wait_until_async(lambda: poses.keys() & tools.keys())
+    number = min(poses.keys() & tools.keys())
     tool, pose = tools[number].tools[0], poses[number]
-    x, y, z = pose.position_m
-    # 2 mm for each mm, y up to z up, then 10 m along x and 1 m up.
-    np.testing.assert_allclose(
-        [x, y, z], [tool.x * 0.002 + 10, -tool.z * 0.002, tool.y * 0.002 + 1], rtol=1e-5
-    )
+    np.testing.assert_allclose(pose.position_m, y_up(tool), rtol=1e-5)
     assert pose.error_m == pytest.approx(tool.error * 0.002)
     w = HALF * tool.q0 - HALF * tool.qx
     assert pose.orientation_xyzw[3] == pytest.approx(w, abs=1e-5)
+
+
+async def test_a_reload_changes_the_frame_of_a_stream_that_goes_on() -> None:
+    endpoint = free_endpoint()
+    poses: dict[int, rtc3d.tool_pose_t] = {}
+    tools: dict[int, rtc3d.tools_t] = {}
+    frames: list[dict[str, Any]] = []
+    async with (
+        Simulator(scene()) as simulator,
+        run_gateway(simulator.port, listen=endpoint, tool_poses=True, frame_id="hall") as gateway,
+    ):
+        await wait_until_cached(gateway)
+        with zenoh_peer(endpoint) as peer:
+            collect(peer, "6d/Tool%201", poses)
+            collect(peer, "6d", tools)
+            await wait_until_async(lambda: poses.keys() & tools.keys())
+            peer.declare_subscriber(
+                "mocap/lab/parameters",
+                lambda sample: frames.append(attachment_of(sample)["frame"]),
+            )
+            moved = gateway.settings.sources[0].model_copy(
+                update={"frame_id": "world", "transform": TransformSettings.model_validate(Y_UP)}
+            )
+            changes = await gateway.reload(gateway.settings.model_copy(update={"sources": (moved,)}))
+            newest = max(tools)
+            await wait_until_async(lambda: [number for number in poses if number > newest + 2])
+            await wait_until_async(lambda: FRAME in frames)
+    assert changes == ["coordinate frame of source lab changed"]
+    in_order = [tools[number] for number in sorted(tools)]
+    assert {each.session for each in in_order} == {1}
+    assert [each.sequence - in_order[0].sequence for each in in_order] == list(range(len(in_order)))
+    for number, expected in ((min(poses.keys() & tools.keys()), plain), (max(poses), y_up)):
+        np.testing.assert_allclose(poses[number].position_m, expected(tools[number].tools[0]), rtol=1e-5)
 
 
 async def test_receivers_on_zenoh_learn_the_frame() -> None:

@@ -2,6 +2,7 @@
 
 import asyncio
 import dataclasses
+import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -10,6 +11,8 @@ from typing import Any
 import pytest
 
 from gateway.config.settings import MetricsSettings, Settings, SourceSettings, SpoolSettings
+from gateway.config.transform import TransformSettings
+from gateway.descriptions.source_frame import source_frame
 from gateway.errors import ConfigError
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
@@ -18,11 +21,12 @@ from gateway.outputs.kind import SubscriptionRequest
 from gateway.outputs.memory import MemoryOutput
 from gateway.outputs.registry import OUTPUTS, settings_type
 from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import Parameters
 from gateway.source import Source
 from tests.example_output import EXAMPLE, UNREACHABLE, ExampleOutput, ExampleSettings, ExampleSubscription
 from tests.servers import c3d_file, packet
 from tests.unit.scripted_sources import Servers, SlowThreads
-from tests.unit.stream.scripted_server import XML
+from tests.unit.stream.scripted_server import XML, silent_to
 from tests.unit.stream.virtual_time import settle, until
 
 pytestmark = pytest.mark.usefixtures("servers", "threads")
@@ -322,6 +326,59 @@ async def test_a_changed_source_connects_again_and_continues_its_numbers(servers
         assert gateway.sources[1] is hall
         assert len(servers["hall"].connections) == 1
         assert gateway.sources[0].fan_out.frames[ComponentType.MARKERS] == 3
+
+
+async def test_a_changed_frame_reaches_every_output_and_the_source_stays_connected(servers: Servers) -> None:
+    """Only the frame changes: in ``plain`` and ``turned``, everything else is the same."""
+    plain = settings("lab", "hall")
+    source = plain.sources[0]
+    turned = plain.model_copy(
+        update={
+            "sources": (
+                source.model_copy(
+                    update={"frame_id": "world", "transform": TransformSettings(units="m", up="y")}
+                ),
+                plain.sources[1],
+            )
+        }
+    )
+    markers = subscribe("local")
+    async with running(plain) as (gateway, _):
+        await connected(gateway)
+        output = example(gateway)
+        servers["lab"].connection.send_frames(1)
+        known = output.parameters.copy()
+        assert await gateway.reload(turned) == ["coordinate frame of source lab changed"]
+        servers["lab"].connection.send_frames(2)
+        [(name, parameters)] = output.parameters[len(known) :]
+        assert (name, parameters.frame) == ("lab", source_frame(turned.sources[0], Parameters()))
+        assert parameters._replace(frame=known[0][1].frame) == known[0][1]
+        frame = await output.query("lab/frame")
+        assert json.loads(frame.payload)["frame_id"] == "world"
+        await asyncio.sleep(1.0)
+        assert decode((await output.query("lab/status")).payload).frame_id == "world"
+        assert [(each.session, each.sequence) for each in markers] == [(1, 0), (1, 1)]
+        assert len(servers["lab"].connections) == len(servers["hall"].connections) == 1
+        assert await gateway.reload(turned) == []
+        assert await gateway.reload(plain) == ["coordinate frame of source lab changed"]
+        assert output.parameters[-1] == known[0]
+        assert servers["lab"].connection.is_open
+
+
+async def test_a_changed_frame_reaches_outputs_although_the_server_gives_no_parameters(
+    servers: Servers,
+) -> None:
+    def framed(frame_id: str) -> Settings:
+        whole_frames = ExampleSettings(enabled=True, whole_frames=True)
+        source = SourceSettings(name="lab", host="lab", frame_id=frame_id)
+        return settings().model_copy(update={"example": whole_frames, "sources": (source,)})
+
+    servers["lab"].answer = silent_to("SendParameters")
+    async with running(framed("hall")) as (gateway, _):
+        await settle()
+        await gateway.reload(framed("world"))
+        found = [(each.version, each.frame.frame_id) for _, each in example(gateway).parameters]
+        assert found == [(0, "hall"), (0, "world")]
 
 
 async def test_sources_can_be_added_and_removed(servers: Servers) -> None:

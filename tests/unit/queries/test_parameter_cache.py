@@ -119,7 +119,7 @@ async def test_a_reload_continues_the_version() -> None:
     await source.connect(CM)
     after = FakeSource()
     after.queries.parameters = ParameterCache(
-        after.queries._settings, after.queries._requests, after._announce, source.queries.parameters
+        after.queries.settings, after.queries._requests, after._announce, source.queries.parameters
     )
     await after.store_parameters(CM)
     await after.connect(MM)

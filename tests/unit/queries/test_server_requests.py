@@ -40,7 +40,7 @@ async def test_cancelling_one_caller_does_not_cancel_a_shared_request() -> None:
 async def test_the_fallback_is_sent_if_the_command_is_refused() -> None:
     source = FakeSource()
     source.server.replies = {"SendParameters 3D": ServerError("err-what?"), "SendParameters": b"<a/>"}
-    requests = ServerRequests(source.queries._settings, lambda: source.streams)
+    requests = ServerRequests(source.queries.settings, lambda: source.streams)
     command, packet = await requests.send(SendParameters(("3d",)), fallback=SendParameters())
     assert (command, packet.body) == (SendParameters(), b"<a/>")
 
@@ -48,7 +48,7 @@ async def test_the_fallback_is_sent_if_the_command_is_refused() -> None:
 async def test_the_error_of_the_fallback_is_raised() -> None:
     source = FakeSource()
     source.server.replies = {"SendCurrentFrame 3D": ServerError("a"), "SendCurrentFrame": ServerError("b")}
-    requests = ServerRequests(source.queries._settings, lambda: source.streams)
+    requests = ServerRequests(source.queries.settings, lambda: source.streams)
     [component, _] = source.streams[0].components
     with pytest.raises(QueryError, match="the server does not know SendCurrentFrame, or refuses it: b"):
         await requests.send(SendCurrentFrame((component,)), fallback=SendCurrentFrame())
