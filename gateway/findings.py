@@ -1,7 +1,7 @@
 """Results of checks; the doctor reports them."""
 
 from enum import StrEnum
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 
 class Result(StrEnum):
@@ -16,6 +16,10 @@ class Result(StrEnum):
     WARNING = "warning"
     FAILING = "red"
     NOT_TESTED = "not tested"
+
+
+NO_CONFIGURATION: Final = "it needs the configuration, which failed"
+"""The reason why a check was not made, if the configuration is not valid."""
 
 
 class Finding(NamedTuple):
@@ -37,6 +41,11 @@ class Finding(NamedTuple):
     def is_of_disabled_output(self) -> bool:
         """Whether the check was not made because the configuration does not enable the output."""
         return self.result is Result.NOT_TESTED and self.found == f"{self.subject}.enabled is false"
+
+    @property
+    def lacks_configuration(self) -> bool:
+        """Whether the check was not made because the configuration is not valid."""
+        return self.result is Result.NOT_TESTED and self.found == NO_CONFIGURATION
 
 
 class Subject(NamedTuple):

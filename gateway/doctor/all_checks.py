@@ -11,7 +11,7 @@ from gateway.doctor.output_checks import check_output
 from gateway.doctor.running_gateway import HealthReport, address_text, read_health
 from gateway.doctor.source_checks import CHECKS, SourceChecks
 from gateway.errors import ConfigError
-from gateway.findings import Finding, MessageLoad, Subject
+from gateway.findings import NO_CONFIGURATION, Finding, MessageLoad, Subject
 from gateway.outputs.registry import OUTPUTS
 from gateway.worker_thread import WorkerThread
 
@@ -68,5 +68,5 @@ def run_checks_without_settings(error: ConfigError) -> Iterator[Finding]:
     }
     for subject, checks in subjects.items():
         for check in checks:
-            yield Subject(subject).not_tested(check, "it needs the configuration, which failed")
+            yield Subject(subject).not_tested(check, NO_CONFIGURATION)
     yield check_clock([])

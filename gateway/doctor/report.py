@@ -25,19 +25,23 @@ _MAX_WIDTH: Final = 100
 _DISABLED: Final = "outputs that are not enabled"
 """The subject under which these outputs are listed."""
 
+_OTHERS: Final = "sources and outputs"
+_AFTER_CONFIGURATION: Final = "correct the configuration first, then run the doctor again"
+"""The one line for all checks that need a valid configuration."""
+
 
 class Report:
     """Prints each finding when it is added, under the name of its subject.
 
-    An output that is not enabled gets one line for all of its checks. If the report is ``quiet``, it prints
-    only warnings and failures.
+    An output that is not enabled gets one line for all of its checks, and so do all checks that need a valid
+    configuration while there is none. If the report is ``quiet``, it prints only warnings and failures.
     """
 
     def __init__(self, console: Console, *, quiet: bool = False) -> None:
         self._console = console
         self._quiet = quiet
         self._subject = ""
-        self._disabled: set[str] = set()
+        self._one_line: set[tuple[str, str]] = set()  # printed for several findings
         self.findings: list[Finding] = []
 
     def add(self, finding: Finding) -> None:
@@ -46,19 +50,22 @@ class Report:
         if self._quiet and finding.result not in {Result.WARNING, Result.FAILING}:
             return
         subject = f"{finding.subject} ({finding.stream})" if finding.stream else finding.subject
-        check = finding.check
-        if finding.is_of_disabled_output:
-            if finding.subject in self._disabled:
+        check, found = finding.check, finding.found
+        if finding.is_of_disabled_output or finding.lacks_configuration:
+            if finding.lacks_configuration:
+                subject, check, found = _OTHERS, "all", _AFTER_CONFIGURATION
+            else:
+                subject, check = _DISABLED, finding.subject
+            if (subject, check) in self._one_line:
                 return
-            self._disabled.add(finding.subject)
-            subject, check = _DISABLED, finding.subject
+            self._one_line.add((subject, check))
         if subject != self._subject:
             self._subject = subject
             self._print(Text(subject, "bold"))
         mark, style = _MARKS[finding.result]
         columns = Text.assemble("  ", (f"{mark:<4}", style), f"  {check:<12}")
         text = "not tested: " if finding.result is Result.NOT_TESTED else ""
-        first, *others = self._wrapped(text + finding.found)
+        first, *others = self._wrapped(text + found)
         self._print(columns + Text(first))
         for line in others:
             self._print(Text(_INDENT + line))

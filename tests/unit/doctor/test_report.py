@@ -4,7 +4,7 @@ import json
 from rich.console import Console
 
 from gateway.doctor.report import Report
-from gateway.findings import Finding, Result, Subject
+from gateway.findings import NO_CONFIGURATION, Finding, Result, Subject
 
 LAB = Subject("lab")
 
@@ -38,6 +38,25 @@ def test_findings_are_printed_in_columns_below_their_subject() -> None:
         "zenoh\n"
         "  ok    link        open\n"
         "2 ok, 1 failed, 1 not tested\n"
+    )
+
+
+def test_checks_that_need_a_valid_configuration_get_one_line() -> None:
+    findings = (
+        Subject("configuration").failing("file", "lab.yaml:1:2: wrong", "Correct it."),
+        *(Subject("source").not_tested(check, NO_CONFIGURATION) for check in ("name", "TCP")),
+        Subject("zenoh").not_tested("link", NO_CONFIGURATION),
+        Subject("this computer").passing("clock", "right"),
+    )
+    assert shown(*findings, width=100) == (
+        "configuration\n"
+        "  FAIL  file        lab.yaml:1:2: wrong\n"
+        "                    → Correct it.\n"
+        "sources and outputs\n"
+        "  skip  all         not tested: correct the configuration first, then run the doctor again\n"
+        "this computer\n"
+        "  ok    clock       right\n"
+        "1 ok, 1 failed, 3 not tested\n"
     )
 
 
