@@ -140,6 +140,11 @@ class StreamRate:
         """Go on with a new measurement, whose clock starts at 0; the rate is probably the same."""
         self.time_us = self._num_frames = 0
 
+    def skip(self, pause_us: int) -> None:
+        """Go on after a pause in which no frames were taken: it says nothing about the stream."""
+        self.time_us += pause_us
+        self._num_frames = 0
+
     def follow(self, former: "StreamRate") -> None:
         """Begin with the rate of a stream that this one replaces."""
         self._intervals_us.extend(former._intervals_us)  # noqa: SLF001 - the same class
@@ -180,7 +185,10 @@ class Arrivals:
         composition = self._composition(frame.layout, wanted)
         if not composition.measured and not composition.has_events:
             return None
-        self.newest_us = max(elapsed_us, self.newest_us + 1)
+        former_us, self.newest_us = self.newest_us, max(elapsed_us, self.newest_us + 1)
+        if not self.frames:
+            for rate in self.rates.values():
+                rate.skip(self.newest_us - max(former_us, 0))
         if self.began_us is None:
             self.began_us = self.newest_us
         arrival = Arrival(frame, composition, stream, self.newest_us)

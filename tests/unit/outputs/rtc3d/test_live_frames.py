@@ -306,6 +306,54 @@ def test_a_client_that_asks_between_two_samples_gets_complete_frames_only() -> N
     assert client.numbers() == [[5, 50], [6, 60]]
 
 
+@pytest.mark.parametrize("command", ["StreamFrames 3D Analog", "SendCurrentFrame 3D Analog"])
+@pytest.mark.parametrize("pause_us", [300_000, 5_000_000])
+@pytest.mark.parametrize("fast_first", [False, True])
+def test_the_first_frames_after_a_pause_are_complete(command: str, pause_us: int, fast_first: bool) -> None:
+    source = LiveSource()
+    play(source, 1, 3, fast_first=True)
+    source.scene.forget_frames()  # nobody asks for any
+    source.wait(pause_us)
+    client = source.client()
+    client.send(command)
+    base_us = 40_000 + pause_us
+    for step in range(5, 10):
+        source.arrive(body(analog(step, base_us - 10_000 + 1000 * step)), FAST)
+        source.wait(1000)
+    play(source, 0, 2, fast_first=fast_first, base_us=base_us)
+    numbers = client.numbers()
+    assert numbers
+    assert all(len(frame) == 2 for frame in numbers)
+
+
+@pytest.mark.parametrize("fast_first", [False, True])
+def test_a_measurement_that_begins_late_begins_with_complete_frames(fast_first: bool) -> None:
+    source = LiveSource()
+    play(source, 1, 3, fast_first=fast_first)
+    source.scene.stop()
+    client = source.client()
+    client.send("StreamFrames 3D Analog")
+    source.wait(1_500_000)
+    source.arrive(body(analog(9, 9_000)), FAST)
+    play(source, 1, 3, fast_first=fast_first)
+    numbers = client.numbers()
+    assert numbers[-2:] == [[2, 20], [3, 30]]
+    assert all(len(frame) == 2 for frame in numbers)
+
+
+def test_requests_with_pauses_between_them_do_not_change_the_rate() -> None:
+    source = LiveSource()
+    play(source, 1, 3, fast_first=False)
+    client = source.client()
+    for number in range(100, 300, 10):
+        source.scene.forget_frames()
+        client.send("SendCurrentFrame")
+        source.wait(500_000)
+        play(source, number, number, fast_first=False)
+    assert all(len(frame) == 3 for frame in client.take())
+    assert source.scene.frames(()).rate == 100
+
+
 def test_a_frame_waits_for_the_faster_stream_and_not_for_ever() -> None:
     source = LiveSource()
     client = source.client()
