@@ -70,7 +70,8 @@ class LiveFrames:
     one in the frame before. A frame waits for these samples, but not longer than WAIT_US. If all components
     come on one stream, its frames are passed on as they are. While the slowest stream has no frames, the next
     slower one sets the rate. Events are kept until the next frame; if there is nothing else, they are frames
-    of their own.
+    of their own. If only events are requested, the slowest of all streams sets the rate, so that events do
+    not wait for further ones; frames without events are empty.
 
     ``requested`` are the components of a command; an empty sequence means all. ``announced_hz`` are the
     rates in the parameters.
@@ -89,6 +90,8 @@ class LiveFrames:
         )
         self._takes_all = not requested or self.chosen == frozenset(WIRE_ORDER)
         self._measured = frozenset(self.measured)
+        # The components whose slowest stream sets the rate.
+        self._timing = self._measured or frozenset(WIRE_ORDER) - {ComponentType.EVENT}
         self._arrivals = arrivals
         self._announced_hz = announced_hz
         self._next_arrival = arrivals.frames.first
@@ -242,11 +245,14 @@ class LiveFrames:
         has_events = self.has_events and composition.has_events
         if has_events:
             self._events.append(events_of(arrival))
-        found = composition.measured & self._measured
-        if not found:
-            if has_events and self._slowest_stream(arrival.time_us) is None:
+        slowest = self._slowest_stream(arrival.time_us)
+        if not self._measured:
+            if has_events or slowest == arrival.stream:
                 self._add(arrival)
-        elif self._slowest_stream(arrival.time_us) != arrival.stream:
+        elif not composition.measured & self._measured:
+            if has_events and slowest is None:
+                self._add(arrival)
+        elif slowest != arrival.stream:
             self._add_sample(arrival)
         elif len(self._streams) == 1:
             self._add(arrival)
@@ -257,9 +263,9 @@ class LiveFrames:
 
     @property
     def _streams(self) -> set[int]:
-        """The streams on which the components of the choice come."""
+        """The streams on which the components come that set the rate."""
         stream_of = self._arrivals.stream_of
-        return {stream_of[each] for each in self.measured if each in stream_of}
+        return {stream_of[each] for each in self._timing if each in stream_of}
 
     def _period_us(self, stream: int) -> float | None:
         """Return the time between two frames of a stream, as measured or else as announced."""

@@ -185,6 +185,41 @@ def test_events_without_other_components_are_frames_of_their_own() -> None:
     assert other.bodies == client.bodies
 
 
+@pytest.mark.parametrize("rate", ["FrequencyDivisor:5", "Frequency:20"])
+def test_an_event_does_not_wait_for_others(rate: str) -> None:
+    source = LiveSource()
+    play(source, 1, 3, fast_first=False)
+    client = source.client()
+    client.send(f"StreamFrames {rate} Events")
+    for number in range(4, 50):
+        events = [event(number, 10_000 * number, number)] if number in {7, 8, 22} else []
+        source.arrive(body(markers(number, 10_000 * number), *events))
+        source.arrive(body(analog(number, 10_000 * number)), FAST)
+        if number == 13:
+            assert [[item[0] for item in each[0].items] for each in client.take()] == [[7, 8]]
+    assert [[item[0] for item in each[0].items] for each in client.take()] == [[22]]
+
+
+def test_an_event_on_a_faster_stream_does_not_wait_for_the_slower_one() -> None:
+    source = LiveSource()
+    play(source, 1, 3, fast_first=False)
+    client = source.client()
+    client.send("StreamFrames Events")
+    source.arrive(body(analog(40, 40_000), event(40, 40_000, 9)), FAST)
+    assert client.bodies == [body(event(40, 40_000, 9))]
+
+
+def test_a_request_for_events_does_not_wait_for_one() -> None:
+    source = LiveSource()
+    client = source.client()
+    client.send("SendCurrentFrame Events")
+    source.arrive(body(markers(1, 10_000)))
+    assert client.bodies == [body()]
+    client.send("SendCurrentFrame Events")
+    source.arrive(body(markers(2, 20_000), event(2, 20_000, 3)))
+    assert client.bodies == [body(), body(event(2, 20_000, 3))]
+
+
 def test_events_in_frames_of_their_own_do_not_shift_a_divisor() -> None:
     source = LiveSource()
     client = source.client()
