@@ -19,7 +19,7 @@ from gateway.outputs.encodings import TEXT
 from gateway.outputs.kind import DemoSide, OutputKind, Receive, SubscriptionRequest
 from gateway.outputs.status import OutputHealth
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import Frame, FrameLayout
 
 UNREACHABLE: Final = "unreachable"
 """The address that never opens."""
@@ -106,6 +106,10 @@ class ExampleFramePublisher:
     def wanted(self) -> bool:
         """Whether somebody is subscribed."""
         return self._publisher.wanted
+
+    def prepare(self, _layout: FrameLayout, _components: frozenset[ComponentType]) -> bool:
+        """Publish all frames, for whoever may be subscribed."""
+        return True
 
     def publish(
         self, frame: Frame, _stamp: Stamp, sequence: int, _components: frozenset[ComponentType]

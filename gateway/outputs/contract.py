@@ -17,7 +17,7 @@ from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.status import OutputHealth
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import Frame, FrameLayout
 from gateway.rtc3d.parameters import Parameters
 
 KeyPath = tuple[str, ...]
@@ -58,6 +58,14 @@ class FramePublisher(Protocol):
     @property
     def wanted(self) -> bool:
         """Whether there may be a subscriber; always True if the output cannot know."""
+
+    def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
+        """Prepare for frames of ``layout``; return whether somebody receives any of their ``components``.
+
+        If not, such frames are neither published nor counted. Called before the first frame of a layout, and
+        again after each call of ``on_change`` (``Output.watch_wanted``), so it costs nothing per frame. An
+        output that learns from frames which items there are does so here.
+        """
 
     def publish(
         self, frame: Frame, stamp: Stamp, sequence: int, components: frozenset[ComponentType]
@@ -247,8 +255,8 @@ class Output(ABC):
         """Return whether ``wanted`` of the publishers of ``source`` is exact; by default, it may be late.
 
         If it is exact, the gateway publishes only what is wanted, and counts nothing else as sent. The output
-        must call ``on_change`` in the event loop whenever ``wanted`` of a publisher changes. Called before
-        ``announce``.
+        must call ``on_change`` in the event loop whenever ``wanted`` of a publisher changes, or what
+        ``FramePublisher.prepare`` returns. Called before ``announce``.
         """
         return False
 

@@ -56,7 +56,7 @@ class _ComponentPlan:
 class _Plan:
     """How to publish the ``wanted`` components of a layout. Made once per layout, not for every frame.
 
-    ``frame_routes`` are those of the outputs that want whole frames now. ``tool_indices`` are the indices
+    ``frame_routes`` are those of the outputs that publish such frames now. ``tool_indices`` are the indices
     of 6D components whose poses are published per tool. ``num_items`` are the numbers of markers, tools,
     channels and plates.
     """
@@ -224,7 +224,7 @@ class FanOut:
             for index, component in indexed
         ]
         tools = [index for index, component in indexed if component.type is ComponentType.TOOLS]
-        frame_routes = [route for route in self._frame_routes if not route.is_idle]
+        frame_routes = [route for route in self._frame_routes if plans and route.prepare(layout, wanted)]
         return _Plan(layout, wanted, plans, frame_routes, tools if self._tool_poses.is_used else [])
 
     def forget_layouts(self) -> None:

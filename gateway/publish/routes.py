@@ -4,6 +4,7 @@ import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any, Final
 
 import rtc3d
@@ -14,10 +15,11 @@ from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name, message_timest
 from gateway.messages.stamp import Stamp
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import FramePublisher, Output
+from gateway.outputs.guard import guarded
 from gateway.outputs.pacing import Pacer
 from gateway.outputs.status import OutputStatus
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import Frame, FrameLayout
 
 _NOT_OPEN: Final = "not open"  # the cause in an OutputError
 
@@ -200,10 +202,9 @@ class FrameRoute:
         self._output_route = output_route
         self._sent = output_route.sent.setdefault("frame", SentCounter())
 
-    @property
-    def is_idle(self) -> bool:
-        """Whether to publish nothing now, because the output wants nothing."""
-        return self._output_route.is_selective and not self.publisher.wanted
+    def prepare(self, layout: FrameLayout, wanted: frozenset[ComponentType]) -> bool:
+        """Return whether to publish frames of ``layout``; never raises."""
+        return guarded(self._output_route.output, partial(self.publisher.prepare, layout, wanted), True)
 
     def publish(self, frame: Frame, stamp: Stamp, sequence: int, wanted: frozenset[ComponentType]) -> None:
         """Publish and count one frame; never raises, because outputs must not disturb each other."""

@@ -81,6 +81,9 @@ class FrameRig(ABC):
     knows_peers: ClassVar[bool] = True
     """Whether ``wanted`` tells if there is a peer."""
 
+    is_exact: ClassVar[bool] = True
+    """Whether ``watch_wanted`` is exact: frames that nobody receives are not counted as sent."""
+
     converts: ClassVar[bool] = True
     """Whether peers get poses in metres and in the source's frame, not what the server sent."""
 
@@ -267,6 +270,7 @@ class ExampleRig(FrameRig):
     """The example of an output, whose network is this process."""
 
     converts = False
+    is_exact = False
 
     def __init__(self) -> None:
         self._received: list[Received] = []

@@ -12,7 +12,7 @@ import os
 import socket
 import threading
 import time
-from collections.abc import AsyncIterator, Callable
+from collections.abc import AsyncIterator, Callable, Mapping
 from concurrent.futures import Future
 from contextlib import suppress
 from typing import Any, Final
@@ -124,6 +124,7 @@ can_be_cut = rigs(lambda rig: rig.listens or rig.has_router)
 has_router = rigs(lambda rig: rig.has_router)
 listens = rigs(lambda rig: rig.listens)
 knows_peers = rigs(lambda rig: rig.knows_peers)
+is_exact = rigs(lambda rig: rig.is_exact)
 converts = rigs(lambda rig: rig.converts)
 
 
@@ -205,6 +206,11 @@ class Lab:
         """Return how many messages of a source were lost, by cause."""
         [(_, status)] = self.fan_outs[source].outputs
         return {cause: messages for cause, (messages, _) in amounts(status.losses).items()}
+
+    def sent(self, source: str = LAB) -> Mapping[str, int]:
+        """Return how many messages of a source count as sent."""
+        [(_, status)] = self.fan_outs[source].outputs
+        return status.messages
 
     def wanted(self, source: str = LAB) -> bool:
         return self.fan_outs[source].has_subscribers(WIRE_ORDER)
@@ -296,6 +302,26 @@ async def test_publishing_needs_no_peer(lab: Lab) -> None:
     assert lab.lost() == {}
 
 
+@is_exact
+async def test_frames_that_nobody_receives_do_not_count_as_sent(lab: Lab) -> None:
+    lab.serve()
+    await lab.open()
+    for odd in odd_frames(1).values():
+        lab.publish(LAB, odd)
+    lab.fan_outs[LAB].publish_status(b"status")
+    assert lab.sent() == {}
+    await lab.subscribe()
+    assert set(lab.sent()) == {"frame"}
+    await asyncio.to_thread(lab.rig.unsubscribe)
+
+    def no_longer_counts() -> bool:
+        before = lab.sent()
+        lab.publish_next()
+        return lab.sent() == before
+
+    await wait_until_async(no_longer_counts, TIMEOUT_S)
+
+
 @every_rig
 async def test_a_second_peer_receives_as_well(lab: Lab) -> None:
     await lab.start()
@@ -332,11 +358,12 @@ async def test_only_frames_for_peers_are_wanted(lab: Lab) -> None:
 
 @knows_peers
 async def test_each_change_of_what_is_wanted_is_reported_in_the_event_loop(lab: Lab) -> None:
-    """If ``watch_wanted`` promises it."""
+    """If it is exact."""
     threads: list[str] = []
     publisher = lab.output.frame_publisher(LAB)
     assert publisher is not None
     is_exact = lab.output.watch_wanted(LAB, lambda: threads.append(threading.current_thread().name))
+    assert is_exact is lab.rig.is_exact
     lab.output.announce(LAB)
     lab.set_parameters(LAB, labelled())
     lab.serve(HALL)

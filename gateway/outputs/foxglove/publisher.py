@@ -12,7 +12,7 @@ from gateway.outputs.event_loop import in_this_loop
 from gateway.outputs.foxglove.live_source import LiveSource
 from gateway.outputs.foxglove.server import FoxgloveServer
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import Frame, FrameLayout
 
 QUEUE_FULL: Final = "queue full"
 
@@ -112,6 +112,10 @@ class FoxglovePublisher:
     def wanted(self) -> bool:
         """Whether a viewer has subscribed to anything that is in frames."""
         return self._source.wanted and not self._is_closed
+
+    def prepare(self, _layout: FrameLayout, _components: frozenset[ComponentType]) -> bool:
+        """See FramePublisher."""
+        return self.wanted
 
     def publish(
         self,

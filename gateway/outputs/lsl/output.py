@@ -16,6 +16,7 @@ from gateway.log import DefectLog
 from gateway.losses import Losses
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import FramePublisher, Output, Publisher, ServerParameters
+from gateway.outputs.event_loop import in_this_loop
 from gateway.outputs.extras import missing_package
 from gateway.outputs.lsl.capture_time import SuspendedTime
 from gateway.outputs.lsl.publisher import LslFramePublisher
@@ -51,7 +52,7 @@ class LslOutput(Output):
                 f"lsl.config: {settings.config} cannot be read; correct the path, or remove the key"
             )
         self._settings = settings
-        self._processes = LslProcesses(settings)
+        self._processes = LslProcesses(settings, self._wanted_changed)
         self._thread = SendThread("lsl-send")
         self._numbers = itertools.count(1)
         self._computer = socket.gethostname()
@@ -84,6 +85,15 @@ class LslOutput(Output):
         if self._publishers.get(publisher.source) is publisher:
             del self._publishers[publisher.source]
         self._submit(publisher.streams.close)
+
+    def watch_wanted(self, source: str, on_change: Callable[[], None]) -> bool:
+        """Frames are wanted while somebody receives a stream that they have samples for."""
+        self._publishers[source].on_change = in_this_loop(on_change)
+        return True
+
+    def _wanted_changed(self) -> None:
+        for publisher in list(self._publishers.values()):
+            publisher.on_change()
 
     def count_losses(self, source: str, losses: Losses) -> None:
         """Count in ``losses`` what the thread that sends cannot push."""

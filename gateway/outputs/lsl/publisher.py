@@ -18,8 +18,6 @@ MAX_WAITING: Final = 4096
 MAX_WAITING_BYTES: Final = 32 * 1024 * 1024
 """The limits of what waits for the thread. Further frames are refused."""
 
-_MAX_LAYOUTS: Final = 64
-
 
 class LslFramePublisher:
     """Takes the frames of one source.
@@ -36,20 +34,36 @@ class LslFramePublisher:
         forget: Callable[["LslFramePublisher"], None],
     ) -> None:
         self.streams = streams
+        self.on_change: Callable[[], None] = lambda: None
+        """To be called when ``prepare`` may return something else, or has something else to do."""
         self._forget = forget
         self._processes = processes
         self._start_sending = start_sending
         self._times = CaptureTimes()
         self._lock = threading.Lock()
-        self._waiting: list[CapturedFrame | ServerParameters] = []
+        self._waiting: list[CapturedFrame | Callable[[], None]] = []
         self._num_bytes = 0
-        self._layouts: set[FrameLayout] = set()  # that have had a chance to open their streams
+        self._num_items: dict[ComponentType, int] = {}  # the most that streams were opened for
         self._is_closed = False
 
     @property
     def wanted(self) -> bool:
         """Whether somebody receives a stream of the source."""
-        return not self._processes.wanted.isdisjoint(self.streams.numbers)
+        return not self._processes.wanted.isdisjoint(self.streams.numbers.values())
+
+    def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
+        """Have the streams of these components opened; return whether somebody receives one of them."""
+        num_items: dict[ComponentType, int] = {}
+        for each in layout.components:
+            if each.type in components:
+                num_items[each.type] = max(each.num_items, num_items.get(each.type, 0))
+        more = {each: count for each, count in num_items.items() if count > self._num_items.get(each, -1)}
+        with self._lock:
+            if more and not self._is_full and not self._is_closed:
+                self._num_items |= more
+                self._append(functools.partial(self.streams.open_for, more), 0)
+        numbers, wanted = self.streams.numbers, self._processes.wanted
+        return any(numbers.get(each) in wanted for each in num_items)
 
     def publish(
         self,
@@ -58,25 +72,14 @@ class LslFramePublisher:
         sequence: int,  # noqa: ARG002 - LSL has none
         components: frozenset[ComponentType],
     ) -> None:
-        """Queue a frame if somebody receives one of its streams, or if it may open one.
-
-        Raises OutputError if too many frames wait, or if receivers wait for LSL to come back.
-        """
+        """Queue a frame. Raises OutputError if too many wait, or if receivers wait for LSL to come back."""
         if self._is_closed:
             raise OutputError("LSL is closed; ask for a new publisher", cause="closed")
-        if not self.wanted:
-            if self._processes.interrupted:
-                raise OutputError(f"LSL: {self._processes.problem}", cause="not open")
-            if frame.layout in self._layouts:
-                return
-        if frame.layout not in self._layouts:
-            if len(self._layouts) >= _MAX_LAYOUTS:
-                self._layouts.clear()
-            self._layouts.add(frame.layout)
+        if not self._processes.are_ready:
+            raise OutputError(f"LSL: {self._processes.problem}", cause="not open")
         captured = CapturedFrame(frame, stamp, components, self._times.steady_us(stamp))
         with self._lock:
-            is_full = len(self._waiting) >= MAX_WAITING or self._num_bytes > MAX_WAITING_BYTES
-            if is_full:
+            if self._is_full:
                 raise OutputError(
                     "the process for LSL does not take frames fast enough; this computer is too busy",
                     cause="queue full",
@@ -86,10 +89,15 @@ class LslFramePublisher:
     def set_parameters(self, parameters: ServerParameters) -> None:
         """Use other parameters for the frames after this call."""
         with self._lock:
-            self._layouts.clear()
-            self._append(parameters, 0)
+            self._num_items.clear()
+            self._append(functools.partial(self.streams.set_parameters, parameters), 0)
+        self.on_change()
 
-    def _append(self, entry: CapturedFrame | ServerParameters, num_bytes: int) -> None:
+    @property
+    def _is_full(self) -> bool:
+        return len(self._waiting) >= MAX_WAITING or self._num_bytes > MAX_WAITING_BYTES
+
+    def _append(self, entry: CapturedFrame | Callable[[], None], num_bytes: int) -> None:
         if not self._waiting:
             self._start_sending()
         self._waiting.append(entry)
@@ -99,18 +107,21 @@ class LslFramePublisher:
         """Send what waits. Called in the thread that sends."""
         with self._lock:
             entries, self._waiting, self._num_bytes = self._waiting, [], 0
-        if self._processes.interrupted:
-            self.streams.count_interrupted(sum(isinstance(entry, CapturedFrame) for entry in entries))
         frames: list[CapturedFrame] = []
-        push = functools.partial(self.streams.push, suspended_us=suspended_us)
         for entry in entries:
             if isinstance(entry, CapturedFrame):
                 frames.append(entry)
                 continue
-            push(frames, self._processes.wanted)
+            self._push(frames, suspended_us)
             frames = []
-            self.streams.set_parameters(entry)
-        push(frames, self._processes.wanted)
+            entry()
+        self._push(frames, suspended_us)
+
+    def _push(self, frames: list[CapturedFrame], suspended_us: int) -> None:
+        if self._processes.are_ready:
+            self.streams.push(frames, self._processes.wanted, suspended_us)
+        else:
+            self.streams.count_not_open(len(frames))
 
     def close(self) -> None:
         """Close the streams of the source."""

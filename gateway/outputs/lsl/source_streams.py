@@ -106,7 +106,7 @@ class SourceStreams:
         send: Callable[[Message], bool],
     ) -> None:
         self.source = name
-        self.numbers: frozenset[int] = frozenset()
+        self.numbers: Mapping[ComponentType, int] = {}
         """The numbers of the open streams. Any thread may read it."""
         self.names: Mapping[str, Mapping[str, str]] = {}
         """By component key, the names of items whose labels the streams cannot use as they are."""
@@ -135,6 +135,12 @@ class SourceStreams:
             elif parsed != Parameters():
                 self._close(component)
 
+    def open_for(self, num_items: Mapping[ComponentType, int]) -> None:
+        """Open the streams for so many items of each component, even if the parameters have fewer."""
+        for component, count in num_items.items():
+            if self._stream(component, count) is None:
+                self._count_refused(component, count, 1)
+
     def push(self, frames: Sequence[CapturedFrame], wanted: frozenset[int], suspended_us: int) -> None:
         """Push the components whose streams are ``wanted``, oldest frame first.
 
@@ -156,7 +162,7 @@ class SourceStreams:
                     push = self._push_events if stream.stream.is_text else self._push_values
                     push(stream, together, index, suspended_us)
 
-    def count_interrupted(self, num_frames: int) -> None:
+    def count_not_open(self, num_frames: int) -> None:
         """Count frames that waited for a process that has ended."""
         if num_frames:
             self._count_loss("not open", NOT_OPEN, num_frames)
@@ -214,7 +220,7 @@ class SourceStreams:
         self._opened_s[component] = time.monotonic()
         opened = _OpenStream(next(self._next_numbers), stream, num_items, self._version)
         self._streams[component] = opened
-        self.numbers |= {opened.number}
+        self.numbers = {**self.numbers, component: opened.number}
         names = changed_labels(self._described, component, num_items)
         self.names = {**self.names, component.key: names}
         self._send(opened.opening(self._buffer_s))
@@ -224,7 +230,7 @@ class SourceStreams:
         self.waiting.pop(component, None)
         closed = self._streams.pop(component, None)
         if closed is not None:
-            self.numbers -= {closed.number}
+            self.numbers = {each: stream.number for each, stream in self._streams.items()}
             self.names = {key: names for key, names in self.names.items() if key != component.key}
             self._send(Message(Kind.CLOSE, closed.number))
 

@@ -35,13 +35,15 @@ logger = logging.getLogger(__name__)
 class LslProcesses:
     """Has one process for LSL at a time. ``send``, ``restart`` and ``stop`` are for one thread.
 
-    ``wanted`` are the numbers of the streams that somebody receives.
+    ``on_wanted_changed`` is called in any thread.
     """
 
-    def __init__(self, settings: LslSettings) -> None:
+    def __init__(self, settings: LslSettings, on_wanted_changed: Callable[[], None] = lambda: None) -> None:
         self.wanted = _NO_STREAMS
-        self.interrupted = False
-        """Whether somebody received streams from a process that has ended, and no other one is ready yet."""
+        """The numbers of the streams that somebody receives, or received from a process that has ended while
+        no other one is ready.
+        """
+        self._on_wanted_changed = on_wanted_changed
         self._settings = settings
         self._report = Report()
         self._problem = "the process for LSL has not started yet"
@@ -52,6 +54,11 @@ class LslProcesses:
         self._retry_delay_s = _FIRST_RETRY_S
         self._is_stopped = False
         self._failures = FailureLog(logger, "lsl")
+
+    @property
+    def are_ready(self) -> bool:
+        """Whether samples that are sent reach those who receive them."""
+        return self._socket is not None and bool(self._report.ready)
 
     @property
     def problem(self) -> str:
@@ -120,7 +127,7 @@ class LslProcesses:
         self._is_stopped = True
         self._problem = "LSL is closed; start the gateway again"
         ours, self._socket = self._socket, None
-        self.wanted = _NO_STREAMS
+        self._set_wanted(_NO_STREAMS)
         if ours is not None:
             with contextlib.suppress(OSError):
                 ours.shutdown(socket.SHUT_RDWR)
@@ -149,9 +156,6 @@ class LslProcesses:
         status = process.wait()
         if self._is_stopped:
             return
-        if self.wanted:
-            self.interrupted = True
-        self.wanted = _NO_STREAMS
         lived_s = time.monotonic() - self._started_s
         if lived_s >= _STEADY_S:
             self._retry_delay_s = _FIRST_RETRY_S
@@ -164,12 +168,17 @@ class LslProcesses:
 
     def _take(self, report: Report) -> None:
         before, self._report = self._report, report
-        self.wanted = frozenset(report.wanted)
+        if report.ready:
+            self._set_wanted(frozenset(report.wanted))
         if report.not_opened and report.not_opened != before.not_opened:
             self._failures.failed(_not_opened(report))
         elif report.ready and not report.not_opened and (before.not_opened or not before.ready):
-            self.interrupted = False
             self._failures.succeeded(f"streams are offered by liblsl {report.ready}")
+
+    def _set_wanted(self, numbers: frozenset[int]) -> None:
+        before, self.wanted = self.wanted, numbers
+        if numbers != before:
+            self._on_wanted_changed()
 
     def _failed(self, text: str) -> None:
         self._problem = f"{text}; it is started again"

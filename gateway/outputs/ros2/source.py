@@ -85,6 +85,10 @@ class RosSource:
         # If the queue is full, the next frame does it.
         self._sender.offer(self._guarded(self.topics.use, parameters), len(parameters.xml))
 
+    def prepare(self, _layout: FrameLayout, _components: frozenset[ComponentType]) -> bool:
+        """See FramePublisher."""
+        return self.wanted
+
     def publish(
         self,
         frame: Frame,

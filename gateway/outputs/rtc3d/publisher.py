@@ -9,7 +9,7 @@ from gateway.messages.stamp import Stamp
 from gateway.outputs.loop_thread import LoopThread
 from gateway.outputs.rtc3d.live_server import SourceState
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import Frame, FrameLayout
 
 QUEUE_FULL: Final = "queue full"
 """The cause of frames that nobody got because the thread of the clients cannot keep up."""
@@ -31,6 +31,10 @@ class Rtc3dPublisher:
     def wanted(self) -> bool:
         """Whether any client asks for frames."""
         return self._state.wanted and not self._is_closed
+
+    def prepare(self, _layout: FrameLayout, _components: frozenset[ComponentType]) -> bool:
+        """See FramePublisher."""
+        return self.wanted
 
     def publish(
         self,

@@ -1,6 +1,6 @@
 """The publisher of one source: hands frames to the server's thread, and makes messages of them there."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import Final
 
@@ -14,13 +14,10 @@ from gateway.outputs.vrpn.protocol import encode_pose
 from gateway.outputs.vrpn.server import VrpnServer
 from gateway.outputs.vrpn.trackers import MAX_TRACKERS, Tracker
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame
+from gateway.rtc3d.frames import Frame, FrameLayout
 
 MAX_TOOLS: Final = 256
 """How many tools of a source can be trackers, and how many poses of a frame are sent, at most."""
-
-_MAX_VERSIONS: Final = 8
-"""How many versions of the parameters are kept: frames of a backlog may belong to an earlier one."""
 
 Offer = Callable[[Callable[[], None], int], bool]
 """LoopThread.offer of the server's thread."""
@@ -40,8 +37,7 @@ class VrpnPublisher:
         self._source = source
         self._server = server
         self._offer = offer
-        self._parameters: dict[int, ServerParameters] = {}  # by version, the newest last
-        self._newest = _NO_PARAMETERS
+        self._parameters = _NO_PARAMETERS
         self._shown: ServerParameters | None = None  # those that the trackers are named by
 
     @property
@@ -50,38 +46,32 @@ class VrpnPublisher:
         return self._server.has_clients
 
     def set_parameters(self, parameters: ServerParameters) -> None:
-        """Take note of the newest parameters."""
-        self._parameters.pop(parameters.version, None)
-        self._parameters[parameters.version] = self._newest = parameters
-        for version in list(self._parameters)[:-_MAX_VERSIONS]:
-            del self._parameters[version]
+        """Use other parameters for the frames after this call."""
+        self._parameters = parameters
         self.name_trackers()
 
     def name_trackers(self) -> None:
         """Name the trackers by the newest parameters. If too many calls wait, the next frame does so."""
-        self._offer(partial(self._show, self._newest, 0), len(self._newest.xml))
+        self._offer(partial(self._show, self._parameters, 0), len(self._parameters.xml))
+
+    def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
+        """Return whether a client is connected and frames of ``layout`` have tools."""
+        return self.wanted and ComponentType.TOOLS in components and bool(_tool_indices(layout))
 
     def publish(
         self,
         frame: Frame,
         stamp: Stamp,
         sequence: int,  # noqa: ARG002 - VRPN has no sequence numbers
-        components: frozenset[ComponentType],
+        components: frozenset[ComponentType],  # noqa: ARG002 - see ``prepare``
     ) -> None:
         """Hand over a frame with tools. Raises OutputError if too many wait, or if the unit is unknown."""
-        if not self._server.has_clients or ComponentType.TOOLS not in components:
+        if not self.wanted:
             return
-        indices = [
-            index
-            for index, component in enumerate(frame.layout.components)
-            if component.type is ComponentType.TOOLS
-        ]
-        if not indices:
-            return
-        parameters = self._parameters.get(stamp.parameters_version, self._newest)
+        parameters = self._parameters
         if parameters.frame.metres_per_unit is None:
             raise OutputError(unknown_unit_text(parameters.parsed), cause="unknown unit")
-        call = partial(self._send, parameters, frame, indices, stamp)
+        call = partial(self._send, parameters, frame, stamp)
         if not self._offer(call, len(frame.body)):
             raise OutputError("frames arrive faster than they can be sent", cause="queue full")
 
@@ -99,10 +89,10 @@ class VrpnPublisher:
         self._server.describe_trackers()
         self._shown = parameters
 
-    def _send(self, parameters: ServerParameters, frame: Frame, indices: Sequence[int], stamp: Stamp) -> None:
+    def _send(self, parameters: ServerParameters, frame: Frame, stamp: Stamp) -> None:
         num_items = num_with_tracker = num_poses = 0
         messages: list[bytes] = []
-        for index in indices:  # usually one
+        for index in _tool_indices(frame.layout):  # usually one
             items = frame.component(index).items()
             num_items += len(items)
             if self._shown is not parameters or min(len(items), MAX_TOOLS) > len(self._trackers):
@@ -137,3 +127,9 @@ class VrpnPublisher:
     def _count_loss(self, cause: str, text: str, num_poses: int) -> None:
         if self.losses is not None:
             self.losses.lost(cause, text, messages=num_poses)
+
+
+def _tool_indices(layout: FrameLayout) -> list[int]:
+    """Return which components of a frame have tools."""
+    components = enumerate(layout.components)
+    return [index for index, each in components if each.type is ComponentType.TOOLS and each.num_items]

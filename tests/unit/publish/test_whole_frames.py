@@ -1,11 +1,13 @@
 """Outputs that take whole frames: what they get, how it is numbered and counted, and how they close."""
 
+from collections.abc import Callable
+
 from gateway.errors import OutputError
 from gateway.losses import Losses
 from gateway.messages.stamp import Stamp
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
-from gateway.rtc3d.frames import Frame, split_frame
+from gateway.rtc3d.frames import Frame, FrameLayout, split_frame
 from tests.losses import amounts
 from tests.toy_output import ToyOutput
 from tests.vectors import FULL_FRAME
@@ -17,10 +19,17 @@ MARKERS = frozenset({ComponentType.MARKERS})
 
 
 class FrameOutput(ToyOutput):
-    """Takes whole frames. ``frames`` are those that it accepted, ``closed`` counts closed publishers."""
+    """Takes whole frames, if they have one of the components in ``received``.
+
+    ``frames`` are those that it accepted, ``prepared`` the layouts and components that it was asked for,
+    ``closed`` counts closed publishers, and ``on_change`` is what it has to call when ``received`` changes.
+    """
 
     def __init__(self, name: str = "toy") -> None:
         super().__init__(name)
+        self.received = ALL
+        self.prepared: list[tuple[FrameLayout, frozenset[ComponentType]]] = []
+        self.on_change: Callable[[], None] = lambda: None
         self.frames: list[tuple[Frame, Stamp, int, frozenset[ComponentType]]] = []
         self.sources: list[str] = []
         self.closed = 0
@@ -29,6 +38,10 @@ class FrameOutput(ToyOutput):
     def frame_publisher(self, source: str) -> "FrameOutputPublisher":
         self.sources.append(source)
         return FrameOutputPublisher(self)
+
+    def watch_wanted(self, source: str, on_change: Callable[[], None]) -> bool:  # noqa: ARG002 - one source
+        self.on_change = on_change
+        return True
 
     def count_losses(self, source: str, losses: Losses) -> None:
         self.losses[source] = losses
@@ -39,6 +52,12 @@ class FrameOutputPublisher:
 
     def __init__(self, output: FrameOutput) -> None:
         self._output = output
+
+    def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
+        self._output.prepared.append((layout, components))
+        if isinstance(self._output.error, ZeroDivisionError):
+            raise self._output.error
+        return not components.isdisjoint(self._output.received)
 
     def publish(
         self, frame: Frame, stamp: Stamp, sequence: int, components: frozenset[ComponentType]
@@ -64,6 +83,7 @@ def test_no_component_is_published_besides_the_frame() -> None:
     output = FrameOutput()
     fan_out = FanOut("lab", [output])
     fan_out.publish(FULL, STAMP, ALL)
+    output.wanted = {"status"}
     fan_out.publish_status(b"status")
     assert {topic.path for topic in output.declared} == {("status",), ("clock",)}
     assert [message for _, message in output.messages] == [b"status"]
@@ -76,6 +96,40 @@ def test_frames_and_their_bytes_are_counted() -> None:
     [(_, status)] = fan_out.outputs
     assert status.messages == {"frame": 3}
     assert status.message_bytes == {"frame": 3 * len(FULL.body)}
+
+
+def test_frames_that_nobody_receives_are_neither_published_nor_counted() -> None:
+    output = FrameOutput()
+    fan_out = FanOut("lab", [output])
+    output.received = MARKERS
+    fan_out.publish(FULL, STAMP, ALL)
+    fan_out.publish(FULL, STAMP, ALL - MARKERS)
+    assert [components for _, _, _, components in output.frames] == [ALL]
+    assert fan_out.outputs[0][1].messages == {"frame": 1}
+    assert fan_out.skip(FULL, STAMP, ALL - MARKERS) == 0
+
+
+def test_an_output_prepares_once_for_each_layout_until_something_changes() -> None:
+    output = FrameOutput()
+    fan_out = FanOut("lab", [output])
+    for components in (ALL, MARKERS, ALL, frozenset[ComponentType]()):
+        for _ in range(3):
+            fan_out.publish(FULL, STAMP, components)
+    assert output.prepared == [(FULL.layout, ALL), (FULL.layout, MARKERS)]
+    output.received = frozenset()
+    output.on_change()
+    fan_out.publish(FULL, STAMP, ALL)
+    assert output.prepared[2:] == [(FULL.layout, ALL)]
+    assert len(output.frames) == 9
+
+
+def test_an_output_with_a_defect_in_preparing_gets_the_frames_and_others_are_not_disturbed() -> None:
+    broken, healthy = FrameOutput("broken"), FrameOutput("healthy")
+    fan_out = FanOut("lab", [broken, healthy])
+    broken.error = ZeroDivisionError("division by zero")
+    fan_out.publish(FULL, STAMP, ALL)
+    assert len(healthy.frames) == 1
+    assert amounts(fan_out.outputs[0][1].losses) == {"ZeroDivisionError": (1, 1)}
 
 
 def test_a_frame_that_is_not_accepted_is_counted_and_uses_up_its_number() -> None:

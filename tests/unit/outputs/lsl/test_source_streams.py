@@ -70,10 +70,10 @@ class Streams:
         captured = [
             CapturedFrame(frame, Stamp(0, 0, 1, 1), ALL, CAPTURED_US + 10_000 * at) for at in range(count)
         ]
-        self.streams.push(captured, self.streams.numbers, SUSPENDED_US)
+        self.streams.push(captured, frozenset(self.streams.numbers.values()), SUSPENDED_US)
         # The streams that have just opened are wanted by nobody, so push again.
         if any(message.kind is Kind.OPEN for message in self.sent[before:]):
-            self.streams.push(captured, self.streams.numbers, SUSPENDED_US)
+            self.streams.push(captured, frozenset(self.streams.numbers.values()), SUSPENDED_US)
         return self.sent[before:]
 
     @property
@@ -141,7 +141,7 @@ def test_streams_open_with_the_parameters_before_any_frame(lab: Streams) -> None
         ("lab_3d", 4),
         ("lab_event", 1),
     ]
-    assert lab.streams.numbers == {1, 2}
+    assert lab.streams.numbers == {ComponentType.MARKERS: 1, ComponentType.EVENT: 2}
 
 
 def test_without_parameters_a_stream_opens_with_its_first_frame(lab: Streams) -> None:
@@ -165,7 +165,7 @@ def test_other_labels_close_the_stream_and_open_another(lab: Streams) -> None:
     lab.set_parameters(with_tools("Wand"))
     assert lab.kinds == [(Kind.OPEN, 1), (Kind.CLOSE, 1), (Kind.OPEN, 2)]
     assert lab.opened[0]["source_id"] != lab.opened[1]["source_id"]
-    assert lab.streams.numbers == {2}
+    assert lab.streams.numbers == {ComponentType.TOOLS: 2}
 
 
 def test_another_frame_of_coordinates_is_another_stream(lab: Streams) -> None:
@@ -248,7 +248,7 @@ def test_closing_closes_every_stream(lab: Streams) -> None:
     lab.push(analog(1), markers(2))
     lab.streams.close()
     assert {message.stream for message in lab.sent if message.kind is Kind.CLOSE} == {1, 2}
-    assert lab.streams.numbers == frozenset()
+    assert lab.streams.numbers == {}
 
 
 def test_another_process_gets_the_same_streams(lab: Streams) -> None:

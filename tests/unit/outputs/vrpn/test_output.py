@@ -44,8 +44,8 @@ def tools_frame(*x_mm: float, order: ByteOrder = "big") -> Frame:
     return split_frame(encode_frame([tools_component(x_mm, order)], order), order)
 
 
-def stamp(utime: int, version: int = 1) -> Stamp:
-    return Stamp(utime + 5, utime, 1, version)
+def stamp(utime: int) -> Stamp:
+    return Stamp(utime + 5, utime, 1, 1)
 
 
 class Lab:
@@ -93,24 +93,30 @@ async def test_frames_of_both_byte_orders_and_with_two_components() -> None:
         ]
 
 
-async def test_frames_without_wanted_tools_send_nothing() -> None:
+async def test_only_frames_with_tools_for_a_client_are_wanted() -> None:
+    markers = np.zeros(3, ITEM_DTYPES[ComponentType.MARKERS])
+    without = split_frame(encode_frame([encode_component(ComponentType.MARKERS, 1, 1000, markers)]), "big")
     async with lab() as here:
-        here.publisher.publish(tools_frame(1000.0), stamp(10), 0, frozenset([ComponentType.MARKERS]))
-        markers = np.zeros(3, ITEM_DTYPES[ComponentType.MARKERS])
-        without = encode_frame([encode_component(ComponentType.MARKERS, 1, 1000, markers)])
-        here.publisher.publish(split_frame(without, "big"), stamp(20), 1, ALL)
-        here.publisher.publish(tools_frame(), stamp(30), 2, ALL)
+        prepare = here.publisher.prepare
+        assert prepare(tools_frame(math.nan).layout, ALL)
+        assert not prepare(tools_frame(1000.0).layout, frozenset([ComponentType.MARKERS]))
+        assert not prepare(without.layout, ALL)
+        assert not prepare(tools_frame().layout, ALL)
+    assert not prepare(tools_frame(1000.0).layout, ALL)
+
+
+async def test_tools_out_of_view_send_nothing() -> None:
+    async with lab() as here:
         here.publisher.publish(tools_frame(math.nan, 2000.0), stamp(40), 3, ALL)
         assert await here.poses(1) == [("foot", 40, 2.0)]
 
 
-async def test_frame_is_named_by_its_own_version_of_the_parameters() -> None:
+async def test_frames_are_named_by_the_parameters_before_them() -> None:
     async with lab() as here:
+        here.publisher.publish(tools_frame(1000.0), stamp(10), 0, ALL)
         here.output.publish_parameters("lab", parameters(["hand", "foot"], 2))
-        here.publisher.publish(tools_frame(1000.0), stamp(10, version=1), 0, ALL)  # of a backlog
-        here.publisher.publish(tools_frame(2000.0), stamp(20, version=2), 1, ALL)
-        here.publisher.publish(tools_frame(3000.0), stamp(30, version=9), 2, ALL)
-        assert await here.poses(3) == [("wand", 10, 1.0), ("hand", 20, 2.0), ("hand", 30, 3.0)]
+        here.publisher.publish(tools_frame(2000.0), stamp(20), 1, ALL)
+        assert await here.poses(2) == [("wand", 10, 1.0), ("hand", 20, 2.0)]
 
 
 async def test_frame_with_more_tools_than_the_parameters() -> None:
