@@ -23,7 +23,7 @@ from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-TEXT, BINARY, CLOSE, PING, PONG = 1, 2, 8, 9, 10
+CONTINUATION, TEXT, BINARY, CLOSE, PING, PONG = 0, 1, 2, 8, 9, 10
 _GUID = b"258EAFA5-E914-47DA-95CA-C5AB0DC85B11"
 
 
@@ -68,7 +68,8 @@ class Viewer:
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._reader = reader
         self._writer = writer
-        self._subscriptions: dict[int, dict[str, Any]] = {}  # channels by the numbers of subscriptions
+        self.subscriptions: dict[int, dict[str, Any]] = {}
+        """The channels by the numbers of subscriptions."""
         self._last_number = 100  # other than the numbers of channels
         self._task: asyncio.Task[None] | None = None
         self._changed = asyncio.Condition()
@@ -167,10 +168,10 @@ class Viewer:
                     self.withdrawn.append(self.channels.pop(number)["topic"])
                 kept = {
                     number: channel
-                    for number, channel in self._subscriptions.items()
+                    for number, channel in self.subscriptions.items()
                     if channel["id"] in self.channels
                 }
-                self._subscriptions = kept
+                self.subscriptions = kept
             case "status":
                 self.warnings.append(message["message"])
             case _:
@@ -179,7 +180,7 @@ class Viewer:
     def _handle_data(self, payload: bytes) -> None:
         opcode, number, time_ns = struct.unpack_from("<BIQ", payload)
         assert opcode == 1
-        channel = self._subscriptions.get(number)
+        channel = self.subscriptions.get(number)
         if channel is not None:  # otherwise it was on the way when the subscription ended
             data = payload[13:]
             content = decode(channel, data)
@@ -217,12 +218,12 @@ class Viewer:
         for topic in topics:
             self._last_number += 1
             channel = self.channel(topic)
-            self._subscriptions[self._last_number] = channel
+            self.subscriptions[self._last_number] = channel
             wanted.append({"id": self._last_number, "channelId": channel["id"]})
         self.send({"op": "subscribe", "subscriptions": wanted})
 
     def unsubscribe(self, topic: str) -> None:
-        [number] = [number for number, channel in self._subscriptions.items() if channel["topic"] == topic]
+        [number] = [number for number, channel in self.subscriptions.items() if channel["topic"] == topic]
         self.send({"op": "unsubscribe", "subscriptionIds": [number]})
 
     async def wait_until(self, condition: Callable[[], object], timeout_s: float = 10) -> None:

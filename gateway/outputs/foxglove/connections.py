@@ -5,6 +5,7 @@ import time
 from typing import Any, Final
 
 from websockets.asyncio.server import ServerConnection, broadcast
+from websockets.frames import DATA_OPCODES, Frame
 from websockets.http11 import Request, Response
 
 from gateway.log import EventLog
@@ -22,9 +23,18 @@ HANDSHAKE_TIMEOUT_S: Final = 5.0
 MAX_REQUEST_BYTES: Final = 64 * 1024
 """The size limit of a message from a viewer: about 1000 subscriptions."""
 
-_RECEIVED_BYTES_PER_S: Final = 64 * 1024
-_RECEIVED_BURST_BYTES: Final = 256 * 1024
+_RECEIVED_BYTES_PER_S: Final = 16 * 1024
+_RECEIVED_BURST_BYTES: Final = 512 * 1024
 """A viewer sends some kB when a panel opens. One that sends more than this is disconnected."""
+
+_BYTES_PER_FRAME: Final = 128
+"""What a frame counts besides its bytes: an empty one has 6 bytes, but costs as much time as others."""
+
+MAX_FRAGMENTS: Final = 1000
+"""How many frames a message may have. websockets limits their bytes only, and keeps even empty ones."""
+
+_PIECE_BYTES: Final = 4096
+"""So much is parsed before the frames in it count; one read may have 256 kB, or 40 000 empty frames."""
 
 MAX_WAITING_BYTES: Final = 1024 * 1024
 """How much may wait for a viewer that does not read fast enough; then it loses messages."""
@@ -85,6 +95,7 @@ class Connection(ServerConnection):
         super().__init__(*args, **options)
         self._admission = admission
         self._received = TokenBucket(_RECEIVED_BYTES_PER_S, _RECEIVED_BURST_BYTES)
+        self._num_fragments = 0  # of the message that is not complete yet
 
     def connection_made(self, transport: Any) -> None:
         """See asyncio.Protocol."""
@@ -98,9 +109,26 @@ class Connection(ServerConnection):
 
     def data_received(self, data: bytes) -> None:
         """See asyncio.Protocol."""
-        if self._received.try_take(len(data)):
-            super().data_received(data)
-        else:
+        for start in range(0, len(data), _PIECE_BYTES):
+            piece = data[start : start + _PIECE_BYTES]
+            self._count_received(len(piece))
+            if self.transport.is_closing():
+                return
+            super().data_received(piece)
+
+    def process_event(self, event: Any) -> None:
+        """Count a frame, and handle it unless the connection ends; the method of websockets does the rest."""
+        if isinstance(event, Frame):
+            self._count_received(_BYTES_PER_FRAME)
+            if event.opcode in DATA_OPCODES:
+                self._num_fragments = 0 if event.fin else self._num_fragments + 1
+            if self._num_fragments > MAX_FRAGMENTS:
+                self._admission.disconnect(self, f"it sends a message in more than {MAX_FRAGMENTS} pieces")
+        if not self.transport.is_closing():
+            super().process_event(event)
+
+    def _count_received(self, num_bytes: int) -> None:
+        if not self._received.try_take(num_bytes):
             self._admission.disconnect(self, "it sends more than a viewer does")
 
 

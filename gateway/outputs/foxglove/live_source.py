@@ -1,7 +1,7 @@
 """One source for viewers: its channels, and the conversion of its frames for those that are subscribed to."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from typing import Final
 
 import numpy as np
@@ -64,11 +64,14 @@ class LiveSource:
     def set_parameters(self, parameters: ServerParameters) -> None:
         """Use other labels, units or another coordinate frame from now on, and tell the viewers."""
         parsed = parameters.parsed
+        before = {topic.name for topic in self._converter.known_topics}
         self._parameters = parsed
         self._frame = parameters.frame
         self._converter = FoxgloveSource(self._topics, parsed, parameters.version, self._frame)
         self.field_names = self._converter.changed_names
-        self._open_channels(self._converter.known_topics)
+        known = self._converter.known_topics
+        self._open_channels(known)
+        self._close_channels(before - {topic.name for topic in known})
         self._needs_frame = parsed == Parameters()
         self._check_wanted()
         found = self._converter.describe(now_utime())
@@ -93,8 +96,7 @@ class LiveSource:
 
     def close(self) -> None:
         """Withdraw all channels."""
-        self._server.close_channels(list(self._channels.values()))
-        self._channels.clear()
+        self._close_channels(set(self._channels))
         self._needs_frame = False
         self._check_wanted()
 
@@ -106,6 +108,9 @@ class LiveSource:
             channel = self._channels.get(topic.name)
             if channel is None or channel.topic != topic:
                 self._open_channel(topic)
+
+    def _close_channels(self, names: Set[str]) -> None:
+        self._server.close_channels([self._channels.pop(name) for name in names if name in self._channels])
 
     def _open_channel(self, topic: Topic) -> None:
         before = self._channels.get(topic.name)

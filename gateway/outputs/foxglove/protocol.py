@@ -22,6 +22,7 @@ _MESSAGE_DATA: Final = struct.Struct("<BIQ")
 _MESSAGE_DATA_OPCODE: Final = 1
 _MAX_ID: Final = (1 << 32) - 1
 _WARNING: Final = 1
+_ERROR: Final = 2
 
 
 class Subscription(NamedTuple):
@@ -73,6 +74,11 @@ def warning(text: str) -> str:
     return json_text({"op": "status", "level": _WARNING, "message": text})
 
 
+def error(text: str) -> str:
+    """Return the message that shows an error in the viewer."""
+    return json_text({"op": "status", "level": _ERROR, "message": text})
+
+
 def message_data(subscription: int, utime: int, data: bytes) -> bytes:
     """Return a message of a channel; ``utime`` is in µs since 1970."""
     return _MESSAGE_DATA.pack(_MESSAGE_DATA_OPCODE, subscription, utime * 1000) + data
@@ -106,6 +112,7 @@ def _subscription(content: Any) -> Subscription:
 
 def _number(value: Any) -> int:
     # JavaScript has no integers, so a client may write 1.0.
-    if isinstance(value, int | float) and not isinstance(value, bool) and 0 <= value <= _MAX_ID:
+    is_number = isinstance(value, int | float) and not isinstance(value, bool)
+    if is_number and 0 <= value <= _MAX_ID and value == int(value):
         return int(value)
     raise QueryError(f"an id is not a whole number from 0 to {_MAX_ID}")

@@ -157,21 +157,29 @@ class FoxgloveServer:
         try:
             request = protocol.parse_request(message)
         except QueryError as error:
-            viewer.send_control(protocol.warning(str(error)))
+            viewer.send_control(protocol.error(str(error)))
             return
-        for subscription in request.subscriptions:
-            self._subscribe(viewer, *subscription)
+        problems = [self._subscribe(viewer, *subscription) for subscription in request.subscriptions]
         for number in request.ended:
             self._unsubscribe(viewer, number)
+        if problem := next(filter(None, problems), ""):  # one of them is enough for the user
+            viewer.send_control(protocol.error(problem))
 
-    def _subscribe(self, viewer: Viewer, number: int, channel_number: int) -> None:
+    def _subscribe(self, viewer: Viewer, number: int, channel_number: int) -> str:
+        """Subscribe a viewer to a channel. Return why the subscription is ignored; "" if it is not."""
+        if channel_number > self._last_number:
+            return f"there has never been a channel {channel_number}; the subscription is ignored"
+        if number in viewer.subscriptions:
+            return f"the subscription {number} exists already; the second one is ignored"
         channel = self._channels.get(channel_number)
-        # A viewer may subscribe to a channel that has just been withdrawn. It will receive that soon.
-        if channel is None or number in viewer.subscriptions or viewer in channel.subscribers:
-            return
+        if channel is None:
+            return ""  # It has just been withdrawn, which the viewer did not know yet.
+        if viewer in channel.subscribers:
+            return f"channel {channel_number} has a subscription already; the second one is ignored"
         viewer.subscriptions[number] = channel_number
         channel.subscribers[viewer] = number
         channel.on_change(viewer)
+        return ""
 
     def _unsubscribe(self, viewer: Viewer, number: int) -> None:
         channel = self._channels.get(viewer.subscriptions.pop(number, -1))

@@ -14,7 +14,16 @@ import pytest
 
 from gateway.outputs.foxglove import connections
 from gateway.rtc3d.components import ComponentType
-from tests.foxglove_viewer import HandshakeRefusedError, Viewer, client_frame, upgrade_request, viewing
+from tests.foxglove_viewer import (
+    CONTINUATION,
+    PING,
+    TEXT,
+    HandshakeRefusedError,
+    Viewer,
+    client_frame,
+    upgrade_request,
+    viewing,
+)
 from tests.unit.outputs.foxglove.live import LiveSource, frame_of, serving
 from tests.waiting import wait_until_async
 
@@ -107,6 +116,51 @@ async def test_a_flood_of_requests_ends_the_connection_and_the_log_says_why(
         hostile.send_bytes(client_frame(b"ping" * 10, 9) * 50_000)
         await hostile.wait_until(lambda: hostile.is_closed)
     assert num_logged(caplog, "is disconnected: it sends more than a viewer does") == 1
+
+
+async def test_a_request_may_come_in_pieces() -> None:
+    async with serving("lab") as (port, [lab]), viewing(port) as viewer:
+        number = viewer.channel("/lab/markers")["id"]
+        text = json.dumps({"op": "subscribe", "subscriptions": [{"id": 7, "channelId": number}]}).encode()
+        first, *others, last = (text[at : at + 1] for at in range(len(text)))
+        viewer.send_bytes(piece(first, TEXT, is_last=False))
+        for each in others:
+            viewer.send_bytes(piece(each, CONTINUATION, is_last=False) + client_frame(b"", PING))
+        viewer.send_bytes(piece(last, CONTINUATION, is_last=True))
+        await lab.wait_until_wanted()
+
+
+async def test_a_message_in_too_many_pieces_ends_the_connection(caplog: pytest.LogCaptureFixture) -> None:
+    """Each piece needs memory until the message is complete, even if it is empty."""
+    caplog.set_level(logging.INFO)
+    async with serving("lab") as (port, _), viewing(port) as hostile:
+        empty = piece(b"", CONTINUATION, is_last=False)
+        hostile.send_bytes(piece(b"", TEXT, is_last=False) + empty * (connections.MAX_FRAGMENTS + 1))
+        await hostile.wait_until(lambda: hostile.is_closed)
+    assert num_logged(caplog, "is disconnected: it sends a message in more than 1000 pieces") == 1
+
+
+def piece(data: bytes, opcode: int, *, is_last: bool) -> bytes:
+    """Return a frame with a piece of a message (RFC 6455, 5.4)."""
+    frame = client_frame(data, opcode)
+    return frame if is_last else bytes((frame[0] & 0x7F,)) + frame[1:]
+
+
+async def test_a_flood_of_empty_frames_ends_the_connection() -> None:
+    """They are few bytes, but each costs as much time as a request."""
+    async with serving("lab") as (port, _), viewing(port) as hostile:
+        hostile.send_bytes(client_frame(b"", PING) * 10_000)
+        await hostile.wait_until(lambda: hostile.is_closed)
+
+
+async def test_thousands_of_subscriptions_may_come_at_once_each_in_a_message() -> None:
+    names = [f"lab_{number}" for number in range(200)]
+    async with serving(*names) as (port, [lab, *_]), viewing(port) as viewer:
+        await viewer.wait_until(lambda: len(viewer.topics) == 1200)
+        for topic in viewer.topics:
+            viewer.subscribe(topic)
+        await lab.wait_until_wanted()
+        assert not viewer.is_closed
 
 
 def num_logged(caplog: pytest.LogCaptureFixture, text: str) -> int:

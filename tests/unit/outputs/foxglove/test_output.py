@@ -127,6 +127,26 @@ async def test_other_labels_of_channels_replace_the_topic_by_one_with_another_sc
             assert floats_of(after.content) == {"left": 1, "right": 2, "time": 3}
 
 
+async def test_a_topic_of_numbers_disappears_with_its_parameters_and_comes_back_with_them() -> None:
+    plates = Parameters(force=ParametersForce((PLATE,)))
+    async with serving("lab") as (port, [lab]):
+        lab.set_parameters(plates)
+        async with viewing(port, "/lab/loads", "/lab/events") as viewer:
+            lab.set_parameters(channels("EMG 1"), 2)
+            await viewer.wait_until(lambda: "/lab/analog" in viewer.topics)
+            await viewer.wait_until(lambda: "/lab/loads" not in viewer.topics)
+            assert set(viewer.withdrawn) == {"/lab/loads", "/lab/loads/cdr"}
+            assert lab.wanted
+            lab.publish_items(EVENT, [(7, 0, 1, 2, 3)])
+            await viewer.wait_for("/lab/events")
+            lab.set_parameters(plates, 3)
+            await viewer.wait_until(lambda: "/lab/loads" in viewer.topics)
+            viewer.subscribe("/lab/loads")
+            await lab.publish_until(
+                frame_of({FORCE: [(1, 2, 3, 4, 5, 6)]}), lambda: viewer.received["/lab/loads"]
+            )
+
+
 async def test_a_number_of_channels_that_goes_up_and_down_is_counted_and_not_followed_each_time() -> None:
     async with serving("lab") as (port, [lab]):
         lab.set_parameters(channels("a", "b"))
@@ -227,21 +247,48 @@ async def test_viewers_have_their_own_subscriptions() -> None:
         assert not first.received["/lab/tools"]
 
 
-async def test_requests_that_make_no_sense_are_answered_or_ignored() -> None:
-    async with serving("lab") as (port, [lab]), viewing(port, "/lab/markers") as viewer:
+async def test_requests_that_make_no_sense_are_answered_with_an_error_and_change_nothing() -> None:
+    async with serving("lab") as (port, [lab]), viewing(port) as viewer:
+        markers, tools = (viewer.channel(topic)["id"] for topic in ("/lab/markers", "/lab/tools"))
+        viewer.subscribe("/lab/markers")
         await lab.wait_until_wanted()
-        number = viewer.channel("/lab/markers")["id"]
-        for request in (
-            {"op": "subscribe", "subscriptions": [{"id": 7, "channelId": number}]},  # a second time
-            {"op": "subscribe", "subscriptions": [{"id": 8, "channelId": 99999}]},
-            {"op": "unsubscribe", "subscriptionIds": [9]},
-            {"op": "getParameters", "parameterNames": []},
-        ):
+        [used] = viewer.subscriptions
+
+        async def answer(request: dict[str, Any]) -> str:
+            viewer.warnings.clear()
             viewer.send(request)
-        await viewer.wait_until(lambda: viewer.warnings)
-        assert viewer.warnings == ["only subscribe and unsubscribe are served"]
+            await viewer.wait_until(lambda: viewer.warnings)
+            [text] = viewer.warnings
+            return text
+
+        def subscribe(*wanted: tuple[int, int]) -> dict[str, Any]:
+            found = [{"id": number, "channelId": channel} for number, channel in wanted]
+            return {"op": "subscribe", "subscriptions": found}
+
+        many = [(number, 99999) for number in range(1000)]
+        assert "channel 99999" in await answer(subscribe(*many))
+        assert f"channel {markers} has a subscription already" in await answer(subscribe((7, markers)))
+        assert f"subscription {used} exists already" in await answer(subscribe((used, tools)))
+        viewer.send({"op": "unsubscribe", "subscriptionIds": [9]})  # it may have ended with its channel
+        for op in ("advertise", "getParameters", "subscribeConnectionGraph"):
+            assert "only subscribe and unsubscribe" in await answer({"op": op})
+        viewer.received.clear()
+        lab.publish(frame_of({MARKERS: [(1, 2, 3, 0)], TOOLS: [pose(1, 2, 3)]}))
         lab.publish_items(MARKERS, [(1, 2, 3, 0)])
-        await viewer.wait_for("/lab/markers")
+        await viewer.wait_for("/lab/markers", 2)
+        assert viewer.received.keys() == {"/lab/markers"}
+
+
+async def test_a_subscription_to_a_channel_that_has_just_been_withdrawn_is_ignored() -> None:
+    async with serving("lab") as (port, [lab]):
+        lab.set_parameters(channels("EMG 1"))
+        async with viewing(port) as viewer:
+            withdrawn = viewer.channel("/lab/analog")["id"]
+            lab.set_parameters(channels("EMG 2"), 2)
+            viewer.send({"op": "subscribe", "subscriptions": [{"id": 1, "channelId": withdrawn}]})
+            viewer.subscribe("/lab/markers")
+            await lab.wait_until_wanted()
+            assert viewer.warnings == []
 
 
 async def test_clients_of_other_protocols_are_refused() -> None:

@@ -11,6 +11,7 @@ from gateway.outputs.foxglove.protocol import (
     Subscription,
     advertise,
     channel_text,
+    error,
     message_data,
     parse_request,
     server_info,
@@ -62,6 +63,7 @@ def test_binary_schemas_are_advertised_as_base64_and_json_schemas_as_text() -> N
     assert json.loads(advertise([])) == {"op": "advertise", "channels": []}
     assert json.loads(unadvertise([2, 1])) == {"op": "unadvertise", "channelIds": [2, 1]}
     assert json.loads(warning("slow")) == {"op": "status", "level": 1, "message": "slow"}
+    assert json.loads(error("no")) == {"op": "status", "level": 2, "message": "no"}
 
 
 def test_requests_of_viewers() -> None:
@@ -93,6 +95,8 @@ def test_requests_of_viewers() -> None:
         '{"op":"subscribe","subscriptions":[{"id":-1,"channelId":1}]}',
         '{"op":"subscribe","subscriptions":[{"id":4294967296,"channelId":1}]}',
         '{"op":"subscribe","subscriptions":[{"id":"1","channelId":1}]}',
+        '{"op":"subscribe","subscriptions":[{"id":1.5,"channelId":1}]}',
+        '{"op":"subscribe","subscriptions":[{"id":1,"channelId":0.1}]}',
         '{"op":"unsubscribe","subscriptionIds":[null]}',
         '{"op":"unsubscribe","subscriptionIds":[NaN]}',
         '{"op":"unsubscribe","subscriptionIds":[1e999]}',
