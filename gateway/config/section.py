@@ -1,6 +1,8 @@
 """The base class of all parts of the configuration: frozen, and with the gateway's error texts."""
 
+import re
 from collections.abc import Mapping
+from decimal import Decimal
 from typing import Any, Final, NamedTuple, Self
 
 from pydantic import (
@@ -20,6 +22,8 @@ UNKNOWN_KEY: Final = "unknown_key"
 """The error type of a key that does not exist; all other errors are about a value or its absence."""
 
 _MISTAKE: Final = "mistake"
+
+_EXPONENT: Final = re.compile(r"[+-]?[0-9]{1,9}(\.[0-9]{0,9})?[eE][+-]?[0-9]")
 
 
 class Effective(NamedTuple):
@@ -77,11 +81,21 @@ def expects(what: str) -> WrapValidator:
             first = error.errors(include_url=False)[0]
             if first["loc"]:
                 raise  # the error is in an item of the value, and already has its own text
-            unquoted = first["type"] == "string_type" and isinstance(value, bool | int | float)
-            hint = " (use quotes to make it text)" if unquoted else ""
-            raise validation_error(f"found {describe(value)}{hint}; expected {what}") from None
+            hint = _quoting_hint(value, first["type"])
+            raise validation_error(
+                f"found {describe(value, show_items=True)}{hint}; expected {what}"
+            ) from None
 
     return WrapValidator(check)
+
+
+def _quoting_hint(value: object, error_type: str) -> str:
+    """Return how to write a number that has to be text, or one such as 1e-3, which YAML takes for text."""
+    if error_type == "string_type" and isinstance(value, bool | int | float):
+        return " (use quotes to make it text)"
+    if error_type == "float_type" and isinstance(value, str) and _EXPONENT.fullmatch(value):
+        return f" (write it as {format(Decimal(value), 'f')})"
+    return ""
 
 
 def _line_error(text: str, location: tuple[str | int, ...], kind: str) -> InitErrorDetails:

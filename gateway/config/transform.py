@@ -3,20 +3,41 @@
 import math
 from typing import Annotated, Final, Literal, Self
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from gateway.config.section import Section, expects, validation_error
 
 _MAX_NORM_ERROR: Final = 0.01  # quaternions are often written with two or three digits
 
-_Number = Annotated[float, Field(strict=True, ge=-1e6, le=1e6, allow_inf_nan=False)]
+_Number = Annotated[
+    float,
+    Field(strict=True, ge=-1e6, le=1e6, allow_inf_nan=False),
+    expects("a number from -1000000 to 1000000"),
+]
+
+
+def _has_items(count: int) -> BeforeValidator:
+    """Return an annotation that refuses lists of another length as a whole."""
+
+    def check(value: object) -> object:
+        if isinstance(value, list | tuple) and len(value) != count:
+            raise ValueError
+        return value
+
+    return BeforeValidator(check)
 
 
 def _unit_quaternion(values: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
     norm = math.hypot(*values)
-    if abs(norm - 1) > _MAX_NORM_ERROR:
-        raise ValueError
+    if not norm:
+        raise validation_error("found only zeros, which is no rotation; expected [0, 0, 0, 1] for none")
     x, y, z, w = (value / norm for value in values)
+    if abs(norm - 1) > _MAX_NORM_ERROR:
+        found, expected = ([f"{number:.4g}" for number in numbers] for numbers in (values, (x, y, z, w)))
+        raise validation_error(
+            f"found [{', '.join(found)}], whose squares do not add up to 1; "
+            f"expected x y z w, such as [{', '.join(expected)}]"
+        )
     return (x, y, z, w)
 
 
@@ -33,11 +54,14 @@ Scale = Annotated[
 UpAxis = Annotated[Literal["y", "z"], expects("y or z")]
 QuaternionXyzw = Annotated[
     tuple[_Number, _Number, _Number, _Number],
+    _has_items(4),
+    expects("a list of four numbers, x y z w, such as [0, 0, 0, 1]"),
     AfterValidator(_unit_quaternion),
-    expects("a list of four numbers, x y z w, whose squares add up to 1"),
 ]
 Metres3 = Annotated[
-    tuple[_Number, _Number, _Number], expects("a list of three numbers of metres, from -1000000 to 1000000")
+    tuple[_Number, _Number, _Number],
+    _has_items(3),
+    expects("a list of three numbers of metres, x y z, such as [2.5, 0, 0]"),
 ]
 
 

@@ -1,13 +1,20 @@
 """Words of error texts: values, lists of alternatives, hints at spelling."""
 
 import difflib
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Final
 
 from gateway.config.secrets import mask_secrets_in_text
 
+_MAX_ITEMS: Final = 8
+"""The length of the longest list that is printed."""
 
-def describe(value: object) -> str:
-    """Return a value as part of a sentence: printable, on one line, of limited length, without passwords."""
+
+def describe(value: object, *, show_items: bool = False) -> str:
+    """Return a value as part of a sentence: printable, on one line, of limited length, without passwords.
+
+    With ``show_items``, a short list of plain values is written as in YAML.
+    """
     match value:
         case None:
             return "nothing"
@@ -16,11 +23,20 @@ def describe(value: object) -> str:
         case Mapping():
             return "a mapping" if value else "an empty mapping"
         case list() | tuple():
-            return "a list" if value else "an empty list"
+            return _describe_list(value, show_items=show_items)
         case str():
             text = mask_secrets_in_text(value)
             return repr(text if len(text) <= 60 else text[:60] + "…")
     return str(value)
+
+
+def _describe_list(values: Sequence[object], *, show_items: bool) -> str:
+    if not values:
+        return "an empty list"
+    is_plain = not any(isinstance(value, Mapping | list | tuple) for value in values)
+    if show_items and is_plain and len(values) <= _MAX_ITEMS:
+        return f"[{', '.join(map(describe, values))}]"
+    return "a list"
 
 
 def join_or(words: Iterable[str]) -> str:

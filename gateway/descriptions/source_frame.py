@@ -12,6 +12,8 @@ from gateway.rtc3d.parameters import Parameters
 _Y_UP_TO_Z_UP: Final[Quaternion] = (math.sqrt(0.5), 0.0, 0.0, math.sqrt(0.5))
 """A quarter turn about x: (x, y, z) becomes (x, -z, y)."""
 
+_ROUNDING_ERROR: Final = 1e-15
+
 
 def source_frame(settings: SourceSettings, parameters: Parameters) -> CoordinateFrame:
     """Return the frame in which poses of a source are published; the unit is that of §6.2 if none is set."""
@@ -26,6 +28,7 @@ def source_frame(settings: SourceSettings, parameters: Parameters) -> Coordinate
         None if metres is None else metres * transform.scale,
         rotation,
         transform.translation_m,
+        transform.scale,
     )
 
 
@@ -43,4 +46,10 @@ def _quaternion(angles: RollPitchYaw) -> Quaternion:
     about_x = (math.sin(roll), 0.0, 0.0, math.cos(roll))
     about_y = (0.0, math.sin(pitch), 0.0, math.cos(pitch))
     about_z = (0.0, 0.0, math.sin(yaw), math.cos(yaw))
-    return product(about_z, product(about_y, about_x))
+    x, y, z, w = product(about_z, product(about_y, about_x))
+    return (_tidy(x), _tidy(y), _tidy(z), _tidy(w))
+
+
+def _tidy(value: float) -> float:
+    """Return 0 for what is 0 but for rounding errors, as the cosine of 90° is, so that poses show 0, too."""
+    return 0.0 if abs(value) < _ROUNDING_ERROR else value

@@ -26,7 +26,6 @@ from foxglove.messages import (
 from gateway.descriptions.plate_forces import METRES_PER_NEWTON, PlacedPlate, force_on, placed_plates
 from gateway.foxglove_schemas.topics import FoxgloveMessage, timestamp, topic_of
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.tool_pose import metres_per_unit
 from gateway.rtc3d.components import Items
 from gateway.rtc3d.parameters import Parameters
 
@@ -48,7 +47,7 @@ class ForceScene:
         self.outlines_topic = topic_of(f"/{source}/plates", SceneUpdate)
         self.arrows_topic = topic_of(f"/{source}/forces", SceneUpdate)
         self._plates = placed_plates(parameters)
-        self._frame = _frame_of_metres(frame, parameters)
+        self._frame = replace(frame, metres_per_unit=frame.scale)  # plates are in metres already
 
     def plates(self, utime: int) -> FoxgloveMessage:
         """Return the outlines and labels of the plates, in place of all earlier ones."""
@@ -85,13 +84,6 @@ class ForceScene:
             if plate is not None
         ]
         return FoxgloveMessage(self.arrows_topic, utime, SceneUpdate(entities=entities).encode())
-
-
-def _frame_of_metres(frame: CoordinateFrame, parameters: Parameters) -> CoordinateFrame:
-    """Return the same frame for plates, which are in metres already: they are scaled like the markers."""
-    unit_m = metres_per_unit(parameters.length_unit)
-    scale = frame.metres_per_unit / unit_m if frame.metres_per_unit and unit_m else 1.0
-    return replace(frame, metres_per_unit=scale)
 
 
 def _placed(points: Sequence[Sequence[float]], frame: CoordinateFrame) -> list[list[float]]:

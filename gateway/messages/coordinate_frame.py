@@ -24,6 +24,9 @@ NO_TRANSLATION: Final[Vector] = (0.0, 0.0, 0.0)
 MAX_FLOAT: Final = 3.4e38
 """Larger values are out of the range of a 32-bit float."""
 
+_ROUNDING_ERROR: Final = 1e-14
+"""Closer than this, an element of a rotation matrix counts as a whole number."""
+
 
 @dataclass(frozen=True)
 class CoordinateFrame:
@@ -31,25 +34,29 @@ class CoordinateFrame:
 
     ``metres_per_unit`` is the length of the server's unit, or a multiple of it if the settings scale it; None
     if the unit is unknown. Positions are first scaled, then rotated, then moved. Component messages keep the
-    server's units and axes.
+    server's units and axes. ``scale`` is what the settings scale by: metres of the server become as many
+    metres of the frame.
     """
 
     frame_id: str
     metres_per_unit: float | None = 1e-3
     rotation_xyzw: Quaternion = NO_ROTATION
     translation_m: Vector = NO_TRANSLATION
+    scale: float = 1.0
 
     @cached_property
     def matrix(self) -> npt.NDArray[np.float64]:
-        """The rotation as a matrix, shape (3, 3)."""
+        """The rotation as a matrix, shape (3, 3); that of quarter turns has only -1, 0 and 1."""
         x, y, z, w = self.rotation_xyzw
-        return np.array(
+        matrix = np.array(
             [
                 [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
                 [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
                 [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
             ]
         )
+        whole = matrix.round() + 0.0  # no -0.0
+        return np.where(np.abs(matrix - whole) < _ROUNDING_ERROR, whole, matrix)
 
     @cached_property
     def only_scales(self) -> bool:

@@ -72,7 +72,7 @@ def _frame_content(message: Any) -> str:
         case rtc3d.tool_pose_t(visible=False):
             text = "out of view"
         case rtc3d.tool_pose_t():
-            position, orientation = _vector(message.position_m), _vector(message.orientation_xyzw)
+            position, orientation = _rounded(message.position_m), _rounded(message.orientation_xyzw)
             text = f"position {position} m, orientation xyzw {orientation}"
         case rtc3d.markers_t():
             text = f"{message.num_markers} markers, {_visibility(message.markers)}"
@@ -89,7 +89,7 @@ def _frame_content(message: Any) -> str:
 
 def _visibility(items: Sequence[Any]) -> str:
     visible = [(item.x, item.y, item.z) for item in items if not math.isnan(item.x)]
-    first = f", first visible at {_vector(visible[0])}" if visible else ""
+    first = f", first visible at {_rounded(visible[0])}" if visible else ""
     return f"{len(items) - len(visible)} missing{first}"
 
 
@@ -113,8 +113,14 @@ def _vector(values: Sequence[float]) -> str:
     return "(" + ", ".join(map(_number, values)) + ")"
 
 
+def _rounded(values: Sequence[float]) -> str:
+    """Return positions or a quaternion without what is only a rounding error, such as 1.6e-17 for 0."""
+    return _vector([round(value, 6) + 0.0 for value in values])  # + 0.0: no -0
+
+
 def _number(value: float) -> str:
-    return f"{value:.4g}"
+    """Return a number with four digits, and all digits before the point."""
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e7 else f"{value:.4g}"
 
 
 def _clock(clock: Any) -> str:

@@ -15,12 +15,21 @@ _FINGERPRINT: Final[bytes] = rtc3d.tool_pose_t._get_packed_fingerprint()  # noqa
 # Frame number, time stamp, visible, position, orientation, error.
 _CONTENT: Final = struct.Struct(">iq?8f")
 _NO_POSE: Final = (math.nan,) * 8
-_METRES: Final = {"m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "in": 0.0254}
+_UNITS: Final = {
+    1.0: "m metre metres meter meters",
+    1e-1: "dm decimetre decimetres decimeter decimeters",
+    1e-2: "cm centimetre centimetres centimeter centimeters",
+    1e-3: "mm millimetre millimetres millimeter millimeters",
+    1e-6: "um µm microm micron microns micrometre micrometres micrometer micrometers",
+    0.0254: "in inch inches",
+    0.3048: "ft foot feet",
+}
+_METRES: Final = {name.casefold(): metres for metres, names in _UNITS.items() for name in names.split()}
 
 
 def metres_per_unit(unit: str) -> float | None:
     """Return the length in metres of ``unit`` in the 3D parameters (§6.2); None if it is unknown."""
-    return _METRES.get(unit.strip().lower() or "mm")
+    return _METRES.get(unit.strip().casefold() or "mm")
 
 
 def tool_poses(

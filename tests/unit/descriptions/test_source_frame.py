@@ -31,7 +31,27 @@ def test_without_settings_a_frame_has_the_name_of_the_source_and_the_unit_of_the
 
 
 def test_settings_name_the_frame_and_the_unit() -> None:
-    assert frame_of("furlong", "world/hall", units="in", scale=2.0) == CoordinateFrame("world/hall", 0.0508)
+    expected = CoordinateFrame("world/hall", 0.0508, scale=2.0)
+    assert frame_of("furlong", "world/hall", units="in", scale=2.0) == expected
+
+
+@pytest.mark.parametrize(
+    ("unit", "metres"),
+    [
+        (" MM ", 1e-3),
+        ("M", 1.0),
+        ("Millimeters", 1e-3),
+        ("\u00b5m", 1e-6),  # the micro sign
+        ("\u03bcm", 1e-6),  # the Greek letter
+        ("inch", 0.0254),
+        ("Feet", 0.3048),
+        ("", 1e-3),
+        ("mV", None),
+        ("m m", None),
+    ],
+)
+def test_units_have_several_names(unit: str, metres: float | None) -> None:
+    assert frame_of(unit).metres_per_unit == metres
 
 
 def test_all_units_of_the_settings_are_known() -> None:
@@ -86,10 +106,48 @@ def test_a_quaternion_is_the_same_as_its_angles() -> None:
         ({"up": "x"}, ("up", "found 'x'; expected y or z")),
         ({"scale": 0}, ("scale", "found 0; expected a number from 0.000001 to 1000000")),
         (
+            {"scale": "1e-3"},
+            ("scale", "found '1e-3' (write it as 0.001); expected a number from 0.000001 to 1000000"),
+        ),
+        (
             {"rotation_xyzw": [0, 0, 1, 1]},
             (
                 "rotation_xyzw",
-                "found a list; expected a list of four numbers, x y z w, whose squares add up to 1",
+                "found [0, 0, 1, 1], whose squares do not add up to 1; "
+                "expected x y z w, such as [0, 0, 0.7071, 0.7071]",
+            ),
+        ),
+        (
+            {"rotation_xyzw": [0, 0, 0, 0]},
+            ("rotation_xyzw", "found only zeros, which is no rotation; expected [0, 0, 0, 1] for none"),
+        ),
+        (
+            {"rotation_xyzw": [0, 0, 1]},
+            (
+                "rotation_xyzw",
+                "found [0, 0, 1]; expected a list of four numbers, x y z w, such as [0, 0, 0, 1]",
+            ),
+        ),
+        (
+            {"rotation_xyzw": [0, 0, math.nan, 1]},
+            ("rotation_xyzw.2", "found nan; expected a number from -1000000 to 1000000"),
+        ),
+        (
+            {"rotation_xyzw": {"w": 1}},
+            (
+                "rotation_xyzw",
+                "found a mapping; expected a list of four numbers, x y z w, such as [0, 0, 0, 1]",
+            ),
+        ),
+        (
+            {"translation_m": [1, "2 m", 3]},
+            ("translation_m.1", "found '2 m'; expected a number from -1000000 to 1000000"),
+        ),
+        (
+            {"translation_m": [1, 2]},
+            (
+                "translation_m",
+                "found [1, 2]; expected a list of three numbers of metres, x y z, such as [2.5, 0, 0]",
             ),
         ),
         (
@@ -104,13 +162,6 @@ def test_a_quaternion_is_the_same_as_its_angles() -> None:
 )
 def test_mistakes_are_told_with_what_is_expected(transform: dict[str, Any], mistake: tuple[str, str]) -> None:
     assert mistakes(TransformSettings, transform) == [mistake]
-
-
-@pytest.mark.parametrize("values", [[1, 2], [1, 2, "3"], 7, [1, 2, math.inf], [1, 2, 3, 4]])
-def test_a_translation_has_three_numbers(values: Any) -> None:
-    assert [key.split(".")[0] for key, _ in mistakes(TransformSettings, {"translation_m": values})] == [
-        "translation_m"
-    ]
 
 
 @pytest.mark.parametrize("frame_id", ["", "/world", "two words", "x" * 65, 7])

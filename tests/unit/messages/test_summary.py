@@ -32,7 +32,7 @@ from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS
             component_message(TOOLS),
             "#41 frame 4 at 0.0075 s: 2 tools, 1 missing, first visible at (100, -200, 1600)",
         ),
-        (component_message(ANALOG), "#41 frame 2 at 0.0025 s: 3 channels, voltages 0.1, -1.5e+04, 0"),
+        (component_message(ANALOG), "#41 frame 2 at 0.0025 s: 3 channels, voltages 0.1, -15000, 0"),
         (component_message(FORCE), "#41 frame 3 at 0.0050 s: 2 plates, forces (1.5, -0.75, 800); (4, 5, 6)"),
         (
             component_message(LONG_EVENTS),
@@ -103,6 +103,22 @@ def test_the_summary_of_a_status_says_what_was_lost_and_why() -> None:
 def test_a_summary_without_visible_markers_has_no_position() -> None:
     message = rtc3d.markers_t()
     assert summarise(message).endswith("0 markers, 0 missing")
+
+
+def test_positions_and_orientations_have_no_rounding_errors_and_large_numbers_no_exponent() -> None:
+    pose = rtc3d.tool_pose_t()
+    pose.visible = True
+    pose.position_m, pose.orientation_xyzw = (
+        [2.15, -1.6e-17, 12345.678],
+        [-3e-9, 1.6e-17, 0.70710678, -0.7071],
+    )
+    assert summarise(pose).endswith("position (2.15, 0, 12346) m, orientation xyzw (0, 0, 0.7071, -0.7071)")
+
+
+def test_small_values_of_channels_are_shown() -> None:
+    message = rtc3d.analog_t()
+    message.num_channels, message.voltages = 3, [1.6e-7, -0.00012345, 2e9]
+    assert summarise(message).endswith("voltages 1.6e-07, -0.0001234, 2e+09")
 
 
 def test_a_summary_shows_four_channels_at_most() -> None:

@@ -332,6 +332,22 @@ async def test_parameters_and_plates_are_sent_to_each_viewer_that_subscribes_and
             await lab.wait_until_wanted(False)
 
 
+async def test_plates_are_scaled_but_have_units_of_their_own() -> None:
+    """Here, the server says mm, and the settings that its positions are in m."""
+    frame = CoordinateFrame("hall", metres_per_unit=2.0, scale=2.0)
+    described = Parameters(markers=Parameters3D(unit="mm"), force=ParametersForce((PLATE,)))
+    async with serving("lab") as (port, [lab]), viewing(port, "/lab/plates") as viewer:
+        lab.set_parameters(described, 1, frame)
+        await viewer.wait_until(lambda: viewer.received["/lab/plates"][-1:] and entities(viewer))
+        [entity] = entities(viewer)
+        corners = [(p.x, p.y) for p in entity.lines[0].points]
+        assert np.allclose(corners, [(1.2, 0.8), (0, 0.8), (0, 0), (1.2, 0)])
+
+
+def entities(viewer: Viewer) -> Any:
+    return viewer.received["/lab/plates"][-1].content.entities
+
+
 async def test_names_of_fields_that_are_not_the_labels_can_be_queried() -> None:
     async with serving("lab") as (port, [lab]), viewing(port) as viewer:
         lab.set_parameters(channels("EMG 1", "EMG_1", "time"))
