@@ -7,9 +7,9 @@ found and what is expected. ``gateway.config.loading`` adds file, line and colum
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Final, Literal, Self
+from typing import Annotated, Any, ClassVar, Final, Literal, NamedTuple, Self
 
 from pydantic import (
     AfterValidator,
@@ -214,6 +214,22 @@ class SourceSettings(Section):
         return self
 
 
+class ListenAddress(NamedTuple):
+    """A TCP address that a section has the gateway listen on; ``key`` is where the section has the port."""
+
+    key: tuple[str, ...]
+    host: str
+    port: int
+
+    def collides_with(self, other: "ListenAddress") -> bool:
+        """Return whether only one of the two can be opened."""
+        hosts = {self.host, other.host}
+        return self.port == other.port and (len(hosts) == 1 or not hosts.isdisjoint(_ALL_ADDRESSES))
+
+
+_ALL_ADDRESSES: Final = {"0.0.0.0", "::"}  # noqa: S104 - not bound here
+
+
 class OutputSettings(Section):
     """The keys that all outputs have."""
 
@@ -222,6 +238,11 @@ class OutputSettings(Section):
 
     enabled: Switch = False
     """Whether to publish on this output."""
+
+    @property
+    def listens_on(self) -> Sequence[ListenAddress]:
+        """The addresses to listen on, as far as they are in keys of the gateway's own."""
+        return ()
 
 
 def folder_of(configured: str | None, name: str) -> Path:
@@ -281,6 +302,11 @@ class MetricsSettings(Section):
     port: Port = 9464
     """The TCP port."""
 
+    @property
+    def listens_on(self) -> Sequence[ListenAddress]:
+        """See OutputSettings."""
+        return [ListenAddress(("port",), self.address, self.port)]
+
 
 class Settings(Section):
     """The configuration without outputs; ``settings_model`` adds a section for each output."""
@@ -331,6 +357,21 @@ class Settings(Section):
             *others, last = (f"{name}.enabled" for name in outputs)
             found = f"found false here and in {' and '.join(others)}" if others else "found false"
             raise validation_error(f"{found}; expected true in at least one of them", *last.split("."))
+        return self
+
+    @model_validator(mode="after")
+    def _check_ports_differ(self) -> Self:
+        sections: dict[str, MetricsSettings | OutputSettings] = {"metrics": self.metrics, **self.outputs}
+        used: dict[str, ListenAddress] = {}
+        for name, section in sections.items():
+            for address in section.listens_on if section.enabled else ():
+                for other_key, other in used.items():
+                    if address.collides_with(other):
+                        raise validation_error(
+                            f"found {address.port}, which {other_key} has too; expected another port",
+                            *(name, *address.key),
+                        )
+                used[".".join((name, *address.key))] = address
         return self
 
 

@@ -1,6 +1,8 @@
 """The section ``foxglove`` of the configuration."""
 
-from gateway.config.settings import OutputSettings
+from collections.abc import Sequence
+
+from gateway.config.settings import ListenAddress, OutputSettings
 from gateway.config.values import Host, Port, Switch
 
 
@@ -15,3 +17,8 @@ class FoxgloveSettings(OutputSettings):
 
     port: Port = 8765
     """The TCP port. Viewers connect to `ws://HOST:PORT`."""
+
+    @property
+    def listens_on(self) -> Sequence[ListenAddress]:
+        """See OutputSettings."""
+        return [ListenAddress(("port",), self.host, self.port)]

@@ -1,12 +1,12 @@
 """The section ``rtc3d`` of the configuration."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Final, Self
 
 from pydantic import AfterValidator, Field, PlainSerializer, model_validator
 
 from gateway.config.section import expects, validation_error
-from gateway.config.settings import OutputSettings
+from gateway.config.settings import ListenAddress, OutputSettings
 from gateway.config.values import Host, Port, SourceName, Switch
 
 DEFAULT_MAX_CLIENTS: Final = 128
@@ -48,6 +48,11 @@ class Rtc3dSettings(OutputSettings):
 
     max_clients: MaxClients = DEFAULT_MAX_CLIENTS
     """How many clients each source can have at the same time."""
+
+    @property
+    def listens_on(self) -> Sequence[ListenAddress]:
+        """See OutputSettings."""
+        return [ListenAddress(("ports", source), self.host, port) for source, port in self.ports.items()]
 
     @model_validator(mode="after")
     def _check_any_port(self) -> Self:

@@ -1,9 +1,10 @@
 """The section ``vrpn`` of the configuration."""
 
+from collections.abc import Sequence
 from typing import Annotated, Final
 
 from gateway.config.section import expects
-from gateway.config.settings import OutputSettings
+from gateway.config.settings import ListenAddress, OutputSettings
 from gateway.config.values import Host, Port, Switch
 from gateway.outputs.vrpn.trackers import TrackerNames
 
@@ -24,3 +25,8 @@ class VrpnSettings(OutputSettings):
 
     tracker_names: Annotated[TrackerNames, expects("auto, tool or source/tool")] = "auto"
     """The names of trackers: tool, source/tool, or auto for tool if there is only one source."""
+
+    @property
+    def listens_on(self) -> Sequence[ListenAddress]:
+        """See OutputSettings."""
+        return [ListenAddress(("port",), self.host, self.port)]

@@ -171,3 +171,38 @@ def test_every_key_has_a_description_in_the_schema() -> None:
     keys = [key for section in sections for key in section["properties"].values()]
     assert len(keys) > 20
     assert all(key["description"] for key in keys)
+
+
+@pytest.mark.parametrize(
+    ("sections", "mistake"),
+    [
+        (
+            {"vrpn": {"enabled": True, "port": 9464}},
+            ("vrpn.port", "found 9464, which metrics.port has too; expected another port"),
+        ),
+        (
+            {"vrpn": {"enabled": True, "port": 8765}, "foxglove": {"enabled": True, "host": "::"}},
+            ("foxglove.port", "found 8765, which vrpn.port has too; expected another port"),
+        ),
+        (
+            {"vrpn": {"enabled": True}, "rtc3d": {"enabled": True, "ports": {"lab": 3120, "hall": 3883}}},
+            ("vrpn.port", "found 3883, which rtc3d.ports.hall has too; expected another port"),
+        ),
+    ],
+)
+def test_two_sections_cannot_listen_on_the_same_port(
+    sections: dict[str, Any], mistake: tuple[str, str]
+) -> None:
+    assert mistakes(MODEL, {"sources": [source()], **sections}) == [mistake]
+
+
+@pytest.mark.parametrize(
+    "sections",
+    [
+        {"vrpn": {"enabled": False, "port": 9464}},
+        {"vrpn": {"enabled": True, "port": 9464}, "metrics": {"enabled": False}},
+        {"vrpn": {"enabled": True, "port": 9464, "host": "192.0.2.7"}},
+    ],
+)
+def test_a_port_can_be_used_again_on_another_address_or_if_a_section_is_off(sections: dict[str, Any]) -> None:
+    assert MODEL.model_validate({"sources": [source()], **sections})
