@@ -68,12 +68,26 @@ class DiagnosticsPublisher:
 
 
 def diagnostics_of(status: Any) -> list[DiagnosticStatus]:
-    """Return what a decoded ``status_t`` says: one status per stream, and one per output."""
+    """Return what a decoded ``status_t`` says: one status per stream and output, and the coordinate frame."""
     name = f"rtc3d_gateway: {status.source}"
     return [
         *(_stream(name, status.server, stream) for stream in status.streams),
         *(_output(name, status.server, output) for output in status.outputs),
+        _frame(name, status),
     ]
+
+
+def _frame(name: str, status: Any) -> DiagnosticStatus:
+    """Return how the source's positions were made from the server's, for nodes that need those."""
+    values = {
+        "metres per unit of the server": f"{status.metres_per_unit:g}",
+        "rotation (x y z w)": " ".join(map(repr, status.rotation_xyzw)),
+        "translation (m)": " ".join(map(repr, status.translation_m)),
+    }
+    level, message = OK, status.frame_id
+    if not status.metres_per_unit:
+        level, message = WARN, f"{status.frame_id}: the server's unit of length is unknown"
+    return DiagnosticStatus(level, f"{name} coordinate frame", message, status.server, values)
 
 
 def _stream(name: str, server: str, stream: Any) -> DiagnosticStatus:

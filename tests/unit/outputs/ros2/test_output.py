@@ -293,13 +293,19 @@ def test_the_status_becomes_diagnostics(lab: RosLab) -> None:
     wait_until(lambda: lab.received["/diagnostics"])
     array = lab.received["/diagnostics"][0].message
     assert seconds(array) == STAMP
-    markers, analog, zenoh = array.status
+    markers, analog, zenoh, frame = array.status
     assert (markers.level, markers.name, markers.message) == (0, "rtc3d_gateway: lab 3d 6d", "streaming")
     assert markers.hardware_id == "192.0.2.20:3020"
     assert {each.key: each.value for each in markers.values}["rate (Hz)"] == "200.0"
     assert (analog.level, analog.message) == (2, "waiting to reconnect: connection refused")
     assert (zenoh.level, zenoh.name, zenoh.message) == (2, "rtc3d_gateway: lab to zenoh", "start zenohd")
     assert {each.key: each.value for each in zenoh.values} == {"sent 3d": "7", "lost: no router": "12"}
+    assert (frame.level, frame.name, frame.message) == (0, "rtc3d_gateway: lab coordinate frame", "hall")
+    assert {each.key: each.value for each in frame.values} == {
+        "metres per unit of the server": "0.001",
+        "rotation (x y z w)": "0.5 0.5 0.5 0.5",
+        "translation (m)": "2.5 0.0 -1.0",
+    }
     publisher.close()
     with pytest.raises(OutputError, match="closed"):
         publisher.publish(example_status())
@@ -309,6 +315,8 @@ def example_status() -> bytes:
     status = rtc3d.status_t()
     status.utime = UTIME
     status.source, status.server = "lab", "192.0.2.20:3020"
+    status.frame_id, status.metres_per_unit = "hall", 0.001
+    status.rotation_xyzw, status.translation_m = [0.5, 0.5, 0.5, 0.5], [2.5, 0.0, -1.0]
     status.streams = [
         statuses.stream("3d 6d", frame_rate_hz=200.0),
         statuses.stream("analog", state="waiting to reconnect", last_error="connection refused"),
