@@ -19,9 +19,12 @@ _RETRY_S: Final = 1.0
 _JOIN_S: Final = 0.5
 """How long to wait for the session to close. The thread then continues without the gateway."""
 
-_WAIT_BEFORE_DROP_US: Final = 20_000
-"""How long Zenoh waits for a router that does not read, before it drops messages. Only the sending thread
-waits for it, so this is longer than for the output zenoh."""
+_WAIT_BEFORE_DROP_US: Final = 11_000_000
+"""How long Zenoh waits for a router that does not read, before it drops messages, which it does not count.
+
+Until then, only the sending thread waits, and what finds no place in its queue is counted. This is longer
+than the 10 s without a sign of life after which Zenoh gives a connection up.
+"""
 
 logger = logging.getLogger(__name__)
 

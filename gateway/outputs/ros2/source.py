@@ -131,6 +131,10 @@ class RosSource:
         refused: Mapping[ComponentType, int],
     ) -> None:
         """Publish a frame; ``refused`` are the frames before it that found no place in the queue."""
+        if self._router.is_cut_off:  # since it was queued
+            refusal = self._router.refusal
+            self.topics.losses.lost(refusal.cause, str(refusal))
+            return
         skipped = self._skipped
         if refused is not skipped:
             self.topics.skip({each: count - skipped.get(each, 0) for each, count in refused.items()})

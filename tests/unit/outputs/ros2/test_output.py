@@ -1,11 +1,16 @@
 """The output for ROS 2 with a real router: topics, messages, losses and life cycle."""
 
 import asyncio
+import json
 import logging
 import math
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -24,6 +29,7 @@ from gateway.outputs.ros2.topic import RosTopic
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Plate
 from tests import statuses
+from tests.networks import zenoh_keys
 from tests.ros_lab import ALL, UTIME, RosLab, frame_of, parameters, ros_lab, stamp, tools_frame
 from tests.waiting import wait_until, wait_until_async
 
@@ -425,17 +431,23 @@ def test_items_whose_topics_are_not_open_yet_are_not_too_many() -> None:
     assert topics.losses.report() == []
 
 
+def stalled(lab: RosLab) -> threading.Event:
+    """Let the sending thread wait for the event that is returned."""
+    may_go_on = threading.Event()
+
+    def wait() -> None:
+        may_go_on.wait(10)
+
+    lab.output.submit(wait)
+    return may_go_on
+
+
 def test_frames_beyond_the_queue_are_refused_and_ros_sees_the_gap(lab: RosLab) -> None:
     publisher = lab.source(given=parameters(markers=1, channels=("Fx",)))
     lab.hear_all()
     frame = frame_of((ComponentType.MARKERS, [(1, 2, 3, 0)]), (ComponentType.ANALOG, [1.0]))
     publisher.publish(frame, stamp(), 0, ALL)
-    may_go_on = threading.Event()
-
-    def stall() -> None:
-        may_go_on.wait(10)
-
-    lab.output.submit(stall)
+    may_go_on = stalled(lab)
     while lab.output.offer(lambda: None):
         pass
     for number in range(3):
@@ -448,6 +460,62 @@ def test_frames_beyond_the_queue_are_refused_and_ros_sees_the_gap(lab: RosLab) -
     wait_until(lambda: len(lab.received["/mocap/lab/analog"]) == 2)
     assert [each.sequence for each in lab.received["/mocap/lab/markers"]] == [1, 5]
     assert [each.sequence for each in lab.received["/mocap/lab/analog"]] == [1, 2]
+
+
+def test_frames_that_wait_when_the_router_goes_are_counted(lab: RosLab) -> None:
+    publisher = lab.source(given=parameters(markers=1))
+    lab.hear_all()
+    may_go_on = stalled(lab)
+    for number in range(3):
+        publisher.publish(frame_of((ComponentType.MARKERS, [(1, 2, 3, 0)])), stamp(), number, ALL)
+    lab.cut()
+    wait_until(lambda: not lab.is_connected())
+    may_go_on.set()
+    wait_until(lambda: lab.lost() == {"no router": 3})
+
+
+def test_a_router_that_stops_reading_for_a_moment_loses_nothing() -> None:
+    with ros_lab() as lab, stoppable_router(lab) as router:
+        lab.open()
+        publisher = lab.source(given=parameters(markers=10_000))
+        wait_until(lambda: publisher.wanted)
+        router.send_signal(signal.SIGSTOP)
+        large = frame_of((ComponentType.MARKERS, [(1, 2, 3, 0)] * 10_000))
+        for number in range(_LARGE_FRAMES):
+            publisher.publish(large, stamp(), number, ALL)
+        time.sleep(0.3)  # the pause
+        router.send_signal(signal.SIGCONT)
+        assert router.stdout is not None
+        assert router.stdout.readline().split() == [str(n + 1).encode() for n in range(_LARGE_FRAMES)]
+
+
+_LARGE_FRAMES = 100
+"""Clouds of 200 kB: more than the buffers of the connection hold."""
+
+_ROUTER = """
+import struct, sys, zenoh
+
+with zenoh.open(zenoh.Config.from_json5(sys.argv[1])) as session:
+    subscriber = session.declare_subscriber("0/mocap/lab/markers/**")
+    for _ in range(int(sys.argv[2])):
+        attachment = subscriber.recv().attachment.to_bytes()
+        print(struct.unpack_from("<q", attachment)[0], end=" ")
+    print(flush=True)
+"""
+"""A router that prints the numbers of the first clouds, and ends."""
+
+
+@contextmanager
+def stoppable_router(lab: RosLab) -> Iterator[subprocess.Popen[bytes]]:
+    """Replace the lab's router by a process that subscribes to the markers."""
+    lab.cut()
+    keys = json.dumps(zenoh_keys("router", listen=lab.endpoint))
+    command = [sys.executable, "-c", _ROUTER, keys, str(_LARGE_FRAMES)]
+    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
+        try:
+            yield process
+        finally:
+            process.kill()
 
 
 def test_a_defect_is_logged_once_and_counted_and_the_next_frame_is_published(
