@@ -47,6 +47,10 @@ Distribution = Annotated[
     expects("humble, jazzy, kilted, lyrical or rolling; for a later one rolling"),
 ]
 Reliability = Annotated[Literal["best_effort", "reliable"], expects("best_effort or reliable")]
+Durability = Annotated[
+    Literal["volatile"],
+    expects("volatile; transient_local would keep old poses for nodes that start later"),
+]
 Depth = Annotated[int, Field(strict=True, ge=1, le=10_000), expects("a whole number from 1 to 10000")]
 
 
@@ -70,6 +74,9 @@ class Ros2Settings(OutputSettings):
 
     reliability: Reliability = "best_effort"
     """The reliability that the publishers announce."""
+
+    durability: Durability = "volatile"
+    """The durability that the publishers announce; there is no other one, because old poses mislead robots."""
 
     depth: Depth = 10
     """The depth of the history that the publishers announce (keep last)."""

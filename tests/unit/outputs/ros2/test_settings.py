@@ -11,7 +11,7 @@ def test_the_defaults_are_those_of_ros() -> None:
     assert not settings.enabled
     assert (settings.domain_id, settings.namespace, settings.distribution) == (0, "mocap", "jazzy")
     assert settings.connect == "tcp/127.0.0.1:7447"
-    assert (settings.reliability, settings.depth) == ("best_effort", 10)
+    assert (settings.reliability, settings.durability, settings.depth) == ("best_effort", "volatile", 10)
 
 
 @pytest.mark.parametrize(
@@ -60,6 +60,7 @@ def test_distributions(name: str) -> None:
         ("domain_id", -1),
         ("domain_id", 233),
         ("reliability", "best effort"),
+        ("durability", "transient_local"),
         ("depth", 0),
     ],
 )
