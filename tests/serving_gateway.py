@@ -10,9 +10,11 @@ from gateway.outputs.contract import Output
 from gateway.outputs.rtc3d.live_server import LiveServer
 from gateway.outputs.rtc3d.output import Rtc3dOutput
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
+from gateway.simulator.simulator import Simulator
 from tests.configurations import make_settings
 from tests.networks import free_port
 from tests.running_gateway import running_gateway
+from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.waiting import wait_until_async
 
 
@@ -82,3 +84,13 @@ async def serving_gateway(
                 lambda: all(status.frames_in for status in served.source.statuses), timeout_s=20
             )
         yield served
+
+
+@asynccontextmanager
+async def playing(scene: Any = None, **settings: Any) -> AsyncIterator[tuple[Simulator, ServingGateway]]:
+    """Run a simulator and a gateway in front of it."""
+    async with (
+        Simulator(scene or CountingScene()) as simulator,
+        serving_gateway(simulator, **settings) as gateway,
+    ):
+        yield simulator, gateway

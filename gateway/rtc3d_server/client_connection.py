@@ -26,8 +26,9 @@ MAX_UNREAD_BYTES: Final = 4 * 1024 * 1024
 MAX_COMMANDS_PER_S: Final = 1000.0
 """How many packets of one client are answered in a second; further ones wait."""
 
-_MAX_WAITING_PACKETS: Final = 100
-"""With more unanswered packets, the server reads nothing more from a client."""
+_READ_BYTES: Final = 4096
+"""How much is read from a client at once. The next bytes are read when all packets in these are answered, so
+that little waits in memory, however many clients send too much."""
 
 _COMMANDS_PAUSE_S: Final = 0.05  # for a client that sends too many
 _MAX_LOGGED_BYTES: Final = 200  # of a command
@@ -85,13 +86,14 @@ class ConnectionOwner(Protocol):
         ...
 
 
-class ClientConnection(asyncio.Protocol):
+class ClientConnection(asyncio.BufferedProtocol):
     """One client's TCP connection: passes packets to its session, and sends replies and due frames.
 
     Nagle's algorithm is off (§2.1): asyncio and uvloop switch it off for every TCP connection. Each
     packet is written at once and by itself, because common clients read a packet with one recv
     (field note 15). While a client does not read, the server drops its frames and does not read from
-    it either. Nor does it read from a client that sends commands faster than they are answered.
+    it either. Nor does it read from a client that sends commands faster than they are answered. If a client
+    closes only its sending half, it gets the replies and the current frames that it has asked for.
     """
 
     transport: asyncio.Transport
@@ -105,12 +107,14 @@ class ClientConnection(asyncio.Protocol):
         self._owner = owner
         self._loop = asyncio.get_running_loop()
         self._reader = PacketReader(max_packet_bytes=MAX_COMMAND_BYTES, max_c3d_bytes=MAX_COMMAND_BYTES)
+        self._read_buffer = bytearray(_READ_BYTES)
         self._inbox: deque[Packet] = deque()
         self._commands = TokenBucket(MAX_COMMANDS_PER_S)
         self._is_processing = False  # whether _process_inbox is to be called
         self._is_held = False  # whether the packets in _inbox wait for the answer to the one before
         self._is_full = False  # whether MAX_UNREAD_BYTES wait for the client to read
         self._was_full = False  # whether it has been full before
+        self._has_ended = False  # whether the client has closed its sending half
         self._first_sent_s: float | None = None  # when the first frame was sent, on the monotonic clock
         self._last_sent_s = 0.0  # when the newest frame was sent
         self.closed: asyncio.Future[None] = self._loop.create_future()
@@ -166,21 +170,30 @@ class ClientConnection(asyncio.Protocol):
         self._process_soon()
 
     def resume_reading(self) -> None:
-        """Read from the socket again, unless enough is waiting or the connection is closing."""
-        if self._can_send() and len(self._inbox) <= _MAX_WAITING_PACKETS:
+        """Read from the socket again, unless packets are waiting or the connection is closing."""
+        if self._can_send() and not self._inbox:
             self.transport.resume_reading()
 
-    def data_received(self, data: bytes) -> None:
-        """See asyncio.Protocol."""
-        self.filter.receive(data)
+    def get_buffer(self, sizehint: int) -> bytearray:  # noqa: ARG002 - the size is bounded
+        """See asyncio.BufferedProtocol."""
+        return self._read_buffer
+
+    def buffer_updated(self, nbytes: int) -> None:
+        """See asyncio.BufferedProtocol."""
+        self.filter.receive(bytes(self._read_buffer[:nbytes]))
+
+    def eof_received(self) -> bool:
+        """Close the connection, unless the client still waits for something (asyncio.BufferedProtocol)."""
+        self._has_ended = True
+        return self._owes_answers or self.filter.is_busy
 
     def handle(self, data: bytes) -> None:
         """Read packets from the next bytes of the client, and answer them."""
         self._inbox.extend(self._reader.feed(data))
-        if len(self._inbox) > _MAX_WAITING_PACKETS:
-            self.transport.pause_reading()
         if not self._is_processing:
             self._process_inbox()
+        if self._inbox and not self.transport.is_closing():
+            self.transport.pause_reading()
 
     def hold_commands(self) -> None:
         """Answer no further packets until ``continue_commands``."""
@@ -210,6 +223,13 @@ class ClientConnection(asyncio.Protocol):
                 self._first_sent_s = self._last_sent_s
             if not self._can_send():
                 break
+        self._close_if_ended()
+
+    def measurement_stopped(self) -> None:
+        """Send No Data for the stream and for each request that waits."""
+        for packet in self.session.measurement_stopped():
+            self.send(packet)
+        self._close_if_ended()
 
     def send(self, packet: bytes) -> None:
         """Send one packet through the filter."""
@@ -231,8 +251,17 @@ class ClientConnection(asyncio.Protocol):
         elapsed_us = self._owner.elapsed_us()
         if elapsed_us is not None:
             self.session.drop_due_frames(elapsed_us)
+        self.resume_reading()
         self._owner.schedule()
         self._process_soon()
+
+    @property
+    def _owes_answers(self) -> bool:
+        return bool(self._inbox) or self._is_held or self.session.waits_for_frame
+
+    def _close_if_ended(self) -> None:
+        if self._has_ended and not self._owes_answers and self._can_send():
+            self.close()
 
     def _can_send(self) -> bool:
         return not (self._is_full or self.filter.is_busy or self.transport.is_closing())
@@ -258,8 +287,6 @@ class ClientConnection(asyncio.Protocol):
                 self._process_soon(_COMMANDS_PAUSE_S)
                 return
             packet = self._inbox.popleft()
-            if len(self._inbox) == _MAX_WAITING_PACKETS:
-                self.resume_reading()
             _log.debug("%s: received %s", self.name, _described(packet))
             for reply in self.filter.answer(packet):
                 self.send(reply)
@@ -272,12 +299,15 @@ class ClientConnection(asyncio.Protocol):
             self._owner.schedule()
         if self._inbox:
             self._process_soon()
-        elif self._reader.error is not None and not self._is_held:
+            return
+        self.resume_reading()
+        if self._reader.error is not None and not self._is_held:
             size = self._reader.error.size
             self.send(
                 error_packet(f"A packet of {size} bytes is out of bounds (8 to {MAX_COMMAND_BYTES}); closing")
             )
             self.close()
+        self._close_if_ended()
 
     def _parameters_xml(self, sections: Sequence[str]) -> bytes:
         address, port = self.transport.get_extra_info("sockname")[:2]

@@ -86,7 +86,12 @@ class ClientSession:
     @property
     def wants_frames(self) -> bool:
         """Whether the client streams, or waits for a frame."""
-        return self._stream_command is not None or bool(self._frame_requests)
+        return self._stream_command is not None or self.waits_for_frame
+
+    @property
+    def waits_for_frame(self) -> bool:
+        """Whether the client waits for an answer to SendCurrentFrame."""
+        return bool(self._frame_requests)
 
     def measurement_started(self) -> None:
         """Start the client's stream, if it requested one, with the measurement's first frame."""

@@ -175,8 +175,7 @@ class RtServer:
         self._measurement.stop()
         self.log_measurement("Measurement stopped")
         for connection in list(self.connections):
-            for packet in connection.session.measurement_stopped():
-                connection.send(packet)
+            connection.measurement_stopped()
         self.schedule()
 
     def change_scene(self, scene: Scene) -> None:

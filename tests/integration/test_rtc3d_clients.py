@@ -1,20 +1,9 @@
 """RTC3D clients of a gateway: what they get, and what happens when something goes wrong."""
 
 import asyncio
-import logging
 import struct
-from collections.abc import AsyncIterator, Sequence
-from contextlib import asynccontextmanager
-from pathlib import Path
-from typing import Any
-
-import pytest
 
 from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
-from gateway.losses import Loss
-from gateway.outputs.contract import ServerFile
-from gateway.outputs.rtc3d import client_filter
-from gateway.outputs.rtc3d.live_server import SLOW_CLIENT
 from gateway.outputs.rtc3d.output import Rtc3dOutput
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.rtc3d.components import ComponentType
@@ -26,7 +15,7 @@ from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.integration.raw_client import TIMEOUT_S, connected, consecutive, numbers, until
 from tests.networks import free_port
-from tests.serving_gateway import ServingGateway, serving_gateway
+from tests.serving_gateway import ServingGateway, playing, serving_gateway
 from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
     COMMAND,
@@ -36,24 +25,12 @@ from tests.unit.rtc3d_server.wire import (
     NO_DATA,
     XML,
     command,
-    components_in,
     packet,
-    packets_in,
 )
 
 C3D = 5
 START = struct.pack(">IIIiqI", 1, 48, EVENT, -1, 0, 1) + struct.pack(">iqiii", 1, 0, -1, -1, -1)
 STOP = struct.pack(">IIIiqI", 1, 48, EVENT, -1, 0, 1) + struct.pack(">iqiii", 0, 0, -1, -1, -1)
-
-
-@asynccontextmanager
-async def playing(scene: Any = None, **settings: Any) -> AsyncIterator[tuple[Simulator, ServingGateway]]:
-    """Run a simulator and a gateway in front of it."""
-    async with (
-        Simulator(scene or CountingScene()) as simulator,
-        serving_gateway(simulator, **settings) as gateway,
-    ):
-        yield simulator, gateway
 
 
 # Parameters ---------------------------------------------------------------------------------
@@ -233,149 +210,6 @@ async def test_recordings_are_passed_on_to_the_server_with_remote_control() -> N
         assert is_recording(simulator)
         assert await client.ask("Recording Stop") == (COMMAND, b"OK-Recording Stop")
         assert not is_recording(simulator)
-
-
-# Files --------------------------------------------------------------------------------------
-
-
-async def test_a_file_of_the_server_is_passed_on_whole_between_frames(tmp_path: Path) -> None:
-    content = bytes(range(256)) * 40_000  # longer than what waits in memory
-    path = tmp_path / "walk.c3d"
-    path.write_bytes(content)
-    async with (
-        playing() as (_, gateway),
-        connected(gateway) as client,
-        connected(gateway) as half_open,
-    ):
-        await client.ask("StreamFrames All")
-        await client.frames(3)
-        gateway.gateway._announce_file("lab", ServerFile(path, len(content)))
-        received = [await client.read()]
-        while received[-1][0] == DATA:
-            received.append(await client.read())
-        assert received[-1] == (C3D, content)
-        events = [each for _, body in received[:-1] for each in events_in(body)]
-        for _ in range(30):
-            packet_type, body = await client.read()
-            assert packet_type == DATA
-            events += events_in(body)
-        assert events == list(range(events[0], events[0] + len(events)))
-        half_open.send(command("Version 1.0"))
-        assert await half_open.read() == (COMMAND, b"OK-Version 1.0")  # and no file before it
-
-
-def events_in(body: bytes) -> list[int]:
-    return [int(item[0]) for each in components_in(body) if each.type == EVENT for item in each.items]
-
-
-def losses_of(gateway: ServingGateway) -> Sequence[Loss]:
-    [(_, status)] = gateway.source.fan_out.outputs
-    losses: Sequence[Loss] = status.losses
-    return losses
-
-
-async def test_a_file_that_is_gone_is_left_out(tmp_path: Path) -> None:
-    async with playing() as (_, gateway), connected(gateway) as client:
-        await client.ask("StreamFrames 3D")
-        gateway.gateway._announce_file("lab", ServerFile(tmp_path / "gone.c3d", 1000))
-        assert consecutive(await client.frames(30))
-        await until(lambda: bool(losses_of(gateway)))
-        [loss] = losses_of(gateway)
-    assert (loss.cause, loss.messages) == ("C3D file", 1)
-    assert "does not get gone.c3d: No such file or directory; " in loss.text
-
-
-# Limits -------------------------------------------------------------------------------------
-
-
-async def test_a_slow_client_loses_only_its_own_frames_and_no_event(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    caplog.set_level(logging.WARNING)
-    scene = CountingScene(300.0, num_markers=3000)
-    async with playing(scene) as (_, gateway), connected(gateway) as slow, connected(gateway) as other:
-        slow.pause()
-        slow.send(command("StreamFrames 3D Events"))
-        await other.ask("StreamFrames 6D")
-        while "does not read" not in caplog.text:
-            assert consecutive(await other.frames(20))
-        while not losses_of(gateway):
-            await other.frames(20)
-        assert {loss.cause for loss in losses_of(gateway)} == {SLOW_CLIENT}
-
-        slow.resume()
-        assert (await slow.read())[0] == COMMAND
-        events: list[int] = []
-        previous = 0
-        has_gap = False
-        while not has_gap or len(events) < 5:
-            packet_type, body = await slow.read()
-            assert packet_type == DATA
-            events += events_in(body)
-            number = struct.unpack_from(">i", body, 12)[0]
-            has_gap = has_gap or bool(previous and number > previous + 1)
-            previous = number
-        assert events == list(range(events[0], events[0] + len(events)))
-    assert caplog.text.count("does not read") == 1
-
-
-async def test_clients_that_are_too_many_are_turned_away() -> None:
-    async with playing(rtc3d={"max_clients": 2}) as (_, gateway):
-        async with connected(gateway) as first, connected(gateway) as second:
-            for client in (first, second):
-                await client.ask("StreamFrames 3D")
-            async with connected(gateway) as third:
-                [(packet_type, text)] = packets_in(await third.rest())
-                assert packet_type == ERROR
-                assert text == b"Error-This gateway serves 2 clients at most; closing"
-            assert consecutive(await first.frames(10))
-        await until(lambda: not gateway.server.connections)
-        async with connected(gateway) as client:
-            assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
-
-
-async def test_a_connection_without_a_command_makes_room_for_a_client() -> None:
-    async with (
-        playing(rtc3d={"max_clients": 2}) as (_, gateway),
-        connected(gateway) as good,
-        connected(gateway) as silent,
-    ):
-        await good.ask("Version 1.0")
-        await until(lambda: len(gateway.server.connections) == 2)
-        async with connected(gateway) as client:
-            assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
-            assert await silent.rest() == b""
-        assert await good.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
-
-
-async def test_a_client_without_a_command_is_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client_filter, "FIRST_COMMAND_S", 0.05)
-    async with playing() as (_, gateway), connected(gateway) as good:
-        await good.ask("Version 1.0")
-        async with connected(gateway) as silent, connected(gateway) as wrong:
-            wrong.send(command("Fly"))
-            assert packets_in(await silent.rest()) == [(ERROR, b"Error-No command within 0.05 s; closing")]
-            assert [each[0] for each in packets_in(await wrong.rest())] == [ERROR, ERROR]
-        assert await good.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
-
-
-@pytest.mark.parametrize("sent", [b"GET / HTTP/1.1\r\n\r\n", b"\x16\x03\x01\x02\x00\x01\x00\x01\xfc\x03\x03"])
-async def test_a_client_of_another_protocol_is_disconnected(sent: bytes) -> None:
-    async with playing() as (_, gateway), connected(gateway) as client:
-        client.send(sent)
-        [(packet_type, text)] = packets_in(await client.rest())
-        assert packet_type == ERROR
-        assert b"out of bounds" in text
-
-
-async def test_a_flood_of_commands_waits_in_the_kernel_and_delays_nobody() -> None:
-    async with playing() as (_, gateway), connected(gateway) as flooding, connected(gateway) as other:
-        flooding.send(command("Version 1.0") * 100_000)
-        await other.ask("StreamFrames 3D")
-        assert consecutive(await other.frames(50))
-        assert max(len(each._inbox) for each in gateway.server.connections) < 30_000
-        for _ in range(500):
-            assert await flooding.read() == (COMMAND, b"OK-Version 1.0")
 
 
 # Ports and reloads --------------------------------------------------------------------------

@@ -135,6 +135,19 @@ async def test_commands_can_arrive_in_pieces_or_several_at_once(served: Served) 
         assert replies == [b"OK-Version 1.0", b"OK-SetByteOrder LittleEndian", b"OK-Version 1.0"] * 2
 
 
+async def test_a_client_that_closes_its_sending_half_gets_all_answers(served: Served) -> None:
+    async with (
+        Simulator(CountingScene()) as simulator,
+        served(simulator) as server,
+        connected(server) as client,
+    ):
+        client.send(command("Version 1.0") * 300, command("SendCurrentFrame 3D"), command("Fly"))
+        client.writer.write_eof()
+        packets = packets_in(await client.rest())
+        kinds = [each[0] for each in packets]
+        assert sorted(kinds) == [ERROR, *[COMMAND] * 301, DATA]
+
+
 @pytest.mark.parametrize(
     "bad",
     [

@@ -187,8 +187,8 @@ class Arrivals:
             return None
         former_us, self.newest_us = self.newest_us, max(elapsed_us, self.newest_us + 1)
         if not self.frames:
-            for rate in self.rates.values():
-                rate.skip(self.newest_us - max(former_us, 0))
+            for known in self.rates.values():
+                known.skip(self.newest_us - max(former_us, 0))
         if self.began_us is None:
             self.began_us = self.newest_us
         arrival = Arrival(frame, composition, stream, self.newest_us)

@@ -12,7 +12,7 @@ from gateway.errors import CommandError, FrameError, QueryError
 from gateway.log import DefectLog
 from gateway.rtc3d import commands
 from gateway.rtc3d.packets import PACKET_HEADER, PACKET_HEADER_BYTES, Packet, PacketType, decode_text
-from gateway.rtc3d_server.client_session import error_packet, recording_switch
+from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS, error_packet, recording_switch
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
 from gateway.worker_thread import WorkerThread
 
@@ -28,7 +28,8 @@ _FILE_POLL_S: Final = 0.01
 _MAX_FILES: Final = 4
 """C3D files are sent in pieces, as fast as the client reads. So many wait for one client."""
 
-_MAX_HELD_PACKETS: Final = 16  # replies and No Data while a file is sent
+MAX_HELD_PACKETS: Final = MAX_FRAME_REQUESTS + 24
+"""How many packets wait for the end of a file: one reply, and No Data for the requests for frames."""
 
 _LONGEST_NAME: Final = 32  # of a command, in bytes
 
@@ -69,6 +70,9 @@ class FilterOwner(Protocol):
     def file_lost(self, client: str, path: Path, reason: str) -> None:
         """Count and log a C3D file that a client does not get."""
 
+    def packet_lost(self, client: str) -> None:
+        """Count and log a packet that a client does not get, because it reads a C3D file too slowly."""
+
     def check_wanted(self) -> None:
         """Note whether any client asks for frames now."""
 
@@ -92,8 +96,10 @@ class ClientFilter(ConnectionFilter):
         """Send a packet, or hold it until the end of a file."""
         if not self.is_busy:
             self.connection.write(packet)
-        elif len(self._held) < _MAX_HELD_PACKETS:
+        elif len(self._held) < MAX_HELD_PACKETS:
             self._held.append(packet)
+        else:
+            self._owner.packet_lost(self.connection.name)
 
     def answer(self, packet: Packet) -> list[bytes]:
         """Return the replies to a packet.

@@ -12,7 +12,7 @@ from typing import Any, Final
 from gateway.log import EventLog
 from gateway.losses import Losses
 from gateway.outputs.contract import ServerParameters
-from gateway.outputs.rtc3d.client_filter import ClientFilter, ControlRecording
+from gateway.outputs.rtc3d.client_filter import MAX_HELD_PACKETS, ClientFilter, ControlRecording
 from gateway.outputs.rtc3d.live_scene import LiveScene
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
@@ -221,6 +221,15 @@ class LiveServer(RtServer):
         if self._state.losses is not None:
             text = f"client {client} does not get {path.name}: {reason}; the gateway keeps files in its spool"
             self._state.losses.lost(FILE, text, frames=0)
+
+    def packet_lost(self, client: str) -> None:
+        """Count and log a packet that a client does not get, because it reads a C3D file too slowly."""
+        if self._state.losses is not None:
+            text = (
+                f"client {client} reads a C3D file too slowly: {MAX_HELD_PACKETS} packets wait for its end, "
+                "further ones are dropped; check that program, or the network to it"
+            )
+            self._state.losses.lost(SLOW_CLIENT, text, frames=0)
 
     def check_wanted(self) -> None:
         """Note whether any client asks for frames now."""
