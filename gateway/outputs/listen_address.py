@@ -1,6 +1,7 @@
 """Addresses that servers listen on: who can connect, and how to connect from this computer."""
 
 import ipaddress
+import os
 import socket
 from typing import Final
 
@@ -20,9 +21,18 @@ def from_this_computer(host: str) -> str:
     return _OF_THIS_COMPUTER.get(host, host)
 
 
-def family_of(host: str) -> socket.AddressFamily:
-    """Return the family of an address; a name counts as one of IPv4."""
-    return socket.AF_INET6 if ":" in host else socket.AF_INET
+def listen_problem(host: str, port: int) -> str:
+    """Return why no server can listen on ``port`` of all addresses of ``host``; "" if one can."""
+    try:
+        for family, _, _, _, address in socket.getaddrinfo(
+            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        ):
+            socket.create_server(address, family=family, backlog=1).close()
+    except socket.gaierror as error:
+        return error.strerror or str(error)
+    except OSError as error:
+        return os.strerror(error.errno) if error.errno else str(error)
+    return ""
 
 
 def host_in_url(host: str) -> str:

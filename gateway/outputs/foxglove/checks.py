@@ -1,14 +1,13 @@
 """The doctor's checks of the output for viewers: its packages, and its port."""
 
 import json
-import socket
 from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Final
 
 from gateway.findings import Finding, MessageLoad, Subject
 from gateway.outputs.foxglove.settings import FoxgloveSettings
-from gateway.outputs.listen_address import family_of, from_this_computer, host_in_url, is_loopback
+from gateway.outputs.listen_address import from_this_computer, host_in_url, is_loopback, listen_problem
 
 CHECKS: Final = ("package", "port")
 
@@ -47,11 +46,9 @@ def leaves_host(settings: FoxgloveSettings) -> bool:
 
 def _check_port(settings: FoxgloveSettings, sources: Sequence[str]) -> Finding:
     address = f"ws://{host_in_url(settings.host)}:{settings.port}"
-    try:
-        with socket.create_server((settings.host, settings.port), family=family_of(settings.host), backlog=1):
-            return _foxglove.passing("port", f"viewers will be able to connect to {address}")
-    except OSError as error:
-        problem = error.strerror or str(error)
+    problem = listen_problem(settings.host, settings.port)
+    if not problem:
+        return _foxglove.passing("port", f"viewers will be able to connect to {address}")
     topics = _advertised_topics(settings)
     if topics is None:
         return _foxglove.failing(

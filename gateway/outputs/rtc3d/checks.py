@@ -1,12 +1,11 @@
 """The doctor's checks of the output for RTC3D clients: the names of the sources, and their ports."""
 
-import os
 import socket
 from collections.abc import Sequence
 from typing import Final
 
 from gateway.findings import Finding, MessageLoad, Subject
-from gateway.outputs.listen_address import family_of, from_this_computer
+from gateway.outputs.listen_address import from_this_computer, listen_problem
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.rtc3d.commands import Version, encode_command
 from gateway.rtc3d.packets import PACKET_HEADER, PACKET_HEADER_BYTES, PacketType, encode_packet
@@ -51,11 +50,9 @@ def _check_ports(settings: Rtc3dSettings, seconds: float) -> list[Finding]:
 
 def _check_port(host: str, source: str, port: int, seconds: float) -> Finding:
     place = f"{host}, port {port} (for {source})"
-    try:
-        with socket.create_server((host, port), family=family_of(host)):
-            return _rtc3d.passing("ports", f"{place} is free")
-    except OSError as error:
-        problem = os.strerror(error.errno) if error.errno else str(error)
+    problem = listen_problem(host, port)
+    if not problem:
+        return _rtc3d.passing("ports", f"{place} is free")
     if _is_rt_server(host, port, seconds):
         return _rtc3d.passing("ports", f"an RT server answers on {place}: the gateway, if it runs")
     return _rtc3d.failing(
