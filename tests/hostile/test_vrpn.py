@@ -1,11 +1,11 @@
 """Hostile VRPN clients: neither the frames of the healthy source nor other VRPN clients suffer from them."""
 
 import asyncio
-import contextlib
 
 import pytest
 
 from tests.hostile.gateway_under_attack import GatewayUnderAttack
+from tests.hostile.port_attacks import ATTACK_S, attacking, check
 from tests.hostile.vrpn_clients import ATTACKS
 from tests.networks import free_port
 from tests.vrpn_client import VrpnClient
@@ -13,7 +13,6 @@ from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
 
-ATTACK_S = 1.5
 MAX_GROWTH_KIB = 30 * 1024
 """How much memory an attack may leave behind."""
 
@@ -27,27 +26,15 @@ async def test_attack_on_the_port(name: str, gateway_under_attack: GatewayUnderA
         await VrpnClient.connect(port) as client,
     ):
         await wait_until_async(lambda: client.poses)
-        attack = asyncio.create_task(_run(name, port))
-        await asyncio.sleep(ATTACK_S)
-        num_poses = len(client.poses)
-        await wait_until_async(lambda: len(client.poses) > num_poses + 100)
-        # A client that comes during the attack is served, too, if need be after some attempts.
-        async with await _connected(port) as late:
-            await wait_until_async(lambda: late.poses)
-        assert not client.has_ended
-        attack.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await attack
-    report = gateway.report
-    report.check()
-    assert report.rss_after_kib - report.rss_before_kib < MAX_GROWTH_KIB, report
-
-
-async def _run(name: str, port: int) -> None:
-    while True:
-        with contextlib.suppress(OSError):
-            await ATTACKS[name](port)
-        await asyncio.sleep(0.01)
+        async with attacking(ATTACKS[name], port):
+            await asyncio.sleep(ATTACK_S)
+            num_poses = len(client.poses)
+            await wait_until_async(lambda: len(client.poses) > num_poses + 100)
+            # A client that comes during the attack is served, too, if need be after some attempts.
+            async with await _connected(port) as late:
+                await wait_until_async(lambda: late.poses)
+            assert not client.has_ended
+    check(gateway.report, MAX_GROWTH_KIB)
 
 
 async def _connected(port: int) -> VrpnClient:

@@ -4,10 +4,9 @@ import asyncio
 import contextlib
 import os
 import socket
-from collections.abc import Awaitable, Callable, Iterator
 from typing import Final
 
-from tests.hostile.endless_sender import send_endlessly
+from tests.hostile.port_attacks import Attack, endless, short, silent, stalled
 from tests.networks import free_port
 from tests.vrpn_client import COOKIE, PING_TYPE, description, message
 
@@ -15,44 +14,12 @@ NUM_STALLED: Final = 60
 NUM_SILENT: Final = 100
 _DATAGRAMS_AT_ONCE: Final = 500
 
-
-@contextlib.contextmanager
-def _connections(port: int, count: int) -> Iterator[list[socket.socket]]:
-    with contextlib.ExitStack() as stack:
-        yield [stack.enter_context(socket.create_connection(("127.0.0.1", port), 5)) for _ in range(count)]
+_NAMES: Final = b"".join(description(number, -1, f"Tool_{number % 9}") for number in range(2000))
+_PINGS: Final = b"".join(message(number, PING_TYPE) for number in range(2000))
 
 
-async def _stalled(port: int) -> None:
-    """Many clients that read nothing after they have connected."""
-    while True:
-        with _connections(port, NUM_STALLED) as clients:
-            for client in clients:
-                client.sendall(COOKIE)
-            await asyncio.sleep(5)
-
-
-async def _silent(port: int) -> None:
-    """Connections that never say anything, one after the other."""
-    with contextlib.ExitStack() as stack:
-        for _ in range(NUM_SILENT):
-            client = stack.enter_context(socket.socket())
-            client.setblocking(False)
-            with contextlib.suppress(OSError):
-                await asyncio.get_running_loop().sock_connect(client, ("127.0.0.1", port))
-        await asyncio.Event().wait()
-
-
-def _sending(begin: bytes, repeated: bytes) -> "Attack":
-    return lambda port: send_endlessly(port, begin, repeated)
-
-
-async def _garbage(port: int) -> None:
-    """Connect, send anything, and disconnect, as fast as possible."""
-    while True:
-        with contextlib.suppress(OSError):
-            _, writer = await asyncio.open_connection("127.0.0.1", port)
-            writer.write(os.urandom(2000) if os.urandom(1)[0] % 2 else COOKIE + os.urandom(2000))
-            writer.close()
+def _garbage() -> bytes:
+    return os.urandom(2000) if os.urandom(1)[0] % 2 else COOKIE + os.urandom(2000)
 
 
 async def _knocks(port: int) -> None:
@@ -71,19 +38,14 @@ async def _knocks(port: int) -> None:
             await asyncio.sleep(0.005)
 
 
-Attack = Callable[[int], Awaitable[None]]
-
-_NAMES: Final = b"".join(description(number, -1, f"Tool_{number % 9}") for number in range(2000))
-_PINGS: Final = b"".join(message(number, PING_TYPE) for number in range(2000))
-
 ATTACKS: Final[dict[str, Attack]] = {
-    "stalled clients": _stalled,
-    "silent connections": _silent,
-    "pings": _sending(COOKIE + description(PING_TYPE, -2, "vrpn_Base ping_message") + _NAMES, _PINGS),
-    "descriptions": _sending(COOKIE, _NAMES),
-    "large messages": _sending(COOKIE, message(0, 9, bytes(64_000)) * 4),
-    "endless cookie": _sending(b"vrpn: ver. 07.", b"7" * 65536),
-    "HTTP": _sending(b"", b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" * 1000),
-    "garbage": _garbage,
+    "stalled clients": stalled(NUM_STALLED, COOKIE),
+    "silent connections": silent(NUM_SILENT),
+    "pings": endless(COOKIE + description(PING_TYPE, -2, "vrpn_Base ping_message") + _NAMES, _PINGS),
+    "descriptions": endless(COOKIE, _NAMES),
+    "large messages": endless(COOKIE, message(0, 9, bytes(64_000)) * 4),
+    "endless cookie": endless(b"vrpn: ver. 07.", b"7" * 65536),
+    "HTTP": endless(b"", b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" * 1000),
+    "garbage": short(_garbage),
     "requests by UDP": _knocks,
 }
