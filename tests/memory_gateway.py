@@ -56,5 +56,5 @@ async def run_gateway(port: int, **settings: Any) -> AsyncIterator[MemoryGateway
         ),
         [output],
     )
-    async with running_gateway(gateway, stop_timeout_s=5):
+    async with running_gateway(gateway):
         yield MemoryGateway(gateway, output)

@@ -12,13 +12,20 @@ from typing import Any, Final
 import zenoh
 
 _LCM_PORTS: Final = itertools.count(7720)
+_PORTS: Final = itertools.cycle(range(10_000, 32_000))
+"""Linux chooses from 32768 on, unless it is told another range."""
 _MULTICAST: Final = ("224.0.0.0/4", "dev", "lo")
 
 
 def free_port() -> int:
-    """Return a free TCP port of 127.0.0.1."""
-    with socket.create_server(("127.0.0.1", 0)) as probe:
-        return int(probe.getsockname()[1])
+    """Return a TCP port of 127.0.0.1 that is free, and that no other test of this run uses.
+
+    It is not one of those that the kernel chooses for other sockets, because one of them could get it
+    before the test does.
+    """
+    while True:
+        with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", next(_PORTS))) as probe:
+            return int(probe.getsockname()[1])
 
 
 def free_endpoint() -> str:

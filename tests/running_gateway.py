@@ -3,18 +3,21 @@
 import asyncio
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
+from typing import Final
 
 from gateway.gateway import Gateway
 
+_STOP_TIMEOUT_S: Final = 30.0
+
 
 @asynccontextmanager
-async def running_gateway(gateway: Gateway, stop_timeout_s: float = 20) -> AsyncIterator[Gateway]:
-    """Run a gateway during the block; after that, it must stop within ``stop_timeout_s``."""
+async def running_gateway(gateway: Gateway) -> AsyncIterator[Gateway]:
+    """Run a gateway during the block; after that, it must stop."""
     stop = asyncio.Event()
     task = asyncio.create_task(gateway.run(stop))
     try:
         yield gateway
     finally:
         stop.set()
-        async with asyncio.timeout(stop_timeout_s):
+        async with asyncio.timeout(_STOP_TIMEOUT_S):
             await task

@@ -80,9 +80,7 @@ async def serving_gateway(
         served = ServingGateway(gateway, output, port)
         await wait_until_async(lambda: output.health().connected)
         if is_streaming:
-            await wait_until_async(
-                lambda: all(status.frames_in for status in served.source.statuses), timeout_s=20
-            )
+            await wait_until_async(lambda: all(status.frames_in for status in served.source.statuses))
         yield served
 
 

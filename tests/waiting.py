@@ -3,11 +3,15 @@
 import asyncio
 import time
 from collections.abc import Callable
+from typing import Final
 
-_POLL_S = 0.005
+_TIMEOUT_S: Final = 30.0
+"""What a test waits for takes much less; a computer with other work may need ten times as long."""
+
+_POLL_S: Final = 0.005
 
 
-def wait_until(condition: Callable[[], object], timeout_s: float = 10) -> None:
+def wait_until(condition: Callable[[], object], timeout_s: float = _TIMEOUT_S) -> None:
     """Wait until ``condition`` holds; raises AssertionError after ``timeout_s``."""
     deadline_s = time.monotonic() + timeout_s
     while not condition():
@@ -16,7 +20,7 @@ def wait_until(condition: Callable[[], object], timeout_s: float = 10) -> None:
         time.sleep(_POLL_S)
 
 
-async def wait_until_async(condition: Callable[[], object], timeout_s: float = 10) -> None:
+async def wait_until_async(condition: Callable[[], object], timeout_s: float = _TIMEOUT_S) -> None:
     """Wait until ``condition`` holds while the event loop runs; raises as ``wait_until`` does."""
     deadline_s = time.monotonic() + timeout_s
     while not condition():

@@ -52,7 +52,7 @@ from tests.losses import amounts
 from tests.waiting import wait_until_async
 
 RETURNS_WITHIN_S: Final = 5.0
-TIMEOUT_S: Final = 20.0
+TIMEOUT_S: Final = 30.0
 """How long data may take to reach a peer on a busy computer."""
 
 MAINTENANCE_S: Final = 0.1

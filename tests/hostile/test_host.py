@@ -45,7 +45,7 @@ ODD_CONFIGURATIONS: Final[dict[str, Callable[[Path], object]]] = {
 
 
 async def _wait_for_refusals(gateway: RunningGateway, count: int) -> None:
-    await wait_until_async(lambda: gateway.log.count("new configuration refused") >= count, 10)
+    await wait_until_async(lambda: gateway.log.count("new configuration refused") >= count)
 
 
 async def test_odd_configurations_at_a_reload_are_refused(gateway_under_attack: GatewayUnderAttack) -> None:
@@ -61,7 +61,7 @@ async def test_odd_configurations_at_a_reload_are_refused(gateway_under_attack: 
                 gateway.config.unlink(missing_ok=True)
             gateway.config.write_text(good)
         gateway.process.send_signal(signal.SIGHUP)
-        await wait_until_async(lambda: "configuration reloaded: nothing changed" in gateway.log, 10)
+        await wait_until_async(lambda: "configuration reloaded: nothing changed" in gateway.log)
     gateway.report.check()
 
 

@@ -4,6 +4,7 @@ import asyncio
 import json
 import signal
 from pathlib import Path
+from typing import Final
 
 import pytest
 import yaml
@@ -15,6 +16,10 @@ from tests.waiting import wait_until_async
 pytestmark = pytest.mark.netns
 
 _DEAD = {f"dead-{number}": {"host": f"dead-{number}.example.org", "port": 3020} for number in range(8)}
+
+
+AT_ONCE_S: Final = 4.0
+"""What waits for the name server takes longer: a program asks it again after 5 s."""
 
 
 def num_threads(gateway: RunningGateway) -> int:
@@ -33,11 +38,13 @@ async def test_eight_dead_names_and_a_dead_name_server(
             configuration["sources"][1]["port"] = 3030
             gateway.config.write_text(yaml.safe_dump(configuration))
             gateway.process.send_signal(signal.SIGHUP)
-            await wait_until_async(lambda: "configuration reloaded: source dead-0 changed" in gateway.log, 2)
+            await wait_until_async(
+                lambda: "configuration reloaded: source dead-0 changed" in gateway.log, AT_ONCE_S
+            )
             await asyncio.sleep(2)  # several attempts of each source
             assert num_threads(gateway) <= threads_before
     gateway.report.check()
-    assert gateway.report.stop_s < 2
+    assert gateway.report.stop_s < AT_ONCE_S
 
 
 async def test_dead_names_of_zenoh_peers(gateway_under_attack: GatewayUnderAttack, tmp_path: Path) -> None:
@@ -47,4 +54,4 @@ async def test_dead_names_of_zenoh_peers(gateway_under_attack: GatewayUnderAttac
         async with gateway_under_attack(environ=environ, before_command=before_command) as gateway:
             await asyncio.sleep(3)
     gateway.report.check()
-    assert gateway.report.stop_s < 2
+    assert gateway.report.stop_s < AT_ONCE_S

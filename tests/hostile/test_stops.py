@@ -80,7 +80,7 @@ class Site:
                 await self.process.wait()
 
     async def until_logged(self, text: str, count: int = 1) -> None:
-        await wait_until_async(lambda: self.log.count(text) >= count, 30)
+        await wait_until_async(lambda: self.log.count(text) >= count)
 
     async def stop(self, number: signal.Signals = signal.SIGTERM) -> float:
         """Send a signal; return how long the gateway took to end in s. Its status must be 0."""

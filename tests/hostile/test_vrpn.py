@@ -41,7 +41,7 @@ async def _connected(port: int) -> VrpnClient:
     """Return a client that has been accepted; libvrpn, too, tries again until it is."""
     while True:
         client = await VrpnClient.connect(port)
-        await wait_until_async(lambda client=client: client.trackers or client.has_ended, 20)  # type: ignore[misc]
+        await wait_until_async(lambda client=client: client.trackers or client.has_ended)  # type: ignore[misc]
         if client.trackers:
             return client
         await client.close()

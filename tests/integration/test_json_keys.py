@@ -60,8 +60,8 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         peer = _peer(endpoint)
         stack.callback(peer.close)
         peer.declare_subscriber("mocap/lab/**", lambda sample: everything.update([str(sample.key_expr)]))
-        wait_until(lambda: all(everything[f"mocap/lab/{key}/json"] > 1 for key in COMPONENTS), 30)
-        wait_until(lambda: any(key.startswith("mocap/lab/6d/") for key in everything), 30)
+        wait_until(lambda: all(everything[f"mocap/lab/{key}/json"] > 1 for key in COMPONENTS))
+        wait_until(lambda: any(key.startswith("mocap/lab/6d/") for key in everything))
         yield Lab(endpoint, folder / "takes", peer, everything)
 
 
@@ -86,7 +86,7 @@ def test_a_web_page_gets_labelled_markers_at_its_pace(lab: Lab) -> None:
     with lab.peer.declare_subscriber(
         "mocap/lab/3d/json", lambda sample: received.append(json.loads(sample.payload.to_string()))
     ):
-        wait_until(lambda: len(received) >= 61, 30)
+        wait_until(lambda: len(received) >= 61)
     first, *_, last = received
     assert len(first["labels"]) == len(first["markers"]) == 12
     assert len(set(first["labels"])) == 12
@@ -97,7 +97,7 @@ def test_a_web_page_gets_labelled_markers_at_its_pace(lab: Lab) -> None:
 def test_a_subscriber_of_json_alone_starts_a_stream_on_demand(lab: Lab) -> None:
     keys: set[str] = set()
     with lab.peer.declare_subscriber("mocap/lazy/3d/json", lambda sample: keys.add(str(sample.key_expr))):
-        wait_until(lambda: keys, 30)
+        wait_until(lambda: keys)
     assert keys == {"mocap/lazy/3d/json"}
 
 

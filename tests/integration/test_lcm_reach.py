@@ -42,7 +42,7 @@ class Gateway:
         self.configure()
         with self._log.open("wb") as log:
             self.process = subprocess.Popen([*PROGRAM, "run", "--config", str(self._config)], stderr=log)
-        wait_until(lambda: self.requests_received() is not None, 20)
+        wait_until(lambda: self.requests_received() is not None)
 
     def configure(self, **lcm_settings: Any) -> None:
         configuration = {
@@ -56,8 +56,8 @@ class Gateway:
     def reload(self, **lcm_settings: Any) -> None:
         self.configure(**lcm_settings)
         self.process.send_signal(signal.SIGHUP)
-        wait_until(lambda: "configuration reloaded" in self._log.read_text(), 10)
-        wait_until(lambda: self.requests_received() == 0, 10)
+        wait_until(lambda: "configuration reloaded" in self._log.read_text())
+        wait_until(lambda: self.requests_received() == 0)
 
     def requests_received(self) -> int | None:
         """Return the number of requests, with or without an answer; None before the start."""
@@ -86,7 +86,7 @@ class Gateway:
 def gateway(tmp_path: Path) -> Iterator[Gateway]:
     with lan_interface("192.0.2.1") as other_computer:
         gateway = Gateway(tmp_path, other_computer)
-        wait_until(lambda: gateway.send_requests(0, from_other=False), 20)  # it receives by now
+        wait_until(lambda: gateway.send_requests(0, from_other=False))  # it receives by now
         yield gateway
         gateway.process.terminate()
         assert gateway.process.wait(10) == 0

@@ -191,15 +191,15 @@ async def test_skipped_frames_are_gaps_in_sequence_and_the_count_in_status_healt
     scene = SyntheticScene(markers=4, tools=2, analog=0, plates=0, rate_hz=200)
     async with Simulator(scene) as simulator, lab_process(tmp_path, simulator.port) as lab:
         simulator.stop_measurement()  # until the subscriber is there
-        await wait_until_async(lambda: lab.messages["status"], timeout_s=20)
+        await wait_until_async(lambda: lab.messages["status"])
         simulator.start_measurement()
-        await wait_until_async(lambda: lab.messages["status"][-1].streams[0].clock.has_clock, timeout_s=20)
+        await wait_until_async(lambda: lab.messages["status"][-1].streams[0].clock.has_clock)
         lab.process.send_signal(signal.SIGSTOP)
         await asyncio.sleep(1.0)
         lab.process.send_signal(signal.SIGCONT)
-        await wait_until_async(lab.losses, timeout_s=20)
+        await wait_until_async(lab.losses)
         simulator.stop_measurement()  # from here on, nothing is skipped on a busy machine either
-        await wait_until_async(lab.has_no_measurement, timeout_s=20)
+        await wait_until_async(lab.has_no_measurement)
 
         messages, frames = lab.losses()["skipped while behind"]
         assert frames > 50
@@ -213,7 +213,7 @@ async def test_skipped_frames_are_gaps_in_sequence_and_the_count_in_status_healt
         amount = f"{messages} messages of {frames} frames (skipped while behind)"
         assert (status, body["status"]) == (200, "degraded")
         assert body["reasons"] == [f"lab (3d 6d): lost in the last minute: {amount}"]
-        await wait_until_async(lambda: "nothing lost for 5 s" in lab.log.read_text(), timeout_s=20)
+        await wait_until_async(lambda: "nothing lost for 5 s" in lab.log.read_text())
         log = lab.log.read_text()
         ends = re.findall(r"(\d+) messages of (\d+) frames \(skipped while behind\)", log)
         assert sum(int(lost) for lost, _ in ends) == messages

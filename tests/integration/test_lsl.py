@@ -235,8 +235,8 @@ def test_the_process_for_lsl_ends_with_the_gateway(tmp_path: Path) -> None:
             lab.receive("lab_3d")
             [process] = children(gateway.pid)
             getattr(gateway, end)()
-            gateway.wait(5)
-            wait_until(lambda process=process: not Path(f"/proc/{process}/cmdline").exists(), 5)  # type: ignore[misc]
+            gateway.wait(30)
+            wait_until(lambda process=process: not Path(f"/proc/{process}/cmdline").exists())  # type: ignore[misc]
         lab.close()
 
 

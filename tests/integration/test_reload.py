@@ -75,7 +75,7 @@ class SettingsBuilder:
 
 @asynccontextmanager
 async def running(settings: Settings) -> AsyncIterator[Gateway]:
-    async with running_gateway(Gateway(settings), stop_timeout_s=10) as gateway:
+    async with running_gateway(Gateway(settings)) as gateway:
         await gateway.opened.wait()
         yield gateway
 

@@ -143,7 +143,7 @@ async def test_poses_have_the_values_and_the_capture_times_of_the_component(rout
             with open_zenoh("client", connect=endpoint) as peer, open_zenoh("client", connect=router) as node:
                 peer.declare_subscriber("mocap/lab/6d", on_tools)
                 node.declare_subscriber("0/mocap/lab/Tool_1/pose/**", on_pose)
-                await wait_until_async(lambda: len(tools.keys() & poses.keys()) >= 20, 30)
+                await wait_until_async(lambda: len(tools.keys() & poses.keys()) >= 20)
     for utime in tools.keys() & poses.keys():
         tool, pose = tools[utime], poses[utime]
         ours = (pose.position.x, pose.position.y, pose.position.z, pose.orientation.x, pose.orientation.w)

@@ -75,7 +75,7 @@ async def contents_of_both(
             simulator.stop_measurement()
             async with two_gateways(simulator, router, byte_order) as gateways:
                 simulator.start_measurement()
-                await wait_until_async(lambda: len(contents["second"]["3d"]) >= num_frames, timeout_s=30)
+                await wait_until_async(lambda: len(contents["second"]["3d"]) >= num_frames)
                 simulator.stop_measurement()
                 sent = simulator.components_sent
                 for gateway in gateways:

@@ -70,7 +70,7 @@ async def served(
     gateway = Gateway(
         make_settings(sources=sources, metrics=MetricsSettings(enabled=False)), [output, memory]
     )
-    async with running_gateway(gateway, stop_timeout_s=10):
+    async with running_gateway(gateway):
         await wait_until_async(lambda: output.health().connected)
         yield Served(gateway, port, memory)
 
@@ -90,7 +90,7 @@ class LibVrpn:
                 self.num_lines += 1
 
     async def wait_for(self, condition: Callable[[Poses], object]) -> None:
-        await wait_until_async(lambda: condition(self.poses), 20)
+        await wait_until_async(lambda: condition(self.poses))
 
 
 @contextlib.asynccontextmanager
@@ -279,7 +279,7 @@ async def test_slow_client_loses_only_its_own_poses(caplog: pytest.LogCaptureFix
             slow.connect(("127.0.0.1", gateway.port))
             slow.sendall(COOKIE)
             async with await VrpnClient.connect(gateway.port) as client:
-                await wait_until_async(lambda: gateway.losses().get("slow client", 0) >= 1000, 30)
+                await wait_until_async(lambda: gateway.losses().get("slow client", 0) >= 1000)
                 num_poses = len(client.poses)
                 await wait_until_async(lambda: len(client.poses) > num_poses + 1000)
                 times = {pose.utime for pose in client.poses}

@@ -181,7 +181,7 @@ class Soak:
         ZenohSubscriber(session, key_patterns("mocap", "lab", None), self.messages.count)
         end_s = time.monotonic() + 60 * self.minutes
         try:
-            await wait_until_async(lambda: self.messages.received["3d"] > RATE_HZ, 20)
+            await wait_until_async(lambda: self.messages.received["3d"] > RATE_HZ)
             self.start_kib = gateway.rss_kib()
             await gateway.arrivals()  # what came before the first round
             while time.monotonic() < end_s and gateway.process.returncode is None:

@@ -71,7 +71,7 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
             process.wait()
 
         start()
-        wait_until(lambda: received, 30)
+        wait_until(lambda: received)
         yield Lab(("--connect", endpoint), ("--lcm", "--url", url), start, stop, simulated)
 
 

@@ -71,9 +71,9 @@ def test_the_exported_file_has_what_the_original_has(
     (lab.folder / "lab.yaml").write_text(yaml.safe_dump(configuration))
     take, copy = lab.folder / "take.lcmlog", lab.folder / "copy.c3d"
     lab.start("run", "--config", lab.folder / "lab.yaml")
-    wait_until(lambda: "zenoh: the session is open" in lab.output("run"), 30)
+    wait_until(lambda: "zenoh: the session is open" in lab.output("run"))
     record = lab.start("record", take, "--connect", endpoint)
-    wait_until(lambda: "gets no frames" in lab.output("record"), 30)  # it receives the gateway's status
+    wait_until(lambda: "gets no frames" in lab.output("record"))  # it receives the gateway's status
     lab.start("simulate", "--c3d", original, "--once", "--port", str(port))
     wait_until(lambda: recorded(take, "3D") == num_frames and recorded(take, "ANALOG") == num_samples, 60)
     record.send_signal(signal.SIGINT)

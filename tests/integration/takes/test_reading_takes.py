@@ -57,7 +57,7 @@ async def logged(scene: Scene, log: Path, *options: str) -> AsyncIterator[None]:
 
 
 async def has_bytes(folder: Path, num_bytes: int) -> None:
-    await wait_until_async(lambda: sum(file.stat().st_size for file in folder.iterdir()) > num_bytes, 30)
+    await wait_until_async(lambda: sum(file.stat().st_size for file in folder.iterdir()) > num_bytes)
 
 
 async def test_a_log_of_lcm_logger_is_a_take(tmp_path: Path) -> None:

@@ -33,7 +33,7 @@ def test_the_queue_is_bounded_by_calls_and_bytes(monkeypatch: pytest.MonkeyPatch
         go_on.wait()
 
     thread.offer(wait)
-    assert entered.wait(5)
+    assert entered.wait(30)
     made: list[int] = []
     assert thread.offer(lambda: made.append(0), 1000)  # of any size, because the queue is empty
     assert not thread.offer(lambda: made.append(1), 1)
@@ -54,7 +54,7 @@ def test_a_call_that_raises_is_logged_and_the_next_one_is_made(caplog: pytest.Lo
 
     thread.offer(fail)
     thread.offer(made.set)
-    assert made.wait(5)
+    assert made.wait(30)
     thread.close(nothing, 5)
     [record] = caplog.records
     assert record.levelno == logging.ERROR

@@ -41,7 +41,7 @@ async def test_zenoh_opens_and_replies_in_threads(threads: Callable[[], dict[str
         await output.stop_queries()
         await wait_until_async(lambda: set(threads()) == {"zenoh-open"})
     await asyncio.to_thread(output.close)
-    await wait_until_async(lambda: "zenoh-open" not in threads(), 30)  # or later tests would see what it logs
+    await wait_until_async(lambda: "zenoh-open" not in threads())  # or later tests would see what it logs
 
 
 async def test_lcm_sends_and_receives_in_threads(threads: Callable[[], dict[str, bool]]) -> None:

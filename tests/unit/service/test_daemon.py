@@ -113,7 +113,7 @@ async def test_a_request_stops_the_gateway_and_all_tasks(systemd: Notifications,
         await until(lambda: gateway.sources[0].streams[0].session)
         await settle()
         os.kill(os.getpid(), signal.SIGTERM)
-        await asyncio.wait([task], timeout=5)
+        await asyncio.wait([task], timeout=30)
         assert task.done()
         assert servers["server"].connection.commands[-1] == "Bye"
         assert systemd.sent[-1] == "STOPPING"
@@ -184,6 +184,6 @@ async def test_the_end_of_the_terminal_stops_a_gateway_that_it_started(
         await until(lambda: configuration.num_loaded == 1)
         has_terminal = False
         os.kill(os.getpid(), signal.SIGHUP)
-        await asyncio.wait([task], timeout=5)
+        await asyncio.wait([task], timeout=30)
         assert task.done()
         assert systemd.sent[-1] == "STOPPING"

@@ -18,7 +18,7 @@ from gateway.outputs.lsl.wire import Kind, Message
 from tests.lsl_receiver import lsl_config
 from tests.waiting import wait_until
 
-TIMEOUT_S = 20.0
+TIMEOUT_S = 30.0
 
 
 @pytest.fixture
