@@ -16,6 +16,7 @@ from gateway.config.settings import (
     SpoolSettings,
 )
 from gateway.gateway import Gateway
+from gateway.outputs.lcm.output import LcmOutput
 from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -178,7 +179,12 @@ def output_queries(gateway: Gateway) -> Any:
 
 
 async def wait_until_cached(gateway: Gateway) -> None:
-    """Wait until the gateway knows the parameters, and its handshakes are done."""
+    """Wait until the gateway answers queries, knows the parameters, and its handshakes are done."""
+    await wait_until_async(lambda: all(output.health().connected for output in gateway.outputs))
+    for output in gateway.outputs:
+        if isinstance(output, LcmOutput) and output._queries is not None and output.settings.queries:
+            receiver = output._queries._receiver  # in a thread of its own: a request before it is lost
+            await wait_until_async(lambda: receiver._subscriptions.keys() == receiver._channels.keys())  # noqa: B023
     [source] = gateway.sources
     await wait_until_async(lambda: source.queries.parameters.known.newest)
     await wait_until_async(lambda: all(stream.session for stream in source.streams))

@@ -79,7 +79,7 @@ class Lab:
         return await asyncio.to_thread(self._get, path)
 
     def _get(self, path: str) -> tuple[int, str]:
-        connection = HTTPConnection("127.0.0.1", self.port, timeout=10)
+        connection = HTTPConnection("127.0.0.1", self.port, timeout=30)
         try:
             connection.request("GET", path)
             answer = connection.getresponse()
@@ -111,13 +111,13 @@ async def running_lab(port: int, metrics_port: int | None = None) -> AsyncIterat
     task = asyncio.create_task(lab.gateway.run(stop))
     await lab.monitoring.start()
     try:
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             await lab.gateway.opened.wait()
         yield lab
     finally:
         await lab.monitoring.close()
         stop.set()
-        async with asyncio.timeout(10):
+        async with asyncio.timeout(30):
             await task
 
 

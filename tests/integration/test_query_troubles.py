@@ -70,7 +70,7 @@ async def test_queries_end_at_once_when_the_gateway_closes() -> None:
             peer.get("mocap/lab/status", end, timeout=60)
             await service.received_query.wait()
             await queries.close()
-            async with asyncio.timeout(10):
+            async with asyncio.timeout(30):
                 await ended.wait()
             assert replies == []
     finally:
@@ -92,8 +92,12 @@ async def test_without_time_stamps_the_log_says_how_to_enable_the_cache_for_late
             peer.declare_subscriber(
                 "mocap/lab/parameters", lambda sample: received.append(sample.payload.to_bytes())
             )
-            queries.publish_parameters("lab", ServerParameters(b"<RT_Parameters/>", 3, 2))
-            await wait_until_async(lambda: received)
+
+            def publish_and_receive() -> object:
+                queries.publish_parameters("lab", ServerParameters(b"<RT_Parameters/>", 3, 2))
+                return received  # nothing before the session knows of the subscriber
+
+            await wait_until_async(publish_and_receive)
         await queries.close()
     finally:
         session.close()

@@ -161,7 +161,7 @@ async def test_sources_are_added_and_removed_with_their_keys_and_queries() -> No
             changes = await gateway.reload(builder.settings({"new": new_server.port, "lab": lab_server.port}))
             assert changes == ["source gone removed", "source new added"]
             assert [source.name for source in gateway.sources] == ["new", "lab"]
-            assert server.count("Bye") == 1
+            await wait_until_async(lambda: server.count("Bye") == 1)
             await wait_until_async(lambda: all(source.streams[0].session for source in gateway.sources))
             assert b"of new" in (await query(peer, "mocap/new/parameters")).payload
             assert b"of lab" in (await query(peer, "mocap/lab/parameters")).payload

@@ -124,7 +124,7 @@ async def test_no_data_beyond_what_can_wait_is_counted_and_logged_once(
 
 
 async def test_a_client_that_was_full_before_a_file_is_answered_after_it(tmp_path: Path) -> None:
-    scene = CountingScene(300.0, num_markers=3000)
+    scene = CountingScene(150.0, num_markers=3000)
     async with playing(scene) as (_, gateway), connected(gateway) as client:
         await client.ask("StreamFrames 3D")
         client.pause()
@@ -145,12 +145,12 @@ async def test_a_slow_client_loses_only_its_own_frames_and_no_event(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     caplog.set_level(logging.WARNING)
-    scene = CountingScene(300.0, num_markers=3000)
+    scene = CountingScene(150.0, num_markers=3000)
     async with playing(scene) as (_, gateway), connected(gateway) as slow, connected(gateway) as other:
         slow.pause()
         slow.send(command("StreamFrames 3D Events"))
         await other.ask("StreamFrames 6D")
-        while "does not read" not in caplog.text:
+        while "lab to rtc3d: client" not in caplog.text:
             assert consecutive(await other.frames(20))
         while not losses_of(gateway):
             await other.frames(20)
@@ -169,7 +169,8 @@ async def test_a_slow_client_loses_only_its_own_frames_and_no_event(
             has_gap = has_gap or bool(previous and number > previous + 1)
             previous = number
         assert events == list(range(events[0], events[0] + len(events)))
-    assert caplog.text.count("does not read") == 1
+    # On a busy computer, the gateway itself may be a client that does not read in time.
+    assert caplog.text.count("lab to rtc3d: client") == 1
 
 
 async def test_clients_that_are_too_many_are_turned_away() -> None:

@@ -51,8 +51,8 @@ def test_echo_and_params_work_with_a_viewers_certificate(router: SecureRouter, t
 def test_connect_replaces_the_address_in_the_file(router: SecureRouter, tmp_path: Path) -> None:
     file = tmp_path / "viewer.json5"
     file.write_text(router.client("viewer", (f"tls/127.0.0.1:{router.port}", "tls/127.0.0.1:9")))
-    arguments = ("params", "3d", "--zenoh-config", str(file), "--timeout", "2")
-    assert run_command(*arguments).returncode == 3
+    arguments = ("params", "3d", "--zenoh-config", str(file))
+    assert run_command(*arguments, "--timeout", "2").returncode == 3
     connect = ("--connect", f"tls/127.0.0.1:{router.port}")
     assert run_command(*arguments, *connect).returncode == 0
     assert run_command("list", "--zenoh-config", str(file), *connect).stdout.startswith("lab\t")

@@ -267,10 +267,14 @@ async def test_a_take_in_several_sources_needs_the_source(tmp_path: Path) -> Non
     async with lab(tmp_path / "takes") as at, lab(tmp_path / "others") as other:
         assert (await take("start", "walk", *at.options("zenoh"))).status == 0
         assert (await take("start", "walk", *other.options("zenoh"))).status == 0
-        keys = {"mode": "client", "connect": {"endpoints": [at.endpoint, other.endpoint]}}
+        # Zenoh waits for the connections of a peer at most for the delay of scouting.
+        keys = {
+            "mode": "peer",
+            "connect": {"endpoints": [at.endpoint, other.endpoint]},
+            "scouting": {"delay": 30_000, "multicast": {"enabled": False}},
+        }
         config = tmp_path / "both.json5"
-        keys["mode"] = "peer"
-        config.write_text(json.dumps(keys | {"scouting": {"multicast": {"enabled": False}}}))
+        config.write_text(json.dumps(keys))
         fetched = await take("fetch", "walk", str(tmp_path), "--zenoh-config", str(config))
         assert (fetched.status, fetched.stdout) == (1, "")
         assert "several sources have a take 'walk': lab, lab_2; choose with --source" in fetched.stderr
