@@ -89,7 +89,7 @@ def main() -> None:
                 xml = inlet.info(timeout=2).as_xml()
                 inlet.open_stream(timeout=2)
                 offset_s = inlet.time_correction(timeout=2)
-            except (TimeoutError, pylsl.util.LostError):
+            except (pylsl.util.TimeoutError, pylsl.util.LostError):
                 continue  # it was replaced at this moment
             inlets[info.source_id()] = inlet
             _print({"name": info.name(), "xml": xml, "offset_s": offset_s})
