@@ -76,7 +76,7 @@ class Ros2Settings(OutputSettings):
     """The reliability that the publishers announce."""
 
     durability: Durability = "volatile"
-    """The durability that the publishers announce; there is no other one, because old poses mislead robots."""
+    """The durability that the publishers announce. There is only this one: old poses would mislead robots."""
 
     depth: Depth = 10
     """The depth of the history that the publishers announce (keep last)."""
