@@ -70,11 +70,12 @@ async def half_open(port: int) -> None:
 
 
 async def huge(port: int) -> None:
-    """A frame of 16 EB, and messages of 1 MB."""
+    """A frame of 16 EB, messages of 1 MB, and messages in empty pieces without end."""
     enormous = bytes((0x81, 0xFF)) + b"\x7f" + b"\xff" * 7 + bytes(4)
     await asyncio.gather(
         repeated(port, HANDSHAKE, enormous, bytes(100_000)),
         repeated(port, HANDSHAKE, client_frame(b'"' + b"x" * 1_000_000 + b'"')),
+        repeated(port, HANDSHAKE + b"\x01\x80" + bytes(4), (b"\x00\x80" + bytes(4)) * 100),
     )
 
 

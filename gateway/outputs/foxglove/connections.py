@@ -4,9 +4,10 @@ import logging
 import time
 from typing import Any, Final
 
-from websockets.asyncio.server import ServerConnection, broadcast
+from websockets.asyncio.server import ServerConnection
 from websockets.frames import DATA_OPCODES, Frame
 from websockets.http11 import Request, Response
+from websockets.protocol import State
 
 from gateway.log import EventLog
 from gateway.outputs.foxglove import protocol
@@ -41,6 +42,9 @@ MAX_WAITING_BYTES: Final = 1024 * 1024
 
 MAX_CONTROL_BYTES: Final = 8 * MAX_WAITING_BYTES
 """How much may wait with the messages about channels, which are not left out; then it is disconnected."""
+
+_FLUSH_BYTES: Final = 64 * 1024
+"""Messages are sent together, but not more of them: so much may come at once after a delay."""
 
 MAX_STALL_S: Final = 30.0
 """A viewer that has read nothing for this long, while so much waits, is disconnected."""
@@ -146,6 +150,7 @@ class Viewer:
         """The numbers of channels by those of subscriptions."""
         self._connection = connection
         self._admission = admission
+        self._queued_bytes = 0  # for the next ``_flush``
         self._was_slow = False
         self._stalled_s: float | None = None  # since when too much waits, on the monotonic clock
 
@@ -160,7 +165,7 @@ class Viewer:
             self._stall()
             return False
         self._stalled_s = None
-        broadcast((self._connection,), protocol.message_data(subscription, utime, data))
+        self._send(protocol.message_data(subscription, utime, data))
         return True
 
     def _stall(self) -> None:
@@ -180,12 +185,34 @@ class Viewer:
         if self._waiting_bytes > MAX_CONTROL_BYTES:
             self._disconnect("it does not read what it must know about the topics")
         else:
-            broadcast((self._connection,), message)
+            self._send(message.encode(), is_text=True)
 
     def _disconnect(self, reason: str) -> None:
         self._admission.disconnect(self._connection, reason)
 
+    def _send(self, message: bytes, *, is_text: bool = False) -> None:
+        """Send a message in this turn of the loop, in one system call with others.
+
+        With four viewers of all topics, a frame takes 0.3 ms instead of 0.5 ms.
+        """
+        frames = self._connection.protocol
+        if frames.state is not State.OPEN:
+            return
+        (frames.send_text if is_text else frames.send_binary)(message)
+        if not self._queued_bytes:
+            self._connection.loop.call_soon(self._flush)
+        self._queued_bytes += len(message)
+        if self._queued_bytes > _FLUSH_BYTES:
+            self._flush()
+
+    def _flush(self) -> None:
+        self._queued_bytes = 0
+        # websockets sends them itself if it has something to send in the same turn.
+        data = b"".join(self._connection.protocol.data_to_send())
+        if data and not self._connection.transport.is_closing():
+            self._connection.transport.write(data)
+
     @property
     def _waiting_bytes(self) -> int:
         waiting: int = self._connection.transport.get_write_buffer_size()
-        return waiting
+        return waiting + self._queued_bytes
