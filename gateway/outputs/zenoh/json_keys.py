@@ -5,7 +5,6 @@ second for each key, and in a thread of its own, which uses a fifth of a process
 """
 
 import functools
-import json
 import logging
 import threading
 import time
@@ -29,8 +28,8 @@ from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.token_bucket import TokenBucket
 
-MAX_LABELS_CHARACTERS: Final = 256 * 1024
-"""Longer lists of labels are left out: they come from the server, and are in every text."""
+MAX_DESCRIPTION_CHARACTERS: Final = 256 * 1024
+"""Longer lists of labels and units are left out: they come from the server, and are in every text."""
 
 _BURST_S: Final = 0.25
 """The messages of this time may come at once, as after a delay on the network."""
@@ -141,8 +140,8 @@ class JsonPublisher:
         self._publisher: zenoh.Publisher | None = None
         self._lock = threading.Lock()
         self._newest: bytes | None = None  # the paced message that waits
-        self._labels_of: tuple[Parameters | None, int] | None = None
-        self._labels_text = ""
+        self._described: tuple[Parameters, int] | None = None
+        self._description = ""  # of ``_described``
 
     def declare(self, session: zenoh.Session) -> None:
         """Declare the publisher on an open session."""
@@ -216,26 +215,28 @@ class JsonPublisher:
 
     def _text(self, message: bytes) -> str:
         decoded = decode(message)
-        labels = self._labels(decoded)
+        description = self._description_of(decoded)
         text = json_text(decoded)
-        return f"{text[:-1]},{labels}}}" if labels else text
+        return f"{text[:-1]},{description}}}" if description else text
 
-    def _labels(self, message: Any) -> str:
-        """Return the field with the labels, as JSON; "" if they are not known."""
+    def _description_of(self, message: Any) -> str:
+        """Return the fields with the labels and units, as JSON; "" if they are not known."""
         if len(self._topic.path) > 1:
-            return f'"label":{json.dumps(self._topic.path[1], ensure_ascii=False)}'
+            return _fields(label=self._topic.path[1])
         parameters = self._keys.parameters(self._topic.source, message.parameters_version)
         if parameters is None:
             return ""
         kind = COMPONENTS_BY_KEY[self._topic.path[0]]
         if kind is ComponentType.EVENT:
             labels = event_labels(parameters)
-            return _labels_text([labels.get(event.id, "") for event in message.events])
+            return _fields(labels=[labels.get(event.id, "") for event in message.events])
         num_items = int(getattr(message, f"num_{kind.item_noun}"))
-        if self._labels_of != (parameters, num_items):
-            self._labels_text = _labels_text(describe(kind, parameters, num_items).labels)
-            self._labels_of = parameters, num_items
-        return self._labels_text
+        if self._described != (parameters, num_items):
+            found = describe(kind, parameters, num_items)
+            moment_unit = {"moment_unit": found.moment_unit} if kind is ComponentType.FORCE else {}
+            self._description = _fields(labels=found.labels, units=found.units, **moment_unit)
+            self._described = parameters, num_items
+        return self._description
 
     def close(self) -> None:
         """Undeclare the publisher."""
@@ -248,6 +249,7 @@ class JsonPublisher:
                 logger.debug("undeclaring %s: %s", self._key, error)
 
 
-def _labels_text(labels: Any) -> str:
-    text = f'"labels":{json_text(list(labels))}'
-    return text if len(text) <= MAX_LABELS_CHARACTERS else ""
+def _fields(**values: Any) -> str:
+    """Return the fields of an object as JSON, without the braces; "" if they are too long."""
+    text = json_text(values)[1:-1]
+    return text if len(text) <= MAX_DESCRIPTION_CHARACTERS else ""

@@ -17,7 +17,7 @@ from gateway.messages.json_text import MAX_JSON_SOURCE_BYTES
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.pacing import Pacer
-from gateway.outputs.zenoh.json_keys import MAX_LABELS_CHARACTERS
+from gateway.outputs.zenoh.json_keys import MAX_DESCRIPTION_CHARACTERS
 from gateway.outputs.zenoh.output import ZenohOutput
 from gateway.outputs.zenoh.publisher import ZenohPublisher
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -42,6 +42,13 @@ LABELS = {
     "analog": ["EMG1", "channel 2", "channel 3"],
     "force": ["First force plate"],
     "event": ["Button", ""],
+}
+UNITS: dict[str, dict[str, Any]] = {
+    "3d": {"units": ["mm", "mm"]},
+    "6d": {"units": ["mm", "mm"]},
+    "analog": {"units": ["mV", "mV", "mV"]},
+    "force": {"units": ["N"], "moment_unit": ""},  # it describes no moments
+    "event": {},
 }
 """Of the specification's parameters."""
 
@@ -112,16 +119,15 @@ def event(sequence: int) -> bytes:
 
 
 @pytest.mark.parametrize("component", WIRE_ORDER, ids=lambda component: component.key)
-def test_a_component_as_json_has_the_fields_of_its_message_and_labels(
+def test_a_component_as_json_has_the_fields_of_its_message_and_labels_and_units(
     lab: Lab, component: ComponentType
 ) -> None:
     lab.set_parameters(SPEC_PARAMETERS)
     lab.subscribe()
     _, message = frame(component, ITEMS[component])
     received = lab.received_of(lab.publisher(component), message)
-    labels = received.pop("labels")
-    assert received == to_json(decode(message))
-    assert labels == LABELS[component.key]
+    description = {"labels": LABELS[component.key], **UNITS[component.key]}
+    assert received == {**to_json(decode(message)), **description}
     [sample] = lab.samples
     assert str(sample.key_expr) == f"mocap/lab/{component.key}/json"
     assert str(sample.encoding) == "application/json"
@@ -185,7 +191,7 @@ def test_labels_may_have_any_characters(lab: Lab) -> None:
 def test_labels_that_are_too_long_together_are_left_out(lab: Lab) -> None:
     lab.subscribe()
     publisher = lab.publisher()
-    num_labels = MAX_LABELS_CHARACTERS // 200 + 1
+    num_labels = MAX_DESCRIPTION_CHARACTERS // 200 + 1
     many = tuple(Marker(str(at), f"{at:0200}") for at in range(num_labels))
     lab.set_parameters(Parameters(markers=Parameters3D(markers=many)))
     assert "labels" in lab.received_of(publisher, markers(10)[1])
