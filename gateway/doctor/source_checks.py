@@ -6,6 +6,7 @@ from collections.abc import AsyncIterator, Iterator
 from typing import Final
 
 from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.descriptions.source_frame import source_frame, unknown_unit_text
 from gateway.doctor.frame_checks import check_byte_order, check_frames, check_visibility
 from gateway.doctor.observation import COMPONENTS_WITH_VISIBILITY, ObservedStream
 from gateway.doctor.rate_check import check_rate
@@ -218,8 +219,15 @@ class SourceChecks:
     def _check_parameters(self) -> Finding:
         first = self._streams[0]
         if first.parsed is not None:
+            parameters = first.parsed.parameters
             repaired = f" (repaired: {first.parsed.recovered[0]})" if first.parsed.recovered else ""
-            return self._subject.passing("parameters", _summary(first.parsed.parameters) + repaired)
+            found = _summary(parameters) + repaired
+            if source_frame(self._source, parameters).metres_per_unit is None:
+                problem, _, remedy = unknown_unit_text(parameters, "positions in metres").partition("; ")
+                return self._subject.warning(
+                    "parameters", f"{found}; {problem}", f"{remedy[:1].upper()}{remedy[1:]}."
+                )
+            return self._subject.passing("parameters", found)
         refusals = [text for text in first.status.limitations if "SendParameters" in text]
         if refusals:
             return self._subject.not_tested(

@@ -195,6 +195,21 @@ async def test_a_repair_of_the_parameters_is_reported() -> None:
     assert "(repaired: " in findings.of("parameters").found
 
 
+async def test_an_unknown_unit_of_length_is_a_warning() -> None:
+    markers = "<The_3D><Frequency>100</Frequency><Unit>furlong</Unit><Markers/></The_3D>"
+    server = replying(parameters(markers), markers_frame(1))
+    finding = (await diagnose(server)).of("parameters")
+    assert (finding.result, finding.found) == (
+        Result.WARNING,
+        "0 markers; unit of length 'furlong' is unknown: no positions in metres are published",
+    )
+    assert finding.remedy == (
+        "Set it to mm or m in the server, or set transform.units of the source in the configuration."
+    )
+    corrected = await diagnose(server, transform={"units": "mm"})
+    assert corrected.of("parameters").result is Result.PASSING
+
+
 async def test_no_measurement_fails() -> None:
     async with Simulator(SyntheticScene(markers=1)) as simulator:
         simulator.stop_measurement()
