@@ -49,6 +49,8 @@ class _Origins:
 
     def resolve(self, settings: Settings, values: dict[str, Any]) -> None:
         """Replace keys without a value in ``values`` by the value in effect."""
+        for source, shown in zip(settings.sources, values["sources"], strict=True):
+            shown.update({key: effective.value for key, effective in source.effective.items()})
         for name in type(settings).model_fields:
             section = getattr(settings, name)
             if not isinstance(section, Section):

@@ -39,6 +39,7 @@ def test_every_value_is_shown_with_its_origin(file: Path) -> None:
     for line in (
         "- name: lab # lab.yaml:2",
         "port: 3020 # default",
+        "frame_id: lab # default",
         "- components: [6d] # lab.yaml:4",
         "frequency_hz: 60.0 # lab.yaml:4",
         "backlog: all # default",
@@ -74,6 +75,8 @@ def test_the_output_is_an_equivalent_configuration(file: Path) -> None:
     configuration = read(file, {})
     again = file.with_name("again.yaml")
     again.write_text(shown_configuration(configuration), encoding="utf-8")
+    [source] = configuration.settings.sources
+    sources = (source.model_copy(update={"frame_id": source.name}),)
     directory = configuration.settings.spool.effective_directory
     spool = configuration.settings.spool.model_copy(update={"directory": str(directory)})
     takes = configuration.settings.takes
@@ -81,7 +84,7 @@ def test_the_output_is_an_equivalent_configuration(file: Path) -> None:
     before = configuration.settings.lcm
     lcm = before.model_copy(update={"queries_url": before.effective_queries_url})
     assert load(again, {}) == configuration.settings.model_copy(
-        update={"spool": spool, "lcm": lcm, "takes": takes}
+        update={"sources": sources, "spool": spool, "lcm": lcm, "takes": takes}
     )
 
 
