@@ -1,13 +1,17 @@
 """Peers that ask without end, on Zenoh and on LCM: the frames of the healthy source do not wait for them."""
 
 import asyncio
+import itertools
 import json
 import signal
+import socket
+import struct
 import sys
 from asyncio.subprocess import DEVNULL, PIPE, Process
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import pytest
 import rtc3d
@@ -146,4 +150,27 @@ async def test_floods_on_lcm(
             for _ in range(100 if len(message) < 1000 else 5):
                 connection.publish("MOCAP_LAB_PARAMETERS_REQUEST", message)
             await asyncio.sleep(0.01)
+    check(gateway)
+
+
+async def test_damaged_datagrams_of_lcm(gateway_under_attack: GatewayUnderAttack) -> None:
+    """LCM's own library takes the rest of a channel from the datagram before, and crashes."""
+    request = struct.pack(">II", 0x4C433032, 0) + b"MOCAP_HEALTHY_PARAMETERS_REQUEST\0" + bytes(40)
+    numbers = (0, 1, 40, 4000, 1 << 31, (1 << 32) - 1)
+    fragments = [
+        struct.pack(">IIIIHH", 0x4C433033, 0, size, offset, number, 2) + request[8:]
+        for size, offset, number in itertools.product(numbers, numbers, (0, 1, 2, 0xFFFF))
+    ]
+    beginnings = [request[:length] for length in range(len(request))]
+    async with gateway_under_attack() as gateway:
+        url = urlsplit(lcm_queries_url(gateway.lcm_url))
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.connect((str(url.hostname), url.port or 0))
+            for beginning in beginnings:
+                sender.send(request.replace(b"MOCAP", b"OTHER"))
+                sender.send(beginning)
+                await asyncio.sleep(0.01)
+            for fragment in fragments:
+                sender.send(fragment)
+                await asyncio.sleep(0.01)
     check(gateway)

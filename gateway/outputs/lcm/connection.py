@@ -48,7 +48,7 @@ def multicast_interface(url: str) -> str | None:
     Returns None if the URL is of another kind, or if LCM itself would reject it. Raises OSError if there is
     no such interface.
     """
-    destination = _multicast_destination(url)
+    destination = multicast_destination(url)
     if destination is None:
         return None
     # rtnetlink(7): a request for the route to an address, whose reply has the interface. The local address of
@@ -81,7 +81,7 @@ def split_url(url: str) -> SplitResult:
         return urlsplit(f"{scheme_of(url)}://")
 
 
-def _multicast_destination(url: str) -> tuple[str, int] | None:
+def multicast_destination(url: str) -> tuple[str, int] | None:
     """Return group and port; None if this is no multicast URL, or one that LCM itself rejects."""
     if scheme_of(url) not in MULTICAST_SCHEMES:
         return None
@@ -97,7 +97,7 @@ def multicast_problem(url: str) -> str:
 
     LCM itself only prints the reason to stderr and raises RuntimeError without it.
     """
-    destination = _multicast_destination(url)
+    destination = multicast_destination(url)
     if destination is None:
         return ""
     try:

@@ -10,12 +10,16 @@ import lcm
 from gateway.errors import OutputError
 from gateway.log import FailureLog
 from gateway.outputs.lcm.connection import open_lcm, reconnect, scheme_of, send_problem
+from gateway.outputs.lcm.datagrams import LcmDatagrams
 from gateway.outputs.lcm.sender import RETRY_S
 from gateway.token_bucket import TokenBucket
 from gateway.worker_thread import WorkerThread
 
 RECEIVED_PER_S: Final = 2000.0
-"""How many messages a second are received. LCM itself discards further ones, which cannot be counted."""
+"""How many messages a second are received. Others are discarded before, and cannot be counted."""
+
+_OTHER_CHANNEL: Final = 0.1
+"""How much of RECEIVED_PER_S a message on another channel uses: on udpm://, all channels arrive."""
 
 _POLL_MS: Final = 100
 _PAUSE_S: Final = 0.02
@@ -31,7 +35,8 @@ class LcmReceiver:
     """Receives requests on ``url``. ``prefix`` begins the name of a channel that nobody subscribes to.
 
     If there is a ``shared`` LCM object (memq://), the owner of that object receives instead. Each
-    subscription has a queue of ``queue_messages``. ``on_open`` is called in the thread once LCM has opened.
+    subscription of LCM's library has a queue of ``queue_messages``; requests on udpm:// wait in the kernel.
+    ``on_open`` is called in the thread once LCM has opened.
     """
 
     def __init__(
@@ -86,7 +91,8 @@ class LcmReceiver:
         if connection is not None:
             self._on_open()
         while connection is not None and not self._closing.is_set():
-            self._subscribe(connection)
+            if isinstance(connection, lcm.LCM):
+                self._subscribe(connection)
             if self._received.left <= 0:
                 self._closing.wait(_PAUSE_S)  # or a flood would keep other threads from running
             try:
@@ -94,14 +100,16 @@ class LcmReceiver:
             except OSError as error:
                 logger.debug("receiving LCM requests: %s", error)
                 self._closing.wait(_POLL_MS / 1000)
-                if scheme_of(self._url) == "tcpq":
+                if isinstance(connection, lcm.LCM) and scheme_of(self._url) == "tcpq":
                     self._reconnect(connection)
+        if isinstance(connection, LcmDatagrams):
+            connection.close()
 
-    def _open(self) -> lcm.LCM | None:
-        """Return the LCM object that receives requests, with retries; None if ``close`` is called first."""
+    def _open(self) -> lcm.LCM | LcmDatagrams | None:
+        """Return what receives requests, with retries; None if ``close`` is called first."""
         while not self._closing.is_set():
             try:
-                connection = open_lcm(self._url)
+                connection = self._try_to_open()
             except OutputError as error:
                 self._opening.failed(f"no requests can be received: {error} (this is lcm.queries_url)")
                 self._closing.wait(RETRY_S)
@@ -109,6 +117,11 @@ class LcmReceiver:
             self._opening.recovered("requests can be received")
             return connection
         return None
+
+    def _try_to_open(self) -> lcm.LCM | LcmDatagrams:
+        if scheme_of(self._url) == "udpm":
+            return LcmDatagrams(self._url, self._handle)
+        return open_lcm(self._url)
 
     def _reconnect(self, connection: lcm.LCM) -> None:
         """Connect to the relay again, with retries, until ``close``."""
@@ -127,13 +140,12 @@ class LcmReceiver:
         """Subscribe to the channels that are new."""
         channels = self._channels.copy()
         for channel in channels.keys() - self._subscriptions.keys():
-            subscription = connection.subscribe(f"^{channel}$", self._handler(channels[channel]))
+            subscription = connection.subscribe(f"^{channel}$", self._handle)
             subscription.set_queue_capacity(self._queue_messages)
             self._subscriptions[channel] = subscription
 
-    def _handler(self, take: Take) -> Callable[[str, bytes], None]:
-        def handle(_channel: str, data: bytes) -> None:
-            self._received.take()
+    def _handle(self, channel: str, data: bytes) -> None:
+        take = self._channels.get(channel)
+        self._received.take(1 if take else _OTHER_CHANNEL)
+        if take:
             take(data)
-
-        return handle
