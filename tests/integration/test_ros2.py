@@ -21,13 +21,15 @@ from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.ros2.message_types import ROS_TYPES
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.zenoh.settings import ZenohSettings
+from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, encode_component
+from gateway.rtc3d.frames import encode_frame
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.configurations import make_settings
 from tests.networks import free_endpoint, open_zenoh, zenoh_keys
 from tests.running_gateway import running_gateway
-from tests.servers import Client, ScriptedServer, error, markers_frame, ok
+from tests.servers import Client, ScriptedServer, error, markers_frame, ok, packet
 from tests.unit.outputs.ros2 import ros_messages as ros
 from tests.waiting import wait_until_async
 
@@ -183,6 +185,39 @@ async def test_frames_are_requested_only_while_ros_wants_them(router: str) -> No
                     subscriber = node.declare_subscriber("0/mocap/lab/markers/**", received.append)
                     await wait_until_async(lambda: received)
                     subscriber.undeclare()
+
+
+MARKERS_ONLY: Final = """<RT_Parameters Ver='1.00'><The_3D><Frequency>100</Frequency><Unit>mm</Unit>
+<Markers><Marker id='1'><Label>a</Label></Marker></Markers></The_3D></RT_Parameters>"""
+
+
+def tool_frame(number: int) -> bytes:
+    """Return a data frame with one tool."""
+    items = np.array([(1.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 0.1)], ITEM_DTYPES[ComponentType.TOOLS])
+    component = encode_component(ComponentType.TOOLS, number, 10_000 * number, items)
+    return packet(3, encode_frame([component]))
+
+
+async def test_a_component_that_the_parameters_lack_has_topics_before_anybody_subscribes(router: str) -> None:
+    async def serve(client: Client) -> None:
+        def answer(command: str) -> bytes:
+            if command.startswith("SendParameters"):
+                return packet(2, MARKERS_ONLY)
+            return ok(f"OK-{command}")
+
+        async def stream() -> None:
+            for number in itertools.count(1):
+                client.send(markers_frame(number, (1.0, 2.0, 3.0)))
+                client.send(tool_frame(number))
+                await asyncio.sleep(0.01)
+
+        await asyncio.gather(client.commands(answer), stream())
+
+    async with ScriptedServer(serve) as server, gateway_of(settings_of(router, {"lab": server.port})):
+        with open_zenoh("client", connect=router) as node:
+            await wait_until_async(
+                lambda: {"/mocap/lab/markers", "/mocap/lab/tool_1/pose"} <= topics_on(node)
+            )
 
 
 async def test_a_server_that_gives_no_parameters_has_topics_by_position(router: str) -> None:

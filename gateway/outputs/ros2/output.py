@@ -127,12 +127,6 @@ class Ros2Output(Output):
         """Forget the source; its FramePublisher is closed."""
         self._sources.pop(source, None)
 
-    def show_streaming(self, source: str, is_streaming: bool) -> None:
-        """Take note whether frames arrive: a server without parameters has topics with its first frame."""
-        publisher = self._sources.get(source)
-        if publisher is not None:
-            publisher.show_streaming(is_streaming)
-
     # What is wanted.
 
     def watch_wanted(self, source: str, on_change: Callable[[], None]) -> bool:

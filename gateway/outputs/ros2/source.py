@@ -4,7 +4,7 @@ import functools
 import logging
 import threading
 from collections.abc import Callable, Mapping
-from typing import Final, Protocol
+from typing import Protocol
 
 import zenoh
 
@@ -19,9 +19,6 @@ from gateway.outputs.ros2.topic import RosNode, RosTopic
 from gateway.outputs.zenoh.config import zenoh_reason
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
-
-_MAX_LAYOUTS: Final = 64
-"""How many layouts of frames are remembered. The server determines them."""
 
 logger = logging.getLogger(__name__)
 
@@ -45,49 +42,53 @@ class RosSource:
 
     def __init__(self, name: str, base: str, tf: RosTopic, router: RouterSession, sender: Sender) -> None:
         self.name = name
-        self.wanted = False
-        """Whether somebody subscribes to anything that the frames are published on."""
         self.on_wanted_changed: Callable[[], None] = lambda: None
         """Called in any thread."""
         self.topics = SourceTopics(name, base, tf, self.update_wanted)
         self.topics.losses = Losses(logger, f"{name} to ros2")
-        self._lock = threading.Lock()  # of ``wanted``
+        self._lock = threading.Lock()  # of ``_wanted``
+        self._wanted: frozenset[ComponentType] = frozenset()  # what somebody subscribes to
         self._router = router
         self._sender = sender
         self._parameters = NOT_YET
-        self._known_layouts: set[FrameLayout] = set()
+        self._num_items: dict[ComponentType, int] = {}  # for how many the frames have opened topics
         self._refused: Mapping[ComponentType, int] = {}  # frames that found no place in the queue
         self._skipped: Mapping[ComponentType, int] = {}  # those whose numbers the topics have used up
         self._defects = DefectLog(logger, f"{name} to ros2")
         self._is_closed = False
-        self._is_streaming = False
 
-    def show_streaming(self, is_streaming: bool) -> None:
-        """Take note whether frames arrive."""
-        self._is_streaming = is_streaming
-        self.update_wanted()
+    @property
+    def wanted(self) -> bool:
+        """Whether somebody subscribes to anything that the frames are published on."""
+        return bool(self._wanted)
 
     def update_wanted(self) -> None:
         """Note that subscribers have come or gone, or topics. In any thread."""
         with self._lock:  # or what one thread has seen could replace what another sees later
-            # If a server gives no parameters, a frame shows which topics to open. Not without a router, or
-            # the first frames after a reload would count as lost.
-            lacks_topics = self._is_streaming and not self.topics.topics and not self._router.is_cut_off
-            is_wanted = (lacks_topics or self.topics.is_wanted) and not self._is_closed
-            if is_wanted is not self.wanted:
-                self.wanted = is_wanted
+            wanted = frozenset() if self._is_closed else self.topics.wanted
+            if wanted != self._wanted:
+                self._wanted = wanted
                 self.on_wanted_changed()
 
     def set_parameters(self, parameters: ServerParameters) -> None:
         """Open the topics of new parameters. The frames that follow belong to them."""
         self._parameters = parameters
-        self._known_layouts.clear()
+        self._num_items.clear()
         # If the queue is full, the next frame does it.
         self._sender.offer(self._guarded(self.topics.use, parameters), len(parameters.xml))
+        self.on_wanted_changed()  # so that the items of the next frames are noted again
 
-    def prepare(self, _layout: FrameLayout, _components: frozenset[ComponentType]) -> bool:
-        """See FramePublisher."""
-        return self.wanted
+    def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
+        """Open the topics of items that the parameters do not mention; return whether frames are wanted."""
+        counts: dict[ComponentType, int] = {}
+        for each in layout.components:
+            if each.type in components:
+                counts[each.type] = max(each.num_items, counts.get(each.type, 0))
+        more = {each: count for each, count in counts.items() if count > self._num_items.get(each, 0)}
+        # If the queue is full, another layout or subscriber does it.
+        if more and self._sender.offer(self._guarded(self.topics.open_for, more, self._parameters)):
+            self._num_items |= more
+        return not self._wanted.isdisjoint(counts)
 
     def publish(
         self,
@@ -96,13 +97,9 @@ class RosSource:
         sequence: int,  # noqa: ARG002 - of the contract; each topic has its own
         components: frozenset[ComponentType],
     ) -> None:
-        """Hand a frame to the sending thread if it is wanted. Raises OutputError if too many wait there."""
+        """Hand a frame to the sending thread. Raises OutputError if too many wait there."""
         if self._router.is_cut_off or self._is_closed:
             raise self._refusal()
-        if frame.layout not in self._known_layouts:
-            self._learn(frame.layout)
-        if not self.wanted:
-            return
         send = self._guarded(self._send, frame, stamp, components, self._parameters, self._refused)
         if not self._sender.offer(send, len(frame.body)):
             # Replaced, not changed: frames in the queue refer to it.
@@ -114,13 +111,6 @@ class RosSource:
         if self._is_closed:
             return OutputError(f"the topics of {self.name} are closed", cause="closed")
         return self._router.refusal
-
-    def _learn(self, layout: FrameLayout) -> None:
-        """Open the topics of items that the parameters do not mention: nobody can subscribe to them yet."""
-        if len(self._known_layouts) >= _MAX_LAYOUTS:
-            self._known_layouts.clear()
-        if self._sender.offer(self._guarded(self.topics.open_for, layout, self._parameters)):
-            self._known_layouts.add(layout)
 
     def _send(
         self,

@@ -34,7 +34,7 @@ from gateway.outputs.ros2.messages import (
 from gateway.outputs.ros2.names import unique_ros_names
 from gateway.outputs.ros2.topic import RosNode, RosTopic
 from gateway.rtc3d.components import Component, ComponentType
-from gateway.rtc3d.frames import Frame, FrameLayout
+from gateway.rtc3d.frames import Frame
 from gateway.rtc3d.parameters import Parameters
 
 MAX_TOOLS: Final = 256
@@ -79,13 +79,16 @@ class SourceTopics:
         self._on_wanted_changed = on_wanted_changed
         self._node: RosNode | None = None
         self._by_name: dict[str, RosTopic] = {}
+        # Replaced, not changed, because any thread may read it.
+        self._by_component: Mapping[ComponentType, Sequence[RosTopic]] = {ComponentType.TOOLS: (tf,)}
         self._former: dict[str, RosTopic] = {}  # those that the newest parameters may need again
         self._use(NOT_YET)
 
     @property
-    def is_wanted(self) -> bool:
-        """Whether somebody subscribes to a topic that the source's frames are published on. In any thread."""
-        return self._tf.wanted or any(topic.wanted for topic in self.topics)
+    def wanted(self) -> frozenset[ComponentType]:
+        """The components that somebody subscribes to. In any thread."""
+        components = self._by_component.items()
+        return frozenset(kind for kind, topics in components if any(topic.wanted for topic in topics))
 
     # Topics.
 
@@ -112,12 +115,9 @@ class SourceTopics:
         self._plates: list[_Plate] = []
         self.names = {}
 
-    def open_for(self, layout: FrameLayout, parameters: ServerParameters) -> None:
-        """Open the topics that a frame needs, even if the parameters do not mention its items."""
+    def open_for(self, counts: Mapping[ComponentType, int], parameters: ServerParameters) -> None:
+        """Open the topics of frames with so many items, even if the parameters do not mention them."""
         self.use(parameters)
-        counts: dict[ComponentType, int] = {}
-        for component in layout.components:
-            counts[component.type] = max(component.num_items, counts.get(component.type, 0))
         self._open(counts)
 
     def _open(self, counts: Mapping[ComponentType, int]) -> None:
@@ -132,6 +132,12 @@ class SourceTopics:
         if num_plates > len(self._plates):
             self._open_plates(num_plates)
         self.topics = tuple(self._by_name.values())
+        self._by_component = {
+            ComponentType.TOOLS: (self._tf, *(tool.topic for tool in self._tools)),
+            ComponentType.FORCE: tuple(plate.topic for plate in self._plates),
+            ComponentType.MARKERS: () if self._markers is None else (self._markers,),
+            ComponentType.ANALOG: () if self._analog is None else (self._analog,),
+        }
         self._on_wanted_changed()  # a subscriber may have come before a topic was among them
 
     def _open_tools(self, num_tools: int) -> None:
@@ -180,6 +186,7 @@ class SourceTopics:
         for topic in self._by_name.values():
             topic.undeclare()
         self._by_name = {}
+        self._by_component = {}
         self.topics = ()
 
     # Frames.
@@ -262,24 +269,12 @@ class SourceTopics:
     def skip(self, num_frames: Mapping[ComponentType, int]) -> None:
         """Use up the numbers of the messages of frames that were not sent, by component."""
         for kind, count in num_frames.items():
-            for topic in self._topics_of(kind):
+            for topic in self._by_component.get(kind, ()):
                 if topic.wanted:
                     topic.skip(count)
 
-    def _topics_of(self, kind: ComponentType) -> list[RosTopic]:
-        match kind:
-            case ComponentType.TOOLS:
-                return [self._tf, *(tool.topic for tool in self._tools)]
-            case ComponentType.FORCE:
-                return [plate.topic for plate in self._plates]
-            case ComponentType.MARKERS if self._markers is not None:
-                return [self._markers]
-            case ComponentType.ANALOG if self._analog is not None:
-                return [self._analog]
-        return []
-
     def _count_unknown_unit(self, kind: ComponentType) -> None:
-        num_messages = sum(topic.wanted for topic in self._topics_of(kind))
+        num_messages = sum(topic.wanted for topic in self._by_component.get(kind, ()))
         if num_messages:
             text = unknown_unit_text(self._parameters.parsed)
             self.losses.lost("unknown unit", text, messages=num_messages)

@@ -71,13 +71,30 @@ def test_topics_follow_from_the_parameters(lab: RosLab) -> None:
     }
 
 
-def test_a_server_without_parameters_has_topics_with_its_first_frame(lab: RosLab) -> None:
-    publisher = lab.source()
-    lab.output.show_streaming("lab", True)
-    wait_until(lambda: publisher.wanted)  # the gateway publishes nothing that is not wanted
-    publisher.publish(tools_frame((0, 0, 0), (0, 0, 0)), stamp(), 0, ALL)
+def test_items_that_the_parameters_lack_have_topics_before_anybody_subscribes(lab: RosLab) -> None:
+    publisher = lab.source(given=parameters(markers=1))
+    layout = frame_of((ComponentType.MARKERS, [(0, 0, 0, 0)]), *_one_tool()).layout
+    assert not publisher.prepare(layout, frozenset({ComponentType.MARKERS}))
+    assert not publisher.prepare(layout, ALL)
+    assert not publisher.prepare(tools_frame((0, 0, 0), (0, 0, 0)).layout, ALL)
     wait_until(lambda: {"/mocap/lab/tool_1/pose", "/mocap/lab/tool_2/pose"} <= lab.topics())
-    assert not publisher.wanted
+    lab.output.publish_parameters("lab", parameters(("wand",), markers=1, version=2))
+    wait_until(lambda: "/mocap/lab/wand/pose" in lab.topics())
+    assert "/mocap/lab/tool_2/pose" not in lab.topics()
+    assert not publisher.prepare(tools_frame((0, 0, 0), (0, 0, 0)).layout, ALL)
+    wait_until(lambda: "/mocap/lab/tool_2/pose" in lab.topics())
+
+
+def test_only_frames_with_a_component_that_somebody_subscribes_to_are_wanted(lab: RosLab) -> None:
+    publisher = lab.source(given=parameters(("wand",), channels=("Fx",)))
+    analog = frame_of((ComponentType.ANALOG, [1.0])).layout
+    both = frame_of((ComponentType.ANALOG, [1.0]), *_one_tool()).layout
+    lab.settle()
+    lab.hear("tf/**")
+    wait_until(lambda: publisher.wanted)
+    assert not publisher.prepare(analog, ALL)
+    assert publisher.prepare(both, ALL)
+    assert not publisher.prepare(both, frozenset({ComponentType.ANALOG}))
 
 
 def test_a_renamed_tool_has_a_new_topic_and_the_others_keep_their_numbers(lab: RosLab) -> None:
