@@ -43,6 +43,9 @@ from tests.waiting import wait_until
 
 ALL = frozenset(WIRE_ORDER)
 UTIME = 1_700_000_000_000_001
+STAMP = (1_700_000_000, 1000)
+"""Seconds and nanoseconds of UTIME."""
+ONE_TOOL = (ComponentType.TOOLS, [(1.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 0.0)])
 
 
 class Received(NamedTuple):
@@ -90,6 +93,11 @@ def tools_frame(*positions: tuple[float, float, float] | None, byte_order: ByteO
     """Return a frame of tools without rotation."""
     items = [None if each is None else (1.0, 0.0, 0.0, 0.0, *each, 0.1) for each in positions]
     return frame_of((ComponentType.TOOLS, items), byte_order=byte_order)
+
+
+def seconds(message: Any) -> tuple[int, int]:
+    """Return the stamp of a message in seconds and nanoseconds."""
+    return message.header.stamp.sec, message.header.stamp.nanosec
 
 
 def stamp(utime: int = UTIME) -> Stamp:

@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any, Final
 
 import zenoh
@@ -24,6 +24,8 @@ ERROR: Final = 2
 _LEVELS: Final = {"streaming": OK, "idle": OK, "no measurement": WARN}
 """By the state of a stream; all other states are errors."""
 
+_MAX_PREVIOUS_US: Final = 3_000_000
+"""The greatest age of a previous status. There is one each second, while somebody subscribes."""
 
 logger = logging.getLogger(__name__)
 
@@ -36,6 +38,7 @@ class DiagnosticsPublisher:
         self._router = router
         self._sender = sender
         self._defects = DefectLog(logger, "ros2 diagnostics")
+        self._previous: Any = None  # only in the sending thread
         self._is_closed = False
 
     @property
@@ -55,8 +58,9 @@ class DiagnosticsPublisher:
 
     def _send(self, message: bytes) -> None:
         try:
-            status = decode(message)
-            self._topic.put(diagnostic_array(cdr.stamp(status.utime), diagnostics_of(status)), time.time_ns())
+            previous, self._previous = self._previous, decode(message)
+            statuses = diagnostics_of(self._previous, previous)
+            self._topic.put(diagnostic_array(cdr.stamp(self._previous.utime), statuses), time.time_ns())
         except zenoh.ZError as error:
             logger.debug("ros2: publishing diagnostics: %s", zenoh_reason(error))
         except Exception as defect:  # noqa: BLE001 - the sending thread continues
@@ -67,12 +71,18 @@ class DiagnosticsPublisher:
         self._is_closed = True
 
 
-def diagnostics_of(status: Any) -> list[DiagnosticStatus]:
-    """Return what a decoded ``status_t`` says: one status per stream and output, and the coordinate frame."""
+def diagnostics_of(status: Any, previous: Any = None) -> list[DiagnosticStatus]:
+    """Return what a decoded ``status_t`` says: one status per stream and output, and the coordinate frame.
+
+    What has lost messages since ``previous``, the ``status_t`` before, gets a warning. If that is missing or
+    old, nobody knows when they were lost.
+    """
     name = f"rtc3d_gateway: {status.source}"
+    is_known = previous is not None and status.utime - previous.utime <= _MAX_PREVIOUS_US
+    lost = _lost(previous) if is_known else {}
     return [
-        *(_stream(name, status.server, stream) for stream in status.streams),
-        *(_output(name, status.server, output) for output in status.outputs),
+        *(_stream(name, status.server, stream, lost) for stream in status.streams),
+        *(_output(name, status.server, output, lost) for output in status.outputs),
         _frame(name, status),
     ]
 
@@ -90,14 +100,16 @@ def _frame(name: str, status: Any) -> DiagnosticStatus:
     return DiagnosticStatus(level, f"{name} coordinate frame", message, status.server, values)
 
 
-def _stream(name: str, server: str, stream: Any) -> DiagnosticStatus:
+def _stream(name: str, server: str, stream: Any, lost: Mapping[str, int]) -> DiagnosticStatus:
     level = _LEVELS.get(stream.state, ERROR)
     message = stream.state
     if level == ERROR and stream.last_error:
         message += f": {stream.last_error}"
     if level == OK and stream.problem:
         level, message = ERROR, stream.problem
-    num_lost = sum(drop.messages for drop in stream.drops)
+    num_lost = _num_lost(stream.drops)
+    if level == OK:
+        level, message = _with_losses(message, num_lost - lost.get(stream.components, num_lost))
     values = {
         "rate (Hz)": f"{stream.frame_rate_hz:.1f}",
         "lag (ms)": f"{stream.lag_ms:.1f}",
@@ -106,17 +118,35 @@ def _stream(name: str, server: str, stream: Any) -> DiagnosticStatus:
         "session": str(stream.session),
         "messages lost": str(num_lost),
         **_drops(stream.drops),
+        **{f"limitation {number}": text for number, text in enumerate(stream.limitations, start=1)},
     }
     return DiagnosticStatus(level, f"{name} {stream.components}", message, server, values)
 
 
-def _output(name: str, server: str, output: Any) -> DiagnosticStatus:
+def _output(name: str, server: str, output: Any, lost: Mapping[str, int]) -> DiagnosticStatus:
     values = {
         **{f"sent {count.name}": str(count.count) for count in output.messages},
         **_drops(output.drops),
     }
-    level, message = (OK, "connected") if output.connected else (ERROR, output.problem)
+    level, message = ERROR, output.problem
+    if output.connected:
+        num_lost = _num_lost(output.drops)
+        level, message = _with_losses("connected", num_lost - lost.get(f"to {output.name}", num_lost))
     return DiagnosticStatus(level, f"{name} to {output.name}", message, server, values)
+
+
+def _with_losses(message: str, num_new: int) -> tuple[int, str]:
+    return (WARN, f"{message}; messages lost: {num_new}") if num_new > 0 else (OK, message)
+
+
+def _lost(status: Any) -> dict[str, int]:
+    """Return how many messages a status says were lost, by stream and output."""
+    streams = {stream.components: _num_lost(stream.drops) for stream in status.streams}
+    return streams | {f"to {output.name}": _num_lost(output.drops) for output in status.outputs}
+
+
+def _num_lost(drops: Iterable[Any]) -> int:
+    return sum(drop.messages for drop in drops)
 
 
 def _drops(drops: Iterable[Any]) -> dict[str, str]:

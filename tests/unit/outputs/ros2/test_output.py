@@ -1,52 +1,34 @@
 """The output for ROS 2 with a real router: topics, messages, losses and life cycle."""
 
 import asyncio
-import json
 import logging
 import math
-import signal
-import subprocess
-import sys
 import threading
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 
 import numpy as np
 import pytest
-import rtc3d
-import zenoh
 
 from gateway.errors import OutputError
-from gateway.losses import Losses
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.messages.topics import Topic
-from gateway.outputs.ros2.message_types import TF_MESSAGE
 from gateway.outputs.ros2.output import Ros2Output
 from gateway.outputs.ros2.settings import Ros2Settings
-from gateway.outputs.ros2.source_topics import MAX_PLATES, MAX_TOOLS, SourceTopics
-from gateway.outputs.ros2.topic import RosTopic
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import ForceChannel, Plate
-from tests import statuses
-from tests.networks import zenoh_keys
-from tests.ros_lab import ALL, UTIME, RosLab, frame_of, parameters, ros_lab, stamp, tools_frame
+from tests.ros_lab import (
+    ALL,
+    ONE_TOOL,
+    STAMP,
+    RosLab,
+    frame_of,
+    parameters,
+    ros_lab,
+    seconds,
+    stamp,
+    tools_frame,
+)
 from tests.waiting import wait_until, wait_until_async
-
-STAMP = (1_700_000_000, 1000)
-"""Seconds and nanoseconds of UTIME."""
-
-
-@pytest.fixture
-def lab() -> Iterator[RosLab]:
-    with ros_lab() as lab:
-        yield lab.open()
-
-
-def seconds(message: object) -> tuple[int, int]:
-    time_stamp = message.header.stamp  # type: ignore[attr-defined]  # rosbags makes its types at run time
-    return time_stamp.sec, time_stamp.nanosec
-
 
 # Topics --------------------------------------------------------------------------------------
 
@@ -73,7 +55,7 @@ def test_topics_follow_from_the_parameters(lab: RosLab) -> None:
 
 def test_items_that_the_parameters_lack_have_topics_before_anybody_subscribes(lab: RosLab) -> None:
     publisher = lab.source(given=parameters(markers=1))
-    layout = frame_of((ComponentType.MARKERS, [(0, 0, 0, 0)]), *_one_tool()).layout
+    layout = frame_of((ComponentType.MARKERS, [(0, 0, 0, 0)]), ONE_TOOL).layout
     assert not publisher.prepare(layout, frozenset({ComponentType.MARKERS}))
     assert not publisher.prepare(layout, ALL)
     assert not publisher.prepare(tools_frame((0, 0, 0), (0, 0, 0)).layout, ALL)
@@ -88,7 +70,7 @@ def test_items_that_the_parameters_lack_have_topics_before_anybody_subscribes(la
 def test_only_frames_with_a_component_that_somebody_subscribes_to_are_wanted(lab: RosLab) -> None:
     publisher = lab.source(given=parameters(("wand",), channels=("Fx",)))
     analog = frame_of((ComponentType.ANALOG, [1.0])).layout
-    both = frame_of((ComponentType.ANALOG, [1.0]), *_one_tool()).layout
+    both = frame_of((ComponentType.ANALOG, [1.0]), ONE_TOOL).layout
     lab.settle()
     lab.hear("tf/**")
     wait_until(lambda: publisher.wanted)
@@ -307,59 +289,6 @@ def test_frames_of_no_and_of_fewer_items(lab: RosLab) -> None:
     assert lab.lost() == {}
 
 
-def test_the_status_becomes_diagnostics(lab: RosLab) -> None:
-    publisher = lab.output.publisher(Topic("lab", ("status",), "rtc3d.status_t"))
-    assert not publisher.wanted
-    lab.hear("diagnostics/**")
-    wait_until(lambda: publisher.wanted)
-    publisher.publish(example_status())
-    wait_until(lambda: lab.received["/diagnostics"])
-    array = lab.received["/diagnostics"][0].message
-    assert seconds(array) == STAMP
-    markers, analog, zenoh, frame = array.status
-    assert (markers.level, markers.name, markers.message) == (0, "rtc3d_gateway: lab 3d 6d", "streaming")
-    assert markers.hardware_id == "192.0.2.20:3020"
-    assert {each.key: each.value for each in markers.values}["rate (Hz)"] == "200.0"
-    assert (analog.level, analog.message) == (2, "waiting to reconnect: connection refused")
-    assert (zenoh.level, zenoh.name, zenoh.message) == (2, "rtc3d_gateway: lab to zenoh", "start zenohd")
-    assert {each.key: each.value for each in zenoh.values} == {"sent 3d": "7", "lost: no router": "12"}
-    assert (frame.level, frame.name, frame.message) == (0, "rtc3d_gateway: lab coordinate frame", "hall")
-    assert {each.key: each.value for each in frame.values} == {
-        "metres per unit of the server": "0.001",
-        "rotation (x y z w)": "0.5 0.5 0.5 0.5",
-        "translation (m)": "2.5 0.0 -1.0",
-    }
-    publisher.close()
-    with pytest.raises(OutputError, match="closed"):
-        publisher.publish(example_status())
-
-
-def example_status() -> bytes:
-    status = rtc3d.status_t()
-    status.utime = UTIME
-    status.source, status.server = "lab", "192.0.2.20:3020"
-    status.frame_id, status.metres_per_unit = "hall", 0.001
-    status.rotation_xyzw, status.translation_m = [0.5, 0.5, 0.5, 0.5], [2.5, 0.0, -1.0]
-    status.streams = [
-        statuses.stream("3d 6d", frame_rate_hz=200.0),
-        statuses.stream("analog", state="waiting to reconnect", last_error="connection refused"),
-    ]
-    status.num_streams = 2
-    status.outputs = [
-        statuses.output(
-            connected=False,
-            problem="start zenohd",
-            num_messages=1,
-            messages=[statuses.count("3d", 7)],
-            num_drops=1,
-            drops=[statuses.loss("no router", 12, 12)],
-        )
-    ]
-    status.num_outputs = 1
-    encoded: bytes = status.encode()
-    return encoded
-
-
 def test_the_clock_is_not_for_ros(lab: RosLab) -> None:
     publisher = lab.output.publisher(Topic("lab", ("clock",), "rtc3d.clock_t"))
     publisher.publish(b"anything")
@@ -381,7 +310,7 @@ async def test_only_what_has_subscribers_is_encoded() -> None:
             changes.append(publisher.wanted)
 
         assert lab.output.watch_wanted("lab", on_change)
-        frame = frame_of((ComponentType.MARKERS, [(1, 2, 3, 0)]), *_one_tool())
+        frame = frame_of((ComponentType.MARKERS, [(1, 2, 3, 0)]), ONE_TOOL)
         publisher.publish(frame, stamp(), 0, ALL)  # to nobody
         subscriber = await asyncio.to_thread(lab.hear, "mocap/lab/markers/**")
         await wait_until_async(lambda: changes == [True])
@@ -391,10 +320,6 @@ async def test_only_what_has_subscribers_is_encoded() -> None:
         subscriber.undeclare()
         await wait_until_async(lambda: changes == [True, False])
         assert set(lab.received) == {"/mocap/lab/markers"}
-
-
-def _one_tool() -> list[tuple[ComponentType, list[object]]]:
-    return [(ComponentType.TOOLS, [(1.0, 0.0, 0.0, 0.0, 1.0, 2.0, 3.0, 0.0)])]
 
 
 def test_a_subscriber_of_tf_wants_all_sources(lab: RosLab) -> None:
@@ -408,162 +333,6 @@ def test_a_subscriber_of_tf_wants_all_sources(lab: RosLab) -> None:
     assert [each.sequence for each in lab.received["/tf"]] == [1, 2]
     children = [each.message.transforms[0].child_frame_id for each in lab.received["/tf"]]
     assert children == ["lab/wand", "hall/wand"]
-
-
-# Losses --------------------------------------------------------------------------------------
-
-
-def test_an_unknown_unit_publishes_no_positions_and_is_counted(lab: RosLab) -> None:
-    frame = CoordinateFrame("lab", None)
-    given = parameters(("wand",), markers=1, channels=("Fx",), unit="furlong", frame=frame)
-    publisher = lab.source(given=given)
-    lab.hear_all()
-    kinds = frame_of((ComponentType.MARKERS, [(1, 2, 3, 0)]), *_one_tool(), (ComponentType.ANALOG, [1.0]))
-    publisher.publish(kinds, stamp(), 0, ALL)
-    wait_until(lambda: lab.received["/mocap/lab/analog"])
-    assert set(lab.received) == {"/mocap/lab/analog"}
-    assert lab.lost() == {"unknown unit": 3}  # the cloud, the pose, /tf
-    assert "furlong" in lab.losses["lab"].report()[0].text
-
-
-def test_thousands_of_labels_and_plates_are_bounded_and_counted(lab: RosLab) -> None:
-    tools = tuple(f"tool {number}" for number in range(3000))
-    plates = tuple(Plate(str(number)) for number in range(1000))
-    publisher = lab.source(given=parameters(tools, plates=plates))
-    wait_until(lambda: len(lab.topics()) == 2 + MAX_TOOLS + MAX_PLATES)
-    lab.hear_all()
-    publisher.publish(tools_frame(*[(1, 2, 3)] * 3000), stamp(), 0, ALL)
-    publisher.publish(frame_of((ComponentType.FORCE, [(1, 2, 3, 4, 5, 6)] * 1000)), stamp(), 1, ALL)
-    wait_until(lambda: len(lab.received) == 1 + MAX_TOOLS + MAX_PLATES)
-    assert len(lab.received["/tf"][0].message.transforms) == MAX_TOOLS
-    assert lab.lost() == {"too many tools": 3000 - MAX_TOOLS, "too many force plates": 1000 - MAX_PLATES}
-
-
-def test_items_whose_topics_are_not_open_yet_are_not_too_many() -> None:
-    tf = RosTopic("/tf", TF_MESSAGE, lambda: None)
-    topics = SourceTopics("lab", "/mocap/lab", tf, lambda: None)
-    topics.losses = Losses(logging.getLogger("tests"), "lab to ros2")
-    tf.wanted = True
-    topics.send(tools_frame((1, 2, 3), (4, 5, 6)), stamp(), ALL, parameters(("wand",)))
-    assert topics.losses.report() == []
-
-
-def stalled(lab: RosLab) -> threading.Event:
-    """Let the sending thread wait for the event that is returned."""
-    may_go_on = threading.Event()
-
-    def wait() -> None:
-        may_go_on.wait(10)
-
-    lab.output.submit(wait)
-    return may_go_on
-
-
-def test_frames_beyond_the_queue_are_refused_and_ros_sees_the_gap(lab: RosLab) -> None:
-    publisher = lab.source(given=parameters(markers=1, channels=("Fx",)))
-    lab.hear_all()
-    frame = frame_of((ComponentType.MARKERS, [(1, 2, 3, 0)]), (ComponentType.ANALOG, [1.0]))
-    publisher.publish(frame, stamp(), 0, ALL)
-    may_go_on = stalled(lab)
-    while lab.output.offer(lambda: None):
-        pass
-    for number in range(3):
-        with pytest.raises(OutputError) as refused:
-            publisher.publish(frame, stamp(), number, frozenset({ComponentType.MARKERS}))
-        assert refused.value.cause == "queue full"
-    may_go_on.set()
-    wait_until(lambda: lab.output.offer(lambda: None))
-    publisher.publish(frame, stamp(), 4, ALL)
-    wait_until(lambda: len(lab.received["/mocap/lab/analog"]) == 2)
-    assert [each.sequence for each in lab.received["/mocap/lab/markers"]] == [1, 5]
-    assert [each.sequence for each in lab.received["/mocap/lab/analog"]] == [1, 2]
-
-
-def test_frames_that_wait_when_the_router_goes_are_counted(lab: RosLab) -> None:
-    publisher = lab.source(given=parameters(markers=1))
-    lab.hear_all()
-    may_go_on = stalled(lab)
-    for number in range(3):
-        publisher.publish(frame_of((ComponentType.MARKERS, [(1, 2, 3, 0)])), stamp(), number, ALL)
-    lab.cut()
-    wait_until(lambda: not lab.is_connected())
-    may_go_on.set()
-    wait_until(lambda: lab.lost() == {"no router": 3})
-
-
-def test_a_router_that_stops_reading_for_a_moment_loses_nothing() -> None:
-    with ros_lab() as lab, stoppable_router(lab) as router:
-        lab.open()
-        publisher = lab.source(given=parameters(markers=10_000))
-        wait_until(lambda: publisher.wanted)
-        router.send_signal(signal.SIGSTOP)
-        large = frame_of((ComponentType.MARKERS, [(1, 2, 3, 0)] * 10_000))
-        for number in range(_LARGE_FRAMES):
-            publisher.publish(large, stamp(), number, ALL)
-        time.sleep(0.3)  # the pause
-        router.send_signal(signal.SIGCONT)
-        assert router.stdout is not None
-        assert router.stdout.readline().split() == [str(n + 1).encode() for n in range(_LARGE_FRAMES)]
-
-
-_LARGE_FRAMES = 100
-"""Clouds of 200 kB: more than the buffers of the connection hold."""
-
-_ROUTER = """
-import struct, sys, zenoh
-
-with zenoh.open(zenoh.Config.from_json5(sys.argv[1])) as session:
-    subscriber = session.declare_subscriber("0/mocap/lab/markers/**")
-    for _ in range(int(sys.argv[2])):
-        attachment = subscriber.recv().attachment.to_bytes()
-        print(struct.unpack_from("<q", attachment)[0], end=" ")
-    print(flush=True)
-"""
-"""A router that prints the numbers of the first clouds, and ends."""
-
-
-@contextmanager
-def stoppable_router(lab: RosLab) -> Iterator[subprocess.Popen[bytes]]:
-    """Replace the lab's router by a process that subscribes to the markers."""
-    lab.cut()
-    keys = json.dumps(zenoh_keys("router", listen=lab.endpoint))
-    command = [sys.executable, "-c", _ROUTER, keys, str(_LARGE_FRAMES)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE) as process:
-        try:
-            yield process
-        finally:
-            process.kill()
-
-
-def test_a_defect_is_logged_once_and_counted_and_the_next_frame_is_published(
-    lab: RosLab, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    publisher = lab.source(given=parameters(("wand",)))
-    lab.hear_all()
-    with monkeypatch.context() as patch:
-        patch.setattr("gateway.outputs.ros2.source_topics.pack_pose", lambda *_values: 1 // 0)
-        for _ in range(3):
-            publisher.publish(tools_frame((1, 2, 3)), stamp(), 0, ALL)
-        wait_until(lambda: lab.lost() == {"ZeroDivisionError": 3})
-    publisher.publish(tools_frame((1, 2, 3)), stamp(), 1, ALL)
-    wait_until(lambda: lab.received["/tf"])
-    errors = [each.message for each in caplog.records if each.levelno == logging.ERROR]
-    assert len(errors) == 1
-    assert "ZeroDivisionError" in errors[0]
-
-
-def test_what_zenoh_refuses_is_counted_and_no_defect(
-    lab: RosLab, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def refuse(_cdr: bytes, _now_ns: int) -> None:
-        raise zenoh.ZError("no")
-
-    publisher = lab.source(given=parameters(("wand",)))
-    lab.hear_all()
-    monkeypatch.setattr(lab.output._tf, "put", refuse)
-    publisher.publish(tools_frame((1, 2, 3)), stamp(), 0, ALL)
-    wait_until(lambda: lab.lost() == {"put failed": 1})
-    assert not [each for each in caplog.records if each.levelno >= logging.ERROR]
 
 
 # Life cycle ----------------------------------------------------------------------------------
