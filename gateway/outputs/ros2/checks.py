@@ -1,21 +1,24 @@
-"""The doctor's checks for ROS 2: is the router there, does a gateway publish, and are there ROS nodes?"""
+"""The doctor's checks for ROS 2: the router, the gateway's node, other nodes, and the types they expect."""
 
 from collections.abc import Sequence
 from typing import Final
 
 import zenoh
 
+from gateway.descriptions.fitting_labels import printable
 from gateway.findings import Finding, MessageLoad, Subject
+from gateway.outputs.ros2.message_types import NO_HASH, ROS_TYPES
 from gateway.outputs.ros2.router import REMEDY, client_config
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.ros2.topic import NODE_NAME
-from gateway.outputs.ros2.wire import node_tokens
+from gateway.outputs.ros2.wire import SeenEntity, full_name, seen_entity, tokens_of
 from gateway.outputs.zenoh.checks import is_local
 from gateway.outputs.zenoh.config import zenoh_reason
 
-CHECKS: Final = ("router", "gateway", "nodes")
+CHECKS: Final = ("router", "gateway", "nodes", "types")
 
 _MAX_NAMED: Final = 8
+_MAX_SHOWN_CHARS: Final = 100
 
 _ros2: Final = Subject("ros2")
 
@@ -36,28 +39,28 @@ def check_ros2(
             *(_ros2.not_tested(check, "it needs router, which failed") for check in CHECKS[1:]),
         ]
     try:
-        tokens = session.liveliness().get(node_tokens(settings.domain_id), timeout=seconds)
-        keys = [str(reply.ok.key_expr) for reply in tokens if reply.ok is not None]
+        replies = session.liveliness().get(tokens_of(settings.domain_id), timeout=seconds)
+        tokens = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
     finally:
         session.close()
-    names = sorted({key.rpartition("/")[2] for key in keys})
+    seen = [each for each in map(seen_entity, tokens) if each is not None]
+    names = sorted({each.node for each in seen if not each.topic})
     reached = _ros2.passing("router", f"connected to the router at {settings.connect}")
-    return [reached, _gateway(names, settings), _nodes(names, settings)]
+    return [reached, _gateway(names, settings), _nodes(names, settings), _types(seen, settings)]
 
 
 _REMEDY: Final = f"{REMEDY[:1].upper()}{REMEDY[1:]}."
 
 
 def _gateway(names: Sequence[str], settings: Ros2Settings) -> Finding:
-    if NODE_NAME in names:
-        return _ros2.passing("gateway", f"the node {NODE_NAME} is visible in domain {settings.domain_id}")
-    return _ros2.not_tested(
-        "gateway", f"no gateway publishes in domain {settings.domain_id} on this router now"
-    )
+    name = full_name(settings.namespace, NODE_NAME)
+    if name in names:
+        return _ros2.passing("gateway", f"the node {name} is visible in domain {settings.domain_id}")
+    return _ros2.not_tested("gateway", f"the node {name} is not in domain {settings.domain_id} now")
 
 
 def _nodes(names: Sequence[str], settings: Ros2Settings) -> Finding:
-    others = [name for name in names if name != NODE_NAME]
+    others = [name for name in names if name != full_name(settings.namespace, NODE_NAME)]
     if not others:
         return _ros2.note(
             "nodes",
@@ -65,10 +68,30 @@ def _nodes(names: Sequence[str], settings: Ros2Settings) -> Finding:
             "If nodes are running, check that RMW_IMPLEMENTATION is rmw_zenoh_cpp, that ROS_DOMAIN_ID is "
             f"{settings.domain_id}, and that they use this router.",
         )
-    shown = ", ".join(others[:_MAX_NAMED]) + (
+    shown = ", ".join(map(_shown, others[:_MAX_NAMED])) + (
         f" and {len(others) - _MAX_NAMED} more" if len(others) > _MAX_NAMED else ""
     )
     return _ros2.passing("nodes", f"visible in domain {settings.domain_id}: {shown}")
+
+
+def _types(seen: Sequence[SeenEntity], settings: Ros2Settings) -> Finding:
+    hashes = {each.dds_name: each.hash_in(settings.distribution) for each in ROS_TYPES}
+    for each in seen:
+        if each.is_subscription and each.type_hash != hashes.get(each.dds_name, each.type_hash):
+            remedy = "These nodes get nothing from the gateway. Correct ros2.distribution"
+            hint = "humble" if each.type_hash == NO_HASH else "that of the nodes, such as jazzy"
+            return _ros2.warning(
+                "types",
+                f"{_shown(each.node)} subscribes to {_shown(each.topic)} with the type hash "
+                f"{_shown(each.type_hash)}, which is not that of {settings.distribution}",
+                f"{remedy}: {hint}.",
+            )
+    return _ros2.passing("types", f"no node expects other types than those of {settings.distribution}")
+
+
+def _shown(text: str) -> str:
+    """Return a text of a ROS node for people: short, and without control characters."""
+    return printable(text[:_MAX_SHOWN_CHARS])
 
 
 def leaves_host(settings: Ros2Settings) -> bool:

@@ -9,7 +9,8 @@ from typing import Final, NamedTuple
 HUMBLE: Final = "humble"
 """The distribution that knows no hashes."""
 
-_NO_HASH: Final = "TypeHashNotSupported"
+NO_HASH: Final = "TypeHashNotSupported"
+"""What Humble has in place of a hash."""
 
 
 class RosType(NamedTuple):
@@ -26,7 +27,7 @@ class RosType(NamedTuple):
 
     def hash_in(self, distribution: str) -> str:
         """Return what a distribution puts in place of the hash."""
-        return _NO_HASH if distribution == HUMBLE else self.type_hash
+        return NO_HASH if distribution == HUMBLE else self.type_hash
 
 
 POSE_STAMPED: Final = RosType(

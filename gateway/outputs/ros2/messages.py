@@ -99,12 +99,11 @@ class CloudEncoder:
 
     def encode(self, stamp: bytes, positions: Array, reliabilities: Array) -> bytes:
         """Return a message with ``positions``, shape (n, 3), in m. A point with any NaN is missing."""
-        is_nan = np.isnan(positions)
-        is_dense = not is_nan.any()
-        if not is_dense:
-            positions[is_nan.any(axis=1)] = np.nan
         with np.errstate(over="ignore"):  # what is beyond float32 becomes infinite
             self._floats[:, :3] = positions
+        is_dense = bool(np.isfinite(self._floats[:, :3]).all())
+        if not is_dense:
+            self._floats[np.isnan(positions).any(axis=1), :3] = np.nan
         self._floats[:, 3] = reliabilities
         return b"".join((ENCAPSULATION, stamp, self._layout, self._points.tobytes(), bytes([is_dense])))
 

@@ -13,6 +13,7 @@ from gateway.outputs.ros2.message_types import RosType
 _ADMIN_SPACE: Final = "@ros2_lv"
 _NODE: Final = "NN"
 _PUBLISHER: Final = "MP"
+_SUBSCRIPTION: Final = "MS"
 _NO_ENCLAVE: Final = "%"
 
 NODE_ID: Final = 0
@@ -61,9 +62,41 @@ class Node(NamedTuple):
         return f"{_ADMIN_SPACE}/{ids}/{kind}/{_NO_ENCLAVE}/{_mangled(f'/{self.namespace}')}"
 
 
-def node_tokens(domain_id: int) -> str:
-    """Return the key expression that matches the tokens of all nodes in a domain."""
-    return f"{_ADMIN_SPACE}/{domain_id}/*/*/*/{_NODE}/**"
+def full_name(namespace: str, name: str) -> str:
+    """Return the name of a node as ``ros2 node list`` shows it: /mocap/rtc3d_gateway."""
+    return f"/{namespace}/{name}" if namespace else f"/{name}"
+
+
+def tokens_of(domain_id: int) -> str:
+    """Return the key expression that matches all tokens of a domain."""
+    return f"{_ADMIN_SPACE}/{domain_id}/**"
+
+
+class SeenEntity(NamedTuple):
+    """A node that a token shows, with its namespace, or a publisher, subscription or service of this node.
+
+    A node has no topic.
+    """
+
+    node: str
+    is_subscription: bool
+    topic: str = ""
+    dds_name: str = ""
+    type_hash: str = ""
+
+
+def seen_entity(token: str) -> SeenEntity | None:
+    """Return what a token shows; None if it has another format."""
+    parts = token.split("/")
+    if len(parts) < 9:
+        return None
+    kind, _, namespace, node, *topic = parts[5:]
+    name = full_name(namespace.replace("%", "/").strip("/"), node)
+    if kind == _NODE:
+        return SeenEntity(name, False)
+    if len(topic) < 3:
+        return None
+    return SeenEntity(name, kind == _SUBSCRIPTION, topic[0].replace("%", "/"), topic[1], topic[2])
 
 
 def data_key(domain_id: int, topic: str, ros_type: RosType, type_hash: str) -> str:

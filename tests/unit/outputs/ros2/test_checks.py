@@ -1,11 +1,13 @@
 """The doctor's checks for ROS 2, with a router, without one, and with nodes."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
 from gateway.findings import Result
 from gateway.outputs.ros2.checks import CHECKS, check_ros2, leaves_host
+from gateway.outputs.ros2.message_types import NO_HASH, POSE_STAMPED
 from gateway.outputs.ros2.settings import Ros2Settings
 from tests.networks import free_endpoint
 from tests.ros_lab import RosLab, ros_lab
@@ -26,33 +28,59 @@ def findings(settings: Ros2Settings, seconds: float = 1.0) -> dict[str, tuple[Re
 
 def test_without_a_router_the_remedy_is_to_start_it() -> None:
     endpoint = free_endpoint()
-    [router, gateway, nodes] = check_ros2(Ros2Settings(connect=endpoint), ["lab"], [], 0.5)
+    [router, gateway, nodes, types] = check_ros2(Ros2Settings(connect=endpoint), ["lab"], [], 0.5)
     assert router.result is Result.FAILING
     assert endpoint in router.found
     assert "rmw_zenohd" in router.remedy
-    assert {gateway.result, nodes.result} == {Result.NOT_TESTED}
+    assert {gateway.result, nodes.result, types.result} == {Result.NOT_TESTED}
 
 
 def test_a_router_without_nodes(lab: RosLab) -> None:
     found = findings(lab.settings)
     assert found["router"][0] is Result.PASSING
-    assert found["gateway"] == (Result.NOT_TESTED, "no gateway publishes in domain 3 on this router now")
+    assert found["gateway"] == (Result.NOT_TESTED, "the node /mocap/rtc3d_gateway is not in domain 3 now")
     assert found["nodes"] == (Result.NOTE, "no ROS node is visible in domain 3")
 
 
 def test_a_gateway_and_nodes(lab: RosLab) -> None:
     lab.open()
     lab.source()
-    keys = [f"@ros2_lv/3/abc/{number}/{number}/NN/%/%/node_{number}" for number in range(10)]
+    keys = [f"@ros2_lv/3/abc/{number}/{number}/NN/%/%arm/node_{number}" for number in range(10)]
     keys.append("@ros2_lv/4/abc/0/0/NN/%/%/elsewhere")
     tokens = [lab.peer.liveliness().declare_token(key) for key in keys]
     wait_until(lambda: len(lab.tokens()) == 14)
     found = findings(lab.settings)
-    assert found["gateway"] == (Result.PASSING, "the node rtc3d_gateway is visible in domain 3")
-    named = ", ".join(f"node_{number}" for number in range(8))
+    assert found["gateway"] == (Result.PASSING, "the node /mocap/rtc3d_gateway is visible in domain 3")
+    named = ", ".join(f"/arm/node_{number}" for number in range(8))
     for token in tokens:
         token.undeclare()
     assert found["nodes"] == (Result.PASSING, f"visible in domain 3: {named} and 2 more")
+
+
+@pytest.mark.parametrize(
+    ("type_hash", "distribution", "remedy"),
+    [
+        (POSE_STAMPED.type_hash, "jazzy", ""),
+        ("TypeHashNotSupported", "humble", ""),
+        ("TypeHashNotSupported", "jazzy", "humble"),
+        (POSE_STAMPED.type_hash, "humble", "jazzy"),
+    ],
+)
+def test_nodes_of_another_distribution_get_nothing(
+    lab: RosLab, type_hash: str, distribution: Any, remedy: str
+) -> None:
+    subscription = f"%mocap%lab%wand%pose/{POSE_STAMPED.dds_name}/{type_hash}/2::,10:,:,:,,"
+    others = [f"@ros2_lv/3/abc/0/2/MS/%/%/rviz/%x/some::Type_/{NO_HASH}/::,10:,:,:,,", "@ros2_lv/3/a/b"]
+    tokens = [f"@ros2_lv/3/abc/0/1/MS/%/%arm/hand/{subscription}", *others]
+    declared = [lab.peer.liveliness().declare_token(token) for token in tokens]
+    wait_until(lambda: len(lab.tokens()) == 3)
+    settings = lab.settings.model_copy(update={"distribution": distribution})
+    [*_, types] = check_ros2(settings, ["lab"], [], 1.0)
+    assert types.result is (Result.WARNING if remedy else Result.PASSING)
+    assert remedy in types.remedy
+    assert ("/arm/hand subscribes to /mocap/lab/wand/pose" in types.found) == bool(remedy)
+    for token in declared:
+        token.undeclare()
 
 
 @pytest.mark.parametrize(
