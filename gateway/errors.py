@@ -27,6 +27,8 @@
 A message says what happened, to which server or file, and what to do.
 """
 
+import os
+
 
 class GatewayError(Exception):
     """Base of all errors that this package raises on purpose."""
@@ -138,3 +140,10 @@ class QueryError(GatewayError):
     def __init__(self, message: str, *, code: str = "bad-request") -> None:
         super().__init__(message)
         self.code = code
+
+
+def system_reason(error: OSError) -> str:
+    """Return what the system says about an error, without what libraries add to it."""
+    if error.errno is not None and error.errno > 0:  # those of getaddrinfo are negative
+        return os.strerror(error.errno)
+    return error.strerror or str(error)

@@ -1,9 +1,10 @@
 """Addresses that servers listen on: who can connect, and how to connect from this computer."""
 
 import ipaddress
-import os
 import socket
 from typing import Final
+
+from gateway.errors import system_reason
 
 _OF_THIS_COMPUTER: Final = {"0.0.0.0": "127.0.0.1", "::": "::1"}  # noqa: S104 - not bound here
 
@@ -28,10 +29,8 @@ def listen_problem(host: str, port: int) -> str:
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         ):
             socket.create_server(address, family=family, backlog=1).close()
-    except socket.gaierror as error:
-        return error.strerror or str(error)
     except OSError as error:
-        return os.strerror(error.errno) if error.errno else str(error)
+        return system_reason(error)
     return ""
 
 

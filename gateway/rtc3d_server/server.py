@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from types import TracebackType
 from typing import Final, Self
 
-from gateway.errors import GatewayError
+from gateway.errors import GatewayError, system_reason
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d_server.client_connection import MAX_UNREAD_BYTES, ClientConnection
 from gateway.rtc3d_server.connection_filter import ConnectionFilter, FilteredConnection
@@ -106,7 +106,7 @@ class RtServer:
             self._server = await loop.create_server(lambda: ClientConnection(self), self.host, self.port)
         except OSError as error:
             raise GatewayError(
-                f"{self.name}: cannot listen on {self.host}, port {self.port}: {error.strerror or error}; "
+                f"{self.name}: cannot listen on {self.host}, port {self.port}: {system_reason(error)}; "
                 "choose an address of this machine and a free port"
             ) from error
         self.port = self._server.sockets[0].getsockname()[1]

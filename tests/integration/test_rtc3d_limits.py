@@ -9,7 +9,7 @@ import pytest
 
 from gateway.losses import Loss
 from gateway.outputs.contract import ServerFile
-from gateway.outputs.rtc3d import client_filter
+from gateway.outputs.rtc3d import client_filter, live_frames
 from gateway.outputs.rtc3d.live_server import SLOW_CLIENT
 from tests.integration.raw_client import RawClient, connected, consecutive, until
 from tests.serving_gateway import ServingGateway, playing
@@ -78,6 +78,13 @@ async def test_a_file_that_is_gone_is_left_out(tmp_path: Path) -> None:
     assert "does not get gone.c3d: No such file or directory; " in loss.text
 
 
+async def ask_for_frames(client: RawClient, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ask for the current frame, again and again, and let all requests wait."""
+    monkeypatch.setattr(live_frames, "_LEARN_US", 60_000_000)
+    for _ in range(count):
+        assert (await client.ask("SendCurrentFrame Force"))[0] == COMMAND
+
+
 async def file_that_is_not_read(client: RawClient, gateway: ServingGateway, folder: Path) -> bytes:
     """Let the gateway send a file to a client that does not read; return the file's content."""
     content = bytes(20_000_000)
@@ -89,10 +96,9 @@ async def file_that_is_not_read(client: RawClient, gateway: ServingGateway, fold
     return content
 
 
-async def test_no_data_waits_for_the_end_of_a_file(tmp_path: Path) -> None:
+async def test_no_data_waits_for_the_end_of_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     async with playing() as (simulator, gateway), connected(gateway) as client:
-        for _ in range(100):
-            assert (await client.ask("SendCurrentFrame Force"))[0] == COMMAND  # it never comes
+        await ask_for_frames(client, 100, monkeypatch)
         content = await file_that_is_not_read(client, gateway, tmp_path)
         simulator.stop_measurement()
         await until(lambda: gateway.server.elapsed_us() is None)
@@ -108,8 +114,7 @@ async def test_no_data_beyond_what_can_wait_is_counted_and_logged_once(
 ) -> None:
     monkeypatch.setattr(client_filter, "MAX_HELD_PACKETS", 10)
     async with playing() as (simulator, gateway), connected(gateway) as client:
-        for _ in range(30):
-            assert (await client.ask("SendCurrentFrame Force"))[0] == COMMAND
+        await ask_for_frames(client, 30, monkeypatch)
         content = await file_that_is_not_read(client, gateway, tmp_path)
         simulator.stop_measurement()
         await until(lambda: gateway.server.elapsed_us() is None)

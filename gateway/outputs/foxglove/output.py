@@ -3,11 +3,11 @@
 import asyncio
 import errno
 import logging
-import os
 from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Final
 
+from gateway.errors import system_reason
 from gateway.log import DefectLog, FailureLog, defect_text
 from gateway.losses import Losses
 from gateway.messages.host_time import now_utime
@@ -162,5 +162,4 @@ def _bind_problem(error: OSError) -> str:
         return "this computer does not have this address; correct foxglove.host"
     if error.errno == errno.EACCES:
         return "this port needs the rights of root; choose a foxglove.port from 1024"
-    reason = os.strerror(error.errno) if error.errno and error.errno > 0 else error.strerror or str(error)
-    return f"{reason}; correct foxglove.host and foxglove.port"
+    return f"{system_reason(error)}; correct foxglove.host and foxglove.port"

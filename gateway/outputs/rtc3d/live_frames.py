@@ -70,8 +70,8 @@ class LiveFrames:
     one in the frame before. A frame waits for these samples, but not longer than WAIT_US. If all components
     come on one stream, its frames are passed on as they are. While the slowest stream has no frames, the next
     slower one sets the rate. Events are kept until the next frame; if there is nothing else, they are frames
-    of their own. If only events are requested, the slowest of all streams sets the rate, so that events do
-    not wait for further ones; frames without events are empty.
+    of their own. If none of the components comes but events, the slowest of all streams sets the rate, so
+    that neither events nor requests wait; frames without events are empty.
 
     ``requested`` are the components of a command; an empty sequence means all. ``announced_hz`` are the
     rates in the parameters.
@@ -90,8 +90,6 @@ class LiveFrames:
         )
         self._takes_all = not requested or self.chosen == frozenset(WIRE_ORDER)
         self._measured = frozenset(self.measured)
-        # The components whose slowest stream sets the rate.
-        self._timing = self._measured or frozenset(WIRE_ORDER) - {ComponentType.EVENT}
         self._arrivals = arrivals
         self._announced_hz = announced_hz
         self._next_arrival = arrivals.frames.first
@@ -246,7 +244,7 @@ class LiveFrames:
         if has_events:
             self._events.append(events_of(arrival))
         slowest = self._slowest_stream(arrival.time_us)
-        if not self._measured:
+        if self._measured.isdisjoint(self._arrivals.stream_of):
             if has_events or slowest == arrival.stream:
                 self._add(arrival)
         elif not composition.measured & self._measured:
@@ -263,9 +261,9 @@ class LiveFrames:
 
     @property
     def _streams(self) -> set[int]:
-        """The streams on which the components come that set the rate."""
+        """The streams on which the components of the choice come; all if none of them comes."""
         stream_of = self._arrivals.stream_of
-        return {stream_of[each] for each in self._timing if each in stream_of}
+        return {stream_of[each] for each in self.measured if each in stream_of} or set(stream_of.values())
 
     def _period_us(self, stream: int) -> float | None:
         """Return the time between two frames of a stream, as measured or else as announced."""

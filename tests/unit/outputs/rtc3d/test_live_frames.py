@@ -220,6 +220,21 @@ def test_a_request_for_events_does_not_wait_for_one() -> None:
     assert client.bodies == [body(), body(event(2, 20_000, 3))]
 
 
+def test_a_request_for_components_that_do_not_come_gets_an_empty_frame() -> None:
+    source = LiveSource()
+    play(source, 1, 3, fast_first=False)
+    client, streaming = source.client(), source.client()
+    streaming.send("StreamFrames 6D")
+    source.arrive(body(markers(4, 40_000)))
+    client.send("SendCurrentFrame 6D")
+    assert client.bodies == [body()]
+    assert streaming.bodies == []
+    source.arrive(body(markers(5, 50_000), TOOL_OUT_OF_VIEW))
+    client.send("SendCurrentFrame 6D")
+    assert client.bodies == [body(), body(TOOL_OUT_OF_VIEW)]
+    assert streaming.bodies == [body(TOOL_OUT_OF_VIEW)]
+
+
 def test_events_in_frames_of_their_own_do_not_shift_a_divisor() -> None:
     source = LiveSource()
     client = source.client()
