@@ -39,7 +39,8 @@ class ZenohClient:
         self._subject = subject
         self.problems: list[QueryError] = []
         self._unique_names: dict[tuple[str, str], str] = {}  # by source and the gateway's Zenoh id
-        self._busy: QueryError | None = None  # what gateways replied that get too many queries
+        self._no_answer: QueryError | None = None
+        """Why nobody has answered yet: too many queries, or too little time."""
 
     def sources(self, limits: TimeLimits) -> list[str]:
         """Return the sources that gateways serve, sorted. Raises QueryError if none is found in time.
@@ -71,7 +72,7 @@ class ZenohClient:
             if left_s == 0 or limits.discovery_is_over:
                 self._require_gateway(source)
             if left_s == 0:
-                raise self._busy or limits.no_reply(", ".join(unanswered))
+                raise self._no_answer or limits.no_reply(", ".join(unanswered))
             time.sleep(min(RETRY_S, left_s))
             unanswered = self._query_once(unanswered, limits, on_reply)
 
@@ -101,16 +102,26 @@ class ZenohClient:
     ) -> bool:
         """Pass on the replies to one query; return whether there was any."""
         is_answered = False
+        is_late = False
         for reply in handler:
             if reply.ok is not None:
                 on_reply(self._reply(reply.ok, str(reply.replier_id)))
             elif reply.err is not None:
-                problem = self._problem(reply.err, limits)
+                if _is_timeout(reply.err):
+                    is_late = True
+                    continue
+                problem = _problem(reply.err)
                 if problem.code in BUSY_CODES:
-                    self._busy = problem
+                    self._no_answer = problem
                     continue
                 self.problems.append(problem)
             is_answered = True
+        if is_late:
+            late = limits.no_reply(self._subject)
+            if is_answered:  # by another gateway
+                self.problems.append(late)
+            else:
+                self._no_answer = late
         return is_answered
 
     def _reply(self, sample: zenoh.Sample, gateway: str) -> ZenohReply:
@@ -121,19 +132,26 @@ class ZenohClient:
         name = self._unique_names[source, gateway]
         return ZenohReply(name, tuple(path), sample.payload.to_bytes(), attachment, gateway)
 
-    def _problem(self, reply: zenoh.ReplyError, limits: TimeLimits) -> QueryError:
-        text = reply.payload.to_bytes().decode("utf-8", "replace")
-        media_type, _, code = str(reply.encoding).partition(";")
-        if media_type == TEXT and code:
-            return QueryError(text, code=code)
-        # Any other error is Zenoh's own. "Timeout" means that a gateway received the query and did not reply.
-        if text == "Timeout":
-            return limits.no_reply(self._subject)
-        return QueryError(f"Zenoh: {text}", code="zenoh")
-
     def _require_gateway(self, source: str | None) -> None:
         """Raise QueryError unless the liveliness token of a gateway that serves ``source`` is found."""
         served = served_sources(self._session, self._prefix)
         problem = no_gateway(self._prefix, () if source is None else (source,), served)
         if problem:
             raise QueryError(problem, code="no-gateway")
+
+
+def _is_timeout(reply: zenoh.ReplyError) -> bool:
+    """Return whether this is from Zenoh itself, because a gateway or a busy router did not answer in time."""
+    return _code(reply) == "" and reply.payload.to_bytes() == b"Timeout"
+
+
+def _code(reply: zenoh.ReplyError) -> str:
+    """Return the code of a gateway's error; "" for an error of Zenoh itself."""
+    media_type, _, code = str(reply.encoding).partition(";")
+    return code if media_type == TEXT else ""
+
+
+def _problem(reply: zenoh.ReplyError) -> QueryError:
+    text = reply.payload.to_bytes().decode("utf-8", "replace")
+    code = _code(reply)
+    return QueryError(text, code=code) if code else QueryError(f"Zenoh: {text}", code="zenoh")

@@ -143,6 +143,21 @@ async def test_a_router_without_a_gateway_is_status_3() -> None:
     assert done.stderr.startswith("no gateway found on Zenoh (mocap/*/alive); check that it is running")
 
 
+async def test_a_router_that_answers_too_late_is_no_gateway() -> None:
+    """As a busy one: the query ends with Zenoh's own error, and there is no gateway."""
+    endpoint = free_endpoint()
+    queries: list[zenoh.Query] = []
+    router = open_zenoh("router", listen=endpoint)
+    router.declare_queryable("mocap/**", queries.append)
+    try:
+        done = await run("params", "--connect", endpoint, "--timeout", "0.5")
+    finally:
+        queries.clear()
+        router.close()
+    assert done.status == 3
+    assert done.stderr.startswith("no gateway found on Zenoh (mocap/*/alive); check that it is running")
+
+
 @sides
 async def test_a_source_that_no_gateway_serves_is_status_3(side: str) -> None:
     async with lab() as at:
