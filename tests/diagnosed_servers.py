@@ -1,15 +1,20 @@
 """Scripted servers for tests of the doctor, and the doctor's findings about them."""
 
 import asyncio
+import math
 import re
 import struct
+import time
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Final
 
 from gateway.config.settings import StreamSettings
 from tests import servers
 from tests.findings import Findings, lab, run_doctor
 from tests.servers import Client, ScriptedServer, ok, packet
+
+PERIOD_S: Final = 0.01
+"""The period of the frames."""
 
 MARKERS_XML = (
     "<The_3D><Frequency>{}</Frequency><Markers><Marker id='1'><Label>hip</Label></Marker>"
@@ -66,12 +71,13 @@ def streaming(
             else:
                 client.send(xml if command.startswith("SendParameters") else ok(f"OK-{command}"))
         client.send(ok(f"OK-{command}"))
-        number = 0
+        began_s = time.monotonic()
+        num_sent = 0
         while not client._writer.is_closing():
-            if stops_after is None or number < stops_after * step:
-                client.send(frame(number))
-            number += step
-            await asyncio.sleep(0.01)
+            while num_sent < min((time.monotonic() - began_s) / PERIOD_S, stops_after or math.inf):
+                client.send(frame(num_sent * step))
+                num_sent += 1
+            await asyncio.sleep(PERIOD_S)
 
     return script
 
