@@ -20,7 +20,7 @@ import threading
 import time
 from typing import Any, Final
 
-from gateway.outputs.lsl.wire import Kind, Message, MessageReader, Report, decode_samples
+from gateway.outputs.lsl.wire import REPORT_INTERVAL_S, Kind, Message, MessageReader, Report, decode_samples
 from gateway.safe_text import safe_text
 
 MAX_MEMORY_BYTES: Final = 768 * 1024 * 1024
@@ -38,6 +38,7 @@ _POLL_S: Final = 0.1
 _RETRY_S: Final = 1.0
 _READ_BYTES: Final = 1 << 20
 _READINGS: Final = 5
+_PR_SET_PDEATHSIG: Final = 1
 
 
 class _LslProcess:
@@ -51,6 +52,7 @@ class _LslProcess:
         self._failed: dict[int, Any] = {}  # the descriptions of streams that could not be opened
         self._retry_s = 0.0
         self._report = Report()
+        self._reported_s = 0.0
         self._closed: queue.SimpleQueue[list[Any]] = queue.SimpleQueue()
         self._offset_s = _lsl_minus_monotonic_s(pylsl)
         threading.Thread(target=self._destroy_closed, daemon=True).start()
@@ -125,15 +127,17 @@ class _LslProcess:
             self._open_failed()
         wanted = tuple(number for number, outlet in self._outlets.items() if outlet.have_consumers())
         self._change(wanted=wanted)
+        if time.monotonic() - self._reported_s >= REPORT_INTERVAL_S:
+            self._send(self._report)
 
     def _change(self, **fields: Any) -> None:
         report = self._report._replace(**fields)
         if report != self._report:
-            self._report = report
             self._send(report)
 
     def _send(self, report: Report) -> None:
         self._report = report
+        self._reported_s = time.monotonic()
         self._gateway.sendall(report.encode())
 
     def _destroy_closed(self) -> None:
@@ -182,10 +186,18 @@ def _limit_stacks() -> None:
         libc.pthread_setattr_default_np(attributes)
 
 
+def _end_with_gateway() -> None:
+    """Have the kernel kill this process when the gateway's thread that started it ends, even if it hangs."""
+    libc = ctypes.CDLL(None)
+    with contextlib.suppress(AttributeError):  # only Linux has it
+        libc.prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))
+
+
 def main() -> None:
     """Run until the gateway closes the socket. Only that ends the process, not a signal to the service."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    _end_with_gateway()
     _limit(resource.RLIMIT_DATA, MAX_MEMORY_BYTES)
     _limit(resource.RLIMIT_NOFILE, MAX_FILES)
     _limit_stacks()

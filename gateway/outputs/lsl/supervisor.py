@@ -16,8 +16,8 @@ from gateway.log import FailureLog
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.wire import Message, Report
 
-SEND_TIMEOUT_S: Final = 10.0
-"""If the process takes nothing for so long, it is killed and another one started."""
+SILENCE_S: Final = 10.0
+"""If the process reports nothing for so long, or takes nothing, it is killed and another one started."""
 
 _FIRST_RETRY_S: Final = 1.0
 _MAX_RETRY_S: Final = 30.0
@@ -101,7 +101,7 @@ class LslProcesses:
             ours.close()
             self._failed(f"the process for LSL cannot be started: {error.strerror}")
             return
-        ours.settimeout(SEND_TIMEOUT_S)
+        ours.settimeout(SILENCE_S)
         ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SOCKET_BYTES)
         self._socket = ours
         threading.Thread(
@@ -147,12 +147,17 @@ class LslProcesses:
     def _read_reports(self, ours: socket.socket, process: subprocess.Popen[bytes]) -> None:
         """Read what the process reports until it ends, in a thread of its own."""
         unread = b""
-        with contextlib.suppress(OSError, ValueError):  # ``stop`` has closed it, or it is no report
-            while (data := _received(ours)) != b"":
+        hung = False
+        try:
+            while data := ours.recv(_READ_BYTES):
                 *lines, unread = (unread + data).split(b"\n")
                 for line in lines:
                     self._take(Report.decode(line))
-        process.kill()  # if its last report cannot be read, it may still run
+        except TimeoutError:
+            hung = True
+        except (OSError, ValueError):  # ``stop`` has closed it, or it is no report
+            pass
+        process.kill()  # if it hangs, or if its last report cannot be read, it still runs
         status = process.wait()
         if self._is_stopped:
             return
@@ -163,8 +168,12 @@ class LslProcesses:
         self._retry_delay_s = min(2 * self._retry_delay_s, _MAX_RETRY_S)
         self._socket = None  # after the delay is known, because is_due needs both
         ours.close()
-        failure = self._report.failure
-        self._failed(f"the process for LSL {f'failed: {failure}' if failure else f'ended {_reason(status)}'}")
+        if hung:
+            self._failed(f"the process for LSL has not answered for {SILENCE_S:g} s")
+        elif self._report.failure:
+            self._failed(f"the process for LSL failed: {self._report.failure}")
+        else:
+            self._failed(f"the process for LSL ended {_reason(status)}")
 
     def _take(self, report: Report) -> None:
         before, self._report = self._report, report
@@ -183,13 +192,6 @@ class LslProcesses:
     def _failed(self, text: str) -> None:
         self._problem = f"{text}; it is started again"
         self._failures.failed(self._problem)
-
-
-def _received(ours: socket.socket) -> bytes:
-    """Return what the process has sent; b"" at its end."""
-    while True:
-        with contextlib.suppress(TimeoutError):  # it has nothing to report
-            return ours.recv(_READ_BYTES)
 
 
 def lsl_environment(settings: LslSettings) -> dict[str, str]:

@@ -42,6 +42,10 @@ class Message(NamedTuple):
         return HEADER.pack(self.kind, self.stream, len(self.content)) + self.content
 
 
+REPORT_INTERVAL_S: Final = 1.0
+"""The process repeats its report this often, even if nothing has changed, to show that it does not hang."""
+
+
 class Report(NamedTuple):
     """What the process reports. ``wanted`` are the numbers of the streams that somebody receives.
 

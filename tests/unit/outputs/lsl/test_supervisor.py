@@ -4,6 +4,8 @@ import importlib.util
 import logging
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -19,6 +21,19 @@ from tests.lsl_receiver import lsl_config
 from tests.waiting import wait_until
 
 TIMEOUT_S = 30.0
+
+_GATEWAY = """
+import signal, sys
+from gateway.outputs.lsl.settings import LslSettings
+from gateway.outputs.lsl.supervisor import LslProcesses
+from tests.waiting import wait_until
+
+processes = LslProcesses(LslSettings(enabled=True, config=sys.argv[1]))
+processes.restart(lambda: None)
+wait_until(lambda: processes.version)
+print(processes._process.pid, flush=True)
+signal.pause()
+"""
 
 
 @pytest.fixture
@@ -80,19 +95,37 @@ def test_the_signals_that_stop_a_gateway_do_not_end_the_process(processes: LslPr
     assert processes.problem.startswith("liblsl cannot open the stream lab_3d: ")
 
 
+@pytest.mark.parametrize("sends", [False, True], ids=["nothing sent", "a lot sent"])
 def test_a_process_that_hangs_is_killed_and_replaced(
-    processes: LslProcesses, monkeypatch: pytest.MonkeyPatch
+    processes: LslProcesses, monkeypatch: pytest.MonkeyPatch, sends: bool
 ) -> None:
-    monkeypatch.setattr(supervisor, "SEND_TIMEOUT_S", 0.2)
+    monkeypatch.setattr(supervisor, "SILENCE_S", 3.0)
     first = start(processes)
     os.kill(first, signal.SIGSTOP)
     large = Message(Kind.TEXTS, 1, bytes(1_000_000))
     sent = 0
-    while processes.send(large):
+    while sends and processes.send(large):
         sent += 1
         assert sent < 100
-    wait_until(lambda: "SIGKILL" in processes.problem, TIMEOUT_S)
+    wait_until(lambda: processes.problem, TIMEOUT_S)
+    assert processes.problem in {
+        "the process for LSL has not answered for 3 s; it is started again",
+        "the process for LSL ended by SIGKILL; it is started again",
+    }
     assert start(processes) != first
+
+
+def test_a_process_that_hangs_ends_with_a_gateway_that_is_killed(tmp_path: Path) -> None:
+    gateway = subprocess.Popen(
+        [sys.executable, "-c", _GATEWAY, str(lsl_config(tmp_path))], stdout=subprocess.PIPE, text=True
+    )
+    assert gateway.stdout is not None
+    with gateway.stdout as lines:
+        number = int(next(lines))
+    os.kill(number, signal.SIGSTOP)
+    gateway.kill()
+    gateway.wait()
+    wait_until(lambda: not Path(f"/proc/{number}/exe").exists(), TIMEOUT_S)
 
 
 def test_why_liblsl_cannot_be_loaded_is_said(
