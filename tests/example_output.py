@@ -5,7 +5,7 @@ ability, so that tests can check that each of them needs nothing but this module
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any, Final
 
 from gateway.config.settings import OutputSettings
@@ -102,9 +102,8 @@ class ExampleFramePublisher:
     def __init__(self, publisher: ExamplePublisher) -> None:
         self._publisher = publisher
 
-    @property
-    def wanted(self) -> bool:
-        """Whether somebody is subscribed."""
+    def wants(self, _components: Collection[ComponentType]) -> bool:
+        """Return whether somebody is subscribed."""
         return self._publisher.wanted
 
     def prepare(self, _layout: FrameLayout, _components: frozenset[ComponentType]) -> bool:

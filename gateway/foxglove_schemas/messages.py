@@ -3,7 +3,6 @@
 docs/reference/takes.md has the table of topics.
 """
 
-import itertools
 from collections.abc import Container
 from typing import Any, Final
 
@@ -107,16 +106,17 @@ class FoxgloveSource:
         self._description = json_topic(f"/{source}/parameters", "rtc3d.Parameters", {"type": "object"})
 
     @property
-    def description_topics(self) -> tuple[Topic, ...]:
-        """The topics of ``describe``."""
-        return self._description, self._forces.outlines_topic
-
-    @property
-    def known_topics(self) -> list[Topic]:
-        """All topics, those of numbers only if the parameters say how many there are."""
+    def known_topics(self) -> dict[Topic, ComponentType | None]:
+        """All topics and their components; those of numbers only if the parameters say how many there are."""
         counts = _announced(self._parameters)
-        found = [self.topics(component, counts.get(component, 0)) for component in WIRE_ORDER]
-        return [*self.description_topics, *itertools.chain.from_iterable(found)]
+        return {
+            **dict.fromkeys((self._description, self._forces.outlines_topic)),
+            **{
+                topic: component
+                for component in WIRE_ORDER
+                for topic in self.topics(component, counts.get(component, 0))
+            },
+        }
 
     @property
     def changed_names(self) -> dict[str, dict[str, str]]:

@@ -7,7 +7,7 @@ caller checks the class of an output.
 
 import asyncio
 from abc import ABC, abstractmethod
-from collections.abc import Awaitable, Callable, Mapping, Sequence
+from collections.abc import Awaitable, Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple, Protocol
 
@@ -55,9 +55,11 @@ class Publisher(Protocol):
 class FramePublisher(Protocol):
     """Takes the whole frames of one source, for outputs that need more than one component at a time."""
 
-    @property
-    def wanted(self) -> bool:
-        """Whether there may be a subscriber; always True if the output cannot know."""
+    def wants(self, components: Collection[ComponentType]) -> bool:
+        """Return whether any of ``components`` may have a subscriber; True if the output cannot know.
+
+        While no output wants any component of a stream on demand, the server need not send it.
+        """
 
     def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
         """Prepare for frames of ``layout``; return whether somebody receives any of their ``components``.
@@ -256,7 +258,7 @@ class Output(ABC):
 
         If it is exact, the gateway publishes only what is wanted, and counts nothing else as sent. The output
         must call ``on_change`` in the event loop whenever ``wanted`` of a publisher changes, or what
-        ``FramePublisher.prepare`` returns. Called before ``announce``.
+        ``FramePublisher.prepare`` would return. Called before ``announce``.
         """
         return False
 

@@ -234,7 +234,7 @@ class FanOut:
 
     def has_subscribers(self, components: Collection[ComponentType]) -> bool:
         """Return whether any output may have a subscriber to any of ``components``."""
-        return any(route.publisher.wanted for route in self._frame_routes) or any(
+        return any(route.publisher.wants(components) for route in self._frame_routes) or any(
             route.components[component].publisher.wanted
             for route in self._routes
             if route.frame_route is None

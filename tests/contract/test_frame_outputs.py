@@ -369,12 +369,12 @@ async def test_each_change_of_what_is_wanted_is_reported_in_the_event_loop(lab: 
     lab.serve(HALL)
     await lab.open()
     await asyncio.to_thread(lab.rig.subscribe)
-    await wait_until_async(lambda: publisher.wanted, TIMEOUT_S)
+    await wait_until_async(lambda: publisher.wants(WIRE_ORDER), TIMEOUT_S)
     if is_exact:
         await wait_until_async(lambda: threads, TIMEOUT_S)
         threads.clear()
     await asyncio.to_thread(lab.rig.unsubscribe)
-    await wait_until_async(lambda: not publisher.wanted, TIMEOUT_S)
+    await wait_until_async(lambda: not publisher.wants(WIRE_ORDER), TIMEOUT_S)
     if is_exact:
         await wait_until_async(lambda: threads, TIMEOUT_S)
     assert set(threads) <= {threading.current_thread().name}
@@ -503,7 +503,7 @@ async def test_before_opening_health_has_the_reason_and_no_frame_waits(lab: Lab)
     assert not health.connected
     assert health.problem
     assert offered(publisher, frame(1)) in {"", "not open"}
-    assert publisher.wanted in {True, False}
+    assert publisher.wants(WIRE_ORDER) in {True, False}
 
 
 @every_rig
@@ -521,7 +521,7 @@ async def test_after_closing_frames_are_refused_or_unwanted_and_health_has_the_r
     health = lab.output.health()
     assert not health.connected
     assert health.problem
-    assert offered(publisher, frame(1)) == "not open" or not publisher.wanted
+    assert offered(publisher, frame(1)) == "not open" or not publisher.wants(WIRE_ORDER)
 
 
 @every_rig
@@ -541,7 +541,7 @@ async def test_closing_an_output_or_a_publisher_twice_is_safe(lab: Lab) -> None:
     await asyncio.to_thread(lab.output.close)
     publisher.close()
     publisher.close()
-    assert offered(publisher, frame(1)) in {"closed", "not open"} or not publisher.wanted
+    assert offered(publisher, frame(1)) in {"closed", "not open"} or not publisher.wants(WIRE_ORDER)
 
 
 @every_rig

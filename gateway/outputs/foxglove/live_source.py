@@ -1,7 +1,7 @@
 """One source for viewers: its channels, and the conversion of its frames for those that are subscribed to."""
 
 import time
-from collections.abc import Callable, Iterable, Mapping, Set
+from collections.abc import Callable, Mapping, Set
 from typing import Final
 
 import numpy as np
@@ -18,7 +18,13 @@ from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.foxglove.connections import Viewer
 from gateway.outputs.foxglove.server import Channel, FoxgloveServer, send, send_to
-from gateway.rtc3d.components import COMPONENT_HEADER_BYTES, ITEM_DTYPES, Component, ComponentType
+from gateway.rtc3d.components import (
+    COMPONENT_HEADER_BYTES,
+    ITEM_DTYPES,
+    WIRE_ORDER,
+    Component,
+    ComponentType,
+)
 from gateway.rtc3d.frames import ComponentLayout, Frame
 from gateway.rtc3d.parameters import Parameters
 
@@ -38,24 +44,28 @@ _CONTENT_HEADER_BYTES: Final = COMPONENT_HEADER_BYTES - 8  # without size and ty
 class LiveSource:
     """The channels of one source, from its announcement until ``close``.
 
-    All methods are called in the loop of ``server``. ``on_wanted`` is called when the first viewer subscribes
-    to a channel that needs frames, and when the last one unsubscribes. If the server gives no parameters, a
-    frame is wanted, too, because it shows which channels to open.
+    All methods are called in the loop of ``server``. ``on_wanted`` is called whenever viewers subscribe to
+    channels of other components than before, with these components. If the server gives no parameters, a
+    frame with any is wanted, too, because it shows which channels to open.
     """
 
-    def __init__(self, name: str, server: FoxgloveServer, on_wanted: Callable[[bool], None]) -> None:
+    def __init__(
+        self, name: str, server: FoxgloveServer, on_wanted: Callable[[frozenset[ComponentType]], None]
+    ) -> None:
         self.losses: Losses | None = None
         self.field_names: Mapping[str, Mapping[str, str]] = {}
         """See ``Output.topic_names``."""
         self._name = name
         self._server = server
         self._on_wanted = on_wanted
-        self._is_wanted = False
+        self._wanted: frozenset[ComponentType] = frozenset()
         self._needs_frame = False  # to know which channels to open
         self._topics = FloatTopics(name, is_live=True)
-        self._channels: dict[str, Channel] = {}  # by the names of the topics
-        self._renamed_s: dict[str, float] = {}  # when a topic got other fields, on the monotonic clock
-        self._description: Mapping[str, FoxgloveMessage] = {}  # by the names of the topics
+        # By the names of the topics.
+        self._channels: dict[str, Channel] = {}
+        self._components: dict[str, ComponentType | None] = {}
+        self._renamed_s: dict[str, float] = {}  # when it got other fields, on the monotonic clock
+        self._description: Mapping[str, FoxgloveMessage] = {}
         self._parameters = Parameters()
         self._frame = CoordinateFrame(name)
         self._converter = FoxgloveSource(self._topics, Parameters(), 0, self._frame)
@@ -87,7 +97,7 @@ class LiveSource:
                 continue
             self._check_number(layout, stamp)
             topics = self._converter.topics(layout.type, layout.num_items)
-            wanted = [topic for topic in topics if self._has_subscribers(topic, stamp)]
+            wanted = [topic for topic in topics if self._has_subscribers(topic, layout.type, stamp)]
             if wanted and self._can_convert(layout.type, stamp):
                 self._send_component(frame.component(index), stamp, wanted)
         if self._needs_frame:
@@ -102,34 +112,35 @@ class LiveSource:
 
     # Channels.
 
-    def _open_channels(self, topics: Iterable[Topic]) -> None:
+    def _open_channels(self, topics: Mapping[Topic, ComponentType | None]) -> None:
         """Open channels, in place of those of the same names."""
-        for topic in topics:
+        for topic, component in topics.items():
             channel = self._channels.get(topic.name)
             if channel is None or channel.topic != topic:
-                self._open_channel(topic)
+                self._open_channel(topic, component)
 
     def _close_channels(self, names: Set[str]) -> None:
         self._server.close_channels([self._channels.pop(name) for name in names if name in self._channels])
 
-    def _open_channel(self, topic: Topic) -> None:
+    def _open_channel(self, topic: Topic, component: ComponentType | None) -> None:
         before = self._channels.get(topic.name)
         if before is not None:
             self._renamed_s[topic.name] = time.monotonic()
             self._server.close_channels([before])
+        self._components[topic.name] = component
         self._channels[topic.name] = self._server.open_channel(
             topic, lambda viewer: self._subscribers_changed(topic.name, viewer)
         )
         if before is not None:
             self._check_wanted()
 
-    def _has_subscribers(self, topic: Topic, stamp: Stamp) -> bool:
+    def _has_subscribers(self, topic: Topic, component: ComponentType, stamp: Stamp) -> bool:
         """Return whether a topic has subscribers. If it has other fields than before, announce it again."""
         channel = self._channels.get(topic.name)
         if channel is None or channel.topic != topic:
             renamed_s = self._renamed_s.get(topic.name)
             if renamed_s is None or time.monotonic() - renamed_s >= _RENAMING_S:
-                self._open_channel(topic)
+                self._open_channel(topic, component)
             elif channel is not None and channel.subscribers:
                 self._count_loss(RENAMED, f"the labels of {topic.name} change more than once a second", stamp)
             return False
@@ -142,13 +153,11 @@ class LiveSource:
         self._check_wanted()
 
     def _check_wanted(self) -> None:
-        descriptions = {topic.name for topic in self._converter.description_topics}
-        is_wanted = self._needs_frame or any(
-            channel.subscribers for name, channel in self._channels.items() if name not in descriptions
-        )
-        if is_wanted is not self._is_wanted:
-            self._is_wanted = is_wanted
-            self._on_wanted(is_wanted)
+        subscribed = {self._components[name] for name, each in self._channels.items() if each.subscribers}
+        wanted = frozenset(each for each in WIRE_ORDER if self._needs_frame or each in subscribed)
+        if wanted != self._wanted:
+            self._wanted = wanted
+            self._on_wanted(wanted)
 
     # Messages.
 
@@ -167,7 +176,7 @@ class LiveSource:
         return True
 
     def _check_number(self, layout: ComponentLayout, stamp: Stamp) -> None:
-        if layout.num_items * NUMBERS_PER_ITEM.get(layout.type, 0) > MAX_FIELDS and self._is_wanted:
+        if has_too_many_numbers(layout) and self._wanted:
             text = f"a frame has more than {MAX_FIELDS} numbers in {layout.type.key}; they are not published"
             self._count_loss(TOO_MANY, text, stamp)
 
@@ -183,6 +192,11 @@ class LiveSource:
     def _count_loss(self, cause: str, text: str, stamp: Stamp | None) -> None:
         if self.losses is not None:
             self.losses.message_lost(cause, text, stamp)
+
+
+def has_too_many_numbers(layout: ComponentLayout) -> bool:
+    """Return whether a component has too many numbers for a topic with a field for each."""
+    return layout.num_items * NUMBERS_PER_ITEM.get(layout.type, 0) > MAX_FIELDS
 
 
 def _slow_text(viewer: Viewer) -> str:

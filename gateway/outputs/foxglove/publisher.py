@@ -1,6 +1,6 @@
 """The way of one source's frames from the gateway's event loop to the thread that serves viewers."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
 from typing import Final
 
@@ -9,7 +9,7 @@ from gateway.losses import Losses
 from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.event_loop import in_this_loop
-from gateway.outputs.foxglove.live_source import LiveSource
+from gateway.outputs.foxglove.live_source import LiveSource, has_too_many_numbers
 from gateway.outputs.foxglove.server import FoxgloveServer
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
@@ -31,15 +31,15 @@ class ServedSource:
         call: Callable[[Callable[[], None]], None],
         call_in_time: Callable[[Callable[[], None], int], bool],
     ) -> None:
-        self.wanted = False
-        """Whether a viewer has subscribed to anything that is in frames."""
+        self.wanted: frozenset[ComponentType] = frozenset()
+        """The components that a viewer has subscribed to."""
         self.losses: Losses | None = None
         """Where to count what viewers lose."""
         self._name = name
         self._server = server
         self._call = call
         self._call_in_time = call_in_time
-        self._report_wanted: Callable[[bool], None] = lambda _wanted: None
+        self._report_wanted: Callable[[frozenset[ComponentType]], None] = lambda _wanted: None
         self._on_change: Callable[[], None] = lambda: None
         self._source: LiveSource | None = None  # assigned in the thread only
         self._is_closed = False
@@ -69,7 +69,7 @@ class ServedSource:
     def close(self) -> None:
         """Withdraw the channels of the source."""
         self._is_closed = True
-        self.wanted = False
+        self.wanted = frozenset()
         self._call(self._close)
 
     # In the thread.
@@ -94,8 +94,8 @@ class ServedSource:
 
     # In the gateway's loop.
 
-    def _set_wanted(self, wanted: bool) -> None:
-        if wanted is not self.wanted and not self._is_closed:
+    def _set_wanted(self, wanted: frozenset[ComponentType]) -> None:
+        if wanted != self.wanted and not self._is_closed:
             self.wanted = wanted
             self._on_change()
 
@@ -108,14 +108,18 @@ class FoxglovePublisher:
         self._source = source
         self._is_closed = False
 
-    @property
-    def wanted(self) -> bool:
-        """Whether a viewer has subscribed to anything that is in frames."""
-        return self._source.wanted and not self._is_closed
+    def wants(self, components: Collection[ComponentType]) -> bool:
+        """Return whether a viewer has subscribed to any of these components."""
+        return not self._is_closed and not self._source.wanted.isdisjoint(components)
 
-    def prepare(self, _layout: FrameLayout, _components: frozenset[ComponentType]) -> bool:
-        """See FramePublisher."""
-        return self.wanted
+    def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
+        """Return whether a viewer has subscribed to what frames of ``layout`` have.
+
+        Nobody can subscribe to too many numbers. They count as lost while viewers watch the source.
+        """
+        found = [each for each in layout.components if each.type in components]
+        is_lost = any(map(has_too_many_numbers, found)) and bool(self._source.wanted)
+        return self.wants([each.type for each in found]) or is_lost
 
     def publish(
         self,
@@ -124,7 +128,7 @@ class FoxglovePublisher:
         sequence: int,  # noqa: ARG002 - the signature is that of FramePublisher
         components: frozenset[ComponentType],
     ) -> None:
-        """Hand over a frame if a viewer wants it; see FramePublisher."""
+        """Hand over a frame; see FramePublisher."""
         if self._is_closed:
             raise OutputError(f"foxglove: {self._name} is closed; ask for a new publisher", cause="closed")
         if self._source.wanted and not self._source.offer(frame, stamp, components):

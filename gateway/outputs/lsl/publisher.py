@@ -2,7 +2,7 @@
 
 import functools
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Final
 
 from gateway.errors import OutputError
@@ -46,10 +46,10 @@ class LslFramePublisher:
         self._num_items: dict[ComponentType, int] = {}  # the most that streams were opened for
         self._is_closed = False
 
-    @property
-    def wanted(self) -> bool:
-        """Whether somebody receives a stream of the source."""
-        return not self._processes.wanted.isdisjoint(self.streams.numbers.values())
+    def wants(self, components: Collection[ComponentType]) -> bool:
+        """Return whether somebody receives a stream of these components."""
+        numbers, wanted = self.streams.numbers, self._processes.wanted
+        return any(numbers.get(each) in wanted for each in components)
 
     def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
         """Have the streams of these components opened; return whether somebody receives one of them."""
@@ -62,8 +62,7 @@ class LslFramePublisher:
             if more and not self._is_full and not self._is_closed:
                 self._num_items |= more
                 self._append(functools.partial(self.streams.open_for, more), 0)
-        numbers, wanted = self.streams.numbers, self._processes.wanted
-        return any(numbers.get(each) in wanted for each in num_items)
+        return self.wants(num_items)
 
     def publish(
         self,

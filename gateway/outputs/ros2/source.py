@@ -3,7 +3,7 @@
 import functools
 import logging
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from typing import Protocol
 
 import zenoh
@@ -57,10 +57,9 @@ class RosSource:
         self._defects = DefectLog(logger, f"{name} to ros2")
         self._is_closed = False
 
-    @property
-    def wanted(self) -> bool:
-        """Whether somebody subscribes to anything that the frames are published on."""
-        return bool(self._wanted)
+    def wants(self, components: Collection[ComponentType]) -> bool:
+        """Return whether somebody subscribes to anything that these components are published on."""
+        return not self._wanted.isdisjoint(components)
 
     def update_wanted(self) -> None:
         """Note that subscribers have come or gone, or topics. In any thread."""
@@ -88,7 +87,7 @@ class RosSource:
         # If the queue is full, another layout or subscriber does it.
         if more and self._sender.offer(self._guarded(self.topics.open_for, more, self._parameters)):
             self._num_items |= more
-        return not self._wanted.isdisjoint(counts)
+        return self.wants(counts)
 
     def publish(
         self,

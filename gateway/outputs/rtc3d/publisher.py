@@ -1,6 +1,6 @@
 """The publisher of one source: it hands whole frames over to the thread of the clients."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import partial
 from typing import Final
 
@@ -31,6 +31,10 @@ class Rtc3dPublisher:
     def wanted(self) -> bool:
         """Whether any client asks for frames."""
         return self._state.wanted and not self._is_closed
+
+    def wants(self, _components: Collection[ComponentType]) -> bool:
+        """See FramePublisher."""
+        return self.wanted
 
     def prepare(self, _layout: FrameLayout, _components: frozenset[ComponentType]) -> bool:
         """See FramePublisher."""

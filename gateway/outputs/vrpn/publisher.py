@@ -54,9 +54,13 @@ class VrpnPublisher:
         """Name the trackers by the newest parameters. If too many calls wait, the next frame does so."""
         self._offer(partial(self._show, self._parameters, 0), len(self._parameters.xml))
 
+    def wants(self, components: Collection[ComponentType]) -> bool:
+        """Return whether a client is connected and the tools are among these components."""
+        return self.wanted and ComponentType.TOOLS in components
+
     def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
         """Return whether a client is connected and frames of ``layout`` have tools."""
-        return self.wanted and ComponentType.TOOLS in components and bool(_tool_indices(layout))
+        return self.wants(components) and bool(_tool_indices(layout))
 
     def publish(
         self,

@@ -1,6 +1,6 @@
 """Outputs that take whole frames: what they get, how it is numbered and counted, and how they close."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 
 from gateway.errors import OutputError
 from gateway.losses import Losses
@@ -48,10 +48,11 @@ class FrameOutput(ToyOutput):
 
 
 class FrameOutputPublisher:
-    wanted = True
-
     def __init__(self, output: FrameOutput) -> None:
         self._output = output
+
+    def wants(self, components: Collection[ComponentType]) -> bool:
+        return not self._output.received.isdisjoint(components)
 
     def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
         self._output.prepared.append((layout, components))
@@ -174,3 +175,12 @@ def test_an_output_of_frames_can_replace_one_of_components() -> None:
     fan_out.set_outputs([before])
     fan_out.publish(FULL, STAMP, MARKERS)
     assert len(before.messages) == 6
+
+
+def test_an_output_of_whole_frames_says_which_components_have_subscribers() -> None:
+    """A stream on demand whose components nobody wants is stopped at the server."""
+    output = FrameOutput()
+    output.received = frozenset({ComponentType.MARKERS})
+    fan_out = FanOut("lab", [output])
+    assert fan_out.has_subscribers([ComponentType.MARKERS, ComponentType.TOOLS])
+    assert not fan_out.has_subscribers([ComponentType.ANALOG, ComponentType.FORCE])

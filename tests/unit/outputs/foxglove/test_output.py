@@ -3,6 +3,7 @@
 import asyncio
 import math
 import socket
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.foxglove.output import FoxgloveOutput
 from gateway.outputs.foxglove.server import FoxgloveServer
 from gateway.outputs.foxglove.settings import FoxgloveSettings
-from gateway.rtc3d.components import MISSING, ByteOrder, ComponentType
+from gateway.rtc3d.components import MISSING, WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.parameters import (
     Marker,
     Parameters,
@@ -185,6 +186,31 @@ async def test_a_source_is_wanted_while_a_viewer_subscribes_to_its_frames() -> N
             await lab.wait_until_wanted(False)
             first.unsubscribe("/hall/events")
             await hall.wait_until_wanted(False)
+
+
+async def test_the_components_of_the_topics_that_viewers_subscribe_to_are_wanted() -> None:
+    async with serving("lab") as (port, [lab]):
+        lab.set_parameters(channels("EMG 1"))
+        async with viewing(port, "/lab/markers", "/lab/plates") as viewer:
+            await lab.wait_until_wanted()
+            assert [kind for kind in WIRE_ORDER if lab.fan_out.has_subscribers([kind])] == [MARKERS]
+            for topic, kind in (("/lab/analog/cdr", ANALOG), ("/lab/forces", FORCE), ("/lab/events", EVENT)):
+                viewer.subscribe(topic)
+                await wait_until_async(partial(lab.fan_out.has_subscribers, [kind]))
+            assert not lab.fan_out.has_subscribers([TOOLS])
+            viewer.unsubscribe("/lab/markers")
+            await wait_until_async(lambda: not lab.fan_out.has_subscribers([MARKERS]))
+            assert lab.wanted
+
+
+async def test_frames_without_anything_that_viewers_subscribe_to_do_not_count_as_sent() -> None:
+    async with serving("lab") as (port, [lab]), viewing(port, "/lab/markers") as viewer:
+        await lab.wait_until_wanted()
+        lab.publish_items(TOOLS, [pose(1, 2, 3)])
+        lab.publish_items(MARKERS, [(1, 2, 3, 0)])
+        await viewer.wait_for("/lab/markers")
+        [(_, status)] = lab.fan_out.outputs
+        assert status.messages == {"frame": 1}
 
 
 async def test_nothing_is_converted_but_what_somebody_subscribes_to(monkeypatch: pytest.MonkeyPatch) -> None:

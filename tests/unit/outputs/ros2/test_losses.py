@@ -108,7 +108,7 @@ def test_a_router_that_stops_reading_for_a_moment_loses_nothing() -> None:
     with ros_lab() as lab, stoppable_router(lab) as router:
         lab.open()
         publisher = lab.source(given=parameters(markers=10_000))
-        wait_until(lambda: publisher.wanted)
+        wait_until(lambda: publisher.wants(ALL))
         router.send_signal(signal.SIGSTOP)
         large = frame_of((ComponentType.MARKERS, [(1, 2, 3, 0)] * 10_000))
         for number in range(_LARGE_FRAMES):

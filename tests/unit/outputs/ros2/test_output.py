@@ -73,7 +73,7 @@ def test_only_frames_with_a_component_that_somebody_subscribes_to_are_wanted(lab
     both = frame_of((ComponentType.ANALOG, [1.0]), ONE_TOOL).layout
     lab.settle()
     lab.hear("tf/**")
-    wait_until(lambda: publisher.wanted)
+    wait_until(lambda: publisher.wants(ALL))
     assert not publisher.prepare(analog, ALL)
     assert publisher.prepare(both, ALL)
     assert not publisher.prepare(both, frozenset({ComponentType.ANALOG}))
@@ -307,7 +307,7 @@ async def test_only_what_has_subscribers_is_encoded() -> None:
 
         def on_change() -> None:
             assert threading.current_thread() is loop_thread
-            changes.append(publisher.wanted)
+            changes.append(publisher.wants(ALL))
 
         assert lab.output.watch_wanted("lab", on_change)
         frame = frame_of((ComponentType.MARKERS, [(1, 2, 3, 0)]), ONE_TOOL)
@@ -326,7 +326,7 @@ def test_a_subscriber_of_tf_wants_all_sources(lab: RosLab) -> None:
     publishers = [lab.source(name, parameters(("wand",))) for name in ("lab", "hall")]
     wait_until(lambda: "/mocap/hall/wand/pose" in lab.topics())
     lab.hear("tf/**")
-    wait_until(lambda: all(publisher.wanted for publisher in publishers))
+    wait_until(lambda: all(publisher.wants(ALL) for publisher in publishers))
     for number, publisher in enumerate(publishers):
         publisher.publish(tools_frame((number, 0, 0)), stamp(), 0, ALL)
     wait_until(lambda: len(lab.received["/tf"]) == 2)

@@ -18,7 +18,7 @@ from gateway.outputs import loop_thread
 from gateway.outputs.contract import FramePublisher, ServerParameters
 from gateway.outputs.vrpn.output import VrpnOutput
 from gateway.outputs.vrpn.settings import VrpnSettings
-from gateway.rtc3d.components import ITEM_DTYPES, ByteOrder, ComponentType, encode_component
+from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, ByteOrder, ComponentType, encode_component
 from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.rtc3d.parameters import Parameters, Parameters6D, Tool
 from tests.losses import amounts
@@ -74,11 +74,11 @@ async def lab(labels: Sequence[str] = ("wand", "foot"), unit_m: float | None = 1
     await wait_until_async(lambda: output.health().connected)
     output.publish_parameters("lab", parameters(labels, unit_m=unit_m))
     async with await VrpnClient.connect(settings.port) as client:
-        await wait_until_async(lambda: publisher.wanted and len(client.trackers) == len(labels))
+        await wait_until_async(lambda: publisher.wants(WIRE_ORDER) and len(client.trackers) == len(labels))
         yield Lab(output, publisher, client)
     await asyncio.to_thread(output.close)
     output.close()
-    assert not publisher.wanted
+    assert not publisher.wants(WIRE_ORDER)
 
 
 async def test_frames_of_both_byte_orders_and_with_two_components() -> None:
@@ -167,7 +167,7 @@ async def test_gateway_is_told_when_the_first_client_comes_and_the_last_one_goes
     publisher = output.frame_publisher("lab")
     assert publisher is not None
     told: list[bool] = []
-    assert output.watch_wanted("lab", lambda: told.append(publisher.wanted))
+    assert output.watch_wanted("lab", lambda: told.append(publisher.wants(WIRE_ORDER)))
     output.start()
     await wait_until_async(lambda: output.health().connected)
     async with await VrpnClient.connect(settings.port) as first:
@@ -198,7 +198,7 @@ def test_output_that_is_not_open_needs_no_clients() -> None:
     assert publisher is not None
     output.publish_parameters("lab", parameters(["wand"]))
     publisher.publish(tools_frame(1.0), stamp(10), 0, ALL)
-    assert not publisher.wanted
+    assert not publisher.wants(WIRE_ORDER)
     assert "does not listen" in output.health().problem
     publisher.close()
     output.close()
