@@ -49,11 +49,12 @@ def geometry_of(plate: Plate, unit: str) -> PlateGeometry | None:
     corners = np.array([_position(corner, unit) for corner in plate.corners])
     origin = np.zeros(3) if plate.origin is None else np.nan_to_num(_position(plate.origin, unit))
     x_axis, y_side = corners[0] - corners[1], corners[0] - corners[3]
-    z_axis = np.cross(x_axis, y_side)
-    y_axis = np.cross(z_axis, x_axis)
-    axes = np.stack([x_axis, y_axis, z_axis], axis=1)
-    lengths = np.linalg.norm(axes, axis=0)
-    if not np.isfinite(axes).all() or not lengths.all():
+    with np.errstate(over="ignore", invalid="ignore"):  # corners can be NaN, and any number by mistake
+        z_axis = np.cross(x_axis, y_side)
+        y_axis = np.cross(z_axis, x_axis)
+        axes = np.stack([x_axis, y_axis, z_axis], axis=1)
+        lengths = np.linalg.norm(axes, axis=0)
+    if not np.isfinite(lengths).all() or not lengths.all():
         return None
     return PlateGeometry(corners, origin, axes / lengths)
 

@@ -40,6 +40,7 @@ def test_channels_give_the_loads_from_which_they_were_computed() -> None:
         (Point(), Point(), Point(), Point()),
         (Point(0, 0, 0), Point(1, 0, 0), Point(2, 0, 0), Point(3, 0, 0)),
         (Point(1, 1, 1),) * 4,
+        (Point(1e200, 0, 0), Point(0, 0, 0), Point(0, 1e200, 0), Point(1e200, 1e200, 0)),
     ],
 )
 def test_a_plate_needs_four_corners_that_span_a_surface(corners: tuple[Point, ...]) -> None:
