@@ -241,7 +241,8 @@ async def test_recording_control_needs_a_valid_option_and_a_single_source() -> N
         assert "accepted: start, stop" in (await query(peer, "mocap/lab/recording?set=pause")).error
         reply = await query(peer, "mocap/*/recording?set=start")
         assert (
-            reply.error == "recording is controlled for one source at a time; accepted: mocap/lab/recording"
+            reply.error
+            == "recording needs the name of one source, not a wildcard; accepted: mocap/lab/recording"
         )
         await query_all(peer, "mocap/**?set=start")
         await query(peer, "mocap/lab/parameters?fresh=true")

@@ -214,7 +214,7 @@ class ZenohAnswers:
     def _nothing_matches(self, selected: str, base: str, source: str) -> str:
         for command in self._service.commands():
             if selected.endswith(f"/{command}"):
-                return f"{command} is controlled for one source at a time; accepted: {base}{command}"
+                return f"{command} needs the name of one source, not a wildcard; accepted: {base}{command}"
         accepted = self._service.accepted_keys(source)
         return f"nothing of source {source!r} matches {selected}; accepted below {base}: {accepted}"
 

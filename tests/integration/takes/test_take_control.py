@@ -288,7 +288,7 @@ async def test_no_wildcard_starts_stops_or_saves_a_take(tmp_path: Path) -> None:
                     reply = await query(peer, f"{key}?set={action}")
                     assert reply.code == "bad-request", (key, action)
             assert (await query(peer, "mocap/*/take")).error == (
-                "take is controlled for one source at a time; accepted: mocap/lab/take"
+                "take needs the name of one source, not a wildcard; accepted: mocap/lab/take"
             )
             assert (await query(peer, "mocap/lab/take")).json["takes"] == []
     assert list((tmp_path / "takes/lab").glob("*")) == []

@@ -136,7 +136,7 @@ async def test_a_selector_with_wildcards_gets_one_reply_for_each_key(lab: Lab) -
         ),
         (
             "mocap/*/recording",
-            "recording is controlled for one source at a time; accepted: mocap/lab/recording",
+            "recording needs the name of one source, not a wildcard; accepted: mocap/lab/recording",
         ),
     ],
 )
