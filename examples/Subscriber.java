@@ -17,8 +17,8 @@ import java.io.PrintStream;
 import java.lang.reflect.Array;
 import java.lang.reflect.Field;
 import java.lang.reflect.Modifier;
-import java.nio.BufferUnderflowException;
 import java.nio.ByteBuffer;
+import java.nio.charset.CharacterCodingException;
 import java.util.Locale;
 import java.util.StringJoiner;
 import java.util.concurrent.CountDownLatch;
@@ -36,22 +36,18 @@ public final class Subscriber {
             out.println("Arguments: [SOURCE [COUNT]], or --vectors < LINES");
             System.exit(arguments[0].equals("--help") ? 0 : 2);
         } else {
-            try {
-                String source = arguments.length > 0 ? arguments[0] : "LAB";
-                subscribe(source, arguments.length > 1 ? Integer.parseInt(arguments[1]) : Integer.MAX_VALUE);
-            } catch (NumberFormatException error) {
-                System.err.println("COUNT must be a number, not " + arguments[1]);
-                System.exit(1);
-            } catch (IOException error) {
-                System.err.println("Cannot open LCM; check $LCM_DEFAULT_URL and the multicast route: " + error);
+            String count = arguments.length > 1 ? arguments[1] : "0";
+            if (!count.matches("[0-9]{1,9}")) {
+                System.err.println("COUNT must be a number, not " + count);
                 System.exit(1);
             }
+            subscribe(arguments.length > 0 ? arguments[0] : "LAB", Integer.parseInt(count));
         }
     }
 
     private static void subscribe(String source, int count) throws Exception {
-        CountDownLatch framesLeft = new CountDownLatch(count);
-        LCM lcm = new LCM();
+        CountDownLatch framesLeft = new CountDownLatch(count == 0 ? Integer.MAX_VALUE : count);
+        LCM lcm = openLcm();
         lcm.subscribe("MOCAP_" + source + "_3D", (from, channel, input) -> {
             try {
                 byte[] data = new byte[input.available()];
@@ -68,6 +64,16 @@ public final class Subscriber {
         framesLeft.await();
         lcm.close();
         System.exit(0); // LCM's thread would wait for one more message
+    }
+
+    private static LCM openLcm() {
+        try {
+            return new LCM();
+        } catch (IOException | RuntimeException error) {
+            System.err.println("Cannot open LCM; check $LCM_DEFAULT_URL and the multicast route: " + error);
+            System.exit(1);
+            throw new AssertionError();
+        }
     }
 
     private static void printMarkers(rtc3d.markers_t message) {
@@ -103,19 +109,20 @@ public final class Subscriber {
             if (!content.hasRemaining()) {
                 return type.getConstructor(DataInput.class).newInstance(new LCMDataInputStream(data));
             }
-        } catch (ReflectiveOperationException | BufferUnderflowException | IllegalArgumentException error) {
-            // An unknown type, a wrong fingerprint, a message that ends too early, or an impossible number of items.
+        } catch (ReflectiveOperationException | RuntimeException | CharacterCodingException error) {
+            // An unknown type, a wrong fingerprint, a message that ends too early, or an impossible number or text.
         }
         throw new IOException(data.length + " bytes are not a whole " + typeName);
     }
 
     /**
-     * Move behind a value, or throw BufferUnderflowException or IllegalArgumentException.
+     * Move behind a value. Throws one of several exceptions if it is not there, or is a text that is not UTF-8.
      *
      * <p>The classes of lcm-gen allocate as many items as a message says that it has. So that a damaged message does not
      * fill the memory, this looks first whether there are as many.
      */
-    private static void skip(Class<?> type, ByteBuffer data) throws ReflectiveOperationException {
+    private static void skip(Class<?> type, ByteBuffer data)
+            throws ReflectiveOperationException, CharacterCodingException {
         if (type == long.class || type == double.class) {
             data.getLong();
         } else if (type == int.class || type == float.class) {
@@ -123,8 +130,12 @@ public final class Subscriber {
         } else if (type == boolean.class) {
             data.get();
         } else if (type == String.class) {
-            int size = data.getInt();
-            data.position(data.position() + Math.max(size, 1));
+            byte[] text = new byte[Math.min(data.getInt() - 1, data.remaining())];
+            data.get(text);
+            UTF_8.newDecoder().decode(ByteBuffer.wrap(text));
+            if (data.get() != 0) {
+                throw new IllegalArgumentException("a text without an end");
+            }
         } else {
             Object empty = type.getConstructor().newInstance();
             int numItems = 0;
@@ -149,17 +160,23 @@ public final class Subscriber {
         BufferedReader input = new BufferedReader(new InputStreamReader(System.in, UTF_8));
         for (String line = input.readLine(); line != null; line = input.readLine()) {
             String[] words = line.trim().split(" ");
-            String digits = words.length > 1 ? words[1] : "";
-            byte[] data = new byte[digits.length() / 2];
-            for (int i = 0; i < data.length; i++) {
-                data[i] = (byte) Integer.parseInt(digits.substring(2 * i, 2 * i + 2), 16);
-            }
             try {
-                out.println(toJson(decode(words[0], data)));
+                out.println(toJson(decode(words[0], decodeHex(words.length > 1 ? words[1] : ""))));
             } catch (IOException error) {
                 out.println("{\"error\": " + quoted(error.getMessage()) + "}");
             }
         }
+    }
+
+    private static byte[] decodeHex(String digits) throws IOException {
+        if (digits.length() % 2 != 0 || !digits.matches("[0-9a-fA-F]*")) {
+            throw new IOException("this is not hexadecimal");
+        }
+        byte[] data = new byte[digits.length() / 2];
+        for (int i = 0; i < data.length; i++) {
+            data[i] = (byte) Integer.parseInt(digits.substring(2 * i, 2 * i + 2), 16);
+        }
+        return data;
     }
 
     private static String toJson(Object value) throws IllegalAccessException {

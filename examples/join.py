@@ -120,6 +120,8 @@ def main() -> None:
     parser.add_argument("--source", default="lab")
     parser.add_argument("--count", type=int, default=0, help="stop after this many frames; 0: never")
     options = parser.parse_args()
+    if options.count < 0:
+        parser.error("--count must not be negative")
 
     config = zenoh.Config()
     if options.connect:
@@ -128,7 +130,11 @@ def main() -> None:
         config.insert_json5("connect/endpoints", json.dumps([options.connect]))
     # Zenoh waits while the queue is full, so even a program that is too slow does not fill the memory.
     messages: queue.Queue[tuple[str, bytes]] = queue.Queue(maxsize=10_000)
-    with zenoh.open(config) as session:
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as error:
+        sys.exit(f"Cannot open Zenoh; check that the gateway runs and --connect is its endpoint: {error}")
+    with session:
         for component in (ANALOG, MARKERS):
             session.declare_subscriber(
                 f"mocap/{options.source}/{component}",

@@ -13,7 +13,7 @@
 local folder = arg[0]:match("^(.*)/") or "."
 package.path = folder .. "/build/lua/?.lua;" .. folder .. "/build/lua/?/init.lua;" .. package.path
 
--- The module lcm: what the types of lcm-gen need from it, by string.pack of Lua 5.3.
+-- The module lcm: what decoding with the types of lcm-gen needs from it, by string.unpack of Lua 5.3.
 
 local Hash = {}
 Hash.__index = Hash
@@ -30,36 +30,34 @@ function Hash:rotate(bits)
   self.value = self.value << bits | self.value >> (64 - bits)
 end
 
-local LETTERS = {q = "i8", i = "i4", I = "I4", f = "f", d = "d", ["?"] = "B", X = "i8"}
+local LETTERS = {q = "i8", i = "i4", I = "I4", f = "f", d = "d", ["?"] = "B"}
 
--- Return the format of string.pack for one of lcm-gen, such as ">qi?" or ">3d".
-local function lua_format(format)
-  format = format:gsub("(%d+)(%a)", function(count, letter) return letter:rep(count) end)
-  return (format:gsub("[%a?]", LETTERS))
-end
-
+-- Return the values of one of lcm-gen's formats, such as ">qi?" or ">3d".
 local function unpack_values(format, data)
-  local values = table.pack(string.unpack(lua_format(format), data))
+  local letters = format:gsub("(%d+)(%a)", function(count, letter) return letter:rep(count) end)
+  local values = table.pack(string.unpack((letters:gsub("[%a?]", LETTERS)), data))
   local place = 0
-  for letter in format:gsub("(%d+)(%a)", function(count, each) return each:rep(count) end):gmatch("[%a?]") do
+  for letter in letters:gmatch("[%a?]") do
     place = place + 1
     if letter == "?" then values[place] = values[place] ~= 0 end
   end
   return table.unpack(values, 1, place)
 end
 
-local function pack_values(format, ...)
-  local values = table.pack(...)
-  for i = 1, values.n do
-    if getmetatable(values[i]) == Hash then values[i] = values[i].value end
-    if type(values[i]) == "boolean" then values[i] = values[i] and 1 or 0 end
-  end
-  return string.pack(lua_format(format), table.unpack(values, 1, values.n))
+-- Return the bytes of a fingerprint, whose format is ">X".
+local function pack_fingerprint(_, hash)
+  return string.pack(">i8", hash.value)
+end
+
+-- Return a text of a message without the NUL at its end.
+local function prepare_string(text)
+  local content = text:match("^([^\0]*)\0$")
+  if not content or not utf8.len(content) then error("a text is not UTF-8 up to a NUL", 0) end
+  return content
 end
 
 package.preload.lcm = function()
-  local function prepare_string(text) return text:match("^[^\0]*") end
-  return {_hash = Hash, _pack = {pack = pack_values, unpack = unpack_values, prepare_string = prepare_string}}
+  return {_hash = Hash, _pack = {pack = pack_fingerprint, unpack = unpack_values, prepare_string = prepare_string}}
 end
 
 local rtc3d = require("rtc3d")
@@ -162,10 +160,12 @@ end
 
 local function print_vectors()
   for line in io.lines() do
-    local name, digits = line:match("^(%S*)%s*(%x*)")
+    local name, digits = line:match("^(%S*)%s*(%S*)")
     local data = digits:gsub("%x%x", function(byte) return string.char(tonumber(byte, 16)) end)
     local found
-    if rtc3d[name] then
+    if #digits % 2 ~= 0 or digits:find("%X") then
+      found = '{"error": "this is not hexadecimal"}'
+    elseif rtc3d[name] then
       local is_whole, message = pcall(decode, rtc3d[name], data)
       found = is_whole and to_json(message) or '{"error": ' .. quoted(tostring(message)) .. "}"
     else

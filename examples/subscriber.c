@@ -8,9 +8,11 @@
  * (lcm_types/vectors/README.md).
  */
 #define _POSIX_C_SOURCE 200809L
+#include <ctype.h>
 #include <inttypes.h>
-#include <limits.h>
 #include <lcm/lcm.h>
+#include <limits.h>
+#include <locale.h>
 #include <math.h>
 #include <stdbool.h>
 #include <stdio.h>
@@ -67,7 +69,17 @@ static int32_t read_int32(const uint8_t *data)
 
 static bool walk_struct(const lcm_type_info_t *info, const uint8_t **data, const uint8_t *end);
 
-/* Move `data` behind a value. Return false if it ends behind `end`, or is a text without a NUL at its end. */
+/* Return whether a text is UTF-8, in a locale that is. */
+static bool is_utf8(const char *text)
+{
+    wchar_t letter;
+    int size;
+    while ((size = mbtowc(&letter, text, MB_CUR_MAX)) > 0 && letter <= 0x10ffff)
+        text += size;
+    return size == 0;
+}
+
+/* Move `data` behind a value. Return false if it ends behind `end`, or is a text that is not UTF-8 up to a NUL. */
 static bool walk_value(const lcm_field_t *field, const uint8_t **data, const uint8_t *end)
 {
     int64_t size = 0;
@@ -85,7 +97,8 @@ static bool walk_value(const lcm_field_t *field, const uint8_t **data, const uin
         break;
     case LCM_FIELD_STRING:
         size = end - *data < 4 ? -1 : read_int32(*data);
-        if (size < 1 || size > end - *data - 4 || (*data)[4 + size - 1] != 0)
+        if (size < 1 || size > end - *data - 4 || memchr(*data + 4, 0, size) != *data + 4 + size - 1 ||
+            !is_utf8((const char *)*data + 4))
             return false;
         size += 4;
         break;
@@ -294,22 +307,28 @@ static void print_vector(const char *type_name, const uint8_t *data, size_t size
     free(message);
 }
 
+/* Replace hexadecimal digits with the bytes that they stand for. Return how many there are; -1 for other characters. */
+static ssize_t decode_hex(char *digits)
+{
+    ssize_t size = 0;
+    for (; isxdigit((unsigned char)digits[2 * size]) && isxdigit((unsigned char)digits[2 * size + 1]); size++)
+        digits[size] = (char)strtol((char[]){digits[2 * size], digits[2 * size + 1], '\0'}, NULL, 16);
+    return digits[2 * size] == '\0' ? size : -1;
+}
+
 /* Read lines TYPE HEX. */
 static int print_vectors(void)
 {
     char *line = NULL;
     size_t capacity = 0;
     while (getline(&line, &capacity, stdin) > 0) {
-        const char *type_name = strtok(line, " \n");
-        const char *digits = strtok(NULL, " \n");
-        size_t size = 0;
-        uint8_t *data = (uint8_t *)line; /* shorter than the digits, which follow */
-        char name[64];
-        snprintf(name, sizeof name, "%s", type_name ? type_name : "");
-        unsigned byte;
-        for (; digits && sscanf(digits, "%2x", &byte) == 1; digits += 2)
-            data[size++] = (uint8_t)byte;
-        print_vector(name, data, size);
+        const char *type_name = strtok(line, " \r\n");
+        char *digits = strtok(NULL, " \r\n");
+        const ssize_t size = digits ? decode_hex(digits) : 0;
+        if (size < 0)
+            printf("{\"error\": \"this is not hexadecimal\"}\n");
+        else
+            print_vector(type_name ? type_name : "", (const uint8_t *)digits, (size_t)size);
     }
     free(line);
     return 0;
@@ -317,6 +336,7 @@ static int print_vectors(void)
 
 int main(int argc, char **argv)
 {
+    setlocale(LC_CTYPE, "C.UTF-8"); /* the gateway's texts are UTF-8 */
     if (argc > 1 && strcmp(argv[1], "--vectors") == 0)
         return print_vectors();
     if (argc > 1 && argv[1][0] == '-') {

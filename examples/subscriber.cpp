@@ -5,13 +5,16 @@
 // Building needs a C++17 compiler, make, and the Python package lcm, which has LCM's library and lcm-gen. SOURCE is the
 // name of the source in upper case. The program stops after COUNT frames. The environment variable LCM_DEFAULT_URL sets
 // the LCM URL. With --vectors, the program decodes messages from standard input instead (lcm_types/vectors/README.md).
+#include <clocale>
 #include <cmath>
 #include <cstdio>
 #include <cstdlib>
+#include <cstring>
 #include <iostream>
 #include <lcm/lcm-cpp.hpp>
 #include <optional>
 #include <sstream>
+#include <stdexcept>
 #include <string>
 #include <sys/resource.h>
 #include <type_traits>
@@ -41,7 +44,8 @@ template <> constexpr std::size_t item_bytes<rtc3d::forces_t> = 24;
 template <> constexpr std::size_t item_bytes<rtc3d::events_t> = 24;
 
 // Return the message, or nothing if these bytes are not one. Component messages must have as many bytes as they say
-// that they have items: the functions of lcm-gen allocate memory for the items before they look.
+// that they have items: the functions of lcm-gen allocate memory for the items before they look. They do not look at
+// the NUL at the end of a text either, so other messages must have the same bytes when they are encoded again.
 template <class Message> std::optional<Message> decode(const void *data, std::size_t size)
 {
     if constexpr (item_bytes<Message> != 0) {
@@ -54,7 +58,11 @@ template <class Message> std::optional<Message> decode(const void *data, std::si
     }
     try {
         Message message;
-        if (message.decode(data, 0, static_cast<int>(size)) == static_cast<int>(size))
+        if (message.decode(data, 0, static_cast<int>(size)) != static_cast<int>(size))
+            return {};
+        std::string again(size, '\0');
+        if (item_bytes<Message> != 0 || (message.encode(&again[0], 0, static_cast<int>(size)) >= 0 &&
+                                         std::memcmp(again.data(), data, size) == 0))
             return message;
     } catch (const std::exception &) { // a text with an impossible length
     }
@@ -132,6 +140,8 @@ public:
 
     void write(const std::string &value)
     {
+        if (!is_utf8(value))
+            throw std::invalid_argument("a text is not UTF-8");
         out << '"';
         for (const char letter : value) {
             char escaped[7];
@@ -160,6 +170,19 @@ public:
 
 private:
     bool is_first = true;
+
+    // Return whether a text is UTF-8, in a locale that is, and has no NUL.
+    static bool is_utf8(const std::string &text)
+    {
+        wchar_t letter = 0;
+        std::size_t i = 0;
+        for (int size = 1; i < text.size() && letter <= 0x10ffff; i += size) {
+            size = std::mbtowc(&letter, &text[i], text.size() - i);
+            if (size < 1)
+                return false;
+        }
+        return letter <= 0x10ffff;
+    }
 
     void write_number(double value, int digits)
     {
@@ -320,7 +343,7 @@ void write_fields(Json &json, const rtc3d::take_t &m)
     json("gateway_version", m.gateway_version)("recorder", m.recorder)("host", m.host);
 }
 
-// Return the message as JSON if `name` is its type and `data` is whole; otherwise nothing.
+// Return the message as JSON; nothing if `name` is none of these types, or if `data` is not a whole message.
 template <class... Messages> std::string to_json(const std::string &name, const std::string &data)
 {
     Json json;
@@ -331,29 +354,47 @@ template <class... Messages> std::string to_json(const std::string &name, const 
         if (const auto message = decode<Message>(data.data(), data.size()))
             json.write(*message);
     };
-    (try_type(std::common_type<Messages>{}), ...);
+    try {
+        (try_type(std::common_type<Messages>{}), ...);
+    } catch (const std::invalid_argument &) { // a text that is not UTF-8
+        return {};
+    }
     return json.out.str();
+}
+
+std::optional<std::string> decode_hex(const std::string &digits)
+{
+    if (digits.size() % 2 != 0 || digits.find_first_not_of("0123456789abcdefABCDEF") != std::string::npos)
+        return {};
+    std::string data;
+    for (std::size_t i = 0; i < digits.size(); i += 2)
+        data += static_cast<char>(std::stoi(digits.substr(i, 2), nullptr, 16));
+    return data;
 }
 
 // Read lines TYPE HEX.
 int print_vectors()
 {
+    std::setlocale(LC_CTYPE, "C.UTF-8"); // the gateway's texts are UTF-8
     // What a damaged message claims to have must not fill the computer's memory.
     const rlimit quarter_gigabyte{1 << 28, 1 << 28};
     setrlimit(RLIMIT_AS, &quarter_gigabyte);
     for (std::string line; std::getline(std::cin, line);) {
         std::istringstream words(line);
-        std::string name, digits, data;
+        std::string name, digits;
         words >> name >> digits;
-        for (std::size_t i = 0; i + 1 < digits.size(); i += 2)
-            data += static_cast<char>(std::stoi(digits.substr(i, 2), nullptr, 16));
+        const auto data = decode_hex(digits);
+        if (!data) {
+            std::cout << "{\"error\": \"this is not hexadecimal\"}\n";
+            continue;
+        }
         const std::string json =
             to_json<rtc3d::markers_t, rtc3d::tools_t, rtc3d::analog_t, rtc3d::forces_t, rtc3d::events_t,
                     rtc3d::tool_pose_t, rtc3d::status_t, rtc3d::clock_t, rtc3d::parameters_t,
                     rtc3d::parameters_request_t, rtc3d::parameters_reply_t, rtc3d::command_request_t,
-                    rtc3d::command_reply_t, rtc3d::take_t>(name, data);
+                    rtc3d::command_reply_t, rtc3d::take_t>(name, *data);
         if (json.empty())
-            std::cout << "{\"error\": \"" << data.size() << " bytes are not a whole " << name << "\"}\n";
+            std::cout << "{\"error\": \"" << data->size() << " bytes are not a whole message of this type\"}\n";
         else
             std::cout << json << "\n";
     }

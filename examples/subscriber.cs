@@ -33,8 +33,8 @@ static class Subscriber
             return arguments[0] == "--help" ? 0 : 2;
         }
         var source = arguments.Length > 0 ? arguments[0] : "LAB";
-        var count = long.MaxValue;
-        if (arguments.Length > 1 && !long.TryParse(arguments[1], out count))
+        long count = 0;
+        if (arguments.Length > 1 && !long.TryParse(arguments[1], NumberStyles.None, null, out count))
         {
             Console.Error.WriteLine("COUNT must be a number, not " + arguments[1]);
             return 1;
@@ -56,13 +56,13 @@ static class Subscriber
         using (var receiver = new LcmReceiver(Environment.GetEnvironmentVariable("LCM_DEFAULT_URL")))
         {
             Console.WriteLine("listening");
-            while (count > 0)
+            for (long received = 0; count == 0 || received < count;)
             {
                 var data = receiver.Receive(channel);
                 try
                 {
                     PrintMarkers((rtc3d.markers_t)Decode("markers_t", data));
-                    count--;
+                    received++;
                 }
                 catch (InvalidDataException error)
                 {
@@ -111,12 +111,9 @@ static class Subscriber
         for (var line = Console.ReadLine(); line != null; line = Console.ReadLine())
         {
             var words = line.Trim().Split(' ');
-            var digits = words.Length > 1 ? words[1] : "";
-            var data = Enumerable.Range(0, digits.Length / 2)
-                .Select(i => Convert.ToByte(digits.Substring(2 * i, 2), 16)).ToArray();
             try
             {
-                Console.WriteLine(Json(Decode(words[0], data)));
+                Console.WriteLine(Json(Decode(words[0], DecodeHex(words.Length > 1 ? words[1] : ""))));
             }
             catch (InvalidDataException error)
             {
@@ -124,6 +121,14 @@ static class Subscriber
             }
         }
         return 0;
+    }
+
+    static byte[] DecodeHex(string digits)
+    {
+        if (digits.Length % 2 != 0 || !digits.All(Uri.IsHexDigit))
+            throw new InvalidDataException("this is not hexadecimal");
+        return Enumerable.Range(0, digits.Length / 2)
+            .Select(i => Convert.ToByte(digits.Substring(2 * i, 2), 16)).ToArray();
     }
 
     static string Json(object value)
@@ -330,9 +335,13 @@ namespace LCM.LCM
             return BitConverter.Int64BitsToDouble(ReadInt64());
         }
 
+        // Read a text. It must be UTF-8, and a NUL must follow.
         public void ReadFully(byte[] bytes)
         {
             Array.Copy(data, Advance(bytes.Length), bytes, 0, bytes.Length);
+            new UTF8Encoding(false, true).GetCharCount(bytes);
+            if (Available == 0 || data[position] != 0)
+                throw new EndOfStreamException();
         }
 
         int Advance(int size)

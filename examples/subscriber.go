@@ -15,17 +15,30 @@ import (
 	"encoding/binary"
 	"encoding/hex"
 	"encoding/json"
+	"errors"
 	"fmt"
 	"math"
 	"net"
 	"net/netip"
 	"net/url"
 	"os"
+	"reflect"
 	"strconv"
 	"strings"
 )
 
-// The messages. binary.Read fills their fields in this order, without padding.
+// The messages. decode fills their fields in this order; there is no padding between them. A slice has as many items as
+// the field before it says.
+
+// Message is a type of messages. The first 8 bytes of each are the fingerprint of its type.
+type Message interface{ fingerprint() uint64 }
+
+func (Markers) fingerprint() uint64  { return 0xe95d5a478ce229e4 }
+func (Tools) fingerprint() uint64    { return 0xf922a353b61657b3 }
+func (Analog) fingerprint() uint64   { return 0xcd43a9dd46669bec }
+func (Forces) fingerprint() uint64   { return 0xdc94defbb591810c }
+func (Events) fingerprint() uint64   { return 0x06a109c2ae7bf07c }
+func (ToolPose) fingerprint() uint64 { return 0xbf985441ca59ae7a }
 
 type Prefix struct {
 	Utime             int64 `json:"utime"`
@@ -126,62 +139,31 @@ func (f Float) MarshalJSON() ([]byte, error) {
 	return strconv.AppendFloat(nil, value, 'g', -1, 32), nil
 }
 
-var fingerprints = map[string]string{
-	"markers_t":   "e95d5a478ce229e4",
-	"tools_t":     "f922a353b61657b3",
-	"analog_t":    "cd43a9dd46669bec",
-	"forces_t":    "dc94defbb591810c",
-	"events_t":    "06a109c2ae7bf07c",
-	"tool_pose_t": "bf985441ca59ae7a",
-}
-
-// decode returns a pointer to the message, or an error for bytes that are not a message of this type.
-func decode(typeName string, message []byte) (any, error) {
-	fingerprint, ok := fingerprints[typeName]
-	if !ok {
-		return nil, fmt.Errorf("no type %q", typeName)
+// decode returns the message, or an error for bytes that are not a whole message of type M.
+func decode[M Message](data []byte) (*M, error) {
+	message := new(M)
+	if len(data) < 8 || binary.BigEndian.Uint64(data) != (*message).fingerprint() {
+		return nil, errors.New("it has the fingerprint of another type")
 	}
-	if len(message) < 8 || hex.EncodeToString(message[:8]) != fingerprint {
-		return nil, fmt.Errorf("this is not a %s: it has another fingerprint", typeName)
-	}
-	body := bytes.NewReader(message[8:])
-	switch typeName {
-	case "markers_t":
-		m := new(Markers)
-		return m, readComponent(body, &m.Prefix, &m.NumMarkers, &m.Markers)
-	case "tools_t":
-		m := new(Tools)
-		return m, readComponent(body, &m.Prefix, &m.NumTools, &m.Tools)
-	case "analog_t":
-		m := new(Analog)
-		return m, readComponent(body, &m.Prefix, &m.NumChannels, &m.Voltages)
-	case "forces_t":
-		m := new(Forces)
-		return m, readComponent(body, &m.Prefix, &m.NumPlates, &m.Plates)
-	case "events_t":
-		m := new(Events)
-		return m, readComponent(body, &m.Prefix, &m.NumEvents, &m.Events)
-	default:
-		m := new(ToolPose)
-		if body.Len() != binary.Size(m) {
-			return nil, fmt.Errorf("%d bytes are not a pose", body.Len())
+	body := bytes.NewReader(data[8:])
+	fields := reflect.ValueOf(message).Elem()
+	for i := 0; i < fields.NumField(); i++ {
+		field := fields.Field(i)
+		if field.Kind() == reflect.Slice {
+			count, itemSize := fields.Field(i-1).Int(), binary.Size(reflect.Zero(field.Type().Elem()).Interface())
+			if count*int64(itemSize) != int64(body.Len()) {
+				return nil, fmt.Errorf("%d bytes are not %d items", body.Len(), count)
+			}
+			field.Set(reflect.MakeSlice(field.Type(), int(count), int(count)))
 		}
-		return m, binary.Read(body, binary.BigEndian, m)
+		if err := binary.Read(body, binary.BigEndian, field.Addr().Interface()); err != nil {
+			return nil, err
+		}
 	}
-}
-
-func readComponent[Item any](body *bytes.Reader, prefix *Prefix, count *int32, items *[]Item) error {
-	if err := binary.Read(body, binary.BigEndian, prefix); err != nil {
-		return err
+	if body.Len() > 0 {
+		return nil, fmt.Errorf("there are %d bytes behind its end", body.Len())
 	}
-	if err := binary.Read(body, binary.BigEndian, count); err != nil {
-		return err
-	}
-	if size := binary.Size(*new(Item)); int64(*count)*int64(size) != int64(body.Len()) {
-		return fmt.Errorf("%d bytes are not %d items", body.Len(), *count)
-	}
-	*items = make([]Item, *count)
-	return binary.Read(body, binary.BigEndian, *items)
+	return message, nil
 }
 
 // LCM's packets: a whole message, or a fragment of one.
@@ -305,12 +287,12 @@ func subscribe(source string, count int) error {
 		if channel != "MOCAP_"+source+"_3D" {
 			continue
 		}
-		message, err := decode("markers_t", data)
+		message, err := decode[Markers](data)
 		if err != nil {
 			fmt.Fprintf(os.Stderr, "ignored a malformed message on %s: %v\n", channel, err)
 			continue
 		}
-		printMarkers(message.(*Markers))
+		printMarkers(message)
 		received++
 	}
 	return nil
@@ -331,18 +313,39 @@ func printMarkers(message *Markers) {
 	fmt.Println()
 }
 
+// decoders has the types that --vectors decodes.
+var decoders = map[string]func([]byte) (any, error){
+	"markers_t":   decodeAny[Markers],
+	"tools_t":     decodeAny[Tools],
+	"analog_t":    decodeAny[Analog],
+	"forces_t":    decodeAny[Forces],
+	"events_t":    decodeAny[Events],
+	"tool_pose_t": decodeAny[ToolPose],
+}
+
+func decodeAny[M Message](data []byte) (any, error) { return decode[M](data) }
+
+// decodeLine decodes a line "TYPE HEX".
+func decodeLine(line string) (any, error) {
+	typeName, digits, _ := strings.Cut(strings.TrimSpace(line), " ")
+	decoder, ok := decoders[typeName]
+	if !ok {
+		return nil, fmt.Errorf("no type %q", typeName)
+	}
+	data, err := hex.DecodeString(digits)
+	if err != nil {
+		return nil, err
+	}
+	return decoder(data)
+}
+
 // printVectors decodes each line "TYPE HEX" of standard input, and prints one line of JSON for it.
 func printVectors() error {
 	lines := bufio.NewScanner(os.Stdin)
-	lines.Buffer(nil, 4*maxMessageBytes)
+	lines.Buffer(nil, math.MaxInt)
 	output := json.NewEncoder(os.Stdout)
 	for lines.Scan() {
-		typeName, digits, _ := strings.Cut(strings.TrimSpace(lines.Text()), " ")
-		message, err := hex.DecodeString(digits)
-		var decoded any
-		if err == nil {
-			decoded, err = decode(typeName, message)
-		}
+		decoded, err := decodeLine(lines.Text())
 		if err != nil {
 			decoded = map[string]string{"error": err.Error()}
 		}
@@ -369,12 +372,16 @@ func run(arguments []string) error {
 		source = arguments[0]
 	}
 	if len(arguments) > 1 {
-		var err error
-		if count, err = strconv.Atoi(arguments[1]); err != nil {
-			return err
+		number, err := strconv.ParseUint(arguments[1], 10, 31)
+		if err != nil {
+			return fmt.Errorf("COUNT must be a number, not %s", arguments[1])
 		}
+		count = int(number)
 	}
-	return subscribe(source, count)
+	if err := subscribe(source, count); err != nil {
+		return fmt.Errorf("cannot receive from LCM; check $LCM_DEFAULT_URL and the multicast route: %w", err)
+	}
+	return nil
 }
 
 func main() {

@@ -163,7 +163,7 @@ function cutChannel(data) {
 function subscribe(source, count) {
   const url = process.env.LCM_DEFAULT_URL || 'udpm://239.255.76.67:7667';
   const [, group, port] = /^udpm:\/\/([\d.]+):(\d+)/.exec(url) ?? [];
-  if (!group) return fail(`${url}: this program needs a URL such as udpm://239.255.76.67:7667?ttl=1`);
+  if (!group || port > 65535) return cannotReceive(`${url} is not a URL such as udpm://239.255.76.67:7667?ttl=1`);
 
   const assembler = new Assembler();
   const socket = dgram.createSocket({ type: 'udp4', reuseAddr: true, recvBufferSize: 2_000_000 });
@@ -182,9 +182,15 @@ function subscribe(source, count) {
     received += 1;
     if (received === count) socket.close();
   });
-  socket.on('error', (error) => fail(error.message));
+  socket.on('error', (error) => cannotReceive(error.message));
   socket.bind(Number(port), () => {
-    socket.addMembership(group);
+    try {
+      socket.addMembership(group);
+    } catch (error) {
+      cannotReceive(error.message);
+      socket.close();
+      return;
+    }
     console.log('listening');
   });
 }
@@ -220,12 +226,17 @@ async function printVectors() {
   for await (const line of readline.createInterface({ input: process.stdin })) {
     const [typeName, digits = ''] = line.trim().split(/\s+/);
     try {
-      if (!/^([0-9a-f]{2})*$/i.test(digits)) throw new Error('not hexadecimal');
-      console.log(toJson(decode(typeName, Buffer.from(digits, 'hex'))));
+      const message = Buffer.from(digits, 'hex'); // ends at the first character that is no digit
+      if (2 * message.length !== digits.length) throw new Error('this is not hexadecimal');
+      console.log(toJson(decode(typeName, message)));
     } catch (error) {
       console.log(toJson({ error: error.message }));
     }
   }
+}
+
+function cannotReceive(reason) {
+  fail(`cannot receive from LCM; check $LCM_DEFAULT_URL and the multicast route: ${reason}`);
 }
 
 function fail(text) {

@@ -59,7 +59,10 @@ def subscribe(source: str, count: float) -> None:
         frames_left -= 1
 
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # LCM's handle() would turn Ctrl-C into an OSError
-    connection = lcm.LCM()
+    try:
+        connection = lcm.LCM()
+    except RuntimeError:
+        sys.exit("Cannot open LCM; check $LCM_DEFAULT_URL and the multicast route")
     subscription = connection.subscribe(f"MOCAP_{source}_3D", on_markers)
     subscription.set_queue_capacity(1000)  # the default of 30 loses frames whenever this program pauses
     print("listening", flush=True)

@@ -93,8 +93,13 @@ def subscribe(endpoint: str | None, source: str, count: int) -> None:
         config.insert_json5("mode", '"client"')
         config.insert_json5("scouting/multicast/enabled", "false")
         config.insert_json5("connect/endpoints", json.dumps([endpoint]))
-    samples: queue.Queue[bytes] = queue.Queue()
-    with zenoh.open(config) as session:
+    # Zenoh waits while the queue is full, so even a program that is too slow does not fill the memory.
+    samples: queue.Queue[bytes] = queue.Queue(maxsize=10_000)
+    try:
+        session = zenoh.open(config)
+    except zenoh.ZError as error:
+        sys.exit(f"Cannot open Zenoh; check that the gateway runs and --connect is its endpoint: {error}")
+    with session:
         session.declare_subscriber(
             f"mocap/{source}/3d", lambda sample: samples.put(sample.payload.to_bytes())
         )

@@ -1,7 +1,11 @@
-"""The test vectors in lcm_types/vectors/: bytes of messages, and the values that they decode to."""
+"""The test vectors in lcm_types/vectors/: bytes of messages, and the values that they decode to.
+
+``random_message`` makes further messages.
+"""
 
 import json
 import math
+import random
 import struct
 from pathlib import Path
 from typing import Any, Final, NamedTuple
@@ -50,6 +54,15 @@ def _read(path: Path) -> list[MessageVector]:
 
 
 VECTORS: Final = [vector for path in sorted(FOLDER.glob("*.json")) for vector in _read(path)]
+
+
+def to_vector_values(value: Any) -> Any:
+    """Return an LCM object as in the vectors: numbers that JSON cannot hold are texts."""
+    if hasattr(value, "__slots__"):
+        return {name: to_vector_values(getattr(value, name)) for name in value.__slots__}
+    if isinstance(value, list | tuple):
+        return [to_vector_values(item) for item in value]
+    return str(value) if isinstance(value, float) and value - value != 0 else value
 
 
 def difference(lcm_type: Any, expected: dict[str, Any], found: Any, where: str = "") -> str | None:
@@ -101,3 +114,41 @@ def _rounded(value: Any, letter: str) -> float | str | None:
     except (OverflowError, struct.error):
         return None
     return "nan" if math.isnan(number) else float(number)
+
+
+def random_message(lcm_type: Any, generator: random.Random) -> Any:
+    """Return a message with random values, among them the largest and smallest ones and odd texts."""
+    message = lcm_type()
+    for field, type_name, dimensions in zip(
+        lcm_type.__slots__, lcm_type.__typenames__, lcm_type.__dimensions__, strict=True
+    ):
+        if dimensions is None:
+            value = _random_value(type_name, generator)
+        else:
+            [size] = dimensions
+            if isinstance(size, str):  # the field with the number of items
+                num_items = generator.choice((0, 1, 2, 7))
+                setattr(message, size, num_items)
+                size = num_items
+            value = [_random_value(type_name, generator) for _ in range(size)]
+        setattr(message, field, value)
+    return message
+
+
+def _random_value(type_name: str, generator: random.Random) -> Any:
+    match type_name:
+        case "int32_t" | "int64_t":
+            limit = 1 << (31 if type_name == "int32_t" else 63)
+            return generator.choice((0, -1, limit - 1, -limit, generator.randrange(-limit, limit)))
+        case "float" | "double":
+            letter, size = ("f", 4) if type_name == "float" else ("d", 8)
+            [anything] = struct.unpack(letter, generator.randbytes(size))
+            [smallest] = struct.unpack(f"<{letter}", (1).to_bytes(size, "little"))
+            [position] = struct.unpack(letter, struct.pack(letter, generator.uniform(-5000, 5000)))
+            return generator.choice((0.0, math.nan, math.inf, -math.inf, anything, smallest, position))
+        case "boolean":
+            return generator.choice((True, False))
+        case "string":
+            letters = "aZ0 /\\\"'{}\t\n\r\x01\x1f\x7f\x80äß€\u2028\ufeff\ufffd😀\U0010ffff"
+            return "".join(generator.choices(letters, k=generator.choice((0, 1, 5, 40))))
+    return random_message(getattr(rtc3d, type_name.removeprefix("rtc3d.")), generator)

@@ -465,8 +465,8 @@ fn print_markers(prefix: &Prefix, markers: &[Marker]) -> io::Result<()> {
 
 /// Decode each line "TYPE HEX" of standard input, and print one line of JSON for it.
 fn print_vectors() -> Result<()> {
-    for line in io::stdin().lock().lines() {
-        let json = match decoded_json(&line?) {
+    for line in io::stdin().lock().split(b'\n') {
+        let json = match decoded_json(&String::from_utf8_lossy(&line?)) {
             Ok(json) => json,
             Err(error) => format!(r#"{{"error":"{}"}}"#, error.to_string().escape_default()),
         };
@@ -496,12 +496,12 @@ fn message_json<M: Message>(message: &[u8]) -> Result<String> {
 }
 
 fn from_hex(digits: &str) -> Result<Vec<u8>> {
-    if digits.len() % 2 != 0 {
-        return Err("an odd number of hexadecimal digits".into());
+    if digits.len() % 2 != 0 || !digits.bytes().all(|digit| digit.is_ascii_hexdigit()) {
+        return Err("this is not hexadecimal".into());
     }
-    let pairs = digits.as_bytes().chunks(2);
-    pairs
-        .map(|pair| Ok(u8::from_str_radix(std::str::from_utf8(pair)?, 16)?))
+    (0..digits.len())
+        .step_by(2)
+        .map(|start| Ok(u8::from_str_radix(&digits[start..start + 2], 16)?))
         .collect()
 }
 
@@ -519,7 +519,10 @@ fn run(arguments: &[String]) -> Result<()> {
     let count = count
         .parse()
         .map_err(|_| format!("{count} is not a number of frames"))?;
-    subscribe(source, count)
+    subscribe(source, count).map_err(|error| {
+        format!("cannot receive from LCM; check $LCM_DEFAULT_URL and the multicast route: {error}")
+            .into()
+    })
 }
 
 fn main() {

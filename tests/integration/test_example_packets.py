@@ -168,7 +168,10 @@ def test_malformed_messages_are_reported(program: ExampleProgram) -> None:
         (["--nonsense"], LCM_URL, 2),
         (["LAB", "many"], LCM_URL, 1),
         ([], "tcpq://127.0.0.1:7700", 1),
+        (["LAB", "-1"], LCM_URL, 1),
         ([], "udpm://nonsense", 1),
+        ([], "udpm://239.255.76.67:99999", 1),
+        ([], "udpm://127.0.0.1:7713", 1),
     ],
 )
 def test_wrong_arguments_end_with_a_sentence(

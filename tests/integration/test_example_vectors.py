@@ -1,4 +1,4 @@
-"""The option --vectors of each example program, with the test vectors and with damaged messages."""
+"""The option --vectors of each example: the test vectors, random and damaged messages, other lines."""
 
 import json
 import random
@@ -10,24 +10,32 @@ import pytest
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME
 from gateway.messages.encode import COUNT_OFFSET
 from tests.example_programs import COMPONENT_TYPES, EXAMPLES, PROGRAMS, ExampleProgram
-from tests.message_vectors import VECTORS, difference
+from tests.message_vectors import VECTORS, difference, random_message, to_vector_values
 
 each_program = pytest.mark.parametrize("program", PROGRAMS, ids=str)
 
 
 def decode_with(program: ExampleProgram, messages: list[tuple[str, bytes]]) -> list[Any]:
     """Return what the program prints for each type and message."""
+    return printed_for(program, [f"{type_name} {data.hex()}".encode() for type_name, data in messages])
+
+
+def printed_for(program: ExampleProgram, lines: list[bytes]) -> list[Any]:
+    """Return what the program prints for each line."""
     program.build()
-    lines = "".join(f"{type_name} {data.hex()}\n" for type_name, data in messages)
-    command = [*program.command, "--vectors"]
     run = subprocess.run(
-        command, input=lines, cwd=EXAMPLES, capture_output=True,
-        encoding="utf-8", errors="replace", check=False, timeout=60,
+        [*program.command, "--vectors"], input=b"".join(line + b"\n" for line in lines), cwd=EXAMPLES,
+        capture_output=True, check=False, timeout=60,
     )  # fmt: skip
-    assert (run.returncode, run.stderr) == (0, "")
-    printed = [json.loads(line) for line in run.stdout.splitlines()]
-    assert len(printed) == len(messages)
+    assert (run.returncode, run.stderr) == (0, b"")
+    printed = [json.loads(line, parse_constant=no_json) for line in run.stdout.decode().split("\n")[:-1]]
+    assert len(printed) == len(lines)
     return printed
+
+
+def no_json(text: str) -> Any:
+    """Refuse NaN and Infinity, which Python's decoder takes for JSON."""
+    raise ValueError(text)
 
 
 @each_program
@@ -39,6 +47,23 @@ def test_each_program_decodes_the_test_vectors(program: ExampleProgram) -> None:
         for vector, values in zip(vectors, found, strict=True)
         if (problem := difference(vector.lcm_type, vector.values, values))
     }
+    assert not problems
+
+
+@each_program
+def test_each_program_decodes_random_messages(program: ExampleProgram) -> None:
+    generator = random.Random(18)
+    messages = [
+        (name, random_message(MESSAGE_TYPES_BY_NAME[name], generator))
+        for name in sorted(program.types)
+        for _ in range(60)
+    ]
+    found = decode_with(program, [(name, message.encode()) for name, message in messages])
+    problems = [
+        problem
+        for (_, message), values in zip(messages, found, strict=True)
+        if (problem := difference(type(message), to_vector_values(message), values))
+    ]
     assert not problems
 
 
@@ -92,3 +117,32 @@ def test_each_program_reports_types_that_it_does_not_know(program: ExampleProgra
     unknown = ["nonsense_t", *sorted(set(MESSAGE_TYPES_BY_NAME) - program.types)]
     found = decode_with(program, [(name, VECTORS[0].data) for name in unknown])
     assert [list(answer) for answer in found] == [["error"]] * len(unknown)
+
+
+@each_program
+def test_each_program_reports_lines_that_are_not_hexadecimal(program: ExampleProgram) -> None:
+    vector = next(vector for vector in VECTORS if vector.type_name == "markers_t")
+    digits = vector.data.hex().encode()
+    damaged = [
+        b"",
+        digits + b"0",
+        digits + b"zz",
+        b"zz" + digits,
+        b"0x" + digits,
+        b"+1",
+        b"-1",
+        digits + b"\xff",
+    ]
+    lines = [b"", b" ", b"\xff 00", b'"\\ 00', b"markers_t", *(b"markers_t " + text for text in damaged)]
+    *found, last = printed_for(program, [*lines, b"markers_t " + digits.upper() + b"\r"])
+    assert [list(answer) for answer in found] == [["error"]] * len(lines)
+    assert difference(vector.lcm_type, vector.values, last) is None
+
+
+@pytest.mark.parametrize("program", [each for each in PROGRAMS if "status_t" in each.types], ids=str)
+def test_each_program_reports_texts_that_are_not_utf8_up_to_a_nul(program: ExampleProgram) -> None:
+    vector = next(vector for vector in VECTORS if vector.type_name == "parameters_t" and vector.values["xml"])
+    texts = (b"ab", b"a\xff\0", b"\xed\xa0\x80\0", b"\xf4\x90\x80\x80\0", b"\xc0\x80\0", b"\xe2\x82\0", b"")
+    begin = vector.data[:40]  # up to the only text
+    messages = [("parameters_t", begin + len(text).to_bytes(4, "big") + text) for text in texts]
+    assert [list(answer) for answer in decode_with(program, messages)] == [["error"]] * len(texts)

@@ -1,5 +1,6 @@
 """The example programs, run as a user runs them."""
 
+import os
 import re
 import signal
 import subprocess
@@ -75,6 +76,22 @@ def test_each_program_prints_the_markers_of_every_frame(endpoint: str, program: 
         text = output_until_the_end(process)
     assert process.returncode == 0, text
     assert_lines_match_the_scene(text)
+
+
+JOIN = ExampleProgram("join.py", (sys.executable, "join.py"), ("--connect", "{endpoint}"))
+
+
+@pytest.mark.parametrize(
+    "program", [*(program for program in PROGRAMS if program.arguments is not None), JOIN], ids=str
+)
+def test_each_program_says_in_a_sentence_that_it_cannot_receive(program: ExampleProgram) -> None:
+    program.build()
+    run = subprocess.run(
+        program.run_command(f"tcp/127.0.0.1:{free_port()}"), cwd=EXAMPLES, capture_output=True, text=True,
+        env={**os.environ, "LCM_DEFAULT_URL": "nothing of LCM"}, check=False, timeout=30,
+    )  # fmt: skip
+    assert (run.returncode, run.stdout) == (1, "")
+    assert re.match(r"(?i)cannot (open|receive from) (LCM|Zenoh)", run.stderr.splitlines()[-1])
 
 
 @pytest.mark.parametrize("program", [program for program in PROGRAMS if program.target], ids=str)

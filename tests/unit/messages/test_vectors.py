@@ -11,7 +11,7 @@ from gateway.messages.encode import MESSAGE_TYPES, encode_message
 from gateway.messages.stamp import Stamp
 from gateway.messages.tool_pose import tool_poses
 from gateway.rtc3d.components import ComponentType
-from tests.message_vectors import FOLDER, VECTORS, MessageVector, difference
+from tests.message_vectors import FOLDER, VECTORS, MessageVector, difference, to_vector_values
 from tests.unit.messages.samples import received
 from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, SHORT_EVENTS, TOOLS, ComponentVector
 
@@ -19,15 +19,6 @@ STAMP = Stamp(1_700_000_000_000_001, 1_700_000_000_000_000, session=3, parameter
 SEQUENCE = 41
 
 each_vector = pytest.mark.parametrize("vector", VECTORS, ids=str)
-
-
-def to_vector_values(value: Any) -> Any:
-    """Return an LCM object as in the vectors: numbers that JSON cannot hold are texts."""
-    if hasattr(value, "__slots__"):
-        return {name: to_vector_values(getattr(value, name)) for name in value.__slots__}
-    if isinstance(value, list | tuple):
-        return [to_vector_values(item) for item in value]
-    return str(value) if isinstance(value, float) and value - value != 0 else value
 
 
 def from_vector_values(lcm_type: Any, values: dict[str, Any]) -> Any:
