@@ -24,9 +24,9 @@ import zenoh
 MAX_FRAMES = 1000  # of markers that wait for analog samples: 5 s at 200 Hz
 MAX_SAMPLES = 20_000  # analog samples that wait for a frame of markers: 10 s at 2000 Hz
 MARKERS, ANALOG = "3d", "analog"
-ITEMS = {
-    MARKERS: np.dtype([(name, ">f4") for name in ("x", "y", "z", "reliability")]),
-    ANALOG: np.dtype(">f4"),
+TYPES = {  # the fingerprint of the messages, and one item of them
+    MARKERS: ("e95d5a478ce229e4", np.dtype([(name, ">f4") for name in ("x", "y", "z", "reliability")])),
+    ANALOG: ("cd43a9dd46669bec", np.dtype(">f4")),
 }
 
 
@@ -85,8 +85,11 @@ class Join:
 
 def decode(component: str, message: bytes) -> Timed:
     """Return the frame or sample in a message. Raises ValueError or struct.error."""
+    fingerprint, item = TYPES[component]
     frame_number, timestamp_us, num_items = struct.unpack_from(">iqi", message, 40)
-    return Timed(timestamp_us, frame_number, np.frombuffer(message, ITEMS[component], num_items, offset=56))
+    if message[:8].hex() != fingerprint or len(message) != 56 + num_items * item.itemsize:
+        raise ValueError(f"{len(message)} bytes for {num_items} items of {component}")
+    return Timed(timestamp_us, frame_number, np.frombuffer(message, item, offset=56))
 
 
 def print_pair(frame: Timed, samples: list[Timed]) -> None:
@@ -94,8 +97,8 @@ def print_pair(frame: Timed, samples: list[Timed]) -> None:
     text = f"at {frame.timestamp_us / 1e6:.4f} s: {in_view} markers in view (frame {frame.frame_number})"
     if samples:
         numbers = f"{samples[0].frame_number} to {samples[-1].frame_number}"
-        means = np.mean([sample.items for sample in samples], axis=0)
-        text += f", {len(samples)} analog samples (frames {numbers}), mean of channel 1: {means[0]:.3f}"
+        mean = np.mean([sample.items[0] if len(sample.items) else np.nan for sample in samples])
+        text += f", {len(samples)} analog samples (frames {numbers}), mean of channel 1: {mean:.3f}"
     print(text)
 
 

@@ -217,7 +217,7 @@ function frames = decode_all(type, bytes, starts, lengths, channel)
     starts = starts(num_items >= 0);
     num_items = num_items(num_items >= 0);
     frames = struct('type', type);
-    counts = unique([num_items; 0]);
+    counts = unique([num_items; isempty(layout.count)]); % at least one, for the fields, even if there is no message
     for count = counts(end:-1:1)' % the messages with the same number of items at once, the most items first
         rows = num_items == count;
         [head, items] = decode(layout, bytes, starts(rows), count);

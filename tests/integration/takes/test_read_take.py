@@ -11,6 +11,7 @@ import pytest
 from gateway.rtc3d.components import ComponentType
 from gateway.takes import open_take
 from tests.example_programs import EXAMPLES, PROGRAMS
+from tests.message_vectors import VECTORS
 from tests.takes import description, frame, log_bytes, markers, parameters, write_take
 
 [OCTAVE] = [program for program in PROGRAMS if program.name.startswith("Octave")]
@@ -107,6 +108,19 @@ def test_frames_may_have_different_numbers_of_items(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found("EVENT", "event_timestamp"), [2**60, -5, 8])
     np.testing.assert_array_equal(found("EVENT", "frame_number"), [1, 2, 2])
     assert found.channels == {"MOCAP_LAB_3D", "MOCAP_LAB_EVENT", "MOCAP_LAB_PARAMETERS"}
+
+
+def test_poses_of_tools_have_a_row_for_each_message(tmp_path: Path) -> None:
+    poses = [vector for vector in VECTORS if vector.type_name == "tool_pose_t"]
+    messages = [("MOCAP_LAB_6D_TOOL_1", vector.data) for vector in poses]
+    malformed = [("MOCAP_LAB_6D_TOOL_2", poses[0].data[:-1])]
+    found = OctaveTake(write_take(tmp_path / "take.lcmlog", [*messages, *malformed, markers(2, 1)]), tmp_path)
+    for field in ("visible", "position_m", "orientation_xyzw", "error_m"):
+        expected = np.array([vector.values[field] for vector in poses], float)  # "nan" becomes NaN
+        np.testing.assert_allclose(found("6D_TOOL_1", field), expected, rtol=1e-6)
+    np.testing.assert_array_equal(found("6D_TOOL_1", "sequence"), [each.values["sequence"] for each in poses])
+    assert found("6D_TOOL_2", "position_m").shape == (0, 3)
+    assert "MOCAP_LAB_6D_TOOL_2: ignored 1 malformed messages" in found.warnings
 
 
 def test_damage_and_malformed_messages_are_skipped_with_a_warning(tmp_path: Path) -> None:

@@ -1,14 +1,18 @@
 """How examples/join.py pairs frames of markers with analog samples."""
 
 import importlib.util
+import struct
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from gateway.rtc3d.components import ComponentType
 from tests.joined_components import SCENARIOS, Pair, Scenario
+from tests.takes import frame, markers
 
 EXAMPLE = Path(__file__).parents[3] / "examples/join.py"
+_, MESSAGE = markers(2, 7)
 
 
 @pytest.fixture(scope="module")
@@ -55,3 +59,26 @@ def test_frames_without_samples_do_not_fill_the_memory(example: Any) -> None:
         for timestamp_us in range(example.MAX_FRAMES + 10)
     )
     assert num_pairs == 9  # the first frame has no frame before it
+
+
+@pytest.mark.parametrize(
+    ("channels", "mean"),
+    [([[1.0, 9.0], [3.0, 9.0]], "2.000"), ([[], []], "nan"), ([[1.0], [3.0, 9.0]], "2.000")],
+)
+def test_samples_may_have_any_number_of_channels(
+    example: Any, capsys: pytest.CaptureFixture[str], channels: list[list[float]], mean: str
+) -> None:
+    samples = [example.decode("analog", frame(ComponentType.ANALOG, each, 7)[1]) for each in channels]
+    example.print_pair(example.decode("3d", MESSAGE), samples)
+    text = capsys.readouterr().out
+    assert text.endswith(f"2 analog samples (frames 7 to 7), mean of channel 1: {mean}\n")
+
+
+@pytest.mark.parametrize(
+    "message",
+    [MESSAGE[:-1], MESSAGE + b"x", MESSAGE[:52] + b"\xff" * 4 + MESSAGE[56:], bytes(8) + MESSAGE[8:], b""],
+    ids=["too short", "too long", "a negative number of items", "another fingerprint", "empty"],
+)
+def test_malformed_messages_are_errors(example: Any, message: bytes) -> None:
+    with pytest.raises((ValueError, struct.error)):
+        example.decode("3d", message)
