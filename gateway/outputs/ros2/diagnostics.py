@@ -2,7 +2,7 @@
 
 import logging
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, Final
 
 import zenoh
@@ -24,6 +24,14 @@ ERROR: Final = 2
 _LEVELS: Final = {"streaming": OK, "idle": OK, "no measurement": WARN}
 """By the state of a stream; all other states are errors."""
 
+_MAX_LABEL_CHARS: Final = 100
+"""How much of a label is published each second."""
+
+Names = Mapping[str, Mapping[str, str]]
+"""Names in topics, by the component's key and by label."""
+
+NO_NAMES: Final[Names] = {}
+
 _MAX_PREVIOUS_US: Final = 3_000_000
 """The greatest age of a previous status. There is one each second, while somebody subscribes."""
 
@@ -31,10 +39,16 @@ logger = logging.getLogger(__name__)
 
 
 class DiagnosticsPublisher:
-    """Publishes each ``status_t`` of a source on /diagnostics."""
+    """Publishes each ``status_t`` of a source on /diagnostics.
 
-    def __init__(self, topic: RosTopic, router: RouterSession, sender: Sender) -> None:
+    ``names`` returns what ``Output.topic_names`` does. The sending thread calls it.
+    """
+
+    def __init__(
+        self, topic: RosTopic, names: Callable[[], Names], router: RouterSession, sender: Sender
+    ) -> None:
         self._topic = topic
+        self._names = names
         self._router = router
         self._sender = sender
         self._defects = DefectLog(logger, "ros2 diagnostics")
@@ -59,7 +73,7 @@ class DiagnosticsPublisher:
     def _send(self, message: bytes) -> None:
         try:
             previous, self._previous = self._previous, decode(message)
-            statuses = diagnostics_of(self._previous, previous)
+            statuses = diagnostics_of(self._previous, previous, self._names())
             self._topic.put(diagnostic_array(cdr.stamp(self._previous.utime), statuses), time.time_ns())
         except zenoh.ZError as error:
             logger.debug("ros2: publishing diagnostics: %s", zenoh_reason(error))
@@ -71,8 +85,10 @@ class DiagnosticsPublisher:
         self._is_closed = True
 
 
-def diagnostics_of(status: Any, previous: Any = None) -> list[DiagnosticStatus]:
+def diagnostics_of(status: Any, previous: Any = None, names: Names = NO_NAMES) -> list[DiagnosticStatus]:
     """Return what a decoded ``status_t`` says: one status per stream and output, and the coordinate frame.
+
+    There is one more for items whose topics have other ``names`` than their labels.
 
     What has lost messages since ``previous``, the ``status_t`` before, gets a warning. If that is missing or
     old, nobody knows when they were lost.
@@ -84,6 +100,7 @@ def diagnostics_of(status: Any, previous: Any = None) -> list[DiagnosticStatus]:
         *(_stream(name, status.server, stream, lost) for stream in status.streams),
         *(_output(name, status.server, output, lost) for output in status.outputs),
         _frame(name, status),
+        *([_labels(name, status.server, names)] if any(names.values()) else ()),
     ]
 
 
@@ -98,6 +115,16 @@ def _frame(name: str, status: Any) -> DiagnosticStatus:
     if not status.metres_per_unit:
         level, message = WARN, f"{status.frame_id}: the server's unit of length is unknown"
     return DiagnosticStatus(level, f"{name} coordinate frame", message, status.server, values)
+
+
+def _labels(name: str, server: str, names: Names) -> DiagnosticStatus:
+    """Return the names in topics by component and label, for nodes that look for a label."""
+    values = {
+        f"{component} {label[:_MAX_LABEL_CHARS]}": part
+        for component, parts in names.items()
+        for label, part in parts.items()
+    }
+    return DiagnosticStatus(OK, f"{name} names", "labels that are no names of ROS", server, values)
 
 
 def _stream(name: str, server: str, stream: Any, lost: Mapping[str, int]) -> DiagnosticStatus:

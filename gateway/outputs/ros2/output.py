@@ -104,7 +104,8 @@ class Ros2Output(Output):
     def publisher(self, topic: Topic) -> Publisher:
         """Return the publisher of diagnostics for the status; other topics have nothing for ROS."""
         if topic.path == _STATUS:
-            return DiagnosticsPublisher(self._diagnostics, self._router, self)
+            names = functools.partial(self.topic_names, topic.source)
+            return DiagnosticsPublisher(self._diagnostics, names, self._router, self)
         return IgnoringPublisher()
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:

@@ -6,8 +6,9 @@ import rtc3d
 from gateway.errors import OutputError
 from gateway.messages.topics import Topic
 from gateway.outputs.ros2.diagnostics import diagnostics_of
+from gateway.rtc3d.parameters import Plate
 from tests import statuses
-from tests.ros_lab import STAMP, UTIME, RosLab, seconds
+from tests.ros_lab import STAMP, UTIME, RosLab, parameters, seconds
 from tests.waiting import wait_until
 
 
@@ -62,6 +63,21 @@ def example_status() -> bytes:
     status.num_outputs = 1
     encoded: bytes = status.encode()
     return encoded
+
+
+def test_the_names_of_labels_that_ros_cannot_use_are_shown(lab: RosLab) -> None:
+    lab.source(given=parameters(("Left Foot", "wand", "x" * 200), plates=(Plate("1", "left"),)))
+    publisher = lab.output.publisher(Topic("lab", ("status",), "rtc3d.status_t"))
+    lab.hear_all()
+    publisher.publish(example_status())
+    wait_until(lambda: lab.received["/diagnostics"])
+    names = lab.received["/diagnostics"][0].message.status[-1]
+    assert (names.level, names.name) == (0, "rtc3d_gateway: lab names")
+    assert {each.key: each.value for each in names.values} == {
+        "6d Left Foot": "Left_Foot",
+        "6d " + "x" * 100: "x" * 48,
+        "force left": "force_1",
+    }
 
 
 def test_what_loses_messages_gets_a_warning_until_it_loses_no_more() -> None:
