@@ -8,6 +8,8 @@ import time
 
 import numpy as np
 import pytest
+import zenoh
+import zenoh.ext
 
 from gateway.errors import OutputError
 from gateway.messages.coordinate_frame import CoordinateFrame
@@ -152,6 +154,19 @@ def test_domain_namespace_distribution_and_qos(settings: dict[str, object], toke
         assert key in lab.keys
         [node] = [each for each in lab.tokens() if "/NN/" in each]
         assert token.format(zid=node.split("/")[2]) in lab.tokens()
+
+
+def test_a_subscription_of_transient_local_durability_gets_messages_too(lab: RosLab) -> None:
+    publisher = lab.source(given=parameters(markers=1))
+    history = zenoh.ext.HistoryConfig(detect_late_publishers=True, max_samples=5)
+    received: list[zenoh.Sample] = []
+    # As rmw_zenoh_cpp subscribes for transient_local.
+    zenoh.ext.declare_advanced_subscriber(
+        *(lab.peer, "0/mocap/lab/markers/**", received.append), history=history, subscriber_detection=True
+    )
+    wait_until(lambda: publisher.wanted)
+    publisher.publish(frame_of((ComponentType.MARKERS, [(1, 2, 3, 0)])), stamp(), 0, ALL)
+    wait_until(lambda: received)
 
 
 # Messages ------------------------------------------------------------------------------------
