@@ -214,7 +214,7 @@ class ClientConnection(asyncio.BufferedProtocol):
             if not self.transport.is_closing():
                 self.session.drop_due_frames(elapsed_us)
             return
-        for packet, components in self.session.due_frames(elapsed_us):
+        for packet, components, _ in self.session.due_frames(elapsed_us):
             self.send(packet)
             self.sent_counts.add(components)
             self._owner.sent_counts.add(components)

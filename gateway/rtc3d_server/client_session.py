@@ -70,6 +70,8 @@ class ClientSession:
         """The byte order of the client's data frames (§4.3)."""
         self.frames_dropped = 0
         """The number of stream frames that were dropped because the client or the server was late."""
+        self.frames_without_events = 0
+        """The number of frames that lack events, because too many waited for the client."""
         self.is_recording = False
         """Whether the client started a recording, as WaveFront's clients do (field notes 16 and 18)."""
         self.said_bye = False
@@ -217,7 +219,9 @@ class ClientSession:
             return frames.packet(self.byte_order, tick)
         events_from_us = time_us if self._events_from_us is None else self._events_from_us
         self._events_from_us = max(events_from_us, time_us + 1)
-        return frames.packet(self.byte_order, tick, events_from_us)
+        packet = frames.packet(self.byte_order, tick, events_from_us)
+        self.frames_without_events += packet.lacks_events
+        return packet
 
     def _set_recording(self, *, start: bool) -> None:
         self.is_recording = start

@@ -21,10 +21,11 @@ NOT_YET_US: Final = 2**63 - 1
 
 
 class DataPacket(NamedTuple):
-    """A type-3 packet's bytes and the components in it."""
+    """A type-3 packet's bytes, the components in it, and whether it lacks events that are not kept."""
 
     packet: bytes
     components: tuple[ComponentType, ...]
+    lacks_events: bool = False
 
 
 class FrameSource(Protocol):

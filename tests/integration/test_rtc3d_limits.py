@@ -178,6 +178,19 @@ async def test_a_slow_client_loses_only_its_own_frames_and_no_event(
     assert caplog.text.count("lab to rtc3d: client") == 1
 
 
+async def test_events_that_wait_for_too_long_are_counted_and_logged_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(live_frames, "KEPT_EVENTS", 3)
+    async with playing() as (_, gateway), connected(gateway) as client:
+        await client.ask("StreamFrames FrequencyDivisor:100 3D Events")
+        assert [len(events_in((await client.read())[1])) for _ in range(3)][1:] == [3, 3]
+        await until(lambda: any(loss.messages >= 2 for loss in losses_of(gateway)))
+        [loss] = losses_of(gateway)
+    assert loss.cause == SLOW_CLIENT
+    assert caplog.text.count("has not taken frames for so long that events are dropped") == 1
+
+
 async def test_clients_that_are_too_many_are_turned_away() -> None:
     async with playing(rtc3d={"max_clients": 2}) as (_, gateway):
         async with connected(gateway) as first, connected(gateway) as second:

@@ -90,12 +90,14 @@ class Kept(Generic[_Item]):
         for index in range(max(0, number - self.first), len(self._items)):
             yield self._items[index]
 
-    def append(self, item: _Item) -> None:
-        """Append an item, and drop the oldest ones that are too many."""
+    def append(self, item: _Item) -> _Item | None:
+        """Append an item, and drop the oldest ones that are too many; return the last one dropped."""
         self._items.append(item)
         self._bytes += self._num_bytes(item)
+        dropped = None
         while len(self._items) > self._most or (self._bytes > self._max_bytes and len(self._items) > 1):
-            self.pop_oldest()
+            dropped = self.pop_oldest()
+        return dropped
 
     def pop_oldest(self) -> _Item:
         """Drop the oldest item and return it. Raises IndexError if there is none."""

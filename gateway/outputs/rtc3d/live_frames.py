@@ -1,6 +1,6 @@
 """The frames of a live source that have certain components, joined by time stamp where they come apart."""
 
-from bisect import bisect_left, bisect_right
+from bisect import bisect_right
 from collections import deque
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
@@ -42,7 +42,9 @@ _FORGOTTEN_US: Final = -1  # the time of a frame that is not kept: long ago
 
 _KEPT_FRAMES: Final = 1024
 _KEPT_SAMPLES: Final = 2048
-_KEPT_EVENTS: Final = 4096
+KEPT_EVENTS: Final = 4096
+"""How many frames with events are kept for clients that do not read, or ask for few frames."""
+
 _KEPT_BYTES: Final = 8 * 1024 * 1024
 _CACHED_PACKETS: Final = 64  # clients with equal streams share them
 
@@ -94,7 +96,8 @@ class LiveFrames:
         self._announced_hz = announced_hz
         self._next_arrival = arrivals.frames.first
         self._frames: Kept[_LiveFrame] = Kept(_KEPT_FRAMES, _KEPT_BYTES, _num_bytes)
-        self._events: Kept[Events] = Kept(_KEPT_EVENTS, _KEPT_BYTES, _num_bytes)
+        self._events: Kept[Events] = Kept(KEPT_EVENTS, _KEPT_BYTES, _num_bytes)
+        self._dropped_event_us = -1  # when the newest events came that are not kept any more
         # Frames that have arrived while it is not known yet what sets the rate; None once it is.
         self._undecided: Kept[Arrival] | None = Kept(_KEPT_SAMPLES, _KEPT_BYTES, _num_bytes)
         self._waiting: deque[Arrival] = deque()
@@ -136,10 +139,17 @@ class LiveFrames:
         """See FrameSource. Events of several frames become one component."""
         if events_from_us is None or not self._events or self._events.newest.time_us < events_from_us:
             return self._packet(byte_order, tick, 0, 0)
-        kept = list(self._events.since(self._events.first))
-        first = bisect_left(kept, events_from_us, key=_time_us)
-        end = bisect_right(kept, self._frames[tick].time_us, key=_time_us)
-        return self._packet(byte_order, tick, self._events.first + first, self._events.first + end)
+        first = self._first_event_from(events_from_us)
+        packet = self._packet(byte_order, tick, first, self._first_event_from(self._frames[tick].time_us + 1))
+        return packet._replace(lacks_events=True) if self._dropped_event_us >= events_from_us else packet
+
+    def _first_event_from(self, time_us: int) -> int:
+        """Return the number of the first events that came at this time or later."""
+        events = self._events
+        number = events.end  # most clients need only the newest
+        while number > events.first and events[number - 1].time_us >= time_us:
+            number -= 1
+        return number
 
     def _packet(self, byte_order: ByteOrder, tick: int, first_event: int, end_event: int) -> DataPacket:
         key = (byte_order, tick, first_event, end_event)
@@ -209,6 +219,7 @@ class LiveFrames:
         self._frames.clear()
         self._packets.clear()
         self._events.clear()
+        self._dropped_event_us = -1
         self._waiting.clear()
         self._samples.clear()
         self._joined.clear()
@@ -242,7 +253,9 @@ class LiveFrames:
         composition = arrival.composition
         has_events = self.has_events and composition.has_events
         if has_events:
-            self._events.append(events_of(arrival))
+            dropped = self._events.append(events_of(arrival))
+            if dropped is not None:
+                self._dropped_event_us = dropped.time_us
         slowest = self._slowest_stream(arrival.time_us)
         if self._measured.isdisjoint(self._arrivals.stream_of):
             if has_events or slowest == arrival.stream:

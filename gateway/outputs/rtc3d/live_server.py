@@ -13,6 +13,7 @@ from gateway.log import EventLog
 from gateway.losses import Losses
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.rtc3d.client_filter import MAX_HELD_PACKETS, ClientFilter, ControlRecording
+from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS
 from gateway.outputs.rtc3d.live_scene import LiveScene
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame
@@ -93,7 +94,8 @@ class LiveServer(RtServer):
         self._ending: asyncio.TimerHandle | None = None  # waits for the last frames, before No Data
         self._last_frame_s = -math.inf
         self._heard = asyncio.Event()  # set once anything is known of the source
-        self._num_counted: dict[ClientConnection, int] = {}  # dropped frames that are in the losses
+        # How many dropped frames and frames without events of each client are in the losses.
+        self._num_counted: dict[ClientConnection, tuple[int, int]] = {}
         self.disk = WorkerThread(f"{state.source} files")
         """Reads C3D files."""
 
@@ -298,17 +300,29 @@ class LiveServer(RtServer):
         _log.debug("%s: %s", self._state.source, text)
 
     def _count_dropped(self, connection: ClientConnection) -> None:
-        num_dropped = connection.session.frames_dropped
-        num_new = num_dropped - self._num_counted.get(connection, 0)
-        if num_new and self._state.losses is not None:
-            self._num_counted[connection] = num_dropped
-            self._state.losses.lost(
+        losses = self._state.losses
+        if losses is None:
+            return
+        session = connection.session
+        frames, lacking = self._num_counted.get(connection, (0, 0))
+        self._num_counted[connection] = (session.frames_dropped, session.frames_without_events)
+        if num_new := session.frames_dropped - frames:
+            losses.lost(
                 SLOW_CLIENT,
                 f"client {connection.name} does not read fast enough; only its own frames are dropped; check "
                 "that program, or let it ask for fewer frames",
                 messages=num_new,
                 frames=num_new,
                 level=logging.DEBUG,  # reading_stopped has logged it
+            )
+        if num_new := session.frames_without_events - lacking:
+            losses.lost(
+                SLOW_CLIENT,
+                f"client {connection.name} has not taken frames for so long that events are dropped: "
+                f"{KEPT_EVENTS} frames with events wait for it; check that program, or let it ask for more "
+                "frames",
+                messages=num_new,
+                frames=num_new,
             )
 
     def _give_up(self) -> None:

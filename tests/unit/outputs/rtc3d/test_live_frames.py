@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from gateway.outputs.rtc3d.live_frames import WAIT_US
+from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS, WAIT_US
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS
 from tests.unit.outputs.rtc3d.live_client import (
@@ -170,6 +170,23 @@ def test_no_event_is_lost_at_a_low_rate() -> None:
     assert [(each.frame_number, each.timestamp_us) for each in events] == [
         (1, 10_000), (5, 50_000), (9, 90_000),
     ]  # fmt: skip
+
+
+def test_a_client_that_lacks_events_is_counted() -> None:
+    source = LiveSource()
+    slow, other = source.client(), source.client()
+    slow.send("StreamFrames FrequencyDivisor:5000 3D Events")
+    other.send("StreamFrames 3D Events")
+    for number in range(1, 5002):
+        source.arrive(body(markers(number, 10_000 * number), event(number, 10_000 * number, number)))
+    _, frame = slow.take()
+    assert [item[0] for item in frame[1].items] == list(range(5002 - KEPT_EVENTS, 5002))
+    assert (slow.session.frames_without_events, other.session.frames_without_events) == (1, 0)
+    for number in range(5002, 10_002):
+        events = [event(number, 10_000 * number, number)] if number % 10 == 0 else []
+        source.arrive(body(markers(number, 10_000 * number), *events))
+    assert [len(frame[1].items) for frame in slow.take()] == [500]
+    assert slow.session.frames_without_events == 1
 
 
 def test_events_without_other_components_are_frames_of_their_own() -> None:
