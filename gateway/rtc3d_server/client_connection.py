@@ -21,7 +21,7 @@ MAX_COMMAND_BYTES: Final = 64 * 1024
 """The largest packet that a client may send."""
 
 MAX_UNREAD_BYTES: Final = 4 * 1024 * 1024
-"""How many bytes are kept for a client that does not read; beyond this, its frames are dropped."""
+"""How many bytes are kept at most for a client that does not read; beyond this, its frames are dropped."""
 
 MAX_COMMANDS_PER_S: Final = 1000.0
 """How many packets of one client are answered in a second; further ones wait."""
@@ -43,6 +43,11 @@ class ConnectionOwner(Protocol):
 
     sent_counts: SentCounts
     """What was sent to all clients."""
+
+    @property
+    def max_unread_bytes(self) -> int:
+        """How many bytes are kept for a client that does not read."""
+        ...
 
     @property
     def scene(self) -> Scene:
@@ -112,7 +117,7 @@ class ClientConnection(asyncio.BufferedProtocol):
         self._commands = TokenBucket(MAX_COMMANDS_PER_S)
         self._is_processing = False  # whether _process_inbox is to be called
         self._is_held = False  # whether the packets in _inbox wait for the answer to the one before
-        self._is_full = False  # whether MAX_UNREAD_BYTES wait for the client to read
+        self._is_full = False  # whether as many bytes as may wait for the client to read
         self._was_full = False  # whether it has been full before
         self._has_ended = False  # whether the client has closed its sending half
         self._first_sent_s: float | None = None  # when the first frame was sent, on the monotonic clock
@@ -138,7 +143,7 @@ class ClientConnection(asyncio.BufferedProtocol):
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         """See asyncio.Protocol."""
         self.transport = cast(asyncio.Transport, transport)
-        self.transport.set_write_buffer_limits(high=MAX_UNREAD_BYTES)
+        self.transport.set_write_buffer_limits(high=self._owner.max_unread_bytes)
         address, port = transport.get_extra_info("peername")[:2]
         self.session.name = f"{address}:{port}"
         self.filter = self._owner.new_filter(self)

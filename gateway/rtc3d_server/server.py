@@ -66,6 +66,11 @@ class RtServer:
         return self._measurement.scene
 
     @property
+    def max_unread_bytes(self) -> int:
+        """How many bytes are kept for a client that does not read."""
+        return MAX_UNREAD_BYTES
+
+    @property
     def is_listening(self) -> bool:
         """Whether clients can connect."""
         return self._server is not None and self._server.is_serving()

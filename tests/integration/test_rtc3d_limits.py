@@ -206,6 +206,13 @@ async def test_clients_that_are_too_many_are_turned_away() -> None:
             assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
 
 
+async def test_many_clients_together_have_a_limit() -> None:
+    async with playing(rtc3d={"max_clients": 1000}) as (_, gateway), connected(gateway) as client:
+        await client.ask("Version 1.0")
+        [connection] = gateway.server.connections
+        assert connection.transport.get_write_buffer_limits()[1] * 1000 <= 512 * 2**20
+
+
 async def test_a_connection_without_a_command_makes_room_for_a_client() -> None:
     async with (
         playing(rtc3d={"max_clients": 2}) as (_, gateway),

@@ -69,9 +69,15 @@ def _is_rt_server(host: str, port: int, seconds: float) -> bool:
         with socket.create_connection((from_this_computer(host), port), timeout=seconds) as tcp:
             tcp.sendall(command)
             header = tcp.recv(PACKET_HEADER_BYTES, socket.MSG_WAITALL)
+            if len(header) < PACKET_HEADER_BYTES:
+                return False
+            size, packet_type = PACKET_HEADER.unpack(header)
+            if packet_type not in {PacketType.ERROR, PacketType.COMMAND}:
+                return False
+            if not PACKET_HEADER_BYTES <= size <= _MAX_REPLY_BYTES:
+                return False
+            # The whole reply, because closing a connection with unread bytes resets it.
+            tcp.recv(size - PACKET_HEADER_BYTES, socket.MSG_WAITALL)
     except OSError:
         return False
-    if len(header) < PACKET_HEADER_BYTES:
-        return False
-    size, packet_type = PACKET_HEADER.unpack(header)
-    return packet_type in {PacketType.ERROR, PacketType.COMMAND} and size <= _MAX_REPLY_BYTES
+    return True

@@ -30,6 +30,9 @@ SLOW_CLIENT: Final = "slow client"
 FILE: Final = "C3D file"
 """The cause of C3D files that a client did not get."""
 
+_MAX_UNREAD_IN_ALL: Final = 512 * 1024 * 1024
+"""How many bytes are kept at most for all clients of a source together."""
+
 _NO_FRAMES_S: Final = 2.0
 """How long a client waits for frames before it gets No Data, if it is unknown whether a measurement runs."""
 
@@ -178,6 +181,11 @@ class LiveServer(RtServer):
         elapsed_us = super().elapsed_us()
         return None if elapsed_us is None else max(elapsed_us, self._live_scene.newest_us)
 
+    @property
+    def max_unread_bytes(self) -> int:
+        """See RtServer."""
+        return min(MAX_UNREAD_BYTES, _MAX_UNREAD_IN_ALL // self.max_clients)
+
     def frames(self, components: Sequence[ComponentType]) -> FrameSource:
         """See ConnectionOwner. Frames that no client asks for are not made."""
         return self._live_scene.frames(components)
@@ -283,8 +291,8 @@ class LiveServer(RtServer):
     def reading_stopped(self, connection: ClientConnection, *, is_first: bool) -> None:
         """See ConnectionOwner."""
         text = (
-            f"client {connection.name} does not read: {MAX_UNREAD_BYTES >> 20} MiB wait for it; its frames "
-            "are dropped until it reads again; check that program, or the network to it"
+            f"client {connection.name} does not read: {self.max_unread_bytes / 2**20:.2g} MiB wait for it; "
+            "its frames are dropped until it reads again; check that program, or the network to it"
         )
         self._events.log(logging.WARNING if is_first else logging.DEBUG, text, "slow")
 

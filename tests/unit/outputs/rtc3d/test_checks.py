@@ -1,6 +1,7 @@
 """The doctor's checks of the output for RTC3D clients."""
 
 import asyncio
+import logging
 import socket
 from contextlib import closing
 
@@ -12,6 +13,7 @@ from gateway.outputs.rtc3d.settings import Rtc3dSettings
 from gateway.simulator.simulator import Simulator
 from tests.networks import free_port
 from tests.unit.rtc3d_server.counting_scene import CountingScene
+from tests.waiting import wait_until_async
 
 
 def findings(sources: list[str], ports: dict[str, int], host: str = "127.0.0.1") -> list[Finding]:
@@ -54,8 +56,11 @@ def test_an_address_of_another_computer_fails() -> None:
     assert finding.result is Result.FAILING
 
 
-async def test_the_port_of_a_running_gateway_passes() -> None:
+async def test_the_port_of_a_running_gateway_passes(caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO)
     async with Simulator(CountingScene()) as server:
         *_, finding = await asyncio.to_thread(findings, ["lab"], {"lab": server.port})
+        await wait_until_async(lambda: "disconnected" in caplog.text)
+    assert "reset" not in caplog.text
     assert finding.result is Result.PASSING
     assert "the gateway, if it runs" in finding.found
