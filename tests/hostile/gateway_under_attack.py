@@ -72,7 +72,7 @@ Source = int | Mapping[str, Any]
 class Report:
     """What happened to the healthy source and the gateway.
 
-    ``arrivals`` has the figures of ``Arrivals.report`` by output and component, and ``recorder_pause_s``.
+    ``arrivals`` has the figures of the recorder's ``Outputs.report``.
     """
 
     arrivals: dict[str, Any]
@@ -144,7 +144,8 @@ class Report:
     def __str__(self) -> str:
         silences = ", ".join(f"{output} {value:.3f} s" for output, value in self.longest_silence_s.items())
         return (
-            f"longest silence {silences} (recorder {self.arrivals['recorder_pause_s']:.3f} s); "
+            f"longest silence {silences} (recorder {self.arrivals['recorder_pause_s']:.3f} s, "
+            f"{self.arrivals['recorder_dropped']} dropped); "
             f"{self.num_missing} of {self.num_received} missing; {self.log_lines_per_minute} lines/min; "
             f"{self.rss_before_kib / 1024:.0f} → {self.rss_after_kib / 1024:.0f} MiB; "
             f"status {self.exit_status} after {self.stop_s:.2f} s"
@@ -170,12 +171,16 @@ def num_missing(arrivals: Mapping[str, Any]) -> int:
     """Return how many messages are missing at both subscribers together.
 
     A message lost behind the gateway is missing in both numbers, a frame lost before it only in the second.
+    On LCM, what the recorder itself does not read in time is not the gateway's loss.
     """
-    return sum(
-        max(report["missing_messages"], report["missing_frames"] if component in FRAME_COMPONENTS else 0)
+    by_output = {
+        output: sum(
+            max(report["missing_messages"], report["missing_frames"] if component in FRAME_COMPONENTS else 0)
+            for component, report in arrivals[output].items()
+        )
         for output in ("zenoh", "lcm")
-        for component, report in arrivals[output].items()
-    )
+    }
+    return by_output["zenoh"] + max(0, by_output["lcm"] - int(arrivals["recorder_dropped"]))
 
 
 def _total(arrivals: Mapping[str, Any], what: str) -> float:

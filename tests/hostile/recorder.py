@@ -14,6 +14,7 @@ import struct
 import sys
 import threading
 import time
+from pathlib import Path
 from typing import Any, Final
 
 import lcm
@@ -90,6 +91,7 @@ class Outputs:
             output: {component: Arrivals() for component in _COMPONENTS} for output in ("zenoh", "lcm")
         }
         self._pause_s = 0.0
+        self._dropped = 0
         threading.Thread(target=self._watch_own_pauses, daemon=True).start()
 
     def _watch_own_pauses(self) -> None:
@@ -120,13 +122,28 @@ class Outputs:
         )
 
     def report(self) -> dict[str, Any]:
-        """Return the reports by output and component, and the longest pause of this process, in s."""
+        """Return the reports by output and component, and what this process itself suffered.
+
+        That is its longest pause, in s, and how many datagrams of LCM it did not read in time.
+        """
         reports: dict[str, Any] = {
             output: {component: arrivals.report() for component, arrivals in components.items()}
             for output, components in self._arrivals.items()
         }
         reports["recorder_pause_s"], self._pause_s = self._pause_s, 0.0
+        dropped_before, self._dropped = self._dropped, _dropped_datagrams()
+        reports["recorder_dropped"] = self._dropped - dropped_before
         return reports
+
+
+def _dropped_datagrams() -> int:
+    """Return how many datagrams the kernel has dropped that this process did not read in time."""
+    mine = set()
+    for file in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):  # the one that lists the folder
+            mine.add(str(file.readlink()).removeprefix("socket:[").removesuffix("]"))
+    rows = [line.split() for line in Path("/proc/net/udp").read_text().splitlines()[1:]]
+    return sum(int(row[-1]) for row in rows if row[9] in mine)
 
 
 def _open_zenoh(endpoint: str) -> zenoh.Session:
