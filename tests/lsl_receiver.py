@@ -63,6 +63,10 @@ class LslReceiver:
                 else:
                     self.samples[name] += zip(report["times"], report["values"], strict=True)
 
+    def forget(self) -> None:
+        """Begin anew with the samples."""
+        self.samples = defaultdict(list)
+
     def close(self) -> None:
         """End the process."""
         self.process.kill()

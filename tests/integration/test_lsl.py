@@ -88,6 +88,12 @@ def has(receiver: LslReceiver, name: str, count: int) -> Callable[[], bool]:
     return lambda: len(receiver.samples[name]) >= count
 
 
+def receive_until_the_clock_is_known(receiver: LslReceiver, rate_hz: int = RATE_HZ) -> None:
+    """Receive lab_3d for the first 2 s, and forget it: the times before were those of the arrival."""
+    wait_until(has(receiver, "lab_3d", 2 * rate_hz), TIMEOUT_S)
+    receiver.forget()
+
+
 def children(process_id: int) -> list[int]:
     """Return the process for LSL of a gateway."""
     listed = subprocess.run(["pgrep", "-P", str(process_id)], capture_output=True, text=True, check=False)
@@ -96,8 +102,9 @@ def children(process_id: int) -> list[int]:
 
 def test_a_recording_has_labels_units_rates_and_capture_times(tmp_path: Path) -> None:
     with running(tmp_path) as lab:
-        began_s = time.monotonic()
         receiver = lab.receive(*NAMES)
+        began_s = time.monotonic()
+        receive_until_the_clock_is_known(receiver)
         wait_until(lambda: all(has(receiver, name, 4)() for name in NAMES), TIMEOUT_S)
         wait_until(has(receiver, "lab_analog", 3 * ANALOG_RATE_HZ), TIMEOUT_S)
         ended_s = time.monotonic()
@@ -180,7 +187,8 @@ def channels(stream: Any) -> list[Any]:
 def test_events_have_their_own_time_between_the_frames(tmp_path: Path) -> None:
     """The simulator's button is pressed for 0.3 s, whatever the rate of the frames is."""
     with running(tmp_path, "--rate", "20", "--analog", "0", "--plates", "0") as lab:
-        receiver = lab.receive("lab_event")
+        receiver = lab.receive("lab_3d", "lab_event")
+        receive_until_the_clock_is_known(receiver, rate_hz=20)
         wait_until(has(receiver, "lab_event", 6), TIMEOUT_S)
     samples = receiver.samples["lab_event"]
     pressed = [time_s for time_s, [text] in samples if text.endswith("ON")]
@@ -247,14 +255,13 @@ def test_a_step_of_the_wall_clock_does_not_disturb_time_stamps(tmp_path: Path, s
         lab = Lab(tmp_path, port)
         lab.start(**clock.environ)
         receiver = lab.receive("lab_3d")
-        # For the first 1.5 s, the gateway does not know the server's clock: times are those of the arrival.
-        known = 2 * RATE_HZ
-        wait_until(has(receiver, "lab_3d", known + 100), TIMEOUT_S)
+        receive_until_the_clock_is_known(receiver)
+        wait_until(has(receiver, "lab_3d", 100), TIMEOUT_S)
         clock.set(step_s)
         wait_until(lambda: "the clock of this computer was set" in lab.log, TIMEOUT_S)
         wait_until(has(receiver, "lab_3d", len(receiver.samples["lab_3d"]) + 100), TIMEOUT_S)
         lab.close()
-    times_s = [time_s for time_s, _ in receiver.samples["lab_3d"][known:]]
+    times_s = [time_s for time_s, _ in receiver.samples["lab_3d"]]
     assert np.diff(times_s).tolist() == pytest.approx([1 / RATE_HZ] * (len(times_s) - 1), abs=5e-3)
 
 
