@@ -12,6 +12,7 @@ import pytest
 from gateway import __version__
 from tests.fresh_clones import (
     COMPILED_MODULES,
+    QUICK_CC,
     ROOT,
     SYSTEM_PYTHON,
     WHEELHOUSE_PYTHON,
@@ -21,7 +22,7 @@ from tests.fresh_clones import (
     skip_if_plain,
 )
 
-# gcc takes a minute for the compiled modules, and several on a busy machine.
+# The compiled modules take a minute on a busy machine.
 pytestmark = [pytest.mark.wheelhouse, pytest.mark.timeout(600)]
 
 _PATH = "/usr/local/bin:/usr/bin:/bin"
@@ -51,7 +52,7 @@ def make_wheel(clone: Path, **environment: str) -> BuiltWheel:
 @pytest.fixture(scope="module")
 def compiled_wheel(tmp_path_factory: pytest.TempPathFactory) -> BuiltWheel:
     """The wheel of this machine: compiled if there is a compiler."""
-    return make_wheel(tmp_path_factory.mktemp("clone"))
+    return make_wheel(tmp_path_factory.mktemp("clone"), CC=QUICK_CC)
 
 
 @pytest.fixture(scope="module")

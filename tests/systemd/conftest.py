@@ -12,6 +12,8 @@ from tests.networks import free_endpoint
 from tests.systemd.machine import CLONE, DROP_INS, Machine, Service
 from tests.systemd.page import commands
 
+QUICKLY = "export CC=/run/repository/tests/quick-cc\n"
+
 
 @pytest.fixture(scope="session")
 def machine() -> Iterator[Machine]:
@@ -25,7 +27,7 @@ def machine() -> Iterator[Machine]:
         booted = Machine(int(process.stdout.readline()))
         clone_into(booted.path(CLONE))
         before = files_in(booted.path(CLONE))
-        booted.install_output = uvloop.run(booted.run_shell(commands("Install", 2))).text
+        booted.install_output = uvloop.run(booted.run_shell(QUICKLY + commands("Install", 2))).text
         booted.left_in_clone = files_in(booted.path(CLONE)) - before
         yield booted
 
