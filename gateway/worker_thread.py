@@ -66,6 +66,21 @@ class WorkerThread:
             del done, call  # or they would stay in memory until the next call
 
 
+async def result_of(call: Future[_Result]) -> _Result:
+    """Return the result of a call that goes on if whoever waits here gives up, or raise its exception.
+
+    An exception that comes after that is nobody's, and no defect.
+    """
+    result = asyncio.wrap_future(call)
+    result.add_done_callback(_retrieve)
+    return await asyncio.shield(result)
+
+
+def _retrieve(result: "asyncio.Future[Any]") -> None:
+    if not result.cancelled():
+        result.exception()  # or asyncio would log that it was never retrieved
+
+
 def make_call(done: Future[_Result], call: Callable[[], _Result]) -> None:
     """Make ``call`` unless ``done`` has been cancelled, and set its result or exception in ``done``."""
     with contextlib.suppress(CancelledError):

@@ -4,13 +4,12 @@ A look-up cannot be cancelled, and without an answer it takes half a minute. So 
 is at most one at a time for a name. asyncio's and uvloop's own look-ups share a few threads.
 """
 
-import asyncio
 import ipaddress
 import socket
 from concurrent.futures import Future
 from typing import Final
 
-from gateway.worker_thread import WorkerThread
+from gateway.worker_thread import WorkerThread, result_of
 
 MAX_ADDRESSES: Final = 8
 """How many addresses of a name are tried."""
@@ -40,7 +39,7 @@ async def look_up(host: str) -> list[str]:
     if found is None:
         found = _look_ups[host] = WorkerThread(f"look-up {host}").submit(lambda: _addresses(host))
     try:
-        return await asyncio.shield(asyncio.wrap_future(found))  # others may wait for it, too
+        return await result_of(found)  # others may wait for it, too
     finally:
         if found.done() and _look_ups.get(host) is found:
             del _look_ups[host]

@@ -1,5 +1,7 @@
 """WorkerThread: a thread that the end of the program does not wait for."""
 
+import asyncio
+import gc
 import subprocess
 import sys
 import threading
@@ -7,7 +9,7 @@ from functools import partial
 
 import pytest
 
-from gateway.worker_thread import WorkerThread
+from gateway.worker_thread import WorkerThread, result_of
 from tests.waiting import wait_until_async
 
 
@@ -43,6 +45,30 @@ async def test_the_age_of_a_call_is_that_of_the_one_in_progress() -> None:
     call.result()
     await worker.run(lambda: None)
     await wait_until_async(lambda: worker.call_age_s == 0)
+
+
+@pytest.mark.parametrize("gives_up", [True, False])
+async def test_an_error_after_the_caller_has_given_up_is_no_defect(gives_up: bool) -> None:
+    released = threading.Event()
+    unhandled: list[object] = []
+    asyncio.get_running_loop().set_exception_handler(lambda _, context: unhandled.append(context))
+
+    def fail() -> None:
+        released.wait()
+        raise OSError("late")
+
+    worker = WorkerThread("test")
+    waiting = asyncio.create_task(result_of(worker.submit(fail)))
+    await asyncio.sleep(0)
+    if gives_up:
+        waiting.cancel()
+    released.set()
+    with pytest.raises(asyncio.CancelledError if gives_up else OSError):
+        await waiting
+    await worker.run(lambda: None)
+    del waiting
+    gc.collect()  # asyncio reports an exception that nobody has retrieved when its future is freed
+    assert unhandled == []
 
 
 async def test_an_idle_thread_ends_and_the_next_call_starts_another(monkeypatch: pytest.MonkeyPatch) -> None:

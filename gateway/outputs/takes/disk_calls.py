@@ -8,7 +8,7 @@ from typing import Final, TypeVar
 
 from gateway.errors import QueryError, TakeError
 from gateway.outputs.takes.disk import Disk, disk_problem
-from gateway.worker_thread import WorkerThread
+from gateway.worker_thread import WorkerThread, result_of
 
 _TIMEOUT_S: Final = 4.0
 """How long a peer waits for the disk."""
@@ -34,7 +34,7 @@ async def disk_result(future: Future[_Result], path: Path, disk: Disk | None = N
     """
     try:
         async with asyncio.timeout(_TIMEOUT_S):
-            return await asyncio.shield(asyncio.wrap_future(future))  # what was asked for happens later
+            return await result_of(future)  # what was asked for happens later
     except TimeoutError:
         problem = "" if disk is None else disk.problem
         text = problem or f"the disk of {path} did not respond within {_TIMEOUT_S:g} s; check it"
