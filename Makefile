@@ -16,7 +16,8 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 # What a wheel is built from.
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-integration test-commands test-takes test-hostile test-contract test-browser test-others test-compiled check lint types contracts generated docs lcm-types examples samples screenshots fuzz soak stops hiroz \
+.PHONY: demo lock test test-integration-1 test-integration-2 test-commands test-takes test-hostile test-ports test-contract test-browser \
+    test-others test-compiled check lint types contracts generated docs lcm-types examples samples screenshots fuzz soak stops hiroz \
     mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
 
 demo: .venv/runtime
@@ -26,21 +27,29 @@ demo: .venv/runtime
 test: .venv/installed
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) tests/with-netns $(BIN)/pytest $(ARGS)
 
-# `make test` in parts, of which `make check` runs several at the same time.
+# `make test` in parts, of which `make check` runs several at the same time. The two halves of the integration tests and
+# of the attacks take as long as each other.
 BROWSER_TESTS := tests/view tests/site
-test-integration: ARGS := 'tests/integration --ignore=tests/integration/takes --ignore=tests/integration/commands'
+INTEGRATION_TESTS := $(wildcard tests/integration/test_[a-k]*.py)
+PORT_ATTACKS := $(addprefix tests/hostile/test_,foxglove.py lsl_ports.py ros2.py rtc3d.py stops.py vrpn.py)
+test-integration-1: ARGS := '$(INTEGRATION_TESTS)'
+test-integration-2: ARGS := '$(filter-out $(INTEGRATION_TESTS),$(wildcard tests/integration/test_*.py))'
 test-commands: ARGS := tests/integration/commands
 test-takes: ARGS := tests/integration/takes
-test-hostile: ARGS := tests/hostile
+test-hostile: ARGS := '$(filter-out $(PORT_ATTACKS),$(wildcard tests/hostile/test_*.py))'
+test-ports: ARGS := '$(PORT_ATTACKS)'
 test-contract: ARGS := tests/contract
 test-browser: ARGS := '$(BROWSER_TESTS)'
 test-others: ARGS := '$(addprefix --ignore=,tests/integration tests/hostile tests/contract $(BROWSER_TESTS))'
-test-integration test-commands test-takes test-hostile test-contract test-browser test-others: .venv/installed
+test-integration-1 test-integration-2 test-commands test-takes test-hostile test-ports test-contract test-browser test-others: .venv/installed
 	$(MAKE) --no-print-directory test ARGS=$(ARGS)
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.
-COMPILED_TESTS := tests/packaging/test_compiled.py tests/property tests/unit/test_log.py \
+PLAIN_PROPERTIES := $(addprefix tests/property/test_,$(addsuffix _properties.py,commands config config_environment \
+    parameters seek_index topics vrpn))
+COMPILED_TESTS := tests/packaging/test_compiled.py tests/unit/test_log.py \
+    $(filter-out $(PLAIN_PROPERTIES),$(wildcard tests/property/test_*.py)) \
     $(addprefix tests/contract/test_,outputs.py back_pressure.py stalled_peers.py) $(wildcard tests/unit/outputs/test_*.py) \
     $(addprefix tests/unit/,messages outputs/zenoh outputs/lcm outputs/takes publish queries recorder rtc3d stream) \
     $(addprefix tests/unit/,subscriber takes) \
@@ -50,14 +59,14 @@ COMPILED_TESTS := tests/packaging/test_compiled.py tests/property tests/unit/tes
 test-compiled: build/compiled/complete
 	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 tests/with-netns $(BIN)/pytest -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
 
-# Each run of pytest has a network namespace of its own, so they do not disturb each other. Most of them wait for most of
-# their time, so four run on two cores. Those of the last line measure delays, or need a core for themselves.
+# Each run of pytest has a network namespace of its own, so they do not disturb each other. Those of the second line wait
+# for most of their time, so six run on two cores. Those of the last line measure delays, or need a core for themselves.
 PARTS_AT_ONCE = $(MAKE) --keep-going --output-sync=target --no-print-directory
 
 check: .venv/installed
-	$(PARTS_AT_ONCE) --jobs=3 lint types contracts generated docs wheelhouse compiled
-	$(PARTS_AT_ONCE) --jobs=4 test-others test-integration test-commands test-takes
-	$(PARTS_AT_ONCE) --jobs=2 test-hostile test-browser test-compiled test-contract
+	$(PARTS_AT_ONCE) --jobs=3 lint contracts generated docs wheelhouse
+	$(PARTS_AT_ONCE) --jobs=6 test-others test-commands test-takes test-integration-2 test-integration-1 compiled types test-contract
+	$(PARTS_AT_ONCE) --jobs=3 test-hostile test-ports test-browser test-compiled
 
 lint: .venv/installed
 	$(BIN)/ruff format --check

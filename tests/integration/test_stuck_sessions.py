@@ -14,7 +14,7 @@ from tests.servers import Client, ScriptedServer, error, markers_frame, ok, pack
 from tests.waiting import wait_until_async
 
 NO_DATA = packet(4)
-MAX_WELL_S = 5.0
+MAX_WELL_S = 10.0
 
 
 def scene() -> SyntheticScene:
@@ -79,10 +79,13 @@ async def test_a_server_that_accepts_and_sends_nothing_is_asked_again_then_left_
 
 
 @pytest.mark.parametrize("hangs_at_first", [True, False])
-@pytest.mark.parametrize("hang_s", [0.5, 1.0, 1.6, 3.0])
-async def test_a_minimal_server_that_hangs_streams_soon_after_it_is_well(
-    hang_s: float, hangs_at_first: bool
-) -> None:
+async def test_a_minimal_server_that_hangs_streams_soon_after_it_is_well(hangs_at_first: bool) -> None:
+    async with asyncio.TaskGroup() as tries:
+        for hang_s in (0.5, 1.0, 1.6, 3.0):
+            tries.create_task(streams_soon_after_a_hang(hang_s, hangs_at_first))
+
+
+async def streams_soon_after_a_hang(hang_s: float, hangs_at_first: bool) -> None:
     async with Simulator(scene()) as simulator:
         simulator.faults.begin(parse_fault("minimal_server"))
         hang = simulator.faults.begin(parse_fault("half_open")) if hangs_at_first else None
