@@ -74,7 +74,7 @@ class LslFramePublisher:
         """Queue a frame. Raises OutputError if too many wait, or if receivers wait for LSL to come back."""
         if self._is_closed:
             raise OutputError("LSL is closed; ask for a new publisher", cause="closed")
-        if not self._processes.are_ready:
+        if not self._processes.is_ready:
             raise OutputError(f"LSL: {self._processes.problem}", cause="not open")
         captured = CapturedFrame(frame, stamp, components, self._times.steady_us(stamp))
         with self._lock:
@@ -117,7 +117,7 @@ class LslFramePublisher:
         self._push(frames, suspended_us)
 
     def _push(self, frames: list[CapturedFrame], suspended_us: int) -> None:
-        if self._processes.are_ready:
+        if self._processes.is_ready:
             self.streams.push(frames, self._processes.wanted, suspended_us)
         else:
             self.streams.count_not_open(len(frames))

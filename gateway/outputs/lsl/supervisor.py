@@ -56,8 +56,8 @@ class LslProcesses:
         self._failures = FailureLog(logger, "lsl")
 
     @property
-    def are_ready(self) -> bool:
-        """Whether samples that are sent reach those who receive them."""
+    def is_ready(self) -> bool:
+        """Whether there is a process that has loaded liblsl."""
         return self._socket is not None and bool(self._report.ready)
 
     @property
