@@ -27,7 +27,7 @@ from gateway.messages.host_time import host_clock
 from gateway.monitoring.http_pages import Page
 from gateway.monitoring.loop_delay import LoopDelay
 from gateway.outputs.guard import health as output_health
-from gateway.outputs.status import OutputStatus
+from gateway.outputs.status import WHOLE_FRAME, OutputStatus
 from gateway.stream.clock import ServerClock
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
@@ -243,7 +243,9 @@ class GatewayCollector(Collector):
                     for sample in _samples(
                         (source.name, output.name),
                         counts(status),
-                        [component.key for component in source.queries.components],
+                        [WHOLE_FRAME]
+                        if status.takes_frames
+                        else [component.key for component in source.queries.components],
                     )
                 ],
             )

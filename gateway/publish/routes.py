@@ -17,7 +17,7 @@ from gateway.messages.topics import Topic
 from gateway.outputs.contract import FramePublisher, Output
 from gateway.outputs.guard import guarded
 from gateway.outputs.pacing import Pacer
-from gateway.outputs.status import OutputStatus
+from gateway.outputs.status import WHOLE_FRAME, OutputStatus
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
 
@@ -56,7 +56,7 @@ class OutputRoute:
         self.source = source
         self.output = output
         self.sent: dict[str, SentCounter] = {} if predecessor is None else predecessor.sent
-        """By component key, or by "status", "clock", "6d/tool" or "frame" (a whole frame)."""
+        """By component key, or by "status", "clock", "6d/tool" or WHOLE_FRAME."""
         self.losses: Losses = (
             Losses(logger, f"{source} to {output.name}") if predecessor is None else predecessor.losses
         )
@@ -87,6 +87,7 @@ class OutputRoute:
             Counter({name: counter.messages for name, counter in sent.items()}),
             self.losses.report(),
             Counter({name: counter.bytes for name, counter in sent.items()}),
+            takes_frames=self.frame_route is not None,
         )
 
     def count_loss(self, error: Exception, frame: object | None) -> None:
@@ -200,7 +201,7 @@ class FrameRoute:
     def __init__(self, output_route: OutputRoute, publisher: FramePublisher) -> None:
         self.publisher = publisher
         self._output_route = output_route
-        self._sent = output_route.sent.setdefault("frame", SentCounter())
+        self._sent = output_route.sent.setdefault(WHOLE_FRAME, SentCounter())
 
     def prepare(self, layout: FrameLayout, wanted: frozenset[ComponentType]) -> bool:
         """Return whether to publish frames of ``layout``; never raises."""

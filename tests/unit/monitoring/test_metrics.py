@@ -21,6 +21,7 @@ from gateway.rtc3d.frames import Frame, encode_frame, split_frame
 from gateway.rtc3d.protocol_state import ProtocolState
 from gateway.stream.state import StreamState
 from tests.configurations import make_settings
+from tests.example_output import ExampleOutput, ExampleSettings
 from tests.toy_output import ToyOutput
 
 STREAMS = (
@@ -149,6 +150,16 @@ async def test_messages_and_bytes_are_counted_by_component_and_output(lab: Lab) 
             labels["component"]: value for labels, value in lab.samples(name) if labels["output"] == "toy"
         }
         assert samples == {"3d": 0, "6d": 0, "analog": 0} | counted
+
+
+async def test_an_output_of_whole_frames_has_one_series_for_them(lab: Lab) -> None:
+    example = ExampleOutput(ExampleSettings(enabled=True, whole_frames=True))
+    example.start()
+    lab.source.fan_out.set_outputs([example])
+    for count in range(2):
+        samples = {labels["component"]: value for labels, value in lab.samples("messages_total")}
+        assert samples == {"frame": count}
+        lab.source.fan_out.publish(analog_frame(), Stamp(2, 1, 1, 1), frozenset({ComponentType.ANALOG}))
 
 
 async def test_frames_are_counted_by_configured_component(lab: Lab) -> None:
