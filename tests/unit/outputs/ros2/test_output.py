@@ -164,7 +164,7 @@ def test_a_subscription_of_transient_local_durability_gets_messages_too(lab: Ros
     zenoh.ext.declare_advanced_subscriber(
         *(lab.peer, "0/mocap/lab/markers/**", received.append), history=history, subscriber_detection=True
     )
-    wait_until(lambda: publisher.wanted)
+    wait_until(lambda: publisher.wants([ComponentType.MARKERS]))
     publisher.publish(frame_of((ComponentType.MARKERS, [(1, 2, 3, 0)])), stamp(), 0, ALL)
     wait_until(lambda: received)
 
