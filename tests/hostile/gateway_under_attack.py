@@ -173,7 +173,7 @@ def num_missing(arrivals: Mapping[str, Any]) -> int:
     A message lost behind the gateway is missing in both numbers, a frame lost before it only in the second.
     On LCM, what the recorder itself does not read in time is not the gateway's loss.
     """
-    by_output = {
+    by_output: dict[str, int] = {
         output: sum(
             max(report["missing_messages"], report["missing_frames"] if component in FRAME_COMPONENTS else 0)
             for component, report in arrivals[output].items()
