@@ -5,6 +5,7 @@ import itertools
 import json
 import socket
 import subprocess
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, Final
@@ -14,6 +15,7 @@ import zenoh
 _LCM_PORTS: Final = itertools.count(7720)
 _PORTS: Final = itertools.cycle(range(10_000, 32_000))
 """Linux chooses from 32768 on, unless it is told another range."""
+_OPEN_TIMEOUT_S: Final = 30.0
 _MULTICAST: Final = ("224.0.0.0/4", "dev", "lo")
 
 
@@ -51,6 +53,18 @@ def open_zenoh(mode: str, *, connect: str | None = None, listen: str | None = No
     """Open a session. The caller must close it, because a process with an open session does not exit."""
     keys = zenoh_keys(mode, connect=connect, listen=listen)
     return zenoh.open(zenoh.Config.from_json5(json.dumps(keys)))
+
+
+def wait_for_zenoh(endpoint: str) -> zenoh.Session:
+    """Open a session that is a client of a gateway, as soon as the gateway listens at ``endpoint``."""
+    deadline_s = time.monotonic() + _OPEN_TIMEOUT_S
+    while True:
+        try:
+            return open_zenoh("client", connect=endpoint)
+        except zenoh.ZError:
+            if time.monotonic() > deadline_s:
+                raise
+            time.sleep(0.05)
 
 
 def lcm_url() -> str:

@@ -22,7 +22,7 @@ import zenoh
 
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.subscriber import QUEUE_MESSAGES
-from tests.networks import open_zenoh
+from tests.networks import wait_for_zenoh
 
 FRAME_COMPONENTS: Final = ("3d", "6d", "analog", "force")
 """The components that every frame of the healthy source has; events are rare."""
@@ -31,7 +31,6 @@ _COMPONENTS: Final = (*FRAME_COMPONENTS, "event")
 _HEADER: Final = struct.Struct(
     ">24xqi4xi"
 )  # fingerprint, both times; sequence, session, version, frame number
-_OPEN_TIMEOUT_S: Final = 30.0
 _TICK_S: Final = 0.01
 
 
@@ -146,15 +145,6 @@ def _dropped_datagrams() -> int:
     return sum(int(row[-1]) for row in rows if row[9] in mine)
 
 
-def _open_zenoh(endpoint: str) -> zenoh.Session:
-    deadline_s = time.monotonic() + _OPEN_TIMEOUT_S
-    while time.monotonic() < deadline_s:
-        with contextlib.suppress(zenoh.ZError):  # the gateway does not listen yet
-            return open_zenoh("client", connect=endpoint)
-        time.sleep(0.05)
-    sys.exit(f"no gateway at {endpoint}")
-
-
 def _serve(outputs: Outputs, messages: lcm.LCM) -> None:
     """Handle the messages of LCM and the lines on stdin."""
     selector = selectors.DefaultSelector()
@@ -181,7 +171,7 @@ def main() -> None:
     messages = open_lcm(receiving_url(url))
     subscription = messages.subscribe(f"MOCAP_{source.upper()}_.*", outputs.receive_lcm)
     subscription.set_queue_capacity(QUEUE_MESSAGES)
-    session = _open_zenoh(endpoint)
+    session = wait_for_zenoh(endpoint)
     session.declare_subscriber(f"mocap/{source}/*", outputs.receive_sample)
     _serve(outputs, messages)
     session.close()

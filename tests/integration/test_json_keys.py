@@ -2,7 +2,6 @@
 
 import json
 import subprocess
-import time
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -17,7 +16,7 @@ from gateway.live.live_data import LiveData
 from gateway.subscriber.subscribe import Transport, subscribe_all
 from gateway.takes.event_log import EventLogReader
 from tests.gateway_process import PROGRAM, program, simulator
-from tests.networks import free_endpoint, open_zenoh, zenoh_keys
+from tests.networks import free_endpoint, wait_for_zenoh, zenoh_keys
 from tests.waiting import wait_until
 
 SCENE: Final = ("--rate", "100", "--analog-rate", "100", "--markers", "12", "--analog", "8", "--tools", "2")
@@ -57,23 +56,12 @@ def lab(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Lab]:
         (folder / "gateway.yaml").write_text(yaml.safe_dump(configuration))
         log = stack.enter_context((folder / "gateway.log").open("wb"))
         stack.enter_context(program("run", "--config", str(folder / "gateway.yaml"), stderr=log))
-        peer = _peer(endpoint)
+        peer = wait_for_zenoh(endpoint)
         stack.callback(peer.close)
         peer.declare_subscriber("mocap/lab/**", lambda sample: everything.update([str(sample.key_expr)]))
         wait_until(lambda: all(everything[f"mocap/lab/{key}/json"] > 1 for key in COMPONENTS))
         wait_until(lambda: any(key.startswith("mocap/lab/6d/") for key in everything))
         yield Lab(endpoint, folder / "takes", peer, everything)
-
-
-def _peer(endpoint: str) -> zenoh.Session:
-    """Return a session as soon as the gateway listens."""
-    deadline_s = time.monotonic() + 30
-    while True:
-        try:
-            return open_zenoh("client", connect=endpoint)
-        except zenoh.ZError:
-            assert time.monotonic() < deadline_s
-            time.sleep(0.1)
 
 
 def run(*arguments: str) -> "subprocess.CompletedProcess[str]":

@@ -1,13 +1,9 @@
-"""``rtc3d-gateway record`` as a program of its own, beside gateways and publishers on real Zenoh and LCM."""
+"""``record`` beside gateways on real Zenoh and LCM: what it writes, with a full disk and a restart, too."""
 
-import os
-import pty
 import re
 import resource
 import signal
 import subprocess
-import sys
-import time
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -20,92 +16,26 @@ import yaml
 import zenoh
 
 from gateway.messages.decode import decode, prefix_of
-from gateway.messages.stamp import PREFIX
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm, receiving_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
-from gateway.subscriber.series import FINGERPRINTS
 from gateway.takes.event_log import EventLogReader
 from gateway.takes.reader import TakeReader
-from tests.gateway_process import PROGRAM, program, simulator
-from tests.networks import free_endpoint, lcm_url, open_zenoh, zenoh_keys
+from tests.gateway_process import program, simulator
+from tests.integration.takes.record_process import (
+    by_channel,
+    events,
+    num_recorded,
+    recording,
+    size,
+)
+from tests.networks import free_endpoint, lcm_url, wait_for_zenoh, zenoh_keys
 from tests.waiting import wait_until
 
 pytestmark = pytest.mark.netns
 
 SCENE: Final = ("--rate", "100", "--analog-rate", "500", "--markers", "20", "--analog", "8")
 COMPONENTS: Final = ("3d", "6d", "analog", "force", "event")
-
-
-class Ended(NamedTuple):
-    status: int
-    stdout: str
-    stderr: str
-
-
-class RecordProcess:
-    """A running ``record``."""
-
-    def __init__(self, process: subprocess.Popen[str], stderr: Path) -> None:
-        self.process = process
-        self._stderr = stderr
-
-    @property
-    def stderr(self) -> str:
-        return self._stderr.read_text()
-
-    def end(self, number: signal.Signals | None = signal.SIGINT) -> Ended:
-        """Wait for the end of the program, after a signal if given."""
-        if number is not None:
-            self.process.send_signal(number)
-        stdout, _ = self.process.communicate(timeout=60)
-        assert "Traceback" not in self.stderr + stdout
-        assert "defect" not in self.stderr
-        return Ended(self.process.returncode, stdout, self.stderr)
-
-
-@contextmanager
-def recording(tmp_path: Path, *arguments: str, command: tuple[str, ...] = PROGRAM) -> Iterator[RecordProcess]:
-    """Run ``record`` with these arguments until the end of the block."""
-    stderr = tmp_path / "stderr"
-    with (
-        stderr.open("w") as file,
-        subprocess.Popen(
-            [*command, "record", *arguments],
-            stdout=subprocess.PIPE,
-            stderr=file,
-            text=True,
-            env=os.environ | {"COLUMNS": "200"},
-        ) as process,
-    ):
-        try:
-            yield RecordProcess(process, stderr)
-        finally:
-            process.kill()
-
-
-def size(path: Path) -> int:
-    return path.stat().st_size if path.exists() else 0
-
-
-def num_recorded(path: Path, channel: str) -> int:
-    """Return how many messages of a channel a recording has so far."""
-    return path.read_bytes().count(channel.encode()) if path.exists() else 0
-
-
-def events(path: Path) -> list[tuple[str, bytes]]:
-    """Return the channels and messages of a file, which must not be damaged."""
-    reader = EventLogReader(path)
-    found = [(event.channel, event.message) for event in reader.events()]
-    assert not reader.damage
-    return found
-
-
-def by_channel(path: Path) -> dict[str, list[bytes]]:
-    found: defaultdict[str, list[bytes]] = defaultdict(list)
-    for channel, message in events(path):
-        found[channel].append(message)
-    return found
 
 
 class Lab(NamedTuple):
@@ -169,15 +99,6 @@ def lab(tmp_path: Path, side: str, *scene: str, **source: Any) -> Iterator[Lab]:
             options = ("--lcm", "--url", url)
         wait_until(lambda: len(published[lcm_channel("MOCAP", "Lab-1", "3d")]) > 10)
         yield Lab(options, published, start, stop)
-
-
-def wait_for_zenoh(endpoint: str) -> zenoh.Session:
-    deadline_s = time.monotonic() + 30
-    while True:
-        try:
-            return open_zenoh("client", connect=endpoint)
-        except zenoh.ZError:
-            assert time.monotonic() < deadline_s
 
 
 def assert_same_bytes(path: Path, published: dict[str, list[bytes]]) -> None:
@@ -321,196 +242,3 @@ def test_a_restart_of_the_gateway_is_told_from_loss(tmp_path: Path) -> None:
         ended = record.end()
     assert ended.status == 0, ended
     assert "Lab-1: its gateway was started again (once)" in ended.stdout
-
-
-# A publisher of the test, which can do what a gateway does not -----------------------------
-
-
-class Publisher:
-    """Publishes markers of sources on Zenoh, as a gateway would; ``record`` connects to it."""
-
-    def __init__(self) -> None:
-        self.endpoint = free_endpoint()
-        self.session = open_zenoh("peer", listen=self.endpoint)
-
-    def publish(self, source: str, *sequences: int, key: str = "3d", session: int = 1) -> None:
-        for sequence in sequences:
-            utime = time.time_ns() // 1000
-            message = FINGERPRINTS[key] + PREFIX.pack(utime, utime, sequence, session, 1) + bytes(16)
-            self.session.put(f"mocap/{source}/{key}", message)
-
-    def wait_for_subscriber(self) -> None:
-        publisher: Any = self.session.declare_publisher("mocap/lab/3d")
-        wait_until(lambda: publisher.matching_status.matching)
-        publisher.undeclare()
-
-
-@pytest.fixture
-def publisher() -> Iterator[Publisher]:
-    publisher = Publisher()
-    yield publisher
-    publisher.session.close()
-
-
-@contextmanager
-def recording_of(publisher: Publisher, tmp_path: Path, *options: str) -> Iterator[RecordProcess]:
-    with recording(tmp_path, str(tmp_path / "walk"), "--connect", publisher.endpoint, *options) as record:
-        publisher.wait_for_subscriber()
-        yield record
-
-
-def test_gaps_are_counted_and_shown(tmp_path: Path, publisher: Publisher) -> None:
-    with recording_of(publisher, tmp_path) as record:
-        publisher.publish("lab", *range(500, 600), *range(605, 700), *range(703, 720))
-        wait_until(lambda: "8 messages were lost on the way" in record.stderr)
-        wait_until(lambda: num_recorded(tmp_path / "walk.lcmlog", "MOCAP_LAB_3D") == 212)
-        ended = record.end()
-    assert ended.status == 1
-    assert re.search(r"^lab +3d +212 .* 2 +8 +-$", ended.stdout, re.MULTILINE)
-    assert len(by_channel(tmp_path / "walk.lcmlog")["MOCAP_LAB_3D"]) == 212
-    assert ended.stdout.endswith("INCOMPLETE\n")
-
-
-def test_two_gateways_with_the_same_source_are_reported(tmp_path: Path, publisher: Publisher) -> None:
-    with recording_of(publisher, tmp_path) as record:
-        for number in range(40):
-            publisher.publish("lab", 1000 + number, 50 + number)
-        wait_until(lambda: "two gateways publish the source lab" in record.stderr)
-        wait_until(lambda: num_recorded(tmp_path / "walk.lcmlog", "MOCAP_LAB_3D") == 80)
-        ended = record.end()
-    assert ended.status == 1
-    assert "two gateways publish the source lab" in ended.stdout
-    assert len(by_channel(tmp_path / "walk.lcmlog")["MOCAP_LAB_3D"]) == 80
-
-
-def test_a_source_that_appears_later_is_described_then(tmp_path: Path, publisher: Publisher) -> None:
-    path = tmp_path / "walk.lcmlog"
-    with recording_of(publisher, tmp_path) as record:
-        publisher.publish("lab", *range(10))
-        wait_until(lambda: size(path))
-        publisher.publish("robot", *range(10))
-        publisher.publish("lab", *range(10, 20))
-        wait_until(lambda: b"MOCAP_ROBOT_3D" in path.read_bytes())
-        assert record.end().status == 0
-    channels = [channel for channel, _ in events(path)]
-    assert channels[0] == "MOCAP_LAB_TAKE"
-    assert channels[channels.index("MOCAP_ROBOT_3D") - 1] == "MOCAP_ROBOT_TAKE"
-
-
-def test_hostile_publishers_are_bounded(tmp_path: Path, publisher: Publisher) -> None:
-    with recording_of(publisher, tmp_path) as record:
-        publisher.publish("lab", *range(10))
-        for number in range(300):
-            publisher.publish(f"source-{number}", 0)
-        for name in (
-            "lab/3d",
-            "lab/status",
-            "lab/parameters",
-            "lab/6d/x",
-            "lab/6d/x/y/z",
-            "l%b/3d",
-            "x" * 200,
-        ):
-            for payload in (b"", b"\x1b[2J", bytes(1000)):
-                publisher.session.put(f"mocap/{name}", payload, attachment=b"[[[")
-        publisher.publish("lab", 2**62, -(2**63), 10)
-        publisher.publish("lab", 1, key="analog")
-        wait_until(lambda: num_recorded(tmp_path / "walk.lcmlog", "MOCAP_LAB_ANALOG"))
-        ended = record.end()
-    assert ended.status == 1
-    assert re.search(r"messages were not recorded: there are more than 64 sources", ended.stdout)
-    assert re.search(r"messages on these keys or channels were not recorded", ended.stdout)
-    assert "\x1b" not in ended.stdout + ended.stderr
-    assert len(ended.stdout.splitlines()) < 100
-
-
-def test_a_terminal_shows_the_progress_on_one_line(tmp_path: Path, publisher: Publisher) -> None:
-    reading, terminal = pty.openpty()
-    arguments = ("record", str(tmp_path / "walk"), "--connect", publisher.endpoint)
-    with subprocess.Popen([*PROGRAM, *arguments], stdout=subprocess.DEVNULL, stderr=terminal) as process:
-        publisher.wait_for_subscriber()
-        publisher.publish("lab", *range(10), *range(12, 20))
-        shown = ""
-        while not re.search(r"\r.*\d:\d\d  2 kB  .* messages/s  .*/s  2 lost  0 kB to be written", shown):
-            shown += os.read(reading, 65536).decode()
-        process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 1
-    os.close(terminal)
-    os.close(reading)
-    assert "2 messages were lost on the way; 2 so far\r\n" in shown
-
-
-# Files and ends --------------------------------------------------------------------------------
-
-
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
-    (tmp_path / "walk.lcmlog").write_bytes(b"precious")
-    with recording(tmp_path, str(tmp_path / "walk")) as record:
-        ended = record.end(None)
-    assert ended.status == 1
-    assert ended.stderr.startswith(f"{tmp_path}/walk.lcmlog exists already, and nothing is overwritten")
-    assert (tmp_path / "walk.lcmlog").read_bytes() == b"precious"
-
-
-@pytest.mark.parametrize(("side", "name"), [("zenoh", "Zenoh"), ("lcm", "LCM")])
-def test_without_a_gateway_it_says_so_and_leaves_no_file(tmp_path: Path, side: str, name: str) -> None:
-    session = open_zenoh("peer", listen=(endpoint := free_endpoint()))
-    options = ["--connect", endpoint] if side == "zenoh" else ["--lcm", "--url", lcm_url()]
-    with recording(tmp_path, str(tmp_path / "walk"), *options) as record:
-        wait_until(lambda: f"no gateway found on {name}" in record.stderr)
-        ended = record.end()
-    session.close()
-    assert ended.status == 1
-    assert ended.stdout == "nothing was recorded, and there is no file: no message has arrived\n"
-    assert {path.name for path in tmp_path.iterdir()} == {"stderr"}
-
-
-def test_an_endpoint_where_nobody_listens_is_an_error_and_leaves_no_file(tmp_path: Path) -> None:
-    with recording(tmp_path, str(tmp_path / "walk"), "--connect", free_endpoint()) as record:
-        ended = record.end(None)
-    assert ended.status == 1
-    assert "no Zenoh session to tcp/" in ended.stderr
-    assert {path.name for path in tmp_path.iterdir()} == {"stderr"}
-
-
-HANGING: Final = """
-import sys, threading
-from gateway.cli.main import main
-from gateway.recorder.take_recording import TakeRecording
-from gateway.takes.recording import LogFile
-
-def hang(*_):
-    print("the disk hangs", file=sys.stderr, flush=True)
-    threading.Event().wait()
-
-def stop(recording, stop=TakeRecording.stop):
-    print("it ends", file=sys.stderr, flush=True)
-    stop(recording)
-
-LogFile.append, TakeRecording.stop = hang, stop
-main()
-"""
-
-
-def test_a_second_ctrl_c_ends_at_once_although_the_disk_hangs(tmp_path: Path, publisher: Publisher) -> None:
-    command = (sys.executable, "-c", HANGING)
-    options = (str(tmp_path / "walk"), "--connect", publisher.endpoint)
-    with recording(tmp_path, *options, command=command) as record:
-        publisher.wait_for_subscriber()
-        publisher.publish("lab", *range(10))
-        wait_until(lambda: "the disk hangs" in record.stderr)
-        record.process.send_signal(signal.SIGINT)
-        wait_until(lambda: "it ends" in record.stderr)
-        assert record.process.poll() is None
-        assert record.end().status == 130
-
-
-def test_a_file_that_is_deleted_meanwhile_is_reported(tmp_path: Path, publisher: Publisher) -> None:
-    path = tmp_path / "walk.lcmlog"
-    with recording_of(publisher, tmp_path) as record:
-        publisher.publish("lab", *range(10))
-        wait_until(lambda: size(path))
-        path.unlink()
-        ended = record.end()
-    assert ended.status == 1
-    assert "the file was moved or deleted while it was recorded" in ended.stdout

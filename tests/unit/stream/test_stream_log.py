@@ -8,7 +8,7 @@ from gateway.errors import ClosedError, LinkError, PacketError
 from gateway.rtc3d.parameters_xml import parse_parameters
 from tests.losses import amounts
 from tests.servers import error, markers_frame, packet
-from tests.unit.stream import test_session, test_stream_control
+from tests.unit.stream import session_lab, test_stream_control
 from tests.unit.stream.scripted_server import obliging, refusing
 from tests.unit.stream.virtual_time import settle
 
@@ -29,8 +29,8 @@ def logged(caplog: pytest.LogCaptureFixture, module: str) -> list[str]:
     ]
 
 
-async def session_with_frames() -> test_session.Lab:
-    lab = test_session.Lab()
+async def session_with_frames() -> session_lab.Lab:
+    lab = session_lab.Lab()
     await lab.streaming()
     lab.connection.send_frames(1)
     return lab
@@ -70,7 +70,7 @@ async def test_rejected_frames_are_a_warning_once_and_their_end_is_logged_with_t
 
 
 async def test_frames_in_another_byte_order_are_a_limitation() -> None:
-    lab = test_session.Lab()
+    lab = session_lab.Lab()
     await lab.streaming()
     lab.connection.send(markers_frame(1, (0.0, 0.0, 0.0), order="<"))
     assert lab.status.byte_order == "little"
