@@ -195,9 +195,14 @@ class LslProcesses:
 
 
 def lsl_environment(settings: LslSettings) -> dict[str, str]:
-    """Return the environment of a process that uses liblsl as the settings say."""
+    """Return the environment of a process that uses liblsl as the settings say.
+
+    It finds the same modules as this process. Python would look for them in the working directory first,
+    where somebody may have a pylsl.py.
+    """
+    modules = {"PYTHONPATH": os.pathsep.join(sys.path), "PYTHONSAFEPATH": "1"}
     config = {"LSLAPICFG": settings.config} if settings.config else {}
-    return {**os.environ, "OPENBLAS_NUM_THREADS": "1", **config}
+    return {**os.environ, **modules, "OPENBLAS_NUM_THREADS": "1", **config}
 
 
 def _not_opened(report: Report) -> str:

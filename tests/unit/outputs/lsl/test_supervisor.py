@@ -132,12 +132,21 @@ def test_why_liblsl_cannot_be_loaded_is_said(
     processes: LslProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "pylsl.py").write_text("raise ImportError('libc is too old')")
-    monkeypatch.setenv("PYTHONPATH", f"{tmp_path}:{os.environ.get('PYTHONPATH', '')}")
+    monkeypatch.syspath_prepend(tmp_path)
     processes.restart(nothing)
     wait_until(lambda: "failed" in processes.problem, TIMEOUT_S)
     assert processes.problem == (
         "the process for LSL failed: ImportError: libc is too old; it is started again"
     )
+
+
+def test_modules_in_the_working_directory_are_not_used(
+    processes: LslProcesses, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "pylsl.py").write_text("raise ImportError('this is a program of the user')")
+    (tmp_path / "queue.py").write_text("raise ImportError('this too')")
+    monkeypatch.chdir(tmp_path)
+    start(processes)
 
 
 def test_a_stream_that_cannot_open_is_reported_and_tried_again(processes: LslProcesses) -> None:
