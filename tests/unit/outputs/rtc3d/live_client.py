@@ -13,6 +13,7 @@ from tests.unit.rtc3d_server.wire import COMMAND, EVENT, WireComponent, componen
 
 _ITEM = {1: "4f", 2: "f", 3: "6f", 4: "8f", EVENT: "iqiii"}
 SLOW, FAST = 1, 2  # the numbers of streams
+TOOL_OUT_OF_VIEW = bytes.fromhex("00000038 00000004 00000007 0000000000002710 00000001" + "ff" * 32)
 
 
 def component(
@@ -111,3 +112,17 @@ class LiveClient:
     def numbers(self) -> list[list[int]]:
         """Return the frame numbers of the components of each of these frames."""
         return [[each.frame_number for each in frame] for frame in self.take()]
+
+
+def play(source: LiveSource, first: int, last: int, *, fast_first: bool, base_us: int = 0) -> None:
+    """Let frames of 100 Hz markers and 1000 Hz analog arrive on two streams."""
+    for number in range(first, last + 1):
+        timestamp_us = base_us + 10_000 * number
+        slow = (body(markers(number, timestamp_us), event(number, timestamp_us, number)), SLOW)
+        fast = (body(analog(10 * number, timestamp_us)), FAST)
+        for each in (fast, slow) if fast_first else (slow, fast):
+            source.arrive(*each)
+        for step in range(1, 10):
+            source.wait(1000)
+            source.arrive(body(analog(10 * number + step, timestamp_us + 1000 * step)), FAST)
+        source.wait(1000)
