@@ -183,8 +183,9 @@ async def wait_until_cached(gateway: Gateway) -> None:
     await wait_until_async(lambda: all(output.health().connected for output in gateway.outputs))
     for output in gateway.outputs:
         if isinstance(output, LcmOutput) and output._queries is not None and output.settings.queries:
-            receiver = output._queries._receiver  # in a thread of its own: a request before it is lost
-            await wait_until_async(lambda: receiver._subscriptions.keys() == receiver._channels.keys())  # noqa: B023
+            # The thread that receives requests opens it once it receives; a request before that is lost.
+            replies = output._queries._reply_sender
+            await wait_until_async(lambda: not replies.problem)  # noqa: B023
     [source] = gateway.sources
     await wait_until_async(lambda: source.queries.parameters.known.newest)
     await wait_until_async(lambda: all(stream.session for stream in source.streams))
