@@ -116,5 +116,5 @@ def _options(
 
     Until here, a signal ends the process at once.
     """
-    if context.obj is not None:
+    if context.obj is not None and context.invoked_subcommand != "run":  # which handles signals itself
         context.obj()

@@ -16,6 +16,7 @@ from gateway.cli.options import (
     chosen_log_level,
 )
 from gateway.service.log_format import LogFormat, LogLevel, set_up_log
+from gateway.service.process_end import end_at_once
 
 logger = logging.getLogger(__name__)
 
@@ -33,11 +34,9 @@ def run(
     log_format: LogFormatOption = LogFormat.AUTO,
 ) -> None:
     """Run the gateway until Ctrl-C or SIGTERM. SIGHUP reloads the configuration."""
-    level = chosen_log_level(log_level, verbose=verbose, quiet=quiet)
-    from gateway.service.process_end import end_at_once
-
     for number in (signal.SIGINT, signal.SIGTERM):  # until the daemon handles them
         signal.signal(number, end_at_once)
+    level = chosen_log_level(log_level, verbose=verbose, quiet=quiet)
     import uvloop
 
     from gateway.cli.configuration import chosen_file, configuration_from_options
