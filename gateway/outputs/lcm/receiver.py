@@ -121,7 +121,9 @@ class LcmReceiver:
     def _try_to_open(self) -> lcm.LCM | LcmDatagrams:
         if scheme_of(self._url) == "udpm":
             return LcmDatagrams(self._url, self._handle)
-        return open_lcm(self._url)
+        connection = open_lcm(self._url)
+        self._subscribe(connection)
+        return connection
 
     def _reconnect(self, connection: lcm.LCM) -> None:
         """Connect to the relay again, with retries, until ``close``."""
