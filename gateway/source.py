@@ -86,6 +86,7 @@ class Source:
         self._has_new_server = before is not None and (before.settings.host, before.settings.port) != (
             *(settings.host, settings.port),
         )
+        self._has_new_frame = before is not None and not before.settings.has_frame_of(settings)
         self.sequence: int = NOT_PUBLISHED if before is None else before.sequence
         """The sequence number of the newest status and clock messages."""
         self._newest_status: bytes = self._encoded_status()
@@ -136,6 +137,8 @@ class Source:
             self.fan_out.begin(self.known_parameters)
         if self._has_new_server:
             await self.queries.parameters.known.make_void("the configuration names another server")
+        elif self._has_new_frame and self.known_parameters.version:
+            await self.queries.parameters.begin_version()
         try:
             async with asyncio.TaskGroup() as tasks:
                 tasks.create_task(_wait_for(self._failure))
@@ -150,9 +153,8 @@ class Source:
     async def change_frame(self, settings: SourceSettings) -> None:
         """Use ``settings``, which differ only in the frame of poses, and tell every output. Streams go on."""
         self.settings = self.queries.settings = settings
-        known = self.queries.parameters.known
-        if known.version:
-            await self._announce_parameters(known.newest, known.version)
+        if self.known_parameters.version:
+            await self.queries.parameters.begin_version()
         else:
             self.fan_out.begin(self.known_parameters)
 

@@ -184,6 +184,10 @@ class SourceSettings(Section):
         """Return whether these settings differ from ``other`` at most in the frame of poses."""
         return self == other.model_copy(update={"frame_id": self.frame_id, "transform": self.transform})
 
+    def has_frame_of(self, other: "SourceSettings") -> bool:
+        """Return whether poses have the same frame as with ``other``."""
+        return (self.frame_id, self.transform) == (other.frame_id, other.transform)
+
     @field_validator("streams")
     @classmethod
     def _check_components_are_in_one_stream(

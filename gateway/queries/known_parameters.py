@@ -110,8 +110,8 @@ Publishes them, and then marks the frames that follow with the version.
 class KnownParameters:
     """The newest parameters of one source's server.
 
-    ``xml_thread`` parses them. The version grows by one whenever they mean something else than before, and
-    when they become void.
+    ``xml_thread`` parses them. The version grows by one whenever they mean something else than before, when
+    they become void, and when another frame of poses goes with them.
     ``former`` are those of the source before a reload, which are continued.
     """
 
@@ -160,6 +160,14 @@ class KnownParameters:
             if self.newest is not None:
                 self.newest = replace(self.newest, session=session)
                 await self._announce(self.newest, self.version)
+
+    async def begin_version(self) -> None:
+        """Announce the parameters as another version, because they go with another frame of poses now."""
+        async with self._lock:
+            self.version += 1
+            if self.newest is not None:
+                self.newest = replace(self.newest, version=self.version)
+            await self._announce(self.newest, self.version)
 
     async def make_void(self, reason: str) -> None:
         """Forget the parameters, because the server does not give any now (field note 23)."""

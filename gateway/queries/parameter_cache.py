@@ -151,6 +151,11 @@ class ParameterCache:
         if not self._is_current:
             await self.known.make_void(reason)
 
+    async def begin_version(self) -> None:
+        """See KnownParameters."""
+        self._answers.clear()
+        await self.known.begin_version()
+
     # While connections are open.
 
     async def refresh(self) -> None:

@@ -110,7 +110,10 @@ async def test_a_reload_changes_the_frame_of_a_stream_that_goes_on() -> None:
     in_order = [tools[number] for number in sorted(tools)]
     assert {each.session for each in in_order} == {1}
     assert [each.sequence - in_order[0].sequence for each in in_order] == list(range(len(in_order)))
-    for number, expected in ((min(poses.keys() & tools.keys()), plain), (max(poses), y_up)):
+    # The version of each pose says in which frame it is.
+    assert {poses[number].parameters_version for number in poses} == {1, 2}
+    for number in poses.keys() & tools.keys():
+        expected = plain if poses[number].parameters_version == 1 else y_up
         np.testing.assert_allclose(poses[number].position_m, expected(tools[number].tools[0]), rtol=1e-5)
 
 

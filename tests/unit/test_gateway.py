@@ -352,17 +352,34 @@ async def test_a_changed_frame_reaches_every_output_and_the_source_stays_connect
         servers["lab"].connection.send_frames(2)
         [(name, parameters)] = output.parameters[len(known) :]
         assert (name, parameters.frame) == ("lab", source_frame(turned.sources[0], Parameters()))
-        assert parameters._replace(frame=known[0][1].frame) == known[0][1]
+        assert parameters._replace(frame=known[0][1].frame, version=1) == known[0][1]
         frame = await output.query("lab/frame")
         assert json.loads(frame.payload)["frame_id"] == "world"
         await asyncio.sleep(1.0)
         assert decode((await output.query("lab/status")).payload).frame_id == "world"
-        assert [(each.session, each.sequence) for each in markers] == [(1, 0), (1, 1)]
+        found = [(each.session, each.sequence, each.parameters_version) for each in markers]
+        assert found == [(1, 0, 1), (1, 1, 2)]
         assert len(servers["lab"].connections) == len(servers["hall"].connections) == 1
         assert await gateway.reload(turned) == []
         assert await gateway.reload(plain) == ["coordinate frame of source lab changed"]
-        assert output.parameters[-1] == known[0]
+        assert output.parameters[-1] == ("lab", known[0][1]._replace(version=3))
         assert servers["lab"].connection.is_open
+
+
+async def test_a_changed_frame_gets_a_version_of_its_own_if_the_source_connects_again(
+    servers: Servers,
+) -> None:
+    def framed(frame_id: str, reply_timeout_s: float) -> Settings:
+        source = SourceSettings(name="lab", host="lab", frame_id=frame_id, reply_timeout_s=reply_timeout_s)
+        return settings().model_copy(update={"sources": (source,)})
+
+    async with running(framed("hall", 2.0)) as (gateway, _):
+        await connected(gateway)
+        assert await gateway.reload(framed("world", 3.0)) == ["source lab changed"]
+        await connected(gateway)
+        found = {(each.version, each.frame.frame_id) for _, each in example(gateway).parameters}
+        assert found == {(1, "hall"), (2, "world")}
+        assert len(servers["lab"].connections) == 2
 
 
 async def test_a_changed_frame_reaches_outputs_although_the_server_gives_no_parameters(
