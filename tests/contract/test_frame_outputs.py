@@ -469,12 +469,12 @@ async def test_thousands_of_labels_disturb_nobody(lab: Lab) -> None:
 
 @converts
 async def test_positions_are_in_metres_in_the_frame_of_the_source(lab: Lab) -> None:
-    """A reload changes only the frame: the parameters and their version stay."""
+    """A reload changes only the frame and the version: the parameters stay."""
     await lab.start()
-    lab.set_parameters(LAB, labelled(), 1, world(1.0, turned=True, x_m=10.0))
+    lab.set_parameters(LAB, labelled(), 2, world(1.0, turned=True, x_m=10.0))
 
     def has_arrived() -> bool:
-        lab.publish(LAB, frame(3), stamp())  # again: on LSL, peers need another stream
+        lab.publish(LAB, frame(3), stamp(2))  # again: on LSL, peers need another stream
         return 7.0 in lab.xs()
 
     await wait_until_async(has_arrived, TIMEOUT_S)
