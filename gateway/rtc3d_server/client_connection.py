@@ -145,7 +145,7 @@ class ClientConnection(asyncio.BufferedProtocol):
         self.transport = cast(asyncio.Transport, transport)
         self.transport.set_write_buffer_limits(high=self._owner.max_unread_bytes)
         address, port = transport.get_extra_info("peername")[:2]
-        self.session.name = f"{address}:{port}"
+        self.session.name = f"[{address}]:{port}" if ":" in address else f"{address}:{port}"
         self.filter = self._owner.new_filter(self)
         self.number = self._owner.connection_opened(self)
 

@@ -1,5 +1,10 @@
 """The RT server as a library: any scene, and a filter between its connections and their sockets."""
 
+import asyncio
+import logging
+
+import pytest
+
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.rtc3d_server.client_session import error_packet
@@ -48,6 +53,19 @@ async def test_a_server_without_a_filter_serves_a_scene_under_its_name() -> None
         assert general.name == "Lab"
         await client.ask("StreamFrames 3D")
         assert consecutive(await client.frames(20))
+
+
+async def test_names_of_clients_have_brackets_if_the_address_is_one_of_ipv6(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    caplog.set_level(logging.INFO)
+    async with RtServer(CountingScene(), host="::1") as server:
+        reader, writer = await asyncio.open_connection("::1", server.port)
+        writer.write(command("Bye"))
+        await reader.read()
+        writer.close()
+        port = writer.get_extra_info("sockname")[1]
+        await until(lambda: f"[::1]:{port}: disconnected" in caplog.text)
 
 
 async def test_a_filter_can_change_all_bytes_of_a_connection() -> None:
