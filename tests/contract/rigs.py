@@ -166,7 +166,7 @@ class TakesRig:
 
     def __init__(self) -> None:
         self.names = LCM_CHANNELS
-        # The output's thread may create its folder again meanwhile: ``close`` waits only briefly for the disk.
+        # The output may create its folder again meanwhile: ``close`` waits only briefly for the disk.
         self._parent = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
         self._folder = Path(self._parent.name) / "takes"
         self._disk = Path(self._parent.name) / "disk"
