@@ -202,9 +202,13 @@ def _copy_elements(root: etree._Element, tree: etree._Element, *, repair: bool) 
                 continue
             _, parent = max(candidates, key=itemgetter(0))
         copies[element] = copy = etree.SubElement(parent, tag)
+        try:
+            text, element_id = element.text or "", element.get("id") or element.get("ID") or ""
+        except UnicodeDecodeError:  # libxml2 keeps what &#xD800; refers to if the XML is malformed
+            text = element_id = ""
         # Depending on its version, libxml2 may keep characters that lxml then refuses.
-        copy.text = _xml_text(element.text or "")
-        copy.set("id", _xml_text(element.get("id") or element.get("ID") or ""))
+        copy.text = _xml_text(text)
+        copy.set("id", _xml_text(element_id))
         latest[tag] = (position, copy)
 
 

@@ -93,6 +93,20 @@ class TestHostileXml:
         assert parameters.markers.unit == "mm"
         assert recovered
 
+    @pytest.mark.parametrize("reference", ["&#xD800;", "&#xdfff;", "&#56320;"])
+    def test_a_text_with_half_a_character_is_empty_and_the_others_are_read(self, reference: str) -> None:
+        """It cannot be in UTF-8, so JSON and protobuf cannot have it."""
+        markers = f"<Marker><Label>a{reference}</Label></Marker><Marker><Label>b</Label></Marker>"
+        xml = in_root(
+            f"<The_3D><Unit>m</Unit><Markers><Marker id='{reference}'/>{markers}</Markers></The_3D>"
+        )
+        for body in (xml, xml.replace(b"</Unit>", b"")):
+            parameters, recovered = parse_parameters(body)
+            assert parameters.markers is not None
+            labels = "".join(marker.id + marker.label for marker in parameters.markers.markers)
+            assert labels.removeprefix("a") == "b"
+            assert recovered
+
     def test_the_number_of_items_is_bounded(self) -> None:
         xml = in_root(f"<The_3D><Markers>{'<Marker/>' * (MAX_ITEMS + 1)}</Markers></The_3D>")
         parameters, recovered = parse_parameters(xml)
