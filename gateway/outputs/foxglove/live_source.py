@@ -45,8 +45,7 @@ class LiveSource:
     """The channels of one source, from its announcement until ``close``.
 
     All methods are called in the loop of ``server``. ``on_wanted`` is called whenever viewers subscribe to
-    channels of other components than before, with these components. If the server gives no parameters, a
-    frame with any is wanted, too, because it shows which channels to open.
+    channels of other components than before, with these components.
     """
 
     def __init__(
@@ -59,7 +58,6 @@ class LiveSource:
         self._server = server
         self._on_wanted = on_wanted
         self._wanted: frozenset[ComponentType] = frozenset()
-        self._needs_frame = False  # to know which channels to open
         self._topics = FloatTopics(name, is_live=True)
         # By the names of the topics.
         self._channels: dict[str, Channel] = {}
@@ -82,13 +80,17 @@ class LiveSource:
         known = self._converter.known_topics
         self._open_channels(known)
         self._close_channels(before - {topic.name for topic in known})
-        self._needs_frame = parsed == Parameters()
         self._check_wanted()
         found = self._converter.describe(now_utime())
         self._description = {message.topic.name: message for message in found}
         for message in found:
             for viewer in list(self._channels[message.topic.name].subscribers):
                 self._send_description(viewer, message)
+
+    def open_for(self, layout: ComponentLayout) -> None:
+        """Open the channels of a component that frames have, in case the parameters do not mention it."""
+        topics = self._converter.topics(layout.type, layout.num_items)
+        self._open_channels({each: layout.type for each in topics if each.name not in self._channels})
 
     def send_frame(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         """Send the components of a frame to the viewers that subscribe to them."""
@@ -100,14 +102,10 @@ class LiveSource:
             wanted = [topic for topic in topics if self._has_subscribers(topic, layout.type, stamp)]
             if wanted and self._can_convert(layout.type, stamp):
                 self._send_component(frame.component(index), stamp, wanted)
-        if self._needs_frame:
-            self._needs_frame = False
-            self._check_wanted()
 
     def close(self) -> None:
         """Withdraw all channels."""
         self._close_channels(set(self._channels))
-        self._needs_frame = False
         self._check_wanted()
 
     # Channels.
@@ -120,7 +118,8 @@ class LiveSource:
                 self._open_channel(topic, component)
 
     def _close_channels(self, names: Set[str]) -> None:
-        self._server.close_channels([self._channels.pop(name) for name in names if name in self._channels])
+        found = [name for name in self._channels if name in names]
+        self._server.close_channels([self._channels.pop(name) for name in found])
 
     def _open_channel(self, topic: Topic, component: ComponentType | None) -> None:
         before = self._channels.get(topic.name)
@@ -154,7 +153,7 @@ class LiveSource:
 
     def _check_wanted(self) -> None:
         subscribed = {self._components[name] for name, each in self._channels.items() if each.subscribers}
-        wanted = frozenset(each for each in WIRE_ORDER if self._needs_frame or each in subscribed)
+        wanted = frozenset(each for each in WIRE_ORDER if each in subscribed)
         if wanted != self._wanted:
             self._wanted = wanted
             self._on_wanted(wanted)

@@ -1,10 +1,11 @@
 """The way of one source's frames from the gateway's event loop to the thread that serves viewers."""
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from functools import partial
 from typing import Final
 
 from gateway.errors import OutputError
+from gateway.foxglove_schemas.messages import NUMBERS_PER_ITEM
 from gateway.losses import Losses
 from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import ServerParameters
@@ -12,7 +13,7 @@ from gateway.outputs.event_loop import in_this_loop
 from gateway.outputs.foxglove.live_source import LiveSource, has_too_many_numbers
 from gateway.outputs.foxglove.server import FoxgloveServer
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame, FrameLayout
+from gateway.rtc3d.frames import ComponentLayout, Frame, FrameLayout
 
 QUEUE_FULL: Final = "queue full"
 
@@ -42,6 +43,7 @@ class ServedSource:
         self._report_wanted: Callable[[frozenset[ComponentType]], None] = lambda _wanted: None
         self._on_change: Callable[[], None] = lambda: None
         self._source: LiveSource | None = None  # assigned in the thread only
+        self._opened: set[ComponentType] = set()  # with numbers, since the newest parameters
         self._is_closed = False
 
     def watch_wanted(self, on_change: Callable[[], None]) -> None:
@@ -56,6 +58,16 @@ class ServedSource:
     def set_parameters(self, parameters: ServerParameters) -> None:
         """Convert the next frames with these parameters."""
         self._call(partial(self._set_parameters, parameters))
+        self._opened.clear()
+        self._on_change()  # so that frames are looked at again for what the parameters do not mention
+
+    def open_for(self, layouts: Iterable[ComponentLayout]) -> None:
+        """Open the channels of numbers in these components, as far as the parameters do not mention them."""
+        for each in layouts:
+            is_new = each.type in NUMBERS_PER_ITEM and each.num_items and each.type not in self._opened
+            # If the queue is full, another layout or subscriber does it.
+            if is_new and self._call_in_time(partial(self._open_for, each), 0):
+                self._opened.add(each.type)
 
     def offer(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> bool:
         """Have the components of a frame sent; return False if too many frames wait."""
@@ -82,6 +94,10 @@ class ServedSource:
     def _set_parameters(self, parameters: ServerParameters) -> None:
         if self._source is not None:
             self._source.set_parameters(parameters)
+
+    def _open_for(self, layout: ComponentLayout) -> None:
+        if self._source is not None:
+            self._source.open_for(layout)
 
     def _send(self, frame: Frame, stamp: Stamp, components: frozenset[ComponentType]) -> None:
         if self._source is not None:
@@ -113,11 +129,13 @@ class FoxglovePublisher:
         return not self._is_closed and not self._source.wanted.isdisjoint(components)
 
     def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
-        """Return whether a viewer has subscribed to what frames of ``layout`` have.
+        """Open channels for frames of ``layout``; return whether a viewer has subscribed to what they have.
 
         Nobody can subscribe to too many numbers. They count as lost while viewers watch the source.
         """
         found = [each for each in layout.components if each.type in components]
+        if not self._is_closed:
+            self._source.open_for(found)
         is_lost = any(map(has_too_many_numbers, found)) and bool(self._source.wanted)
         return self.wants([each.type for each in found]) or is_lost
 

@@ -79,18 +79,34 @@ async def test_the_channels_of_each_source_are_advertised_before_it_has_frames()
 async def test_channels_of_numbers_appear_with_the_first_frame_if_there_are_no_parameters() -> None:
     async with serving("lab") as (port, [lab]), viewing(port) as viewer:
         lab.set_parameters(Parameters())
-        await lab.wait_until_wanted()  # the gateway publishes nothing that is not wanted
-        lab.publish(frame_of({ANALOG: [1, 2], FORCE: [(1, 2, 3, 4, 5, 6)]}))
-        await viewer.wait_until(lambda: {"/lab/analog", "/lab/loads"} <= viewer.topics.keys())
-        await lab.wait_until_wanted(False)
-        viewer.subscribe("/lab/analog", "/lab/loads")
         frame = frame_of({ANALOG: [1, 2], FORCE: [(1, 2, 3, 4, 5, 6)]})
+        lab.publish(frame)
+        await viewer.wait_until(lambda: {"/lab/analog", "/lab/loads"} <= viewer.topics.keys())
+        assert not lab.wanted
+        viewer.subscribe("/lab/analog", "/lab/loads")
         [analog] = (await lab.publish_until(frame, lambda: viewer.received["/lab/analog"]))[:1]
         assert floats_of(analog.content) == {"channel_1": 1, "channel_2": 2}
         [loads] = (await viewer.wait_for("/lab/loads"))[:1]
         assert floats_of(loads.content) == {
             f"plate_1_{load}": number for number, load in enumerate(("fx", "fy", "fz", "mx", "my", "mz"), 1)
         }
+
+
+async def test_channels_of_numbers_that_the_parameters_do_not_mention_appear_with_a_frame() -> None:
+    """Of another stream than the one that a viewer watches."""
+    async with serving("lab") as (port, [lab]), viewing(port, "/lab/markers") as viewer:
+        lab.set_parameters(Parameters(markers=Parameters3D(100.0)))
+        await lab.wait_until_wanted()
+        lab.publish(frame_of({MARKERS: [], ANALOG: []}))
+        lab.publish(frame_of({ANALOG: [1]}))
+        await viewer.wait_until(lambda: "/lab/analog" in viewer.topics)
+        lab.set_parameters(channels("EMG 1"), 2)
+        await viewer.wait_until(lambda: viewer.channel("/lab/analog")["schemaName"] == "rtc3d.lab.Analog_2")
+        viewer.withdrawn.clear()
+        lab.set_parameters(Parameters(), 3)
+        await viewer.wait_until(lambda: "/lab/analog" in viewer.withdrawn)
+        lab.publish(frame_of({ANALOG: [1]}))
+        await viewer.wait_until(lambda: "/lab/analog" in viewer.topics)
 
 
 async def test_channels_are_withdrawn_with_their_source_and_come_back_with_it() -> None:
@@ -354,8 +370,7 @@ async def test_parameters_and_plates_are_sent_to_each_viewer_that_subscribes_and
             await viewer.wait_for("/lab/plates", 2)
             assert [log.content["version"] for log in viewer.received["/lab/parameters"]] == [3, 4]
             assert not viewer.received["/lab/plates"][1].content.entities
-            lab.publish(frame_of({MARKERS: []}))  # without parameters, a frame shows which channels there are
-            await lab.wait_until_wanted(False)
+            assert not lab.wanted
 
 
 async def test_plates_are_scaled_but_have_units_of_their_own() -> None:
