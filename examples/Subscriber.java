@@ -41,7 +41,12 @@ public final class Subscriber {
                 System.err.println("COUNT must be a number, not " + count);
                 System.exit(1);
             }
-            subscribe(arguments.length > 0 ? arguments[0] : "LAB", Integer.parseInt(count));
+            try {
+                subscribe(arguments.length > 0 ? arguments[0] : "LAB", Integer.parseInt(count));
+            } catch (IOException error) {
+                System.err.println("Cannot open LCM; check $LCM_DEFAULT_URL and the multicast route: " + error);
+                System.exit(1);
+            }
         }
     }
 
@@ -62,17 +67,14 @@ public final class Subscriber {
         });
         out.println("listening");
         framesLeft.await();
-        lcm.close();
-        System.exit(0); // LCM's thread would wait for one more message
+        System.exit(0); // closing LCM would wait for one more message, and then print an error
     }
 
-    private static LCM openLcm() {
+    private static LCM openLcm() throws IOException {
         try {
             return new LCM();
-        } catch (IOException | RuntimeException error) {
-            System.err.println("Cannot open LCM; check $LCM_DEFAULT_URL and the multicast route: " + error);
-            System.exit(1);
-            throw new AssertionError();
+        } catch (RuntimeException error) { // a URL that LCM cannot use
+            throw new IOException(error.getMessage());
         }
     }
 

@@ -287,27 +287,19 @@ impl Assembler {
         if magic != MAGIC_FRAGMENT || size > MAX_MESSAGE_BYTES {
             return Err("no message of LCM, or a message that is too long".into());
         }
-        let is_continued = self.0.get(&sender).map_or(false, |partial| {
-            partial.sequence == sequence
-                && partial.data.len() == size
-                && partial.received.len() == count
-        });
-        if !is_continued {
-            if self.0.len() >= MAX_SENDERS {
-                self.0.clear();
-            }
-            let (data, received) = (vec![0; size], vec![false; count]);
-            self.0.insert(
-                sender,
-                PartialMessage {
-                    sequence,
-                    channel: String::new(),
-                    data,
-                    received,
-                },
-            );
-        }
-        let partial = self.0.get_mut(&sender).ok_or("unreachable")?;
+        let mut partial = self
+            .0
+            .remove(&sender)
+            .filter(|earlier| {
+                (earlier.sequence, earlier.data.len(), earlier.received.len())
+                    == (sequence, size, count)
+            })
+            .unwrap_or_else(|| PartialMessage {
+                sequence,
+                channel: String::new(),
+                data: vec![0; size],
+                received: vec![false; count],
+            });
         let mut data = reader.0;
         if header.number == 0 {
             (partial.channel, data) = cut_channel(data)?;
@@ -322,13 +314,14 @@ impl Assembler {
             .received
             .get_mut(usize::from(header.number))
             .ok_or("a fragment too many")? = true;
-        if partial.received.contains(&false) {
-            return Ok(None);
+        if !partial.received.contains(&false) {
+            return Ok(Some((partial.channel, partial.data)));
         }
-        Ok(self
-            .0
-            .remove(&sender)
-            .map(|complete| (complete.channel, complete.data)))
+        if self.0.len() >= MAX_SENDERS {
+            self.0.clear();
+        }
+        self.0.insert(sender, partial);
+        Ok(None)
     }
 }
 
