@@ -1,5 +1,6 @@
 """The doctor's checks for ROS 2: the router, the gateway's node, other nodes, and the types they expect."""
 
+import itertools
 from collections.abc import Sequence
 from typing import Final
 
@@ -19,6 +20,7 @@ CHECKS: Final = ("router", "gateway", "nodes", "types")
 
 _MAX_NAMED: Final = 8
 _MAX_SHOWN_CHARS: Final = 100
+_MAX_TOKENS: Final = 100_000
 
 _ros2: Final = Subject("ros2")
 
@@ -40,7 +42,8 @@ def check_ros2(
         ]
     try:
         replies = session.liveliness().get(tokens_of(settings.domain_id), timeout=seconds)
-        tokens = [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
+        first = itertools.islice(replies, _MAX_TOKENS)
+        tokens = [str(reply.ok.key_expr) for reply in first if reply.ok is not None]
     finally:
         session.close()
     seen = [each for each in map(seen_entity, tokens) if each is not None]

@@ -73,9 +73,9 @@ def tokens_of(domain_id: int) -> str:
 
 
 class SeenEntity(NamedTuple):
-    """A node that a token shows, with its namespace, or a publisher, subscription or service of this node.
+    """What a token shows: a node, which has no topic, or one of its publishers, subscriptions and services.
 
-    A node has no topic.
+    ``node`` is the full name of the node.
     """
 
     node: str
