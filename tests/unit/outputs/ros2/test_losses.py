@@ -85,7 +85,9 @@ def test_frames_beyond_the_queue_are_refused_and_ros_sees_the_gap(lab: RosLab) -
             publisher.publish(frame, stamp(), number, frozenset({ComponentType.MARKERS}))
         assert refused.value.cause == "queue full"
     may_go_on.set()
-    wait_until(lambda: lab.output.offer(lambda: None))
+    is_empty = threading.Event()
+    wait_until(lambda: lab.output.offer(is_empty.set))
+    assert is_empty.wait(10)
     publisher.publish(frame, stamp(), 4, ALL)
     wait_until(lambda: len(lab.received["/mocap/lab/analog"]) == 2)
     assert [each.sequence for each in lab.received["/mocap/lab/markers"]] == [1, 5]
