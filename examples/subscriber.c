@@ -18,6 +18,7 @@
 #include <stdio.h>
 #include <stdlib.h>
 #include <string.h>
+#include <wchar.h>
 
 #include "rtc3d_analog_t.h"
 #include "rtc3d_clock_model_t.h"
@@ -72,9 +73,10 @@ static bool walk_struct(const lcm_type_info_t *info, const uint8_t **data, const
 /* Return whether a text is UTF-8, in a locale that is. */
 static bool is_utf8(const char *text)
 {
+    mbstate_t state = {0};
     wchar_t letter;
-    int size;
-    while ((size = mbtowc(&letter, text, MB_CUR_MAX)) > 0 && letter <= 0x10ffff)
+    size_t size; /* 0 for the NUL; larger than MB_CUR_MAX if this is no letter */
+    while ((size = mbrtowc(&letter, text, MB_CUR_MAX, &state)) > 0 && size <= MB_CUR_MAX && letter <= 0x10ffff)
         text += size;
     return size == 0;
 }

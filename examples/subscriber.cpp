@@ -10,6 +10,7 @@
 #include <cstdio>
 #include <cstdlib>
 #include <cstring>
+#include <cwchar>
 #include <iostream>
 #include <lcm/lcm-cpp.hpp>
 #include <optional>
@@ -174,14 +175,14 @@ private:
     // Return whether a text is UTF-8, in a locale that is, and has no NUL.
     static bool is_utf8(const std::string &text)
     {
+        std::mbstate_t state{};
         wchar_t letter = 0;
-        std::size_t i = 0;
-        for (int size = 1; i < text.size() && letter <= 0x10ffff; i += size) {
-            size = std::mbtowc(&letter, &text[i], text.size() - i);
-            if (size < 1)
+        for (std::size_t i = 0, size = 0; i < text.size(); i += size) {
+            size = std::mbrtowc(&letter, &text[i], text.size() - i, &state);
+            if (size == 0 || size > text.size() - i || letter > 0x10ffff)
                 return false;
         }
-        return letter <= 0x10ffff;
+        return true;
     }
 
     void write_number(double value, int digits)

@@ -144,5 +144,10 @@ def test_each_program_reports_texts_that_are_not_utf8_up_to_a_nul(program: Examp
     vector = next(vector for vector in VECTORS if vector.type_name == "parameters_t" and vector.values["xml"])
     texts = (b"ab", b"a\xff\0", b"\xed\xa0\x80\0", b"\xf4\x90\x80\x80\0", b"\xc0\x80\0", b"\xe2\x82\0", b"")
     begin = vector.data[:40]  # up to the only text
-    messages = [("parameters_t", begin + len(text).to_bytes(4, "big") + text) for text in texts]
-    assert [list(answer) for answer in decode_with(program, messages)] == [["error"]] * len(texts)
+    damaged = [begin + len(text).to_bytes(4, "big") + text for text in texts]
+    messages = [("parameters_t", data) for each in damaged for data in (each, vector.data)]
+    found = decode_with(program, messages)
+    assert [list(answer) for answer in found[::2]] == [["error"]] * len(texts)
+    assert [difference(vector.lcm_type, vector.values, values) for values in found[1::2]] == [None] * len(
+        texts
+    )
