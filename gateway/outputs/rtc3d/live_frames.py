@@ -2,7 +2,7 @@
 
 from bisect import bisect_right
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from fractions import Fraction
 from operator import attrgetter
 from typing import Final, NamedTuple
@@ -111,7 +111,7 @@ class LiveFrames:
     @property
     def rate(self) -> Fraction:
         """See FrameSource."""
-        periods_us = [self._period_us(stream) for stream in self._streams]
+        periods_us = [self._period_us(stream) for stream in self._streams or self._all_streams]
         longest_us = max((period_us for period_us in periods_us if period_us), default=None)
         if longest_us:
             return exact_rate(1e6 / longest_us)
@@ -256,13 +256,13 @@ class LiveFrames:
             dropped = self._events.append(events_of(arrival))
             if dropped is not None:
                 self._dropped_event_us = dropped.time_us
-        slowest = self._slowest_stream(arrival.time_us)
-        if self._measured.isdisjoint(self._arrivals.stream_of):
+        slowest = self._slowest_stream(self._streams, arrival.time_us)
+        if slowest is None:
+            slowest = self._slowest_stream(self._all_streams, arrival.time_us)
             if has_events or slowest == arrival.stream:
                 self._add(arrival)
         elif not composition.measured & self._measured:
-            if has_events and slowest is None:
-                self._add(arrival)
+            pass  # its events wait for the next frame
         elif slowest != arrival.stream:
             self._add_sample(arrival)
         elif len(self._streams) == 1:
@@ -274,9 +274,13 @@ class LiveFrames:
 
     @property
     def _streams(self) -> set[int]:
-        """The streams on which the components of the choice come; all if none of them comes."""
+        """The streams on which the components of the choice come, or came last."""
         stream_of = self._arrivals.stream_of
-        return {stream_of[each] for each in self.measured if each in stream_of} or set(stream_of.values())
+        return {stream_of[each] for each in self.measured if each in stream_of}
+
+    @property
+    def _all_streams(self) -> set[int]:
+        return set(self._arrivals.stream_of.values())
 
     def _period_us(self, stream: int) -> float | None:
         """Return the time between two frames of a stream, as measured or else as announced."""
@@ -287,11 +291,11 @@ class LiveFrames:
         announced_hz = [hz for each, hz in self._announced_hz.items() if stream_of.get(each) == stream]
         return 1e6 / min(announced_hz) if announced_hz else None
 
-    def _slowest_stream(self, now_us: int) -> int | None:
-        """Return the stream that sets the rate; None if no stream of the choice has frames now."""
+    def _slowest_stream(self, streams: Iterable[int], now_us: int) -> int | None:
+        """Return the slowest of these streams; None if none of them has frames now."""
         slowest: int | None = None
         slowest_us = 0.0
-        for stream in sorted(self._streams):
+        for stream in sorted(streams):
             period_us = self._period_us(stream) or 1.0
             alive_us = max(_ALIVE_US, _ALIVE_PERIODS * period_us)
             is_alive = now_us - self._arrivals.rates[stream].time_us <= alive_us

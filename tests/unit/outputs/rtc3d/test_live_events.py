@@ -5,6 +5,7 @@ import pytest
 from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS
 from tests.unit.outputs.rtc3d.live_client import (
     FAST,
+    SLOW,
     TOOL_OUT_OF_VIEW,
     LiveSource,
     analog,
@@ -111,6 +112,20 @@ def test_a_request_for_components_that_do_not_come_gets_an_empty_frame() -> None
     client.send("SendCurrentFrame 6D")
     assert client.bodies == [body(), body(TOOL_OUT_OF_VIEW)]
     assert streaming.bodies == [body(TOOL_OUT_OF_VIEW)]
+
+
+def test_a_request_for_components_that_a_new_server_lacks_gets_an_empty_frame() -> None:
+    source = LiveSource()
+    client = source.client()
+    for number in range(1, 4):
+        source.arrive(body(markers(number, 10_000 * number), TOOL_OUT_OF_VIEW))
+        source.wait(10_000)
+    source.scene.stop()
+    client.send("SendCurrentFrame 6D")
+    for number in range(1, 4):
+        source.arrive(body(markers(number, 10_000 * number)), SLOW + 2)
+        source.wait(1_000_000)
+    assert client.bodies == [body()]
 
 
 def test_events_in_frames_of_their_own_do_not_shift_a_divisor() -> None:
