@@ -1,5 +1,6 @@
 """An output for ROS 2, the router that it connects to, and a subscriber that hears everything."""
 
+import json
 import logging
 import struct
 import threading
@@ -37,7 +38,7 @@ from gateway.rtc3d.parameters import (
     Plate,
     Tool,
 )
-from tests.networks import free_endpoint, open_zenoh
+from tests.networks import free_endpoint, open_zenoh, zenoh_keys
 from tests.unit.outputs.ros2 import ros_messages as ros
 from tests.waiting import wait_until
 
@@ -104,12 +105,21 @@ def stamp(utime: int = UTIME) -> Stamp:
     return Stamp(utime + 500, utime, 1, 1)
 
 
+def _open_router(endpoint: str) -> zenoh.Session:
+    """Open a router that drops nothing, although the subscriber takes long to decode hundreds of messages."""
+    keys = zenoh_keys("router", listen=endpoint)
+    keys["transport"]["link"] = {
+        "tx": {"queue": {"congestion_control": {"drop": {"wait_before_drop": 10_000_000}}}}
+    }
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(keys)))
+
+
 class RosLab:
     """The output, after ``open`` with the source "lab". ``received`` are the messages by topic."""
 
     def __init__(self, **settings: Any) -> None:
         self.endpoint = free_endpoint()
-        self.router: zenoh.Session | None = open_zenoh("router", listen=self.endpoint)
+        self.router: zenoh.Session | None = _open_router(self.endpoint)
         self.settings = Ros2Settings(enabled=True, connect=self.endpoint, **settings)
         self.output = Ros2Output(self.settings)
         self.received: defaultdict[str, list[Received]] = defaultdict(list)
@@ -189,7 +199,7 @@ class RosLab:
         self.router = None
 
     def restore(self) -> None:
-        self.router = open_zenoh("router", listen=self.endpoint)
+        self.router = _open_router(self.endpoint)
 
     def close(self) -> None:
         self.output.close()
