@@ -1,5 +1,6 @@
 """An output with viewers, and a source that publishes on it as in the gateway."""
 
+import math
 from collections.abc import AsyncIterator, Callable, Iterable, Mapping
 from contextlib import asynccontextmanager
 from typing import Any, Final, TypeVar
@@ -14,7 +15,7 @@ from gateway.outputs.foxglove.settings import FoxgloveSettings
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, ByteOrder, ComponentType, encode_component
 from gateway.rtc3d.frames import Frame, encode_frame, split_frame
-from gateway.rtc3d.parameters import AnalogChannel, Parameters, ParametersAnalog
+from gateway.rtc3d.parameters import AnalogChannel, Parameters, ParametersAnalog, Plate, Point
 from tests.losses import amounts
 from tests.networks import free_port
 from tests.waiting import wait_until_async
@@ -22,6 +23,23 @@ from tests.waiting import wait_until_async
 _Result = TypeVar("_Result")
 
 UTIME: Final = 1_700_000_000_000_000
+
+
+PLATE: Final = Plate(
+    "1",
+    "left",
+    corners=tuple(
+        Point(x, y, 0.0, "mm") for x, y in ((600.0, 400.0), (0.0, 400.0), (0.0, 0.0), (600.0, 0.0))
+    ),
+)
+QUARTER_TURN: Final = CoordinateFrame(
+    "hall", 1e-3, (0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)), (10.0, 0.0, 0.0)
+)
+"""Turns x to y, and then moves 10 m along x."""
+
+
+def pose(x: float, y: float, z: float) -> tuple[float, ...]:
+    return (1, 0, 0, 0, x, y, z, 0.1)
 
 
 def frame_of(
