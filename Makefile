@@ -17,7 +17,7 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
 .PHONY: demo lock test test-integration-1 test-integration-2 test-commands test-takes test-hostile test-ports test-contract test-browser \
-    test-others test-compiled check lint types contracts generated docs lcm-types examples samples screenshots fuzz soak stops hiroz \
+    test-installation test-others test-compiled check lint types contracts generated docs lcm-types examples samples screenshots fuzz soak stops hiroz \
     mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
 
 demo: .venv/runtime
@@ -30,6 +30,7 @@ test: .venv/installed
 # `make test` in parts, of which `make check` runs several at the same time. The two halves of the integration tests and
 # of the attacks take as long as each other.
 BROWSER_TESTS := tests/view tests/site
+INSTALLATION_TESTS := tests/packaging tests/systemd
 INTEGRATION_TESTS := $(wildcard tests/integration/test_[a-k]*.py)
 PORT_ATTACKS := $(addprefix tests/hostile/test_,foxglove.py lsl_ports.py ros2.py rtc3d.py stops.py vrpn.py)
 test-integration-1: ARGS := '$(INTEGRATION_TESTS)'
@@ -40,8 +41,10 @@ test-hostile: ARGS := '$(filter-out $(PORT_ATTACKS),$(wildcard tests/hostile/tes
 test-ports: ARGS := '$(PORT_ATTACKS)'
 test-contract: ARGS := tests/contract
 test-browser: ARGS := '$(BROWSER_TESTS)'
-test-others: ARGS := '$(addprefix --ignore=,tests/integration tests/hostile tests/contract $(BROWSER_TESTS))'
-test-integration-1 test-integration-2 test-commands test-takes test-hostile test-ports test-contract test-browser test-others: .venv/installed
+test-installation: ARGS := '$(INSTALLATION_TESTS)'
+test-others: ARGS := '$(addprefix --ignore=,tests/integration tests/hostile tests/contract $(INSTALLATION_TESTS) $(BROWSER_TESTS))'
+test-integration-1 test-integration-2 test-commands test-takes test-hostile test-ports test-contract test-browser \
+test-installation test-others: .venv/installed
 	$(MAKE) --no-print-directory test ARGS=$(ARGS)
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
@@ -65,7 +68,8 @@ PARTS_AT_ONCE = $(MAKE) --keep-going --output-sync=target --no-print-directory
 
 check: .venv/installed
 	$(PARTS_AT_ONCE) --jobs=3 lint contracts generated docs wheelhouse
-	$(PARTS_AT_ONCE) --jobs=6 test-others test-commands test-takes test-integration-2 test-integration-1 compiled types test-contract
+	$(PARTS_AT_ONCE) --jobs=6 test-commands test-takes test-others test-integration-2 test-installation test-integration-1 \
+	    compiled types test-contract
 	$(PARTS_AT_ONCE) --jobs=3 test-hostile test-ports test-browser test-compiled
 
 lint: .venv/installed
