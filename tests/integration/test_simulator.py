@@ -249,10 +249,11 @@ async def test_each_packet_is_sent_with_one_send(served: Served) -> None:
     ):
         client.send(command("StreamFrames"), command("SendParameters"))
         num_packets = 0
-        while num_packets < max(60, client.segments_received()):  # the next ones arrive meanwhile
+        # The next packets arrive meanwhile, and TCP divides a few while this client is slow.
+        while num_packets < 60 or client.segments_received() > 1.5 * num_packets:
             await client.read()
             num_packets += 1
-            assert num_packets < 1000, "some packets are sent in several parts"
+            assert num_packets < 1000, "packets are sent in several parts"
 
 
 # Many clients -------------------------------------------------------------------------------
