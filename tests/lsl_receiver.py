@@ -55,6 +55,8 @@ class LslReceiver:
         assert self.process.stdout is not None
         with self.process.stdout as lines:
             for line in lines:
+                if not line.endswith(b"\n"):
+                    break  # the process was killed while it wrote
                 report = json.loads(line)
                 name = report["name"]
                 if "xml" in report:
