@@ -1,8 +1,8 @@
 """Outputs that take whole frames, each with the network around it and a real peer.
 
 The rig of the output NAME is the class ``Rig`` of the module NAME_rig.py beside this one. All tests of
-test_frame_outputs.py then run with it. Every number that the tests send is the x position of the only tool
-in view, so a rig has to recognise nothing else in what its peer receives.
+frames, test_frame_*.py, then run with it. Every number that the tests send is the x position of the only
+tool in view, so a rig has to recognise nothing else in what its peer receives.
 """
 
 import math
