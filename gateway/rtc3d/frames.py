@@ -1,7 +1,7 @@
 """Data frames (§7.1): splitting them into components, and encoding them."""
 
 import struct
-from collections.abc import Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from typing import Final, NamedTuple
 
 from gateway.errors import FrameError
@@ -69,6 +69,14 @@ class FrameLayout:
         """Returns (frame number, time stamp in µs) from a buffer and the offset of a component's content."""
         self.content_spans = tuple(_content_spans(fields))
         """The (start, end) of each known component's content in the body."""
+
+    def num_items(self, components: Collection[ComponentType]) -> dict[ComponentType, int]:
+        """Return how many items each of ``components`` has that is there; the most, if it is repeated."""
+        found: dict[ComponentType, int] = {}
+        for each in self.components:
+            if each.type in components:
+                found[each.type] = max(each.num_items, found.get(each.type, 0))
+        return found
 
 
 def _content_spans(fields: tuple[LayoutField, ...]) -> Iterator[tuple[int, int]]:

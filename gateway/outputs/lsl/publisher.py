@@ -53,10 +53,7 @@ class LslFramePublisher:
 
     def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
         """Have the streams of these components opened; return whether somebody receives one of them."""
-        num_items: dict[ComponentType, int] = {}
-        for each in layout.components:
-            if each.type in components:
-                num_items[each.type] = max(each.num_items, num_items.get(each.type, 0))
+        num_items = layout.num_items(components)
         more = {each: count for each, count in num_items.items() if count > self._num_items.get(each, -1)}
         with self._lock:
             if more and not self._is_full and not self._is_closed:

@@ -79,10 +79,7 @@ class RosSource:
 
     def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:
         """Open the topics of items that the parameters do not mention; return whether frames are wanted."""
-        counts: dict[ComponentType, int] = {}
-        for each in layout.components:
-            if each.type in components:
-                counts[each.type] = max(each.num_items, counts.get(each.type, 0))
+        counts = layout.num_items(components)
         more = {each: count for each, count in counts.items() if count > self._num_items.get(each, 0)}
         # If the queue is full, another layout or subscriber does it.
         if more and self._sender.offer(self._guarded(self.topics.open_for, more, self._parameters)):

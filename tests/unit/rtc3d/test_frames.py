@@ -39,6 +39,13 @@ def test_a_frame_of_all_five_components_is_encoded(order: ByteOrder) -> None:
     assert encode_frame(parts, order) == FULL_FRAME[order]
 
 
+def test_a_layout_counts_the_items_of_components_that_may_be_repeated() -> None:
+    encoded = [encode_component(ComponentType.ANALOG, 1, 1, np.zeros(count, ">f4")) for count in (2, 3, 1)]
+    layout = split_frame(encode_frame(encoded), "big").layout
+    assert layout.num_items(list(ComponentType)) == {ComponentType.ANALOG: 3}
+    assert layout.num_items({ComponentType.MARKERS}) == {}
+
+
 @both_orders
 def test_an_empty_frame_has_no_components(order: ByteOrder) -> None:
     split = split_frame(EMPTY_FRAME[order], order)
