@@ -10,7 +10,7 @@ import struct
 import rtc3d
 
 class output_status_t(object):
-    """ The status of one output (zenoh or lcm) for this source. """
+    """ The status of one output, such as zenoh or ros2, for this source. """
 
     __slots__ = ["name", "connected", "problem", "num_messages", "messages", "num_drops", "drops", "num_queries", "queries"]
 
