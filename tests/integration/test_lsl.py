@@ -102,8 +102,8 @@ def children(process_id: int) -> list[int]:
 
 def test_a_recording_has_labels_units_rates_and_capture_times(tmp_path: Path) -> None:
     with running(tmp_path) as lab:
-        receiver = lab.receive(*NAMES)
         began_s = time.monotonic()
+        receiver = lab.receive(*NAMES)
         receive_until_the_clock_is_known(receiver)
         wait_until(lambda: all(has(receiver, name, 4)() for name in NAMES), TIMEOUT_S)
         wait_until(has(receiver, "lab_analog", 3 * ANALOG_RATE_HZ), TIMEOUT_S)
