@@ -42,15 +42,9 @@ class LcmDatagrams:
         problem = multicast_problem(url) if destination else f"{url} has no multicast address; check lcm.url"
         if destination is None or problem:
             raise OutputError(problem, cause="not open")
-        group, _ = destination
-        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         try:
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            self._socket.bind(destination)
-            membership = struct.pack("=4s4s", ipaddress.IPv4Address(group).packed, bytes(4))
-            self._socket.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+            self._socket = _joined_socket(*destination)
         except OSError as error:
-            self._socket.close()
             raise OutputError(f"LCM does not open {url}: {error}; check lcm.url", cause="not open") from error
 
     def handle_timeout(self, timeout_ms: int) -> None:
@@ -66,3 +60,17 @@ class LcmDatagrams:
     def close(self) -> None:
         """Leave the group."""
         self._socket.close()
+
+
+def _joined_socket(group: str, port: int) -> socket.socket:
+    """Return a socket that receives what is sent to a multicast group. Raises OSError."""
+    joined = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        joined.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        joined.bind((group, port))
+        membership = struct.pack("=4s4s", ipaddress.IPv4Address(group).packed, bytes(4))
+        joined.setsockopt(socket.IPPROTO_IP, socket.IP_ADD_MEMBERSHIP, membership)
+    except OSError:
+        joined.close()
+        raise
+    return joined
