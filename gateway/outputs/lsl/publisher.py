@@ -56,8 +56,9 @@ class LslFramePublisher:
         num_items = layout.num_items(components)
         more = {each: count for each, count in num_items.items() if count > self._num_items.get(each, -1)}
         with self._lock:
-            if more and not self._is_full and not self._is_closed:
+            if more and not self._is_closed:
                 self._num_items |= more
+                # Even if the queue is full, because nobody may ask again.
                 self._append(functools.partial(self.streams.open_for, more), 0)
         return self.wants(num_items)
 

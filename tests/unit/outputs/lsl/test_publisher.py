@@ -126,6 +126,14 @@ def test_what_waits_for_the_thread_is_bounded(lab: Lab) -> None:
     assert refused.value.cause == "queue full"
 
 
+def test_streams_open_although_too_many_frames_wait(lab: Lab) -> None:
+    frame = frame_with((MARKERS, 3))
+    for number in range(MAX_WAITING):
+        lab.publisher.publish(frame, STAMP, number, ALL)
+    lab.prepare(frame_with((ANALOG, 2)))
+    assert ANALOG in lab.streams.numbers
+
+
 def test_a_closed_publisher_takes_nothing(lab: Lab) -> None:
     frame = frame_with((MARKERS, 3))
     lab.publisher.close()
