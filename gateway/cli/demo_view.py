@@ -9,6 +9,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import AbstractAsyncContextManager, asynccontextmanager
 from typing import Final, TypeAlias
 
+from gateway.child_process import module_environment
 from gateway.errors import ViewError
 
 ViewProcess: TypeAlias = Callable[[str], AbstractAsyncContextManager[None]]
@@ -37,7 +38,7 @@ async def view_process(endpoint: str, *, is_required: bool, opens_browser: bool)
         command.append("--no-browser")
     # A session of its own: Ctrl-C in the terminal must not end it before the demo does.
     process = await asyncio.create_subprocess_exec(
-        *command, stdout=asyncio.subprocess.PIPE, start_new_session=True
+        *command, stdout=asyncio.subprocess.PIPE, start_new_session=True, env=module_environment()
     )
     assert process.stdout is not None  # noqa: S101 - it is a pipe
     try:

@@ -2,7 +2,6 @@
 
 import contextlib
 import logging
-import os
 import signal
 import socket
 import subprocess
@@ -12,6 +11,7 @@ import time
 from collections.abc import Callable
 from typing import Final
 
+from gateway.child_process import module_environment
 from gateway.log import FailureLog
 from gateway.outputs.lsl.settings import LslSettings
 from gateway.outputs.lsl.wire import Message, Report
@@ -83,22 +83,12 @@ class LslProcesses:
         """Start a process if there is none; ``reopen`` sends it the streams."""
         if not self.is_due:
             return
-        ours, theirs = socket.socketpair()
         self._report = Report()
         self._started_s = time.monotonic()
         self._retry_s = self._started_s + self._retry_delay_s
         try:
-            with theirs:
-                self._process = subprocess.Popen(
-                    [sys.executable, "-m", "gateway.outputs.lsl.process"],
-                    stdin=theirs.fileno(),
-                    stdout=subprocess.DEVNULL,
-                    stderr=subprocess.DEVNULL,  # liblsl writes a line for each mistake of a client
-                    env=lsl_environment(self._settings),
-                    start_new_session=True,  # Ctrl+C is for the gateway
-                )
+            ours, self._process = _start_process(self._settings)
         except OSError as error:
-            ours.close()
             self._failed(f"the process for LSL cannot be started: {error.strerror}")
             return
         ours.settimeout(SILENCE_S)
@@ -194,15 +184,29 @@ class LslProcesses:
         self._failures.failed(self._problem)
 
 
-def lsl_environment(settings: LslSettings) -> dict[str, str]:
-    """Return the environment of a process that uses liblsl as the settings say.
+def _start_process(settings: LslSettings) -> tuple[socket.socket, subprocess.Popen[bytes]]:
+    """Return the socket to a new process, and the process. Raises OSError."""
+    ours, theirs = socket.socketpair()
+    try:
+        with theirs:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "gateway.outputs.lsl.process"],
+                stdin=theirs.fileno(),
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,  # liblsl writes a line for each mistake of a client
+                env=lsl_environment(settings),
+                start_new_session=True,  # Ctrl+C is for the gateway
+            )
+    except OSError:
+        ours.close()
+        raise
+    return ours, process
 
-    It finds the same modules as this process. Python would look for them in the working directory first,
-    where somebody may have a pylsl.py.
-    """
-    modules = {"PYTHONPATH": os.pathsep.join(sys.path), "PYTHONSAFEPATH": "1"}
+
+def lsl_environment(settings: LslSettings) -> dict[str, str]:
+    """Return the environment of a process that uses liblsl as the settings say."""
     config = {"LSLAPICFG": settings.config} if settings.config else {}
-    return {**os.environ, **modules, "OPENBLAS_NUM_THREADS": "1", **config}
+    return {**module_environment(), "OPENBLAS_NUM_THREADS": "1", **config}
 
 
 def _not_opened(report: Report) -> str:

@@ -1,9 +1,11 @@
 """The process for LSL: started, replaced when it ends or hangs, and what is said about it."""
 
+import errno
 import importlib.util
 import logging
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -47,6 +49,10 @@ def processes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[LslPr
 
 def nothing() -> None:
     """There are no streams to open again."""
+
+
+def raise_too_many_files() -> None:
+    raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
 
 
 def start(processes: LslProcesses, reopen: Callable[[], None] = nothing) -> int:
@@ -146,6 +152,18 @@ def test_modules_in_the_working_directory_are_not_used(
     (tmp_path / "pylsl.py").write_text("raise ImportError('this is a program of the user')")
     (tmp_path / "queue.py").write_text("raise ImportError('this too')")
     monkeypatch.chdir(tmp_path)
+    start(processes)
+
+
+def test_a_process_that_cannot_be_started_is_tried_again(
+    processes: LslProcesses, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with monkeypatch.context() as without_descriptors:
+        without_descriptors.setattr(socket, "socketpair", raise_too_many_files)
+        processes.restart(nothing)
+    assert processes.problem == (
+        "the process for LSL cannot be started: Too many open files; it is started again"
+    )
     start(processes)
 
 
