@@ -82,6 +82,11 @@ class Subject(NamedTuple):
         return self.not_tested(check, f"{self.name}.enabled is false")
 
 
+def as_sentence(text: str) -> str:
+    """Return the words of an error, such as what to do about it, with a capital letter and a full stop."""
+    return f"{text[:1].upper()}{text[1:]}."
+
+
 class MessageLoad(NamedTuple):
     """The rate of one component's messages, and the size of the largest."""
 

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Sequence
 from typing import Final
 
 from gateway.doctor.running_gateway import HealthReport, NoReport, RunningLoss, RunningOutput, RunningStream
-from gateway.findings import Finding, Subject
+from gateway.findings import Finding, Subject, as_sentence
 from gateway.stream.state import StreamState
 
 CHECKS: Final = ("health", "stream", "output", "loss")
@@ -100,7 +100,7 @@ def _check_output(output: RunningOutput) -> Finding:
     return _gateway.failing(
         "output",
         f"{output.output}: {found}",
-        f"{remedy[:1].upper()}{remedy[1:]}." if remedy else f"See the checks of {output.output} below.",
+        as_sentence(remedy) if remedy else f"See the checks of {output.output} below.",
     )
 
 

@@ -6,7 +6,7 @@ from typing import Final
 
 from gateway.config.settings import OutputSettings
 from gateway.errors import ConfigError
-from gateway.findings import Finding, MessageLoad, Subject
+from gateway.findings import Finding, MessageLoad, Subject, as_sentence
 from gateway.outputs.kind import OPENS, OutputKind
 
 _POLL_S: Final = 0.05
@@ -49,4 +49,4 @@ def _check_opens(kind: OutputKind, settings: OutputSettings, seconds: float) -> 
     if health.connected:
         return subject.passing(OPENS, "the output opens")
     found, _, remedy = health.problem.partition("; ")
-    return subject.failing(OPENS, found, f"{remedy[:1].upper()}{remedy[1:]}." if remedy else default_remedy)
+    return subject.failing(OPENS, found, as_sentence(remedy) if remedy else default_remedy)

@@ -13,7 +13,7 @@ from gateway.doctor.rate_check import check_rate
 from gateway.doctor.receive_buffer_check import check_receive_buffer
 from gateway.doctor.running_gateway import HealthReport
 from gateway.errors import ConnectError, LinkError, PacketError
-from gateway.findings import Finding, MessageLoad, Result, Subject
+from gateway.findings import Finding, MessageLoad, Result, Subject, as_sentence
 from gateway.rtc3d.default_ports import FIRST_PRINCIPLES_PORT, WAVEFRONT_PORT
 from gateway.rtc3d.parameters import Parameters
 from gateway.safe_text import quoted
@@ -224,9 +224,7 @@ class SourceChecks:
             found = _summary(parameters) + repaired
             if source_frame(self._source, parameters).metres_per_unit is None:
                 problem, _, remedy = unknown_unit_text(parameters, "positions in metres").partition("; ")
-                return self._subject.warning(
-                    "parameters", f"{found}; {problem}", f"{remedy[:1].upper()}{remedy[1:]}."
-                )
+                return self._subject.warning("parameters", f"{found}; {problem}", as_sentence(remedy))
             return self._subject.passing("parameters", found)
         refusals = [text for text in first.status.limitations if "SendParameters" in text]
         if refusals:

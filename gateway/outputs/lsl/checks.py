@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import Any, Final
 
 from gateway.errors import ConfigError, OutputError
-from gateway.findings import Finding, MessageLoad, Subject
+from gateway.findings import Finding, MessageLoad, Subject, as_sentence
 from gateway.messages.coordinate_frame import CoordinateFrame
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.lsl.output import LslOutput
@@ -91,7 +91,7 @@ def _find_streams(settings: LslSettings, seconds: float) -> list[dict[str, Any]]
 
 
 def _not_open(found: str, remedy: str) -> list[Finding]:
-    remedy = f"{remedy[:1].upper()}{remedy[1:]}." if remedy else "Correct lsl in the configuration."
+    remedy = as_sentence(remedy) if remedy else "Correct lsl in the configuration."
     others = [_lsl.not_tested(check, "it needs opens, which failed") for check in CHECKS[1:]]
     return [_lsl.failing("opens", found, remedy), *others]
 

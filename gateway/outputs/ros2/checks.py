@@ -7,7 +7,7 @@ from typing import Final
 import zenoh
 
 from gateway.descriptions.fitting_labels import printable
-from gateway.findings import Finding, MessageLoad, Subject
+from gateway.findings import Finding, MessageLoad, Subject, as_sentence
 from gateway.outputs.ros2.message_types import NO_HASH, ROS_TYPES
 from gateway.outputs.ros2.router import REMEDY, client_config
 from gateway.outputs.ros2.settings import Ros2Settings
@@ -52,7 +52,7 @@ def check_ros2(
     return [reached, _gateway(names, settings), _nodes(names, settings), _types(seen, settings)]
 
 
-_REMEDY: Final = f"{REMEDY[:1].upper()}{REMEDY[1:]}."
+_REMEDY: Final = as_sentence(REMEDY)
 
 
 def _gateway(names: Sequence[str], settings: Ros2Settings) -> Finding:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Final
 
-from gateway.findings import Finding, MessageLoad, Subject
+from gateway.findings import Finding, MessageLoad, Subject, as_sentence
 from gateway.outputs.takes.disk import disk_problem
 from gateway.outputs.takes.folder import check_directory
 from gateway.outputs.takes.settings import TakesSettings
@@ -39,7 +39,7 @@ def check_takes(
         found, _, remedy = disk_problem(directory, error).partition("; ")
         reason = "it needs folder, which failed"
         return [
-            _takes.failing("folder", found, f"{remedy[:1].upper()}{remedy[1:]}."),
+            _takes.failing("folder", found, as_sentence(remedy)),
             *(_takes.not_tested(check, reason) for check in CHECKS[1:]),
         ]
     writable = _takes.passing("folder", f"{directory} can be written")
