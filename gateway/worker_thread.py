@@ -67,9 +67,9 @@ class WorkerThread:
 
 
 async def result_of(call: Future[_Result]) -> _Result:
-    """Return the result of a call that goes on if whoever waits here gives up, or raise its exception.
+    """Return the result of a call, or raise its exception. Cancelling this does not cancel the call.
 
-    An exception that comes after that is nobody's, and no defect.
+    What the call raises after that is not logged.
     """
     result = asyncio.wrap_future(call)
     result.add_done_callback(_retrieve)
@@ -78,7 +78,7 @@ async def result_of(call: Future[_Result]) -> _Result:
 
 def _retrieve(result: "asyncio.Future[Any]") -> None:
     if not result.cancelled():
-        result.exception()  # or asyncio would log that it was never retrieved
+        result.exception()  # otherwise, asyncio logs that it was never retrieved
 
 
 def make_call(done: Future[_Result], call: Callable[[], _Result]) -> None:

@@ -219,7 +219,7 @@ class SourceSettings(Section):
 
 
 class ListenAddress(NamedTuple):
-    """A TCP address that a section has the gateway listen on; ``key`` is where the section has the port."""
+    """A TCP address that the gateway listens on; ``key`` is the path to the port in its section."""
 
     key: tuple[str, ...]
     host: str
@@ -245,7 +245,7 @@ class OutputSettings(Section):
 
     @property
     def listens_on(self) -> Sequence[ListenAddress]:
-        """The addresses to listen on, as far as they are in keys of the gateway's own."""
+        """The TCP addresses that the gateway listens on, except those in URLs of Zenoh and LCM."""
         return ()
 
 

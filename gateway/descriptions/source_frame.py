@@ -51,5 +51,5 @@ def _quaternion(angles: RollPitchYaw) -> Quaternion:
 
 
 def _tidy(value: float) -> float:
-    """Return 0 for what is 0 but for rounding errors, as the cosine of 90° is, so that poses show 0, too."""
+    """Return 0 for a rounding error such as the cosine of 90°, so that poses have 0 there, too."""
     return 0.0 if abs(value) < _ROUNDING_ERROR else value

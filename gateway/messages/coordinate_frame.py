@@ -34,8 +34,7 @@ class CoordinateFrame:
 
     ``metres_per_unit`` is the length of the server's unit, or a multiple of it if the settings scale it; None
     if the unit is unknown. Positions are first scaled, then rotated, then moved. Component messages keep the
-    server's units and axes. ``scale`` is what the settings scale by: metres of the server become as many
-    metres of the frame.
+    server's units and axes. ``scale`` is the factor in the settings: 1 m on the server is ``scale`` m here.
     """
 
     frame_id: str

@@ -58,7 +58,7 @@ class FramePublisher(Protocol):
     def wants(self, components: Collection[ComponentType]) -> bool:
         """Return whether any of ``components`` may have a subscriber; True if the output cannot know.
 
-        While no output wants any component of a stream on demand, the server need not send it.
+        A stream on demand is not requested while no output wants any of its components.
         """
 
     def prepare(self, layout: FrameLayout, components: frozenset[ComponentType]) -> bool:

@@ -23,7 +23,7 @@ def from_this_computer(host: str) -> str:
 
 
 def listen_problem(host: str, port: int) -> str:
-    """Return why no server can listen on ``port`` of all addresses of ``host``; "" if one can."""
+    """Return why a server cannot listen on ``port`` at every address of ``host``; "" if it can."""
     try:
         for family, _, _, _, address in socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE

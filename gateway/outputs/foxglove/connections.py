@@ -29,13 +29,13 @@ _RECEIVED_BURST_BYTES: Final = 512 * 1024
 """A viewer sends some kB when a panel opens. One that sends more than this is disconnected."""
 
 _BYTES_PER_FRAME: Final = 128
-"""What a frame counts besides its bytes: an empty one has 6 bytes, but costs as much time as others."""
+"""Added to the size of each frame: an empty one has 6 bytes, but takes as much time as others."""
 
 MAX_FRAGMENTS: Final = 1000
 """How many frames a message may have. websockets limits their bytes only, and keeps even empty ones."""
 
 _PIECE_BYTES: Final = 4096
-"""So much is parsed before the frames in it count; one read may have 256 kB, or 40 000 empty frames."""
+"""Data is parsed in pieces of this size: one read may have 256 kB, or 40 000 empty frames to count."""
 
 MAX_WAITING_BYTES: Final = 1024 * 1024
 """How much may wait for a viewer that does not read fast enough; then it loses messages."""
@@ -44,7 +44,7 @@ MAX_CONTROL_BYTES: Final = 8 * MAX_WAITING_BYTES
 """How much may wait with the messages about channels, which are not left out; then it is disconnected."""
 
 _FLUSH_BYTES: Final = 64 * 1024
-"""Messages are sent together, but not more of them: so much may come at once after a delay."""
+"""How many bytes are collected for one system call. After a delay, many messages come at once."""
 
 MAX_STALL_S: Final = 30.0
 """A viewer that has read nothing for this long, while so much waits, is disconnected."""

@@ -16,7 +16,7 @@ from gateway.token_bucket import TokenBucket
 from gateway.worker_thread import WorkerThread
 
 RECEIVED_PER_S: Final = 2000.0
-"""How many messages a second are received. Others are discarded before, and cannot be counted."""
+"""How many messages a second are received. LCM or the kernel discards further ones, uncounted."""
 
 _OTHER_CHANNEL: Final = 0.1
 """How much of RECEIVED_PER_S a message on another channel uses: on udpm://, all channels arrive."""

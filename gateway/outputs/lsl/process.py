@@ -187,7 +187,7 @@ def _limit_stacks() -> None:
 
 
 def _end_with_gateway() -> None:
-    """Have the kernel kill this process when the gateway's thread that started it ends, even if it hangs."""
+    """Have the kernel kill this process, even if it hangs, when the thread that started it ends."""
     libc = ctypes.CDLL(None)
     with contextlib.suppress(AttributeError):  # only Linux has it
         libc.prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL))

@@ -90,8 +90,8 @@ def diagnostics_of(status: Any, previous: Any = None, names: Names = NO_NAMES) -
 
     There is one more for items whose topics have other ``names`` than their labels.
 
-    What has lost messages since ``previous``, the ``status_t`` before, gets a warning. If that is missing or
-    old, nobody knows when they were lost.
+    A stream or output that has lost messages since ``previous``, the ``status_t`` before, gets a warning. If
+    that is missing or old, it is unknown when they were lost.
     """
     name = f"rtc3d_gateway: {status.source}"
     is_known = previous is not None and status.utime - previous.utime <= _MAX_PREVIOUS_US
@@ -124,7 +124,7 @@ def _labels(name: str, server: str, names: Names) -> DiagnosticStatus:
         for component, parts in names.items()
         for label, part in parts.items()
     }
-    return DiagnosticStatus(OK, f"{name} names", "labels that are no names of ROS", server, values)
+    return DiagnosticStatus(OK, f"{name} names", "labels that are not valid names in ROS", server, values)
 
 
 def _stream(name: str, server: str, stream: Any, lost: Mapping[str, int]) -> DiagnosticStatus:

@@ -4,6 +4,7 @@ import socket
 from collections.abc import Sequence
 from typing import Final
 
+from gateway.errors import system_reason
 from gateway.findings import Finding, MessageLoad, Subject
 from gateway.outputs.listen_address import from_this_computer, is_loopback
 from gateway.outputs.vrpn.protocol import COOKIE_BYTES, COOKIE_START
@@ -39,7 +40,7 @@ def _check_port(settings: VrpnSettings) -> Finding:
             return _vrpn.passing("port", f"a VRPN server answers on {where}")
         return _vrpn.failing(
             "port",
-            f"cannot listen on {where}: {error.strerror or error}, and no VRPN server answers there",
+            f"cannot listen on {where}: {system_reason(error)}, and no VRPN server answers there",
             "Stop the program that uses the port, or set vrpn.host and vrpn.port to an address of this "
             "computer and a free port.",
         )
