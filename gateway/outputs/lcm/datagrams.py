@@ -18,6 +18,8 @@ from gateway.outputs.lcm.connection import multicast_destination, multicast_prob
 _MAGIC: Final = b"LC02"
 """Begins a datagram with a whole message. Those with fragments of one are ignored."""
 
+NO_CHANNEL: Final = ""
+
 _HEADER_BYTES: Final = 8
 _MAX_DATAGRAM_BYTES: Final = 65_535
 
@@ -33,7 +35,8 @@ def split_datagram(datagram: bytes) -> tuple[str, bytes] | None:
 class LcmDatagrams:
     """Receives on a URL udpm://, and passes the channel and the bytes of each message to ``receive``.
 
-    Raises OutputError if the group cannot be joined.
+    A datagram that has no whole message counts as an empty message on NO_CHANNEL, because it takes as much
+    time. Raises OutputError if the group cannot be joined.
     """
 
     def __init__(self, url: str, receive: Callable[[str, bytes], None]) -> None:
@@ -54,8 +57,7 @@ class LcmDatagrams:
             datagram = self._socket.recv(_MAX_DATAGRAM_BYTES)
         except TimeoutError:
             return
-        if found := split_datagram(datagram):
-            self._receive(*found)
+        self._receive(*(split_datagram(datagram) or (NO_CHANNEL, b"")))
 
     def close(self) -> None:
         """Leave the group."""

@@ -18,8 +18,8 @@ from gateway.worker_thread import WorkerThread
 RECEIVED_PER_S: Final = 2000.0
 """How many messages a second are received. LCM or the kernel discards further ones, uncounted."""
 
-_OTHER_CHANNEL: Final = 0.1
-"""How much of RECEIVED_PER_S a message on another channel uses: on udpm://, all channels arrive."""
+_OTHER_CHANNEL: Final = 0.05
+"""How much of RECEIVED_PER_S any other datagram uses. On udpm://, what the gateway publishes arrives, too."""
 
 _POLL_MS: Final = 100
 _PAUSE_S: Final = 0.02

@@ -7,7 +7,7 @@ import lcm
 import pytest
 
 from gateway.errors import OutputError
-from gateway.outputs.lcm.datagrams import LcmDatagrams, split_datagram
+from gateway.outputs.lcm.datagrams import NO_CHANNEL, LcmDatagrams, split_datagram
 
 PORT = 7721
 URL = f"udpm://239.255.76.67:{PORT}?ttl=0"
@@ -58,13 +58,15 @@ def test_it_receives_what_lcm_sends_while_another_program_receives_too(
 
 
 @pytest.mark.netns
-def test_it_ignores_what_is_no_message(datagrams: LcmDatagrams, received: list[tuple[str, bytes]]) -> None:
+def test_what_is_no_message_counts_as_an_empty_one(
+    datagrams: LcmDatagrams, received: list[tuple[str, bytes]]
+) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for datagram in (b"", b"nothing of LCM", b"LC02\0\0\0\0NAME"):
             sender.sendto(datagram, ("239.255.76.67", PORT))
             datagrams.handle_timeout(5000)
     datagrams.handle_timeout(1)  # nothing arrives
-    assert received == []
+    assert received == 3 * [(NO_CHANNEL, b"")]
 
 
 @pytest.mark.netns
