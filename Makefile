@@ -27,17 +27,18 @@ demo: .venv/runtime
 test: .venv/installed
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) tests/with-netns $(BIN)/pytest $(ARGS)
 
-# `make test` in parts, of which `make check` runs several at the same time. The two halves of the integration tests and
-# of the attacks take as long as each other.
+# `make test` in parts, of which `make check` runs several at the same time. The two parts of the integration tests take
+# about as long as each other, and so do those of the attacks.
 BROWSER_TESTS := tests/view tests/site
 INSTALLATION_TESTS := tests/packaging tests/systemd
 INTEGRATION_TESTS := $(wildcard tests/integration/test_[a-k]*.py)
 PORT_ATTACKS := $(addprefix tests/hostile/test_,foxglove.py lsl_ports.py ros2.py rtc3d.py stops.py vrpn.py)
 test-integration-1: ARGS := '$(INTEGRATION_TESTS)'
-test-integration-2: ARGS := '$(filter-out $(INTEGRATION_TESTS),$(wildcard tests/integration/test_*.py))'
+test-integration-2: ARGS := 'tests/integration \
+    $(addprefix --ignore=,tests/integration/commands tests/integration/takes $(INTEGRATION_TESTS))'
 test-commands: ARGS := tests/integration/commands
 test-takes: ARGS := tests/integration/takes
-test-hostile: ARGS := '$(filter-out $(PORT_ATTACKS),$(wildcard tests/hostile/test_*.py))'
+test-hostile: ARGS := 'tests/hostile $(addprefix --ignore=,$(PORT_ATTACKS))'
 test-ports: ARGS := '$(PORT_ATTACKS)'
 test-contract: ARGS := tests/contract
 test-browser: ARGS := '$(BROWSER_TESTS)'
