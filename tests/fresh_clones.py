@@ -19,8 +19,8 @@ WHEELHOUSE_PYTHON: Final = ROOT / "build/wheelhouse-venv/bin/python"
 SYSTEM_PYTHON: Final = os.environ.get("SYSTEM_PYTHON", "/usr/bin/python3")
 """The Python to install with. Services must be able to run it, so it must not be in a home directory."""
 
-QUICK_CC: Final = str(ROOT / "tests/quick-cc")
-"""A C compiler that does not optimise."""
+QUICK_CC: Final = str(ROOT / "tests/quick-cc") if shutil.which("cc") else "cc"
+"""A C compiler that does not optimise, if there is a compiler."""
 
 _PROJECT: Final = tomllib.loads((ROOT / "pyproject.toml").read_text())
 

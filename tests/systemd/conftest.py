@@ -12,7 +12,7 @@ from tests.networks import free_endpoint
 from tests.systemd.machine import CLONE, DROP_INS, Machine, Service
 from tests.systemd.page import commands
 
-QUICKLY = "export CC=/run/repository/tests/quick-cc\n"
+QUICKLY = "export CC=/run/repository/tests/quick-cc\n" if shutil.which("cc") else ""
 
 
 @pytest.fixture(scope="session")
