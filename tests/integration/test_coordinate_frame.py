@@ -103,9 +103,8 @@ async def test_a_reload_changes_the_frame_of_a_stream_that_goes_on() -> None:
                 update={"frame_id": "world", "transform": TransformSettings.model_validate(Y_UP)}
             )
             changes = await gateway.reload(gateway.settings.model_copy(update={"sources": (moved,)}))
-            newest = max(tools)
-            await wait_until_async(lambda: [number for number in poses if number > newest + 2])
             await wait_until_async(lambda: FRAME in frames)
+            await wait_until_async(lambda: poses[max(poses.keys() & tools.keys())].parameters_version == 2)
     assert changes == ["coordinate frame of source lab changed"]
     in_order = [tools[number] for number in sorted(tools)]
     assert {each.session for each in in_order} == {1}

@@ -155,11 +155,11 @@ async def test_a_flood_of_empty_frames_ends_the_connection() -> None:
 
 async def test_thousands_of_subscriptions_may_come_at_once_each_in_a_message() -> None:
     names = [f"lab_{number}" for number in range(200)]
-    async with serving(*names) as (port, [lab, *_]), viewing(port) as viewer:
+    async with serving(*names) as (port, sources), viewing(port) as viewer:
         await viewer.wait_until(lambda: len(viewer.topics) == 1200)
         for topic in viewer.topics:
             viewer.subscribe(topic)
-        await lab.wait_until_wanted()
+        await wait_until_async(lambda: all(source.wanted for source in sources))
         assert not viewer.is_closed
 
 

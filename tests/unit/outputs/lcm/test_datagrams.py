@@ -2,15 +2,17 @@
 
 import socket
 from collections.abc import Iterator
+from urllib.parse import urlsplit
 
 import lcm
 import pytest
 
 from gateway.errors import OutputError
 from gateway.outputs.lcm.datagrams import NO_CHANNEL, LcmDatagrams, split_datagram
+from tests.networks import lcm_url
 
-PORT = 7721
-URL = f"udpm://239.255.76.67:{PORT}?ttl=0"
+URL = lcm_url()
+GROUP = ("239.255.76.67", urlsplit(URL).port)
 
 
 @pytest.mark.parametrize(
@@ -63,7 +65,7 @@ def test_what_is_no_message_counts_as_an_empty_one(
 ) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         for datagram in (b"", b"nothing of LCM", b"LC02\0\0\0\0NAME"):
-            sender.sendto(datagram, ("239.255.76.67", PORT))
+            sender.sendto(datagram, GROUP)
             datagrams.handle_timeout(5000)
     datagrams.handle_timeout(1)  # nothing arrives
     assert received == 3 * [(NO_CHANNEL, b"")]

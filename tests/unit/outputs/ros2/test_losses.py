@@ -66,7 +66,7 @@ def stalled(lab: RosLab) -> threading.Event:
     may_go_on = threading.Event()
 
     def wait() -> None:
-        may_go_on.wait(10)
+        may_go_on.wait(60)
 
     lab.output.submit(wait)
     return may_go_on
@@ -87,7 +87,7 @@ def test_frames_beyond_the_queue_are_refused_and_ros_sees_the_gap(lab: RosLab) -
     may_go_on.set()
     is_empty = threading.Event()
     wait_until(lambda: lab.output.offer(is_empty.set))
-    assert is_empty.wait(10)
+    assert is_empty.wait(30)
     publisher.publish(frame, stamp(), 4, ALL)
     wait_until(lambda: len(lab.received["/mocap/lab/analog"]) == 2)
     assert [each.sequence for each in lab.received["/mocap/lab/markers"]] == [1, 5]
