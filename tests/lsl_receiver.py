@@ -66,7 +66,7 @@ class LslReceiver:
                     self.samples[name] += zip(report["times"], report["values"], strict=True)
 
     def forget(self) -> None:
-        """Begin anew with the samples."""
+        """Forget the samples received so far."""
         self.samples = defaultdict(list)
 
     def close(self) -> None:

@@ -82,28 +82,21 @@ def short(sent: Callable[[], bytes]) -> Attack:
 
 
 def endless(begin: bytes, repeated: bytes, *, reads: bool = True) -> Attack:
-    """Send ``begin``, then ``repeated`` without end; connect again if the connection ends."""
+    """Send ``begin``, then ``repeated`` without end."""
 
     async def attack(port: int) -> None:
-        while True:
-            with contextlib.suppress(OSError):
-                await _send_endlessly(port, begin, repeated, reads=reads)
-            await asyncio.sleep(0.01)
+        reader, writer = await asyncio.open_connection("127.0.0.1", port)
+        reading = asyncio.create_task(_discard(reader) if reads else asyncio.Event().wait())
+        try:
+            writer.write(begin)
+            while not reading.done():
+                writer.write(repeated)
+                await writer.drain()
+        finally:
+            reading.cancel()
+            writer.close()
 
     return attack
-
-
-async def _send_endlessly(port: int, begin: bytes, repeated: bytes, *, reads: bool) -> None:
-    reader, writer = await asyncio.open_connection("127.0.0.1", port)
-    reading = asyncio.create_task(_discard(reader) if reads else asyncio.Event().wait())
-    try:
-        writer.write(begin)
-        while not reading.done():
-            writer.write(repeated)
-            await writer.drain()
-    finally:
-        reading.cancel()
-        writer.close()
 
 
 async def _discard(reader: asyncio.StreamReader) -> None:

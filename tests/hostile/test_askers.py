@@ -123,7 +123,8 @@ async def test_askers_that_do_not_read_the_answers(
         await wait_for_frames(gateway)
         spool = Path(gateway.folder) / "spool"
         spool.mkdir(exist_ok=True)
-        (spool / "lab-20260102T030405.678901Z.c3d").write_bytes(bytes(10_000_000))  # one may be on its way
+        # The answer on its way to the stalled asker, a whole file, stays in memory.
+        (spool / "lab-20260102T030405.678901Z.c3d").write_bytes(bytes(10_000_000))
         async with asker(
             gateway, 1000, "mocap/lab/3d?format=json", "mocap/lab/c3d", "mocap/lab/**"
         ) as stalled:

@@ -89,7 +89,7 @@ def has(receiver: LslReceiver, name: str, count: int) -> Callable[[], bool]:
 
 
 def receive_until_the_clock_is_known(receiver: LslReceiver, rate_hz: int = RATE_HZ) -> None:
-    """Receive lab_3d for the first 2 s, and forget it: the times before were those of the arrival."""
+    """Forget the samples of the first 2 s: until the server's clock is known, their times are of arrival."""
     wait_until(has(receiver, "lab_3d", 2 * rate_hz), TIMEOUT_S)
     receiver.forget()
 

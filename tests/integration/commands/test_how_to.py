@@ -26,7 +26,8 @@ PAGES: Final = sorted(
 def test_pages_can_be_tried() -> None:
     """Other tests run the commands of the pages record, use-takes, secure and service."""
     servers = {"first-principles", "wavefront", "several-servers"}
-    assert servers | {"router", "lcm", "ros2", "replay", "troubleshoot"} <= set(PAGES)
+    outputs = {"lcm", "ros2", "rtc3d-clients", "vrpn", "lsl", "foxglove"}
+    assert servers | outputs | {"router", "replay", "troubleshoot"} <= set(PAGES)
 
 
 @pytest.fixture

@@ -7,9 +7,7 @@ import pytest
 from gateway.errors import ClosedError, LinkError
 from gateway.rtc3d.commands import Version
 from gateway.stream.state import StreamState
-from tests.unit.stream.scripted_server import (
-    silent_to,
-)
+from tests.unit.stream.scripted_server import silent_to
 from tests.unit.stream.session_lab import Lab, lab, now_s
 from tests.unit.stream.virtual_time import settle
 

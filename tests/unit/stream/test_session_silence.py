@@ -9,11 +9,7 @@ from gateway.errors import DefectError, SilenceError
 from gateway.rtc3d.commands import StopStreaming, Version
 from gateway.stream.state import StreamState
 from tests.servers import ok, packet
-from tests.unit.stream.scripted_server import (
-    BROKEN_FRAME,
-    obliging,
-    silent_to,
-)
+from tests.unit.stream.scripted_server import BROKEN_FRAME, obliging, silent_to
 from tests.unit.stream.session_lab import NO_DATA, Lab, lab, now_s
 from tests.unit.stream.virtual_time import stop_process
 

@@ -43,6 +43,8 @@ LABELS = {
     "force": ["First force plate"],
     "event": ["Button", ""],
 }
+"""Of the specification's parameters."""
+
 UNITS: dict[str, dict[str, Any]] = {
     "3d": {"units": ["mm", "mm"]},
     "6d": {"units": ["mm", "mm"]},
@@ -50,7 +52,6 @@ UNITS: dict[str, dict[str, Any]] = {
     "force": {"units": ["N"], "moment_unit": ""},  # it describes no moments
     "event": {},
 }
-"""Of the specification's parameters."""
 
 
 class Lab:
