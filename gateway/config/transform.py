@@ -44,7 +44,8 @@ def _unit_quaternion(values: tuple[float, float, float, float]) -> tuple[float, 
 _ANGLE: Final = expects("a number of degrees from -360 to 360")
 Degrees = Annotated[float, Field(strict=True, ge=-360, le=360, allow_inf_nan=False), _ANGLE]
 Unit = Annotated[
-    Literal["m", "dm", "cm", "mm", "um", "in"], expects("m, dm, cm, mm, um or in, or null for the server's")
+    Literal["m", "dm", "cm", "mm", "um", "in", "ft"],
+    expects("m, dm, cm, mm, um, in or ft, or null for the server's"),
 ]
 Scale = Annotated[
     float,

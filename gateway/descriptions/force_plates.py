@@ -11,6 +11,7 @@ from typing import Any, Final, NamedTuple, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from gateway.messages.tool_pose import metres_per_unit
 from gateway.rtc3d.parameters import ParametersAnalog, Plate, Point
 
 Array: TypeAlias = npt.NDArray[Any]
@@ -24,7 +25,6 @@ CALIBRATED: Final = 4
 
 ADDED_LABELS: Final = ("Fx", "Fy", "Fz", "Mx", "My", "Mz")
 
-_MILLIMETRES: Final = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "um": 0.001, "µm": 0.001, "in": 25.4}
 _MOMENT_UNIT: Final = re.compile(r"\s*k?n\W?(mm|cm|m)\s*", re.IGNORECASE)
 _TOLERANCE: Final = 1e-3
 """How much computed loads may differ from recorded ones, as a part of the largest."""
@@ -137,9 +137,9 @@ def _position(point: Point, unit: str) -> Array:
 
 
 def _length_factor(unit: str, wanted: str) -> float:
-    """Return the factor from one unit of length to another; 1 if one of them is not known."""
-    from_mm, to_mm = (_MILLIMETRES.get(name.strip().lower()) for name in (unit, wanted))
-    return from_mm / to_mm if from_mm and to_mm else 1.0
+    """Return the factor from one unit of length to another; 1 if one of them is unknown or missing."""
+    from_m, to_m = (metres_per_unit(name) if name.strip() else None for name in (unit, wanted))
+    return from_m / to_m if from_m and to_m else 1.0
 
 
 def _reader_origin(origin: Array) -> Array:

@@ -57,6 +57,12 @@ def test_positions_have_the_unit_of_the_points() -> None:
     assert in_metres.origin.tolist() == [0, 0, 0]
 
 
+def test_a_plate_may_be_in_any_unit_that_markers_have() -> None:
+    geometry = geometry_of(replace(PLATE, origin=Point(1, 2, -3, "Feet")), "dm")
+    assert geometry
+    assert geometry.origin.tolist() == pytest.approx([3.048, 6.096, -9.144])
+
+
 @pytest.mark.parametrize(
     ("moment_unit", "position_unit", "factor"),
     [

@@ -33,6 +33,7 @@ def test_without_settings_a_frame_has_the_name_of_the_source_and_the_unit_of_the
 def test_settings_name_the_frame_and_the_unit() -> None:
     expected = CoordinateFrame("world/hall", 0.0508, scale=2.0)
     assert frame_of("furlong", "world/hall", units="in", scale=2.0) == expected
+    assert frame_of("mm", units="ft") == CoordinateFrame("lab", 0.3048)
 
 
 @pytest.mark.parametrize(
@@ -56,7 +57,7 @@ def test_units_have_several_names(unit: str, metres: float | None) -> None:
 
 def test_all_units_of_the_settings_are_known() -> None:
     units = get_args(get_args(Unit)[0])
-    assert len(units) == 6
+    assert len(units) == 7
     assert all(metres_per_unit(unit) for unit in units)
 
 
@@ -101,7 +102,7 @@ def test_a_quaternion_is_the_same_as_its_angles() -> None:
     [
         (
             {"units": "feet"},
-            ("units", "found 'feet'; expected m, dm, cm, mm, um or in, or null for the server's"),
+            ("units", "found 'feet'; expected m, dm, cm, mm, um, in or ft, or null for the server's"),
         ),
         ({"up": "x"}, ("up", "found 'x'; expected y or z")),
         ({"scale": 0}, ("scale", "found 0; expected a number from 0.000001 to 1000000")),
