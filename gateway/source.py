@@ -151,7 +151,7 @@ class Source:
                 stream.status.losses.close()
 
     async def change_frame(self, settings: SourceSettings) -> None:
-        """Use ``settings``, which differ only in the frame of poses, and tell every output. Streams go on."""
+        """Use ``settings``, which differ only in the frame of poses, and tell outputs. Streams continue."""
         self.settings = self.queries.settings = settings
         if self.known_parameters.version:
             await self.queries.parameters.begin_version()

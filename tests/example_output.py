@@ -107,7 +107,7 @@ class ExampleFramePublisher:
         return self._publisher.wanted
 
     def prepare(self, _layout: FrameLayout, _components: frozenset[ComponentType]) -> bool:
-        """Publish all frames, for whoever may be subscribed."""
+        """Publish all frames, whether or not anybody has subscribed."""
         return True
 
     def publish(

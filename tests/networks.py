@@ -14,7 +14,7 @@ import zenoh
 
 _LCM_PORTS: Final = itertools.count(7720)
 _PORTS: Final = itertools.cycle(range(10_000, 32_000))
-"""Linux chooses from 32768 on, unless it is told another range."""
+"""By default, Linux chooses ports from 32768 on."""
 _OPEN_TIMEOUT_S: Final = 30.0
 _MULTICAST: Final = ("224.0.0.0/4", "dev", "lo")
 
