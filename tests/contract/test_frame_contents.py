@@ -57,6 +57,13 @@ WEIRD_LABELS: Final = (
 )
 
 
+async def subscribe_again(lab: Lab, version: int) -> None:
+    """Give LAB its usual parameters again, and subscribe to its streams anew."""
+    lab.set_parameters(LAB, labelled(), version)
+    await asyncio.to_thread(lab.rig.unsubscribe)
+    await lab.subscribe()
+
+
 @every_rig
 @pytest.mark.parametrize("name", odd_frames(1))
 async def test_frames_may_lack_or_repeat_components(lab: Lab, name: str) -> None:
@@ -100,9 +107,7 @@ async def test_tools_may_come_and_go(lab: Lab) -> None:
         for number in (10_000 * version, 10_000 * version + 1):
             items = tools(number, *[np.nan] * (num_tools - 1))
             lab.publish(LAB, frame_of(component(number, ComponentType.TOOLS, items)), stamp(version))
-    lab.set_parameters(LAB, labelled(), 6)
-    await asyncio.to_thread(lab.rig.unsubscribe)
-    await lab.subscribe()
+    await subscribe_again(lab, 6)
     assert not set(lab.lost()) - {"queue full"}
 
 
@@ -114,9 +119,7 @@ async def test_labels_may_be_no_valid_names(lab: Lab) -> None:
         items = tools(number, *[np.nan] * (len(WEIRD_LABELS) - 1))
         lab.publish(LAB, frame_of(component(number, ComponentType.TOOLS, items)), stamp(2))
     await lab.arrives_next(HALL)
-    lab.set_parameters(LAB, labelled(), 3)
-    await asyncio.to_thread(lab.rig.unsubscribe)
-    await lab.subscribe()
+    await subscribe_again(lab, 3)
 
 
 @every_rig
@@ -134,9 +137,7 @@ async def test_thousands_of_labels_disturb_nobody(lab: Lab) -> None:
     for _ in range(5):
         await returns(lambda: lab.publish(LAB, huge, stamp(2)))
         await lab.arrives_next(HALL)
-    lab.set_parameters(LAB, labelled(), 3)
-    await asyncio.to_thread(lab.rig.unsubscribe)
-    await lab.subscribe()
+    await subscribe_again(lab, 3)
 
 
 @converts

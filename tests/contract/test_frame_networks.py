@@ -57,11 +57,15 @@ GARBAGE: Final = {
 # Without a network -----------------------------------------------------------------------------------
 
 
-@can_be_cut
-async def test_without_a_network_starting_raises_nothing_and_health_names_the_remedy(lab: Lab) -> None:
+async def start_without_a_network(lab: Lab) -> None:
     await asyncio.to_thread(lab.rig.cut)
     lab.serve()
     lab.output.start()
+
+
+@can_be_cut
+async def test_without_a_network_starting_raises_nothing_and_health_names_the_remedy(lab: Lab) -> None:
+    await start_without_a_network(lab)
     await wait_until_async(lambda: names_remedy(lab))
     lab.publish_next()
     assert set(lab.lost()) <= {"not open", "no router"}
@@ -69,9 +73,7 @@ async def test_without_a_network_starting_raises_nothing_and_health_names_the_re
 
 @can_be_cut
 async def test_an_output_started_without_a_network_recovers_by_itself(lab: Lab) -> None:
-    await asyncio.to_thread(lab.rig.cut)
-    lab.serve()
-    lab.output.start()
+    await start_without_a_network(lab)
     await wait_until_async(lambda: names_remedy(lab))
     await asyncio.to_thread(lab.rig.restore)
     await wait_until_async(lambda: lab.output.health().connected)
@@ -80,9 +82,7 @@ async def test_an_output_started_without_a_network_recovers_by_itself(lab: Lab) 
 
 @can_be_cut
 async def test_closing_is_safe_without_a_network(lab: Lab) -> None:
-    await asyncio.to_thread(lab.rig.cut)
-    lab.serve()
-    lab.output.start()
+    await start_without_a_network(lab)
     await returns(lab.output.close)
     assert not lab.output.health().connected
 

@@ -25,6 +25,13 @@ _Result = TypeVar("_Result")
 UTIME: Final = 1_700_000_000_000_000
 
 
+MARKERS, TOOLS, ANALOG, FORCE, EVENT = (
+    ComponentType.MARKERS,
+    ComponentType.TOOLS,
+    ComponentType.ANALOG,
+    ComponentType.FORCE,
+    ComponentType.EVENT,
+)
 PLATE: Final = Plate(
     "1",
     "left",

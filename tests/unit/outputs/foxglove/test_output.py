@@ -23,16 +23,21 @@ from gateway.rtc3d.parameters import (
 from tests.foxglove_viewer import HandshakeRefusedError, Viewer, viewing
 from tests.networks import free_port
 from tests.unit.export.read_mcap import floats_of
-from tests.unit.outputs.foxglove.live import PLATE, QUARTER_TURN, channels, frame_of, pose, serving
+from tests.unit.outputs.foxglove.live import (
+    ANALOG,
+    EVENT,
+    FORCE,
+    MARKERS,
+    PLATE,
+    QUARTER_TURN,
+    TOOLS,
+    channels,
+    frame_of,
+    pose,
+    serving,
+)
 from tests.waiting import wait_until_async
 
-MARKERS, TOOLS, ANALOG, FORCE, EVENT = (
-    ComponentType.MARKERS,
-    ComponentType.TOOLS,
-    ComponentType.ANALOG,
-    ComponentType.FORCE,
-    ComponentType.EVENT,
-)
 ALWAYS = {
     "/lab/markers": "foxglove.PointCloud",
     "/lab/tools": "foxglove.FrameTransforms",

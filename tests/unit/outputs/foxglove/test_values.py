@@ -7,7 +7,7 @@ import pytest
 
 from gateway.foxglove_schemas import messages
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.rtc3d.components import MISSING, ByteOrder, ComponentType
+from gateway.rtc3d.components import MISSING, ByteOrder
 from gateway.rtc3d.parameters import (
     Parameters,
     Parameters3D,
@@ -17,14 +17,19 @@ from gateway.rtc3d.parameters import (
 )
 from tests.foxglove_viewer import viewing
 from tests.unit.export.read_mcap import floats_of, points_of
-from tests.unit.outputs.foxglove.live import PLATE, QUARTER_TURN, UTIME, channels, frame_of, pose, serving
-
-MARKERS, TOOLS, ANALOG, FORCE, EVENT = (
-    ComponentType.MARKERS,
-    ComponentType.TOOLS,
-    ComponentType.ANALOG,
-    ComponentType.FORCE,
-    ComponentType.EVENT,
+from tests.unit.outputs.foxglove.live import (
+    ANALOG,
+    EVENT,
+    FORCE,
+    MARKERS,
+    PLATE,
+    QUARTER_TURN,
+    TOOLS,
+    UTIME,
+    channels,
+    frame_of,
+    pose,
+    serving,
 )
 
 
