@@ -16,37 +16,23 @@ SYSTEM_PYTHON ?= /usr/bin/python3
 # What a wheel is built from.
 SOURCES := gateway lcm_types config pyproject.toml README.md LICENSE
 
-.PHONY: demo lock test test-integration-1 test-integration-2 test-commands test-takes test-hostile test-ports test-contract test-browser \
-    test-installation test-others test-compiled check lint types contracts generated docs lcm-types examples samples screenshots fuzz soak stops hiroz \
-    mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
+.PHONY: demo lock test test-slow test-compiled check lint types contracts generated docs lcm-types examples samples \
+    screenshots fuzz soak stops hiroz mutants bench bench-quick zenohd wheel compiled wheelhouse install uninstall clone-url clean
 
 demo: .venv/runtime
 	$(BIN)/rtc3d-gateway demo
 
-# Without MAKEFLAGS, a make that a test runs does not look for the job slots of this one.
+# Unit, property, contract and integration tests. Without MAKEFLAGS, a make that a test runs does not look for the job
+# slots of this one.
 test: .venv/installed
-	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) tests/with-netns $(BIN)/pytest $(ARGS)
+	MAKEFLAGS= $(BIN)/python tests/run.py $(ARGS)
 
-# `make test` in parts, of which `make check` runs several at the same time. The two parts of the integration tests take
-# about as long as each other, and so do those of the attacks.
-BROWSER_TESTS := tests/view tests/site
-INSTALLATION_TESTS := tests/packaging tests/systemd
-INTEGRATION_TESTS := $(wildcard tests/integration/test_[a-k]*.py)
-PORT_ATTACKS := $(addprefix tests/hostile/test_,foxglove.py lsl_ports.py ros2.py rtc3d.py stops.py vrpn.py)
-test-integration-1: ARGS := '$(INTEGRATION_TESTS)'
-test-integration-2: ARGS := 'tests/integration \
-    $(addprefix --ignore=,tests/integration/commands tests/integration/takes $(INTEGRATION_TESTS))'
-test-commands: ARGS := tests/integration/commands
-test-takes: ARGS := tests/integration/takes
-test-hostile: ARGS := 'tests/hostile $(addprefix --ignore=,$(PORT_ATTACKS))'
-test-ports: ARGS := '$(PORT_ATTACKS)'
-test-contract: ARGS := tests/contract
-test-browser: ARGS := '$(BROWSER_TESTS)'
-test-installation: ARGS := '$(INSTALLATION_TESTS)'
-test-others: ARGS := '$(addprefix --ignore=,tests/integration tests/hostile tests/contract $(INSTALLATION_TESTS) $(BROWSER_TESTS))'
-test-integration-1 test-integration-2 test-commands test-takes test-hostile test-ports test-contract test-browser \
-test-installation test-others: .venv/installed
-	$(MAKE) --no-print-directory test ARGS=$(ARGS)
+# What is slow by nature: attacks, browsers, installation, systemd, the examples in other languages, and the commands
+# in the documents.
+SLOW_TESTS := $(addprefix tests/,hostile documents systemd packaging languages benchmarks view site)
+
+test-slow: .venv/installed build/wheelhouse/complete
+	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) $(BIN)/python tests/run.py $(or $(ARGS),$(SLOW_TESTS))
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.
@@ -61,17 +47,14 @@ COMPILED_TESTS := tests/packaging/test_compiled.py tests/unit/test_log.py \
     tests/integration/test_faults.py::test_data_flows_again_after_several_faults_at_once
 
 test-compiled: build/compiled/complete
-	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 tests/with-netns $(BIN)/pytest -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
+	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 $(BIN)/python tests/run.py -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
 
-# Each run of pytest has a network namespace of its own, so they do not disturb each other. Those of the second line wait
-# for most of their time, so six run on two cores. Those of the last line measure delays, or need a core for themselves.
-PARTS_AT_ONCE = $(MAKE) --keep-going --output-sync=target --no-print-directory
-
+# The tests use both cores, and wait often enough for the compiler and mypy to run beside them.
 check: .venv/installed
-	$(PARTS_AT_ONCE) --jobs=3 lint contracts generated docs wheelhouse
-	$(PARTS_AT_ONCE) --jobs=6 test-commands test-takes test-others test-integration-2 test-installation test-integration-1 \
-	    compiled types test-contract
-	$(PARTS_AT_ONCE) --jobs=3 test-hostile test-ports test-browser test-compiled
+	$(MAKE) --keep-going --output-sync=target --no-print-directory --jobs=3 lint contracts generated docs wheelhouse
+	$(MAKE) --keep-going --no-print-directory --jobs=3 test compiled types
+	$(MAKE) --no-print-directory test-slow
+	$(MAKE) --no-print-directory test-compiled
 
 lint: .venv/installed
 	$(BIN)/ruff format --check

@@ -12,6 +12,8 @@ from typing import Any, Final
 
 import zenoh
 
+from tests.needs import need_programs
+
 _LCM_PORTS: Final = itertools.count(7720)
 _PORTS: Final = itertools.cycle(range(10_000, 32_000))
 """By default, Linux chooses ports from 32768 on."""
@@ -72,8 +74,13 @@ def lcm_url() -> str:
     return f"udpm://239.255.76.67:{next(_LCM_PORTS)}?ttl=0"
 
 
+def _need_ip() -> None:
+    need_programs("ip", "tc", packages="iproute2")
+
+
 def remove_multicast_route() -> None:
     """Remove the multicast route of the network namespace (marker netns)."""
+    _need_ip()
     subprocess.run(["ip", "route", "del", *_MULTICAST], check=True)
 
 
@@ -89,6 +96,7 @@ def lan_interface(address: str) -> Iterator[int]:
     ``address`` is this computer's, with /24; the other one has 254 at the end. Yields the process id of the
     other computer's network namespace, for ``nsenter``.
     """
+    _need_ip()
     other = address.rpartition(".")[0] + ".254"
     with subprocess.Popen(
         ["unshare", "--net", "sh", "-c", "echo ready; exec cat"],
@@ -121,6 +129,7 @@ def lan_interface(address: str) -> Iterator[int]:
 @contextlib.contextmanager
 def slow_interface(kbit_per_s: int) -> Iterator[str]:
     """Add a network interface that sends slowly (marker netns); yield a multicast URL that uses it."""
+    _need_ip()
     group = "239.255.77.1"
     commands = (
         "ip link add slow type veth peer name slow-end",

@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from tests.gateway_process import PROGRAM
+from tests.needs import need_programs
 from tests.networks import free_port, lan_interface
 from tests.waiting import wait_until
 
@@ -93,6 +94,7 @@ def gateway(tmp_path: Path) -> Iterator[Gateway]:
 
 
 def test_requests_of_another_computer_arrive_until_a_firewall_drops_them(gateway: Gateway) -> None:
+    need_programs("nft", packages="nftables")
     assert gateway.send_requests(1, from_other=True) > 0
     assert gateway.send_requests(0, from_other=True) == 0
     try:

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from tests.log_messages import message_patterns
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 OPERATIONS = (ROOT / "docs/operations.md").read_text()
 TEST_OUTPUT = "outputs/memory.py"
 

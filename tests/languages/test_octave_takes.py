@@ -10,7 +10,7 @@ import pytest
 
 from gateway.rtc3d.components import ComponentType
 from gateway.takes import open_take
-from tests.example_programs import EXAMPLES, PROGRAMS
+from tests.example_programs import EXAMPLES, PROGRAMS, printed_errors
 from tests.message_vectors import VECTORS
 from tests.takes import description, frame, log_bytes, markers, parameters, write_take
 
@@ -27,10 +27,10 @@ def octave_prints(code: str) -> tuple[str, str]:
     """Run code with read_take.m, and return what Octave prints: results, and warnings."""
     run = subprocess.run(
         ["octave-cli", "--quiet", "--no-init-file", "--path", str(EXAMPLES), "--eval", code],
-        capture_output=True, text=True, check=False, timeout=60,
+        capture_output=True, check=False, timeout=60,
     )  # fmt: skip
     assert run.returncode == 0, run.stderr
-    return run.stdout, run.stderr
+    return run.stdout.decode(), printed_errors(run).decode()
 
 
 class OctaveTake:

@@ -9,7 +9,7 @@ import pytest
 
 from gateway.messages.decode import MESSAGE_TYPES_BY_NAME
 from gateway.messages.encode import COUNT_OFFSET
-from tests.example_programs import COMPONENT_TYPES, EXAMPLES, PROGRAMS, ExampleProgram
+from tests.example_programs import COMPONENT_TYPES, EXAMPLES, PROGRAMS, ExampleProgram, printed_errors
 from tests.message_vectors import VECTORS, difference, random_message, to_vector_values
 
 each_program = pytest.mark.parametrize("program", PROGRAMS, ids=str)
@@ -27,7 +27,7 @@ def printed_for(program: ExampleProgram, lines: list[bytes]) -> list[Any]:
         [*program.command, "--vectors"], input=b"".join(line + b"\n" for line in lines), cwd=EXAMPLES,
         capture_output=True, check=False, timeout=60,
     )  # fmt: skip
-    assert (run.returncode, run.stderr) == (0, b"")
+    assert (run.returncode, printed_errors(run)) == (0, b"")
     printed = [json.loads(line, parse_constant=no_json) for line in run.stdout.decode().split("\n")[:-1]]
     assert len(printed) == len(lines)
     return printed

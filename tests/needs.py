@@ -1,0 +1,20 @@
+"""What a test needs from the machine. Without it, tests skip on a developer's machine and fail in CI."""
+
+import os
+import shutil
+
+import pytest
+
+
+def need(present: object, reason: str) -> None:
+    """Go on if the machine has what the test needs; ``reason`` says what that is and how to get it."""
+    if not present and os.environ.get("CI") == "true":
+        pytest.fail(f"CI must not skip this: {reason}", pytrace=False)
+    if not present:
+        pytest.skip(reason)
+
+
+def need_programs(*names: str, packages: str) -> None:
+    """Go on if all programs are installed; ``packages`` are those of Debian."""
+    missing = [name for name in names if shutil.which(name) is None]
+    need(not missing, f"needs {' and '.join(missing)}: install Debian's {packages}")

@@ -1,0 +1,72 @@
+"""Run pytest in several workers, each in a network namespace of its own, and leave no process behind.
+
+    python tests/run.py [ARGUMENT_OF_PYTEST ...]
+
+Ctrl-C or SIGTERM ends the run with pytest's summary. Whatever the tests have started and not ended is killed.
+"""
+
+import contextlib
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from types import FrameType
+from typing import Final
+
+WORKERS_PER_CORE: Final = 3
+"""Most tests wait for most of their time."""
+
+SUMMARY_S: Final = 4.0
+"""How long pytest may take for its summary after Ctrl-C."""
+
+_PR_SET_CHILD_SUBREAPER: Final = 36  # prctl(2): orphans of this process's descendants become its children
+_WITH_NETNS: Final = Path(__file__).with_name("with-netns")
+
+
+def main() -> int:
+    ctypes.CDLL(None).prctl(_PR_SET_CHILD_SUBREAPER, 1)
+    workers = WORKERS_PER_CORE * len(os.sched_getaffinity(0))
+    arguments = [
+        *("--tx", f"{workers}*popen//python={_WITH_NETNS} {sys.executable}"),
+        *("--dist", "worksteal", "--durations", "10", *sys.argv[1:]),
+    ]
+    # In a session of its own, pytest receives one signal for each Ctrl-C: that of ``stop``.
+    pytest = subprocess.Popen([sys.executable, "-m", "pytest", *arguments], start_new_session=True)
+
+    def stop(_signal: int, _frame: FrameType | None) -> None:
+        for name in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(name, signal.SIG_IGN)
+        pytest.send_signal(signal.SIGINT)
+        _kill(set(_descendants(os.getpid())) - {pytest.pid})
+        timer = threading.Timer(SUMMARY_S, pytest.kill)
+        timer.daemon = True
+        timer.start()
+
+    for name in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(name, stop)
+    status = pytest.wait()
+    _kill(_descendants(os.getpid()))
+    return status if status >= 0 else 128 - status
+
+
+def _kill(processes: Iterator[int] | set[int]) -> None:
+    for process in processes:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(process, signal.SIGKILL)
+
+
+def _descendants(process: int) -> Iterator[int]:
+    """Yield the processes that ``process`` has started, those that these have started, and so on."""
+    with contextlib.suppress(OSError):
+        for children in Path(f"/proc/{process}/task").glob("*/children"):
+            for child in map(int, children.read_text().split()):
+                yield child
+                yield from _descendants(child)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
