@@ -25,14 +25,14 @@ demo: .venv/runtime
 # Unit, property, contract and integration tests. Without MAKEFLAGS, a make that a test runs does not look for the job
 # slots of this one.
 test: .venv/installed
-	MAKEFLAGS= $(BIN)/python tests/run.py $(ARGS)
+	MAKEFLAGS= exec $(BIN)/python tests/run.py $(ARGS)
 
 # What is slow by nature: attacks, browsers, installation, systemd, the examples in other languages, and the commands
 # in the documents.
 SLOW_TESTS := $(addprefix tests/,hostile documents systemd packaging languages benchmarks view site)
 
 test-slow: .venv/installed build/wheelhouse/complete
-	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) $(BIN)/python tests/run.py $(or $(ARGS),$(SLOW_TESTS))
+	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py $(or $(ARGS),$(SLOW_TESTS))
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.
@@ -47,7 +47,7 @@ COMPILED_TESTS := tests/packaging/test_compiled.py tests/unit/test_log.py \
     tests/integration/test_faults.py::test_data_flows_again_after_several_faults_at_once
 
 test-compiled: build/compiled/complete
-	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 $(BIN)/python tests/run.py -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
+	MAKEFLAGS= $(COMPILED) RTC3D_COMPILED=1 exec $(BIN)/python tests/run.py -m 'not interpreted' $(or $(ARGS),$(COMPILED_TESTS))
 
 # The tests use both cores, and wait often enough for the compiler and mypy to run beside them.
 check: .venv/installed

@@ -12,7 +12,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from types import FrameType
 from typing import Final
@@ -20,8 +20,11 @@ from typing import Final
 WORKERS_PER_CORE: Final = 3
 """Most tests wait for most of their time."""
 
+WORKERS_S: Final = 1.0
+"""When the workers are killed after Ctrl-C. By then, pytest no longer counts what they run as failed."""
+
 SUMMARY_S: Final = 4.0
-"""How long pytest may take for its summary after Ctrl-C."""
+"""When pytest is killed after Ctrl-C, with or without its summary."""
 
 _PR_SET_CHILD_SUBREAPER: Final = 36  # prctl(2): orphans of this process's descendants become its children
 _WITH_NETNS: Final = Path(__file__).with_name("with-netns")
@@ -40,20 +43,33 @@ def main() -> int:
     def stop(_signal: int, _frame: FrameType | None) -> None:
         for name in (signal.SIGINT, signal.SIGTERM):
             signal.signal(name, signal.SIG_IGN)
-        pytest.send_signal(signal.SIGINT)
-        _kill(set(_descendants(os.getpid())) - {pytest.pid})
-        timer = threading.Timer(SUMMARY_S, pytest.kill)
+        os.kill(pytest.pid, signal.SIGINT)
+        kill_later(WORKERS_S, lambda: set(_descendants(os.getpid())) - {pytest.pid})
+        kill_later(SUMMARY_S, lambda: {pytest.pid})
+
+    def kill_later(delay_s: float, processes: Callable[[], set[int]]) -> None:
+        timer = threading.Timer(delay_s, lambda: _kill(processes()))
         timer.daemon = True
         timer.start()
 
     for name in (signal.SIGINT, signal.SIGTERM):
         signal.signal(name, stop)
-    status = pytest.wait()
-    _kill(_descendants(os.getpid()))
+    status = _reap_until(pytest.pid)
+    while processes := list(_descendants(os.getpid())):
+        _kill(processes)
+        _reap_until(processes[0])
     return status if status >= 0 else 128 - status
 
 
-def _kill(processes: Iterator[int] | set[int]) -> None:
+def _reap_until(process: int) -> int:
+    """Wait for a process, and for all that end before it: tests look whether a process has gone."""
+    while True:
+        ended, status = os.waitpid(-1, 0)
+        if ended == process:
+            return os.waitstatus_to_exitcode(status)
+
+
+def _kill(processes: Iterable[int]) -> None:
     for process in processes:
         with contextlib.suppress(ProcessLookupError):
             os.kill(process, signal.SIGKILL)
