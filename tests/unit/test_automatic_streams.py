@@ -213,6 +213,18 @@ async def test_a_second_connection_that_always_breaks_soon_is_given_up(lab: Auto
         assert len(lab.scripted.connections) == 3
 
 
+async def test_a_late_end_of_a_second_connection_counts_as_the_first_of_its_failures(lab: AutoLab) -> None:
+    """Two failures in a row are enough, also if the first one came after a while."""
+    async with running(lab):
+        for lasted_s in (20, 3):
+            await lab.uses_two()
+            await asyncio.sleep(lasted_s)
+            lab.scripted.connections[-1].end()
+            await settle()
+        await until(lambda: lab.limitations)
+        assert len(lab.scripted.connections) == 3
+
+
 async def test_the_further_connection_ends_with_the_first(lab: AutoLab) -> None:
     async with running(lab):
         await lab.uses_two()

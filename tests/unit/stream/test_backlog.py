@@ -100,6 +100,19 @@ def test_a_stream_that_arrives_in_batches_is_not_delayed() -> None:
         subscriber.now_s = arrived_s + 10 * MS
 
 
+@pytest.mark.parametrize(("pause_s", "continues"), [(0.49, True), (0.51, False)])
+def test_a_pace_ends_after_half_a_second_without_a_backlog(pause_s: float, *, continues: bool) -> None:
+    """Later frames begin a new pace: the first is due at once, and so is the one after it."""
+    subscriber = Subscriber(speed=1.0)
+    subscriber.arrive(frames(2))
+    subscriber.run()
+    subscriber.now_s = 100.001 + pause_s
+    subscriber.arrive(frames(40, 2))
+    subscriber.backlog.publish_due()
+    late_ms = 15  # what a continued pace makes up for
+    assert (len(subscriber.numbers) - 2 > late_ms) is continues
+
+
 def test_a_stream_as_fast_as_the_gateway_is_never_throttled() -> None:
     """Every read has more frames than one publishes at once, and publishing takes as long as measuring."""
     subscriber = Subscriber()

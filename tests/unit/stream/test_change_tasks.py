@@ -9,6 +9,7 @@ import pytest
 
 from gateway.config.settings import SourceSettings, StreamSettings
 from gateway.errors import DefectError, RequestError
+from gateway.rtc3d.components import ComponentType
 from gateway.stream.change_tasks import DEMAND_POLL_S, MAX_RESUMES, ChangeTasks
 from gateway.stream.files import IgnoredFiles
 from gateway.stream.session import Session
@@ -142,6 +143,18 @@ async def test_lateness_is_a_warning_once_and_its_end_is_reported(caplog: pytest
     assert second.endswith("asked the server for FrequencyDivisor:4 (failure 2 in a row)")
     assert third == "lab (3d): frames arrive in time; asked the server for FrequencyDivisor:2"
     assert last.startswith("lab (3d): frames arrive in time; asked the server for AllFrames, after ")
+
+
+async def test_a_reduced_rate_is_requested_again_with_other_components() -> None:
+    """The request for components has no rate; without another one, the full rate would reach a slow link."""
+    lab = Lab(adapt_rate=True)
+    await lab.start()
+    lab.adaptation.lateness_changed(1)
+    await settle()
+    lab.adaptation.request_components((ComponentType.MARKERS,))
+    await settle()
+    assert lab.requests == [HALF, "StreamFrames AllFrames 3D", f"{HALF} 3D"]
+    lab.adaptation.cancel()
 
 
 async def test_by_default_the_server_is_asked_for_nothing(caplog: pytest.LogCaptureFixture) -> None:

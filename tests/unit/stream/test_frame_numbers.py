@@ -73,3 +73,18 @@ def test_a_pause_that_the_caller_knows_of_is_not_counted() -> None:
     for number in range(1000, 1300):
         assert observer.observe(number, number * PERIOD_US) == 0
     assert sum(observer.observe(number, number * PERIOD_US) for number in range(1305, 1400)) == 5
+
+
+@pytest.mark.parametrize(("num_steps", "missing"), [(19, 0), (20, 10)])
+def test_twenty_regular_steps_confirm_a_gap(num_steps: int, missing: int) -> None:
+    """Fewer may be chance; waiting for more would report the loss later."""
+    assert num_missing([*range(300), *range(310, 311 + num_steps)]) == missing
+
+
+@pytest.mark.parametrize(("num_gaps", "missing"), [(3, 6), (21, 42), (22, 0)])
+def test_gaps_count_if_the_first_is_confirmed_within_200_frames(num_gaps: int, missing: int) -> None:
+    """Gaps that come back again and again, here after every ten frames, are another rate and no loss."""
+    numbers = list(range(300))
+    for _ in range(num_gaps):
+        numbers += range(numbers[-1] + 3, numbers[-1] + 13)
+    assert num_missing([*numbers, *range(numbers[-1] + 1, numbers[-1] + 31)]) == missing

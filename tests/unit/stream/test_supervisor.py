@@ -327,6 +327,23 @@ async def test_a_defect_in_what_takes_frames_delays_the_next_connection_more_eac
     assert len([record for record in caplog.records if record.levelno >= logging.ERROR]) == 1
 
 
+async def test_a_defect_after_data_does_not_start_the_delays_again() -> None:
+    """Data prove that a server is back, but a gateway with a defect must not reconnect in a tight loop."""
+    lab = Lab(on_demand=True)
+    lab.server.refuses = True
+    async with running(lab):
+        await lab.tried(6)
+        lab.server.refuses = False
+        await lab.ready()
+        lab.server.connection.send_frames(1)
+        await until(lambda: lab.published)
+        lab.has_defect = True
+        await until(lambda: lab.supervisor.session is None)
+        lab.has_defect = False
+        await lab.ready(2)
+    assert lab.delays_s[-1] > 3
+
+
 async def test_a_defect_in_a_task_ends_the_session_with_the_reason(caplog: pytest.LogCaptureFixture) -> None:
     lab = Lab(on_demand=True)
     async with running(lab):
