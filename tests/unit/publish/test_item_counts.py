@@ -25,6 +25,7 @@ def test_a_change_counts_only_within_a_session() -> None:
     assert not counts.update({MARKERS: 4}, 2)
     assert not counts.update({TOOLS: 1}, 2)
     assert counts.update({MARKERS: 4, TOOLS: 2}, 2)
+    assert counts.update({MARKERS: 5, TOOLS: 2}, 2)
 
 
 def test_a_server_that_changes_its_number_all_the_time_does_not_fill_the_log(

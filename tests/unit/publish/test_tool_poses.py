@@ -119,6 +119,17 @@ def test_a_tool_that_keeps_its_label_continues_its_numbers() -> None:
     assert [pose.sequence for pose in output.poses("Head")] == [0, 1]
 
 
+def test_of_more_than_1024_names_those_that_were_used_last_keep_their_numbers() -> None:
+    """Whoever watches a tool sees no loss where there is none; names of long ago must not fill the memory."""
+    output = ToyOutput("toy", "0-0", "1-0", has_tool_poses=True)
+    fan_out = FanOut("lab", [output])
+    for group in (0, 1, 2, 3, 0, 4, 0, 1):
+        fan_out.set_parameters(in_metres(parameters(*(f"{group}-{number}" for number in range(256)))))
+        publish_tools(fan_out, 256)
+    assert [pose.sequence for pose in output.poses("0-0")] == [0, 1, 2]
+    assert [pose.sequence for pose in output.poses("1-0")] == [0, 0]
+
+
 def test_a_number_of_tools_that_goes_up_and_down_reopens_no_topic() -> None:
     output = ToyOutput("toy", "A", "B", "C", has_tool_poses=True)
     fan_out = FanOut("lab", [output])

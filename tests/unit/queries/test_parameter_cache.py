@@ -178,9 +178,11 @@ async def test_a_stream_asks_itself_if_the_other_connection_ends(is_cancelled: b
 async def test_a_second_connection_need_not_ask_again_for_a_while() -> None:
     source = FakeSource(two_streams=True, fresh_interval_s=3600.0)
     await source.store_parameters(MM)
+    before = (await source.parameters()).session
     await source.connect_second(CM)
     assert source.server.commands == []
     assert source.announced == [(MM, 1), (MM, 1)]
+    assert (await source.parameters()).session == before + 1
 
 
 async def test_a_second_connection_asks_if_the_first_one_has_ended() -> None:

@@ -115,6 +115,25 @@ async def test_more_different_questions_than_are_answered_at_a_time_wait(
         assert {reply.payload for reply in replies} == {b"1", b"2", b"3", b"4", b"5"}
 
 
+async def test_a_query_with_wildcards_counts_once_for_each_of_its_keys(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Otherwise a peer could ask for everything at the price of one query."""
+    async with open_lab() as lab:
+
+        async def answer_all(_source: str, paths: list[KeyPath], _options: object) -> dict[KeyPath, Answer]:
+            return {path: Answer(b"", "text/plain") for path in paths}
+
+        monkeypatch.setattr(lab.service, "keys", lambda _source: [("a",), ("b",), ("c",)])
+        monkeypatch.setattr(lab.service, "answer_all", answer_all, raising=False)
+        queries = lab.output._queries
+        assert queries is not None
+        counted: list[int] = []
+        monkeypatch.setattr(queries._admission, "count", counted.append)
+        assert len(await query_all(lab.peer, "mocap/lab/*")) == 3
+        assert counted == [2]  # besides the query itself
+
+
 async def test_queries_beyond_the_rate_get_an_error_and_are_counted(caplog: pytest.LogCaptureFixture) -> None:
     async with open_lab(max_queries_per_key_per_s=10.0, max_queries_per_s=1000.0) as lab:
         codes = await lab.codes("mocap/lab/status", 60)
