@@ -109,9 +109,9 @@ def test_an_event_that_lost_its_end_does_not_hide_those_that_follow(tmp_path: Pa
     """Its content may have sync words, too: each must be tried until one begins an event."""
     broken = encode_event(1, 1, b"MOCAP_LAB_3D", before + bytes(1000))[: 28 + 12 + len(before) + 5]
     path = tmp_path / "take.lcmlog"
-    path.write_bytes(EVENTS[0] + broken + b"".join(EVENTS[2:6]))
+    path.write_bytes(EVENTS[0] + broken + b"".join(EVENTS[2:20]))
     events, reader = read(path)
-    assert [number for number, *_ in events] == [0, 2, 3, 4, 5]
+    assert [number for number, *_ in events] == [0, *range(2, 20)]
     assert reader.damaged_bytes == len(broken)
 
 
