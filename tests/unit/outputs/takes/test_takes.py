@@ -340,6 +340,24 @@ def test_a_saved_take_goes_on_for_some_seconds_from_the_command_on(
     run_in_virtual_time(save())
 
 
+def test_a_save_that_was_ended_does_not_end_again(tmp_path: Path) -> None:
+    """Its timer would claim a C3D file that arrives long after the take."""
+
+    async def save_and_end() -> None:
+        async with still_lab(tmp_path, keep_last_s=60) as lab:
+            lab.publish()
+            saved = await lab.takes.save("lab", 60, 30, "fall")
+            recording, recorder = lab.takes.recording("lab"), lab.takes._started_recorder()
+            recording.end_takes(recorder)
+            assert not recording.saves
+            await asyncio.sleep(59)
+            assert recording.take_of_c3d() == lab.path(saved.name)
+            await asyncio.sleep(2)
+            assert recording.take_of_c3d() is None
+
+    run_in_virtual_time(save_and_end())
+
+
 async def test_the_seconds_that_are_saved_are_counted_from_the_command_on(tmp_path: Path) -> None:
     """A peer asks for what is just over, by the clock of this computer."""
     clock = Clock()
