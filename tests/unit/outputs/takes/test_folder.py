@@ -275,6 +275,19 @@ def test_after_a_problem_the_folder_is_checked_again_at_once(
     watched.watch.close()
 
 
+def test_a_lock_that_somebody_deletes_is_taken_again(tmp_path: Path) -> None:
+    """Otherwise, another gateway could lock a new file of that name, and both would delete segments."""
+    folder, other = TakesFolder(tmp_path), TakesFolder(tmp_path)
+    assert folder.open() == ""
+    for path in tmp_path.iterdir():
+        path.unlink()
+    assert folder.open() == ""
+    assert "another gateway records" in other.open()
+    folder.close()
+    assert other.open() == ""
+    other.close()
+
+
 def test_a_disk_that_does_not_respond_is_a_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A network drive that hangs makes no error; only the time shows it."""
     watched = Watched(tmp_path, monkeypatch)

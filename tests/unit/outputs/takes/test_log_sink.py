@@ -2,6 +2,7 @@
 
 import errno
 import logging
+import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import cast
@@ -120,6 +121,20 @@ def test_what_is_given_up_is_counted_in_messages_and_in_frames() -> None:
     assert amounts(sink.losses.report()) == {"not written": (7, 3)}
     sink.write([message(10)])  # the disk has room again
     assert sink.log.content[-1] == message(10)
+
+
+def test_a_file_that_cannot_begin_is_deleted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty file of that name would refuse the next attempt."""
+
+    def write(_descriptor: int, _content: memoryview) -> int:
+        raise FULL
+
+    header = FileHeader(SourceDescription("lab", "MOCAP", ""), None)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", write)
+        with pytest.raises(OSError, match="No space left"):
+            header.begin_log(tmp_path / "walk.lcmlog", "walk", 1)
+    header.begin_log(tmp_path / "walk.lcmlog", "walk", 1).close()
 
 
 @pytest.mark.parametrize(

@@ -15,19 +15,15 @@ from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerFile, ServerParameters
 from gateway.outputs.takes import recorded_takes
-from gateway.outputs.takes.folder import ROLLING, TakesFolder
+from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.recorded_takes import MAX_SAVES
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.outputs.takes.stored import StoredTake
-from gateway.takes.reader import log_paths
 from tests.recording_output import (
     Clock,
-    NoThread,
     RecordingLab,
     events,
     frames,
-    settings_in,
-    still_host,
     still_lab,
 )
 from tests.virtual_time import run_in_virtual_time
@@ -409,92 +405,32 @@ async def test_saving_needs_something_that_is_kept(tmp_path: Path) -> None:
             await lab.takes.start("lab", "fall")
 
 
-# Limits and settings -------------------------------------------------------------------------
-
-
-async def test_a_take_ends_when_the_folder_is_full_and_nothing_can_be_deleted(tmp_path: Path) -> None:
-    """Rather a take that ends in good order than a full disk; a take that is started then goes on."""
-
-    class FolderThread(NoThread):
-        is_stuck = False
-
-        def submit(self, call: Callable[[], Any]) -> Future[Any]:
-            return Future() if self.is_stuck else super().submit(call)
-
-    host, folder_thread = still_host(Clock()), FolderThread("takes-folder")
-    host = type(host)(
-        host.monotonic, lambda name: folder_thread if "folder" in name else NoThread(name), host.recorder
-    )
-    lab = RecordingLab(tmp_path, host=host, max_bytes=MIB)
-    lab.output.start()
-    await lab.takes.start("lab", "walk")
-    while lab.path("walk.lcmlog").stat().st_size <= MIB:
-        lab.publish(size=1000)
-        await lab.takes.written()
-    lab.output.maintain()
-    assert lab.takes.running("lab") is not None
-    folder_thread.is_stuck = True
-    lab.output.maintain()
-    assert lab.takes.running("lab") is None
-    [loss] = lab.takes.recording("lab").losses.report()
-    assert (loss.cause, loss.messages, loss.frames) == ("folder full", 1, 0)
-    assert "walk ends, because the folder" in loss.text
-    await lab.takes.start("lab", "run")
-    lab.output.maintain()  # what was too much is known from before
-    assert lab.takes.running("lab") is not None
-    lab.output.close()
-
-
-async def test_the_older_half_of_the_segments_makes_room_if_no_take_does(tmp_path: Path) -> None:
-    """With long keep_last_s, the segments alone can be more than the limit."""
-    clock = Clock()
-    async with still_lab(tmp_path, clock, keep_last_s=3600, max_bytes=MIB) as lab:
-        for _ in range(8):
-            for _ in range(10):
-                lab.publish(size=1000)
-            await lab.takes.written()
-            clock.now_s += 10
-        segments = tmp_path / ROLLING / "lab"
-        before = sorted(segments.iterdir())
+async def test_a_publisher_that_closes_frees_its_channel(tmp_path: Path) -> None:
+    """A tool whose label comes back continues on the channel that it had."""
+    async with still_lab(tmp_path) as lab:
+        await lab.takes.start("lab", "walk")
         for _ in range(2):
-            lab.output.maintain()
-        assert sorted(segments.iterdir()) == before[4:]
-        assert sum(path.stat().st_size for path in segments.iterdir()) <= MIB
-        lab.output.maintain()
-        assert sorted(segments.iterdir()) == before[4:]
+            pose = lab.output.publisher(Topic("lab", ("6d", "probe"), "rtc3d.tool_pose_t"))
+            pose.publish(bytes(16))
+            pose.close()
+    assert [event.channel for event in events(lab.path("walk.lcmlog"))[1:]] == ["MOCAP_LAB_6D_PROBE"] * 2
 
 
-@pytest.mark.parametrize(
-    ("changes", "kept_s"),
-    [
-        ({"keep_last_s": 30.0}, 25.0),
-        ({"keep_last_s": 10.0}, 15.0),
-        ({"prefix": "HALL"}, 0.0),
-        ({"components": ["event"]}, 0.0),
-        ({"directory": "other"}, 0.0),
-        ({"keep_last_s": 0.0}, 0.0),
-    ],
-)
-async def test_a_reload_keeps_the_segments_if_their_files_stay_the_same(
-    tmp_path: Path, changes: dict[str, Any], kept_s: float
-) -> None:
-    """The last seconds must survive a change of limits, but not be mixed with other channels."""
-    clock = Clock()
-    async with still_lab(tmp_path / "takes", clock, keep_last_s=60) as lab:
-        for _ in range(25):
-            lab.publish()
-            await lab.takes.written()
-            clock.now_s += 1
-        before = [*(tmp_path / "takes" / ROLLING / "lab").iterdir()]
-        if "directory" in changes:
-            changes = {"directory": str(tmp_path / "other")}
-        base = settings_in(tmp_path / "takes", keep_last_s=60)
-        lab.takes.change(type(base).model_validate(base.model_dump() | changes))
-        await lab.takes.written()
-        assert (await lab.takes.list("lab")).kept_s == kept_s
-        assert all(not path.exists() for path in before) is (kept_s == 0.0)
-        lab.publish("event")
-        await lab.takes.written()
-        folders = [tmp_path / "takes" / ROLLING / "lab", tmp_path / "other" / ROLLING / "lab"]
-        num_segments = sum(len(log_paths(folder)) for folder in folders if folder.exists())
-        assert (num_segments > 0) is (changes.get("keep_last_s") != 0.0)
+async def test_whoever_publishes_learns_when_messages_are_wanted(tmp_path: Path) -> None:
+    """Only then are frames encoded for this output."""
+    async with still_lab(tmp_path) as lab:
+        seen: list[bool] = []
+        lab.output.watch_wanted("lab", lambda: seen.append(lab.publishers["3d"].wanted))
+        await lab.takes.start("lab", "walk")
+        await lab.takes.stop("lab")
+        assert seen == [True, False]
+
+
+async def test_the_end_of_the_gateway_forgets_the_timers_of_saves(tmp_path: Path) -> None:
+    """They would fire while the output closes in another thread."""
+    async with still_lab(tmp_path, keep_last_s=60) as lab:
+        lab.publish()
+        await lab.takes.save("lab", 60, 600, "fall")
+        [timer] = lab.takes.recording("lab").saves.values()
+        await lab.output.stop_queries()
+        assert timer.cancelled()
