@@ -1,33 +1,67 @@
 """An output that records takes, with a source whose messages the test publishes."""
 
 import asyncio
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
+from concurrent.futures import Future
 from contextlib import asynccontextmanager
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import rtc3d
 
 from gateway.messages.encode import MESSAGE_TYPES, lcm_type_name
 from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic
+from gateway.outputs.takes.disk_calls import Host
 from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.rtc3d.components import COMPONENTS_BY_KEY
 from gateway.takes.event_log import Event
 from gateway.takes.reader import TakeReader
-from gateway.takes.recording import MAX_QUEUED_BYTES
+from gateway.takes.recording import MAX_QUEUED_BYTES, Recorder
+from gateway.worker_thread import WorkerThread, make_call
 from tests.waiting import wait_until_async
+
+_Result = TypeVar("_Result")
+
+
+class NoThread(WorkerThread):
+    """Makes each call at once, where it is submitted."""
+
+    def submit(self, call: Callable[[], _Result]) -> Future[_Result]:
+        done: Future[_Result] = Future()
+        make_call(done, call)
+        return done
+
+
+class Clock:
+    """A monotonic clock that the test sets."""
+
+    def __init__(self, now_s: float = 1000.0) -> None:
+        self.now_s = now_s
+
+    def __call__(self) -> float:
+        return self.now_s
+
+
+def still_host(monotonic: Callable[[], float]) -> Host:
+    """Return a host without threads, on this clock: whoever waits for the disk has its answer at once."""
+    return Host(monotonic, NoThread, partial(Recorder, has_thread=False))
 
 
 class RecordingLab:
     """The source "lab" on an output whose folder is ``directory``."""
 
     def __init__(
-        self, directory: Path | None, max_queued_bytes: int = MAX_QUEUED_BYTES, **settings: Any
+        self,
+        directory: Path | None,
+        max_queued_bytes: int = MAX_QUEUED_BYTES,
+        host: Host | None = None,
+        **settings: Any,
     ) -> None:
         self.directory = Path() if directory is None else directory
-        self.output = TakesOutput(settings_in(directory, **settings), max_queued_bytes)
+        self.output = TakesOutput(settings_in(directory, **settings), max_queued_bytes, host)
         self.takes = self.output.takes
         self.publishers = {
             component.key: self.output.publisher(Topic("lab", (component.key,), lcm_type_name(kind)))
@@ -89,3 +123,20 @@ async def recording_lab(directory: Path | None, **settings: Any) -> AsyncIterato
     finally:
         task.cancel()
         await asyncio.to_thread(lab.output.close)
+
+
+@asynccontextmanager
+async def still_lab(
+    directory: Path, clock: Clock | None = None, **settings: Any
+) -> AsyncIterator[RecordingLab]:
+    """Run an output without threads; its clock is ``clock``, or else the event loop's.
+
+    Messages are written when somebody waits for the disk. The test calls ``maintain`` itself.
+    """
+    monotonic = clock or asyncio.get_running_loop().time
+    lab = RecordingLab(directory, host=still_host(monotonic), **settings)
+    lab.output.start()
+    try:
+        yield lab
+    finally:
+        lab.output.close()

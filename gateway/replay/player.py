@@ -33,6 +33,22 @@ class MessageSink(Protocol):
         """Take one message; ``key`` is that of a TakeMessage."""
 
 
+class PlayerClock:
+    """The time of a player; tests replace it."""
+
+    def now_s(self) -> float:
+        """Return the time on the monotonic clock."""
+        return time.monotonic()
+
+    def sleep(self, seconds: float) -> None:
+        """Let the thread sleep."""
+        time.sleep(seconds)
+
+    def wait(self, changed: threading.Condition, seconds: float | None) -> None:
+        """Wait until ``changed`` is notified, or for so long."""
+        changed.wait(seconds)
+
+
 class Player:
     """Replays a take with ``publication``, in a thread, until its end or ``stop``.
 
@@ -55,6 +71,8 @@ class Player:
         max_gap_s: float = MAX_GAP_S,
         on_jump: Callable[[Jump], None] = lambda _jump: None,
     ) -> None:
+        self.clock = PlayerClock()
+        """The time; it may be replaced before ``start``."""
         self.lateness = Lateness()
         self.position_us = selection.start_us
         """Where in the take the newest message is."""
@@ -69,7 +87,8 @@ class Player:
         self._reader = reader
         self._selection = selection
         self._publication = publication
-        self._pace = None if rate is None else Pace(rate)
+        now_s = lambda: self.clock.now_s()  # noqa: E731, PLW0108 - the clock may be replaced later
+        self._pace = None if rate is None else Pace(rate, now_s)
         self.is_repeated = is_repeated
         """Whether it begins again at the end. It may be changed at any time."""
         self.is_at_end = False
@@ -150,7 +169,7 @@ class Player:
     # In the thread.
 
     def _run(self) -> None:
-        self._started_s = time.monotonic()
+        self._started_s = self.clock.now_s()
         try:
             start_us: int | None = self._selection.start_us
             while start_us is not None:
@@ -158,7 +177,7 @@ class Player:
         except BaseException as error:  # noqa: BLE001 - the waiting thread raises it
             self.error = error
         finally:
-            self._ended_s = time.monotonic()
+            self._ended_s = self.clock.now_s()
 
     def _next_start(self, start_us: int) -> int | None:
         """Replay from a position on; return where to go on, None if this was the end."""
@@ -182,14 +201,15 @@ class Player:
             )
         if not self.is_repeated:
             return self._wait_at_end() if self._is_watched else None
-        time.sleep(_PASS_S)
+        self.clock.sleep(_PASS_S)
         return self._selection.start_us
 
     def _wait_at_end(self) -> int | None:
         """Wait for a seek, and return its position; None if the replay is to stop."""
         with self._changed:
             self.is_at_end = True
-            self._changed.wait_for(lambda: self._is_stopping or self._seek_us is not None)
+            while not (self._is_stopping or self._seek_us is not None):
+                self.clock.wait(self._changed, None)
             self.is_at_end = False
             seek_us, self._seek_us = self._seek_us, None
             self._notify()
@@ -212,7 +232,7 @@ class Player:
                 if not is_begun and key != "parameters":
                     is_begun = True
                     pace.start(max(start_us, preview_end_us))
-                    self._begun_s = time.monotonic()
+                    self._begun_s = self.clock.now_s()
                 if is_begun and not self._wait(pace, position_us):
                     return False
             publish(source, key, message)
@@ -225,21 +245,21 @@ class Player:
         now_s = self._now_s(pace)
         while (wait_s := pace.due_s(position_us) - now_s) > 0:
             if wait_s <= _FINE_S:
-                time.sleep(wait_s)
+                self.clock.sleep(wait_s)
             else:
                 with self._changed:
                     if not self._must_attend:
-                        self._changed.wait(wait_s - _FINE_S / 2)
+                        self.clock.wait(self._changed, wait_s - _FINE_S / 2)
                 if self._must_attend and not self._attend():
                     return False
-            self._begun_s = max(self._begun_s, min(pace.due_s(position_us), time.monotonic()))
+            self._begun_s = max(self._begun_s, min(pace.due_s(position_us), self.clock.now_s()))
             now_s = self._now_s(pace)
         self.lateness.add(-wait_s)
         return True
 
     def _now_s(self, pace: Pace) -> float:
         """Return the time; if the process stood still since ``_begun_s``, let all the rest be due later."""
-        now_s = time.monotonic()
+        now_s = self.clock.now_s()
         stalled_s = now_s - self._begun_s
         if stalled_s > STALL_S:
             pace.shift(stalled_s)
@@ -249,15 +269,14 @@ class Player:
 
     def _attend(self) -> bool:
         """Pause until the replay is to continue; return False if it is to stop or to go elsewhere."""
-        began_s = time.monotonic()
+        began_s = self.clock.now_s()
         with self._changed:
-            self._changed.wait_for(
-                lambda: self._is_stopping or self._seek_us is not None or not self._is_paused
-            )
+            while self._is_paused and not self._is_stopping and self._seek_us is None:
+                self.clock.wait(self._changed, None)
             is_continued = not self._is_stopping and self._seek_us is None
             rate, self._rate = self._rate, None
             self._notify()
-        paused_s = time.monotonic() - began_s
+        paused_s = self.clock.now_s() - began_s
         if self._pace is not None:
             self._pace.shift(paused_s)
             if rate is not None:

@@ -116,10 +116,13 @@ class Sink(Protocol):
 class Recorder:
     """A thread that writes messages to sinks, in the order in which they were recorded.
 
-    The program does not wait for the thread when it ends; ``close`` does.
+    The program does not wait for the thread when it ends; ``close`` does. Without a thread, ``call`` and
+    ``close`` write: then a test knows when something is written.
     """
 
-    def __init__(self, name: str, max_queued_bytes: int = MAX_QUEUED_BYTES) -> None:
+    def __init__(
+        self, name: str, max_queued_bytes: int = MAX_QUEUED_BYTES, *, has_thread: bool = True
+    ) -> None:
         self._max_queued_bytes = max_queued_bytes
         self._queue: deque[tuple[Sink, bytes, bytes] | Callable[[], None]] = deque()
         # Each is changed by one thread only; the difference is what waits.
@@ -129,8 +132,10 @@ class Recorder:
         self._is_closed = False
         self._unsynced: dict[Sink, None] = {}
         self._defects = DefectLog(logger, name)
-        self._writer = threading.Thread(target=self._run, name=name, daemon=True)
-        self._writer.start()
+        self._writer: threading.Thread | None = None
+        if has_thread:
+            self._writer = threading.Thread(target=self._run, name=name, daemon=True)
+            self._writer.start()
 
     @property
     def queued_bytes(self) -> int:
@@ -153,12 +158,19 @@ class Recorder:
         """
         done: Future[_Result] = Future()
         self._queue.append(lambda: make_call(done, function))
-        self._wake.set()
+        if self._writer is None:
+            self._write_queue()
+        else:
+            self._wake.set()
         return done
 
     def close(self, timeout_s: float) -> bool:
         """Write what waits, and end the thread. Return False if the disk needs longer than ``timeout_s``."""
         self._is_closed = True
+        if self._writer is None:
+            self._write_queue()
+            self._sync()
+            return True
         self._wake.set()
         self._writer.join(timeout_s)
         return not self._writer.is_alive()
@@ -170,10 +182,13 @@ class Recorder:
             self._wake.clear()
             self._write_queue()
             if time.monotonic() - synced_s >= SYNC_PERIOD_S or self._is_closed:
-                for sink in self._unsynced:
-                    sink.sync()
-                self._unsynced.clear()
+                self._sync()
                 synced_s = time.monotonic()
+
+    def _sync(self) -> None:
+        for sink in self._unsynced:
+            sink.sync()
+        self._unsynced.clear()
 
     def _write_queue(self) -> None:
         # This is the inner loop of recording; benchmarks/own_cost.py measures it.

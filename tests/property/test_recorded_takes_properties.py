@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.outputs.contract import ServerParameters
-from tests.recording_output import events, recording_lab
+from tests.recording_output import events, still_lab
 
 STEPS = st.lists(
     st.one_of(
@@ -20,9 +20,10 @@ STEPS = st.lists(
 )
 
 
-@settings(max_examples=25)
+@settings(max_examples=50)
 @given(steps=STEPS)
 def test_a_take_is_what_was_published(steps: list[tuple[str, int]]) -> None:
+    """However starts, stops, frames and parameters follow each other."""
     with tempfile.TemporaryDirectory() as folder:
         expected = asyncio.run(_record(Path(folder), steps))
         for name, messages in expected.items():
@@ -40,7 +41,7 @@ async def _record(folder: Path, steps: list[tuple[str, int]]) -> dict[str, list[
     takes: dict[str, list[bytes | None]] = {}
     running: list[bytes | None] | None = None
     has_parameters = False
-    async with recording_lab(folder) as lab:
+    async with still_lab(folder) as lab:
         for number, (step, size) in enumerate(steps):
             match step:
                 case "start" if running is None:
@@ -50,7 +51,7 @@ async def _record(folder: Path, steps: list[tuple[str, int]]) -> dict[str, list[
                     await lab.takes.stop("lab")
                     running = None
                 case "pause":
-                    await asyncio.sleep(0.01)
+                    await lab.takes.written()
                 case "parameters":
                     xml = b"<!--" + b"x" * (size * 1000) + b"-->"
                     sent = lab.output.publish_parameters("lab", ServerParameters(xml, 1, number))

@@ -34,6 +34,7 @@ def entries(reader: TakeReader, start_us: int, index: SeekIndex | None) -> list[
 def test_reading_from_the_index_gives_the_same(
     made: list[tuple[str, str, int]], num_files: int, starts: list[int]
 ) -> None:
+    """Whatever the gaps, the steps of clocks and the division into files are."""
     utimes = dict.fromkeys(("lab", "stage"), START_UTIME)
     messages = [description(), description("stage")]  # one for each source
     for number, (source, kind, step_us) in enumerate(made):

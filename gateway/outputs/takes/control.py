@@ -1,7 +1,8 @@
 """The key ``take`` of each source: peers start, stop, save, list and read takes with its options."""
 
 import re
-from collections.abc import Mapping
+import time
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from gateway.errors import QueryError
@@ -39,9 +40,9 @@ _ACCEPTED: Final = (
 class TakeCommand:
     """The command ``take`` of the output: checks the options, and asks ``takes``."""
 
-    def __init__(self, takes: Takes) -> None:
+    def __init__(self, takes: Takes, monotonic: Callable[[], float] = time.monotonic) -> None:
         self._takes = takes
-        self._reads = TokenBucket(READS_PER_S)
+        self._reads = TokenBucket(READS_PER_S, monotonic=monotonic)
 
     async def __call__(self, source: str, options: Mapping[str, str]) -> Answer:
         """Implement Command (outputs/contract.py)."""

@@ -1,13 +1,16 @@
-"""Waiting for calls that need the disk, on behalf of peers."""
+"""The clock and the threads of takes, and waiting for calls that need the disk, on behalf of peers."""
 
 import asyncio
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, TypeVar
 
 from gateway.errors import QueryError, TakeError
 from gateway.outputs.takes.disk import Disk, disk_problem
+from gateway.takes.recording import Recorder
 from gateway.worker_thread import WorkerThread, result_of
 
 _TIMEOUT_S: Final = 4.0
@@ -16,11 +19,20 @@ _TIMEOUT_S: Final = 4.0
 _Result = TypeVar("_Result")
 
 
-class DiskReader:
-    """A thread that reads the disk for peers."""
+@dataclass(frozen=True)
+class Host:
+    """The clock and the threads that takes use; tests replace them."""
 
-    def __init__(self) -> None:
-        self._thread = WorkerThread("takes-read")
+    monotonic: Callable[[], float] = time.monotonic
+    thread: Callable[[str], WorkerThread] = WorkerThread
+    recorder: Callable[[str, int], Recorder] = Recorder
+
+
+class DiskReader:
+    """Reads the disk for peers in a thread."""
+
+    def __init__(self, thread: WorkerThread) -> None:
+        self._thread = thread
 
     async def read(self, call: Callable[[], _Result], path: Path) -> _Result:
         """Return the result of ``call``, which reads ``path``. Raises QueryError."""

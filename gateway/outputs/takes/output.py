@@ -16,6 +16,7 @@ from gateway.outputs.contract import (
 )
 from gateway.outputs.status import OutputHealth
 from gateway.outputs.takes.control import TakeCommand
+from gateway.outputs.takes.disk_calls import Host
 from gateway.outputs.takes.follow import EventPublisher, TakeFollower
 from gateway.outputs.takes.recorded_takes import RecordedTakes
 from gateway.outputs.takes.settings import TakesSettings
@@ -29,11 +30,14 @@ class TakesOutput(Output):
     name = "takes"
     drop_causes = ("disk too slow", "not written", "folder full")
 
-    def __init__(self, settings: TakesSettings, max_queued_bytes: int = MAX_QUEUED_BYTES) -> None:
+    def __init__(
+        self, settings: TakesSettings, max_queued_bytes: int = MAX_QUEUED_BYTES, host: Host | None = None
+    ) -> None:
         self.has_tool_poses = settings.tool_poses
-        self.takes = RecordedTakes(settings, max_queued_bytes)
+        self._host = host or Host()
+        self.takes = RecordedTakes(settings, max_queued_bytes, self._host)
         """What is recorded, and what peers can do with it."""
-        self._command = TakeCommand(self.takes)
+        self._command = TakeCommand(self.takes, self._host.monotonic)
         self._followers: dict[str, TakeFollower] = {}  # by source
 
     def start(self) -> None:
@@ -50,7 +54,7 @@ class TakesOutput(Output):
 
     def _follower(self, source: str) -> TakeFollower:
         if source not in self._followers:
-            self._followers[source] = TakeFollower(source, self.takes)
+            self._followers[source] = TakeFollower(source, self.takes, self._host.monotonic)
         return self._followers[source]
 
     def watch_wanted(self, source: str, on_change: Callable[[], None]) -> bool:

@@ -3,7 +3,6 @@
 import asyncio
 import logging
 import math
-import time
 from collections.abc import Callable, Coroutine
 from concurrent.futures import Future
 from functools import partial
@@ -13,7 +12,7 @@ from typing import Any, Final
 from gateway.errors import OutputError, QueryError, TakeError
 from gateway.messages.host_time import now_utime
 from gateway.outputs.takes.disk import Disk, disk_problem
-from gateway.outputs.takes.disk_calls import DiskReader, disk_result
+from gateway.outputs.takes.disk_calls import DiskReader, Host, disk_result
 from gateway.outputs.takes.folder import ROLLING, TakesFolder, add_c3d
 from gateway.outputs.takes.folder_watch import FolderWatch
 from gateway.outputs.takes.header import FileHeader, SourceDescription
@@ -23,8 +22,7 @@ from gateway.outputs.takes.source_recording import SourceRecording
 from gateway.outputs.takes.stored import SourceTakes, StoredTake, TakePiece
 from gateway.outputs.takes.take_file import TakeFile
 from gateway.takes.names import check_name, default_name
-from gateway.takes.recording import MAX_QUEUED_BYTES, Recorder
-from gateway.worker_thread import WorkerThread
+from gateway.takes.recording import Recorder
 
 MAX_AFTER_S: Final = 3600.0
 """How long a take that is saved may go on."""
@@ -44,17 +42,18 @@ class RecordedTakes:
     ``server`` returns HOST:PORT of a source's server.
     """
 
-    def __init__(self, settings: TakesSettings, max_queued_bytes: int = MAX_QUEUED_BYTES) -> None:
+    def __init__(self, settings: TakesSettings, max_queued_bytes: int, host: Host) -> None:
         self.settings = settings
         self.server: Callable[[str], str] = lambda _source: ""
         self.disk = Disk()
-        self._watch = FolderWatch(settings)
         self._max_queued_bytes = max_queued_bytes
+        self._host = host
+        self._watch = FolderWatch(settings, host)
         self._recorder: Recorder | None = None
         self._is_closed = False
         self._recordings: dict[str, SourceRecording] = {}
-        self._reader = DiskReader()
-        self._copy_thread = WorkerThread("takes-copy")
+        self._reader = DiskReader(host.thread("takes-read"))
+        self._copy_thread = host.thread("takes-copy")
 
     @property
     def _folder(self) -> TakesFolder:
@@ -152,14 +151,14 @@ class RecordedTakes:
                 f"{MAX_SAVES} takes of source {source!r} are being saved already; wait until one is complete",
                 code="refused",
             )
-        now_s = time.monotonic()
+        now_s = self._host.monotonic()
         folder = self._folder.directory / source / (name or default_name(source))
         since_s = now_s - last_s
         call = partial(segments.save, folder, since_s, has_free_name=not name, goes_on=after_s > 0)
         save = await disk_result(recorder.call(call), folder, self.disk)
         if after_s > 0:
             loop = asyncio.get_running_loop()
-            delay_s = max(0.0, now_s + after_s - time.monotonic())
+            delay_s = max(0.0, now_s + after_s - self._host.monotonic())
             recording.saves[save] = loop.call_later(delay_s, recording.end_save, recorder, save)
         else:
             recording.ended(save.folder)
@@ -213,7 +212,7 @@ class RecordedTakes:
 
     def recording(self, source: str) -> SourceRecording:
         """Return the recording of a source, a new one the first time."""
-        return self._recordings.setdefault(source, SourceRecording(source))
+        return self._recordings.setdefault(source, SourceRecording(source, self._host))
 
     def announce(self, source: str) -> None:
         """Accept takes of a source."""
@@ -238,6 +237,7 @@ class RecordedTakes:
             header=self._header(recording),
             disk=self.disk,
             losses=recording.losses,
+            monotonic=self._host.monotonic,
         )
         recording.segments = segments
         recording.add(recorder, segments, self.settings.components)
@@ -259,7 +259,7 @@ class RecordedTakes:
         """Start to write, and to check the folder."""
         if self._recorder is not None or self._is_closed:
             return
-        self._recorder = recorder = Recorder("takes", self._max_queued_bytes)
+        self._recorder = recorder = self._host.recorder("takes", self._max_queued_bytes)
         recorder.call(partial(self._recover, self._folder))
         self._check_folder()
         for recording in self._recordings.values():
@@ -337,7 +337,7 @@ class RecordedTakes:
         """Apply settings: limits at once, everything else to the next take and to the rolling segments."""
         before, self.settings = self.settings, settings
         if settings.effective_directory != before.effective_directory:
-            old, self._watch = self._watch, FolderWatch(settings)
+            old, self._watch = self._watch, FolderWatch(settings, self._host)
             old.close()
             self._check_folder()
         recorder = self._recorder

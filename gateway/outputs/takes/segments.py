@@ -6,6 +6,7 @@ import os
 import shutil
 import time
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -66,9 +67,17 @@ class RollingSegments(LogSink):
     """
 
     def __init__(
-        self, folder: Path, keep_s: float, *, header: FileHeader, disk: Disk, losses: Losses
+        self,
+        folder: Path,
+        keep_s: float,
+        *,
+        header: FileHeader,
+        disk: Disk,
+        losses: Losses,
+        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         super().__init__(header, disk, losses)
+        self._monotonic = monotonic
         self._keep_s = keep_s
         self._folder = folder
         self._segments: deque[_Segment] = deque()
@@ -84,8 +93,8 @@ class RollingSegments(LogSink):
     def kept_s(self) -> float:
         """Return how many seconds of the past could be saved now."""
         with contextlib.suppress(IndexError):  # the thread may take the last one
-            return time.monotonic() - self._segments[0].begin_s
-        return 0.0 if self._log is None else time.monotonic() - self._log_began_s
+            return self._monotonic() - self._segments[0].begin_s
+        return 0.0 if self._log is None else self._monotonic() - self._log_began_s
 
     def keep(self, keep_s: float) -> None:
         """Keep another number of seconds from now on."""
@@ -96,7 +105,7 @@ class RollingSegments(LogSink):
 
     def log_for(self, utime: int) -> LogFile:
         """See LogSink: begins another segment when it is time."""
-        now_s = time.monotonic()
+        now_s = self._monotonic()
         if self._log is not None and (
             now_s - self._log_began_s >= max(SEGMENT_S, self._keep_s / MAX_SEGMENTS)
             or (not self._is_in_place and not self._log.is_in_place())
@@ -121,11 +130,11 @@ class RollingSegments(LogSink):
     def _end_segment(self) -> None:
         log = self._close_log()
         if log is not None:
-            self._segments.append(_Segment(log.path, self._log_began_s, time.monotonic()))
+            self._segments.append(_Segment(log.path, self._log_began_s, self._monotonic()))
             self._delete_expired()
 
     def _delete_expired(self) -> None:
-        oldest_s = time.monotonic() - self._keep_s
+        oldest_s = self._monotonic() - self._keep_s
         while self._segments and self._segments[0].end_s < oldest_s:
             self._delete_oldest()
 

@@ -2,7 +2,6 @@
 
 import asyncio
 import logging
-import time
 from collections.abc import Callable, Collection
 from concurrent.futures import Future
 from functools import partial
@@ -15,13 +14,13 @@ from gateway.messages.host_time import now_utime
 from gateway.messages.topics import Topic, lcm_channel, unique_name
 from gateway.outputs.contract import ServerParameters
 from gateway.outputs.parameters_message import encode_parameters, published_again
+from gateway.outputs.takes.disk_calls import Host
 from gateway.outputs.takes.log_sink import LogSink
 from gateway.outputs.takes.publisher import TakesPublisher
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.outputs.takes.take_file import TakeFile
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.takes.recording import Recorder
-from gateway.worker_thread import WorkerThread
 
 C3D_WAIT_S: Final = 60.0
 """A C3D file that the server sends within this time after a take belongs to the take."""
@@ -62,8 +61,9 @@ class _Files:
 class SourceRecording:
     """The recording of one source. Call it in the event loop."""
 
-    def __init__(self, source: str) -> None:
+    def __init__(self, source: str, host: Host) -> None:
         self.source = source
+        self._monotonic = host.monotonic
         self.losses = Losses(logger, source)
         """Where losses are counted."""
         self.on_wanted_changed: Callable[[], None] = lambda: None
@@ -81,7 +81,7 @@ class SourceRecording:
         self._files: list[_Files] = []
         self._num_parameters = 0
         self._long_parameters: Future[bytes] | None = None  # that are being encoded
-        self._encoder = WorkerThread("takes-parameters")
+        self._encoder = host.thread("takes-parameters")
         self._are_parameters_missing = False
         self._newest_take: tuple[Path, float] | None = None  # that has ended, and when
 
@@ -182,7 +182,7 @@ class SourceRecording:
 
     def ended(self, path: Path) -> None:
         """Remember a take that ends now."""
-        self._newest_take = path, time.monotonic()
+        self._newest_take = path, self._monotonic()
 
     def take_of_c3d(self) -> Path | None:
         """Return the path of the take to which a C3D file belongs that arrives now."""
@@ -190,7 +190,7 @@ class SourceRecording:
             return self.take.stem
         for save in reversed(self.saves):
             return save.folder
-        if self._newest_take is not None and time.monotonic() - self._newest_take[1] <= C3D_WAIT_S:
+        if self._newest_take is not None and self._monotonic() - self._newest_take[1] <= C3D_WAIT_S:
             return self._newest_take[0]
         return None
 

@@ -15,7 +15,6 @@ from tests.gateway_process import PROGRAM
 from tests.integration.takes.record_process import (
     Publisher,
     by_channel,
-    events,
     num_recorded,
     publisher,
     recording,
@@ -52,20 +51,6 @@ def test_two_gateways_with_the_same_source_are_reported(tmp_path: Path, publishe
     assert ended.status == 1
     assert "two gateways publish the source lab" in ended.stdout
     assert len(by_channel(tmp_path / "walk.lcmlog")["MOCAP_LAB_3D"]) == 80
-
-
-def test_a_source_that_appears_later_is_described_then(tmp_path: Path, publisher: Publisher) -> None:
-    path = tmp_path / "walk.lcmlog"
-    with recording_of(publisher, tmp_path) as record:
-        publisher.publish("lab", *range(10))
-        wait_until(lambda: size(path))
-        publisher.publish("robot", *range(10))
-        publisher.publish("lab", *range(10, 20))
-        wait_until(lambda: b"MOCAP_ROBOT_3D" in path.read_bytes())
-        assert record.end().status == 0
-    channels = [channel for channel, _ in events(path)]
-    assert channels[0] == "MOCAP_LAB_TAKE"
-    assert channels[channels.index("MOCAP_ROBOT_3D") - 1] == "MOCAP_ROBOT_TAKE"
 
 
 def test_hostile_publishers_are_bounded(tmp_path: Path, publisher: Publisher) -> None:

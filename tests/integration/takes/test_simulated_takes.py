@@ -176,14 +176,14 @@ async def test_a_take_that_loops_jumps_back_as_it_was(take: Path) -> None:
 
 
 async def test_clients_may_join_at_any_time(tmp_path: Path) -> None:
-    take = small_take(tmp_path / "lab.lcmlog", num_frames=1000)  # it does not end during the test
+    take = small_take(tmp_path / "lab.lcmlog", num_frames=3000)  # it does not end during the test
     async with Simulator(TakeScene(take), once=True) as simulator, connected(simulator) as client:
         await client.ask("StreamFrames Analog")
         await client.frames(300)
         async with connected(simulator) as late:
             await late.ask("SendCurrentFrame 3D")
             [current] = await late.frames(1)
-            assert 29 <= current[0].frame_number < 990
+            assert 29 <= current[0].frame_number < 2990
             await late.ask("StreamFrames 3D")
             assert consecutive(await late.frames(3))
 

@@ -240,3 +240,16 @@ async def test_the_end_of_a_source_waits_for_the_disk_but_not_long(tmp_path: Pat
         await lab.files.finish()
     disk.respond()
     await lab.ended(2)
+
+
+async def test_the_rest_of_an_interrupted_file_is_no_other_file(tmp_path: Path) -> None:
+    """Pieces without a beginning are skipped silently; the next file is stored."""
+    lab = Lab(tmp_path)
+    lab.begin(FILE, 1000)
+    lab.receiver.interrupt("the connection broke")
+    lab.receiver.receive(FilePiece(FILE[1000:], 1000, len(FILE)))
+    await lab.ended(1)
+    assert len(lab.lost) == 1
+    lab.send(FILE)
+    await lab.ended(2)
+    assert (lab.contents, len(lab.lost)) == ([FILE], 1)

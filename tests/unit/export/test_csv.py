@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from gateway.errors import TakeError
+from gateway.export.extensions import EXTENSIONS
+from gateway.export.formats import FORMATS
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import (
     EventDefinition,
@@ -200,3 +202,8 @@ def test_parts_of_a_long_take_follow_each_other(tmp_path: Path, monkeypatch: pyt
     export_messages(tmp_path, messages, "parts.csv")
     for key in ("3d", "6d", "analog", "force"):
         assert (tmp_path / f"parts-{key}.csv").read_bytes() == (tmp_path / f"whole-{key}.csv").read_bytes()
+
+
+def test_every_extension_has_a_format() -> None:
+    """The command line lists what the module of formats, which is slow to import, can do."""
+    assert tuple(FORMATS) == EXTENSIONS

@@ -100,3 +100,23 @@ def test_nonsense_of_a_time_stamp_takes_no_memory(tmp_path: Path) -> None:
 def test_a_single_frame_has_the_announced_rate(tmp_path: Path) -> None:
     found = grid(tmp_path, [(0, 123)])
     assert (found.rate_hz, found.num_rows) == (100.0, 1)
+
+
+@pytest.mark.parametrize("step_us", [4900, 1, 0, -3000])
+def test_two_frames_never_share_a_row(tmp_path: Path, step_us: int) -> None:
+    """A time stamp that is much too early would otherwise overwrite the frame before it."""
+    stamps = [10_000 * number for number in range(20)]
+    stamps[10] = stamps[9] + step_us
+    found = grid(tmp_path, [*enumerate(stamps)])
+    assert found.rows.tolist()[:11] == [*range(11)]
+    assert np.all(np.diff(found.rows) >= 1)
+
+
+@pytest.mark.parametrize(("gap_s", "num_grids"), [(10.0, 1), (10.01, 2)])
+def test_a_gap_of_ten_seconds_is_filled_and_a_longer_one_is_not(
+    tmp_path: Path, gap_s: float, num_grids: int
+) -> None:
+    """Empty rows for a break of an hour would make a file of gigabytes."""
+    rows = [(n, 10_000 * n) for n in range(5)]
+    rows += [(5 + n, 40_000 + round(gap_s * 1e6) + 10_000 * n) for n in range(5)]
+    assert len(place(series(tmp_path, rows))) == num_grids

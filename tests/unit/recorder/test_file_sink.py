@@ -1,3 +1,5 @@
+"""The file of a recording while its disk is full."""
+
 import os
 import resource
 import threading
@@ -75,3 +77,18 @@ def test_no_end_of_an_event_is_left_behind_if_the_disk_is_full(sink: FileSink) -
         sink.write(messages(200))
     sink.write(messages(1))
     assert len(written(sink)) == 97  # 95 of the 200 fit
+
+
+def test_each_period_without_room_counts_as_one_error(sink: FileSink) -> None:
+    """The report says how often the disk failed, not how often it was tried."""
+    for _ in range(2):
+        with disk_of(100_000):
+            sink.write(messages(0))
+            thread = threading.Thread(target=sink.write, args=(messages(200),))
+            thread.start()
+            wait_until(lambda: sink.problem)
+            for _ in range(3):
+                sink._failed(OSError(28, "No space left on device"))
+        thread.join(30)
+        assert not sink.problem
+    assert (sink.num_errors, sink.lost, sink.is_unsafe) == (2, {}, False)

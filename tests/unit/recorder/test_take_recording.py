@@ -1,5 +1,7 @@
-import time
+"""What `record` writes: each source described before its first message; the clock is the test's."""
+
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import rtc3d
@@ -8,15 +10,20 @@ from gateway.errors import TakeError
 from gateway.messages.decode import decode
 from gateway.messages.encode import MESSAGE_TYPES
 from gateway.messages.stamp import PREFIX
+from gateway.recorder import series as recorder_series
+from gateway.recorder import take_recording
 from gateway.recorder.file_sink import FileSink
 from gateway.recorder.series import RecordedSeries, RecordedSource
 from gateway.recorder.take_recording import TakeRecording
 from gateway.recorder.target import Target
 from gateway.rtc3d.components import ComponentType
-from gateway.subscriber.reception import MAX_SERIES, MAX_SOURCES
+from gateway.subscriber import reception
+from gateway.subscriber import series as subscriber_series
+from gateway.subscriber.reception import MAX_SOURCES
 from gateway.subscriber.series import FINGERPRINTS
 from gateway.takes.event_log import EventLogReader
 from gateway.takes.reader import TakeReader
+from tests.recording_output import Clock
 from tests.waiting import wait_until
 
 UTIME = 1_700_000_000_000_000
@@ -40,7 +47,7 @@ def status(source: str, sequence: int = 0) -> bytes:
 class Recorded:
     """A recording on a file in a folder."""
 
-    def __init__(self, folder: Path, *components: str) -> None:
+    def __init__(self, folder: Path, *components: str, start_s: float = 0.0) -> None:
         self.path = folder / "walk.lcmlog"
         target = Target(self.path)
         self.opened: list[list[str]] = []
@@ -49,7 +56,7 @@ class Recorded:
             self.opened.append(sources)
             return FileSink(target.open(sources))
 
-        self.recording = TakeRecording(open_file, components or None)
+        self.recording = TakeRecording(open_file, components or None, start_s)
 
     def source(self, name: str) -> RecordedSource:
         source = self.recording.source(name, f"MOCAP_{name.upper().replace('-', '_')}", is_known=True)
@@ -90,12 +97,22 @@ class Recorded:
         return [channel for channel, _ in self.events()]
 
 
+@pytest.fixture(autouse=True)
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """The monotonic clock of everything that is received and recorded."""
+    clock = Clock()
+    for module in (recorder_series, take_recording, reception, subscriber_series):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=clock))
+    return clock
+
+
 @pytest.fixture
-def recorded(tmp_path: Path) -> Recorded:
+def recorded(clock: Clock, tmp_path: Path) -> Recorded:  # noqa: ARG001 - the clock comes first
     return Recorded(tmp_path)
 
 
 def test_the_file_begins_with_the_description_although_messages_came_first(recorded: Recorded) -> None:
+    """Whoever reads the file from its beginning can label every frame."""
     recorded.receive("lab", "3d", *map(markers, range(40, 50)))
     recorded.recording.tick()
     assert recorded.recording.sink is None
@@ -118,6 +135,7 @@ def test_the_file_begins_with_the_description_although_messages_came_first(recor
 
 
 def test_parameters_are_written_when_they_change_only(recorded: Recorded) -> None:
+    """LCM repeats them every 5 s; a change back is a change."""
     recorded.describe("lab")
     for xml, version in ((b"<a/>", 1), (b"<a/>", 1), (b"<b/>", 2), (b"<b/>", 2), (b"<a/>", 3), (b"", 4)):
         recorded.publish_parameters("lab", xml, version)
@@ -134,6 +152,7 @@ def test_parameters_are_written_when_they_change_only(recorded: Recorded) -> Non
 
 
 def test_parameters_that_change_before_the_description_stay_in_order(recorded: Recorded) -> None:
+    """Each frame has the parameters before it that were valid then."""
     recorded.publish_parameters("lab", b"<a/>", 1)
     recorded.receive("lab", "3d", markers(1, 1))
     recorded.publish_parameters("lab", b"<b/>", 2)
@@ -144,6 +163,7 @@ def test_parameters_that_change_before_the_description_stay_in_order(recorded: R
 
 
 def test_all_sources_at_the_start_are_described_before_any_message(recorded: Recorded) -> None:
+    """The head of the file tells what is in it."""
     recorded.source("robot")
     recorded.receive("lab", "3d", markers(1))
     recorded.describe("lab")
@@ -157,6 +177,7 @@ def test_all_sources_at_the_start_are_described_before_any_message(recorded: Rec
 
 
 def test_a_later_source_is_described_then_and_delays_no_other(recorded: Recorded) -> None:
+    """A gateway may be started in the middle of a recording."""
     recorded.describe("lab")
     recorded.receive("robot", "3d", markers(1))
     recorded.receive("lab", "3d", markers(1))
@@ -168,16 +189,64 @@ def test_a_later_source_is_described_then_and_delays_no_other(recorded: Recorded
     assert channels.index("MOCAP_ROBOT_TAKE") < channels.index("MOCAP_ROBOT_3D")
 
 
-def test_a_source_without_answers_is_recorded_after_a_moment(recorded: Recorded) -> None:
+@pytest.mark.parametrize("after_s", [0.0, 1.5, 1.6])
+def test_a_source_without_answers_is_recorded_after_a_moment(
+    recorded: Recorded, clock: Clock, after_s: float
+) -> None:
+    """An old gateway answers no query, and its messages must not wait for ever."""
     recorded.receive("lab", "3d", *map(markers, range(3)))
-    deadline_s = time.monotonic() + 10
-    while recorded.recording.sink is None:
-        recorded.recording.tick()
-        assert time.monotonic() < deadline_s
+    clock.now_s += after_s
+    recorded.recording.tick()
+    assert (recorded.recording.sink is not None) is (after_s > 1.5)
     assert recorded.channels() == ["MOCAP_LAB_TAKE", *["MOCAP_LAB_3D"] * 3]
 
 
+def test_the_file_is_created_after_the_time_in_which_sources_are_found(tmp_path: Path, clock: Clock) -> None:
+    """Its name has the names of all sources, so it waits for those that answer later."""
+    recorded = Recorded(tmp_path, start_s=2.0)
+    recorded.describe("lab")
+    clock.now_s += 1.9
+    recorded.describe("robot")
+    assert recorded.recording.sink is None
+    clock.now_s += 0.1
+    recorded.recording.tick()
+    assert recorded.opened == [["lab", "robot"]]
+    recorded.events()
+
+
+def test_what_waits_for_descriptions_is_bounded_and_makes_room(
+    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A source that is never described must not take all memory; what is refused is counted."""
+    monkeypatch.setattr(take_recording, "MAX_QUEUED_BYTES", 3 * len(markers(0)))
+    recorded.receive("lab", "3d", *map(markers, range(5)))
+    assert recorded.series("lab", "3d").num_refused == 2
+    assert recorded.recording.queued_bytes == 3 * len(markers(0))
+    recorded.describe("lab")
+    recorded.receive("robot", "3d", *map(markers, range(5)))
+    assert recorded.series("robot", "3d").num_refused == 2
+    recorded.describe("robot")
+    channels = recorded.channels()
+    assert (channels.count("MOCAP_LAB_3D"), channels.count("MOCAP_ROBOT_3D")) == (3, 3)
+    assert recorded.recording.queued_bytes == 0
+
+
+def test_parameters_of_an_answer_have_times_on_the_clock_of_the_gateway(recorded: Recorded) -> None:
+    """The clock of this computer may differ by hours, and the answer says only how old they are."""
+    recorded.receive("lab", "3d", markers(2))
+    source = recorded.source("lab")
+    first, second = (
+        decode(recorded.recording.parameters_message(source, b"<a/>", session, 4, age_s=2.5))
+        for session in (None, 7)
+    )
+    assert first.utime == UTIME + 10_000
+    assert first.utime - first.capture_utime == 2_500_000
+    assert [(each.sequence, each.session) for each in (first, second)] == [(0, 1), (1, 7)]
+    recorded.events()
+
+
 def test_sources_whose_channels_are_equal_are_kept_apart(recorded: Recorded) -> None:
+    """Channels know no hyphen, so two names can be one channel."""
     for name in ("a-b", "a_b"):
         recorded.describe(name)
         recorded.receive(name, "3d", markers(1))
@@ -187,6 +256,7 @@ def test_sources_whose_channels_are_equal_are_kept_apart(recorded: Recorded) -> 
 
 
 def test_only_the_chosen_components_are_recorded(tmp_path: Path) -> None:
+    """The parameters are always recorded: they say what the rest means."""
     recorded = Recorded(tmp_path, "6d")
     recorded.describe("lab")
     recorded.receive("lab", "3d", markers(1))
@@ -197,22 +267,28 @@ def test_only_the_chosen_components_are_recorded(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("message", [b"", b"x", bytes(100), markers(1)[:39], status("lab")])
 def test_what_is_no_message_of_the_series_is_left_out_and_counted(recorded: Recorded, message: bytes) -> None:
+    """Anybody can publish on these keys."""
     recorded.describe("lab")
     recorded.receive("lab", "3d", message)
     assert recorded.channels() == ["MOCAP_LAB_TAKE", "MOCAP_LAB_PARAMETERS", "MOCAP_LAB_STATUS"]
     assert recorded.recording.num_foreign == 1
 
 
-def test_sources_and_keys_are_bounded(recorded: Recorded) -> None:
-    found = [recorded.recording.source(f"s{number}", f"S{number}", is_known=True) for number in range(1000)]
+def test_sources_and_keys_are_bounded(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Names come from the network and must not fill the memory."""
+    monkeypatch.setattr(reception, "MAX_SERIES", 50)
+    found = [recorded.recording.source(f"s{number}", f"S{number}", is_known=True) for number in range(100)]
     assert sum(source is not None for source in found) == len(recorded.recording.sources) == MAX_SOURCES
-    source = found[0]
-    assert source is not None
-    keys = [recorded.recording.series(source, f"6d/{number}", "C") for number in range(10_000)]
-    assert sum(series is not None for series in keys) == MAX_SERIES
+    first, second = found[:2]
+    assert first is not None
+    assert second is not None
+    keys = [recorded.recording.series(first, f"6d/{number}", "C") for number in range(40)]
+    keys += [recorded.recording.series(second, f"6d/{number}", "C") for number in range(40)]
+    assert sum(series is not None for series in keys) == 50
 
 
 def test_nothing_is_recorded_without_a_message(recorded: Recorded) -> None:
+    """A recording that found nothing leaves no file."""
     recorded.source("lab")
     recorded.recording.stop()
     assert recorded.recording.close(10)
@@ -220,6 +296,8 @@ def test_nothing_is_recorded_without_a_message(recorded: Recorded) -> None:
 
 
 def test_a_file_that_cannot_be_created_is_an_error() -> None:
+    """The user learns it at the end, too."""
+
     def fail(_sources: list[str]) -> FileSink:
         raise TakeError("no permission")
 

@@ -102,17 +102,6 @@ async def test_messages_keep_their_bytes_and_their_order(tmp_path: Path) -> None
     assert replayed.player.lateness.num_messages == 0
 
 
-@pytest.mark.parametrize("rate", [100.0, 1000.0])
-async def test_a_paced_replay_publishes_everything_and_measures_its_lateness(
-    tmp_path: Path, rate: float
-) -> None:
-    replayed = Replayed()
-    messages = some_messages()
-    await replayed.play(write_take(tmp_path / "take.lcmlog", messages), rate=rate)
-    assert replayed.keys == keyed(messages)
-    assert replayed.player.lateness.num_messages == 40
-
-
 async def test_from_the_middle_the_valid_parameters_come_first(tmp_path: Path) -> None:
     other = parameters(XML + b"<!-- 2 -->", 2, utime=START_UTIME + 95_000)
     messages = [description(), parameters(XML), *(markers(2, number) for number in range(10)), other]
@@ -187,39 +176,6 @@ async def test_the_take_may_be_repeated_until_it_is_stopped(tmp_path: Path) -> N
         assert replayed.keys[start : start + len(expected)] == expected
 
 
-async def test_pause_continue_and_seek(tmp_path: Path) -> None:
-    replayed = Replayed()
-    messages = [description(), parameters(XML), *(markers(1, number) for number in range(3000))]
-    player = replayed.prepare(write_take(tmp_path / "take.lcmlog", messages), rate=1.0)
-    player.pause(True)
-    async with playing(player):
-        player.pause(False)
-        await wait_until_async(lambda: player.num_messages > 2)
-        player.pause(True)
-        player.seek(10_000_000)
-        player.seek(10_000_000)
-        await wait_until_async(lambda: player.position_us >= 20_000_000)
-        num_messages = player.num_messages
-        assert player.is_paused
-        player.pause(False)
-        await wait_until_async(lambda: player.num_messages > num_messages + 2)
-        assert player.position_us < 25_000_000
-        player.seek(-30_000_000)
-        await wait_until_async(lambda: player.position_us < 5_000_000)
-    assert replayed.keys[num_messages][0] == "lab/parameters"
-    assert replayed.keys[num_messages + 1][1] in {messages[2 + number][1] for number in range(2000, 2500)}
-    assert not player.is_alive
-
-
-async def test_a_long_gap_is_skipped_and_reported(tmp_path: Path) -> None:
-    messages = some_messages()
-    messages.append(markers(1, 20, utime=START_UTIME + 3_600_000_000))
-    replayed = Replayed()
-    await replayed.play(write_take(tmp_path / "take.lcmlog", messages), rate=100.0)
-    assert replayed.keys == keyed(messages)
-    assert [(jump.jump_us, jump.is_skipped) for jump in replayed.jumps] == [(3_599_810_000, True)]
-
-
 async def test_bad_input_is_left_out_and_counted(tmp_path: Path) -> None:
     messages = some_messages()[1:]
     cut_parameters = ("MOCAP_LAB_PARAMETERS", parameters(XML)[1][:60])
@@ -291,47 +247,3 @@ async def test_the_number_of_keys_is_limited(tmp_path: Path) -> None:
     await replayed.play(write_take(tmp_path / "take.lcmlog", messages))
     assert len(replayed.keys) == MAX_TOPICS
     assert replayed.publication.num_surplus == 10
-
-
-async def test_a_player_that_stays_at_the_end_can_go_back(tmp_path: Path) -> None:
-    replayed = Replayed()
-    path = write_take(tmp_path / "take.lcmlog", some_messages())
-    player = replayed.prepare(path, is_watched=True)
-    async with playing(player):
-        await wait_until_async(lambda: player.is_at_end)
-        assert len(replayed.keys) == 41
-        player.seek_to(180_000)
-        await wait_until_async(lambda: player.num_passes == 2 and player.is_at_end)
-    sequences = [
-        rtc3d.markers_t.decode(message).sequence for key, message in replayed.keys if key == "lab/3d"
-    ]
-    assert sequences == [*range(20), *range(18, 20)]
-
-
-async def test_a_seek_in_a_pause_shows_that_moment_and_pauses_there(tmp_path: Path) -> None:
-    replayed = Replayed()
-    messages = [description(), parameters(XML), *(markers(2, number) for number in range(2000))]
-    player = replayed.prepare(write_take(tmp_path / "take.lcmlog", messages), rate=1.0, is_watched=True)
-    player.pause(True)
-    async with playing(player):
-        await wait_until_async(lambda: player.position_us == 90_000)
-        player.seek_to(5_000_000)
-        await wait_until_async(lambda: player.position_us == 5_090_000)
-        shown = len(replayed.keys)
-        player.pause(False)
-        await wait_until_async(lambda: len(replayed.keys) >= shown + 3)
-    sequences = [
-        rtc3d.markers_t.decode(message).sequence for key, message in replayed.keys if key == "lab/3d"
-    ]
-    assert sequences[:23] == [*range(10), *range(500, 513)]
-
-
-async def test_the_rate_may_change_at_any_time(tmp_path: Path) -> None:
-    replayed = Replayed()
-    messages = [description(), parameters(XML), *(markers(2, number) for number in range(20_000))]
-    player = replayed.prepare(write_take(tmp_path / "take.lcmlog", messages), rate=0.01)
-    async with playing(player):
-        await wait_until_async(lambda: len(replayed.keys) >= 2)
-        player.set_rate(1000.0)
-        await wait_until_async(lambda: not player.is_alive)
-    assert len(replayed.keys) == 20_001

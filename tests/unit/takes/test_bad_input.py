@@ -37,7 +37,7 @@ def c3d(path: Path) -> None:
 
 
 def sync_words(path: Path) -> None:
-    path.write_bytes(bytes.fromhex("eda1da01") * 100_000)
+    path.write_bytes(bytes.fromhex("eda1da01") * 10_000)
 
 
 def huge_hole(path: Path) -> None:

@@ -74,18 +74,6 @@ def test_a_complete_take(tmp_path: Path) -> None:
     assert [change.text for change in source.parameters_changes] == ["first: 3d"]
 
 
-def test_gaps_are_counted_and_the_largest_is_found(tmp_path: Path) -> None:
-    gaps = markers_of(tmp_path, [markers(1, number) for number in (5, 6, 8, 9, 20, 21)]).gaps
-    assert (gaps.missing, gaps.num_gaps, gaps.late, gaps.repeated, gaps.restarts) == (11, 2, 0, 0, 0)
-    assert gaps.largest
-    assert (gaps.largest.missing, gaps.largest.utime) == (10, START_UTIME + 200_000)
-
-
-def test_messages_that_arrive_late_or_twice_are_not_missing(tmp_path: Path) -> None:
-    gaps = markers_of(tmp_path, [markers(1, number) for number in (0, 1, 4, 2, 3, 3, 5, 7)]).gaps
-    assert (gaps.missing, gaps.num_gaps, gaps.late, gaps.repeated, gaps.restarts) == (1, 1, 2, 1, 0)
-
-
 def test_damaged_numbers_are_neither_gaps_nor_restarts(tmp_path: Path) -> None:
     numbers = (0, 1, 2**62, 2, -5, 3, -(2**63), 5)
     messages = [
@@ -94,12 +82,6 @@ def test_damaged_numbers_are_neither_gaps_nor_restarts(tmp_path: Path) -> None:
     ]
     gaps = markers_of(tmp_path, messages).gaps
     assert (gaps.missing, gaps.num_gaps, gaps.implausible, gaps.restarts) == (1, 1, 3, 0)
-
-
-def test_a_gap_or_a_restart_of_any_size_counts_also_at_the_end(tmp_path: Path) -> None:
-    messages = [markers(1, 0), markers(1, 5_000_000), markers(1, 5_000_001), markers(1, 0, utime=2**60)]
-    gaps = markers_of(tmp_path, messages).gaps
-    assert (gaps.missing, gaps.num_gaps, gaps.implausible, gaps.restarts) == (4_999_999, 1, 0, 1)
 
 
 def test_restarts_of_server_and_gateway(tmp_path: Path) -> None:

@@ -209,14 +209,14 @@ def test_values_are_those_of_lcms_own_decoder(tmp_path: Path) -> None:
 
 
 def test_what_comes_after_the_range_is_not_read(tmp_path: Path) -> None:
-    path = write_take(tmp_path / "a.lcmlog", [markers(0, number) for number in range(45_000)])
+    path = write_take(tmp_path / "a.lcmlog", [markers(200, number) for number in range(3000)])
     with path.open("ab") as file:
         file.write(b"damage")
     take = open_take(path, to_s=1)
     assert take.sources["lab"].markers
     assert len(take.sources["lab"].markers) == 100
     assert take.num_damaged == 0
-    assert open_take(path, from_s=449).num_damaged == 1
+    assert open_take(path, from_s=29).num_damaged == 1
 
 
 def test_one_message_with_damaged_numbers_does_not_end_a_run(tmp_path: Path) -> None:

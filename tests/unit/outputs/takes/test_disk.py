@@ -1,11 +1,9 @@
 """Takes on a disk that is full, slow, gone, or not what it should be."""
 
-import asyncio
 import contextlib
 import logging
 import os
 import resource
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +12,8 @@ import pytest
 from gateway.errors import OutputError, QueryError
 from gateway.losses import Losses
 from gateway.outputs.takes import disk_calls
+from gateway.outputs.takes.folder import ROLLING
+from gateway.takes.event_log import encode_event
 from tests.losses import amounts
 from tests.recording_output import RecordingLab, frames, recording_lab
 from tests.waiting import wait_until_async
@@ -35,6 +35,7 @@ def files_of_at_most(num_bytes: int) -> Iterator[None]:
 async def test_what_waits_for_a_full_disk_is_written_when_there_is_room(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """A full disk costs nothing if somebody makes room, and is logged once."""
     async with recording_lab(tmp_path) as lab:
         await lab.takes.start("lab", "walk")
         with files_of_at_most(300_000):
@@ -52,6 +53,7 @@ async def test_what_waits_for_a_full_disk_is_written_when_there_is_room(
 
 
 async def test_what_does_not_fit_into_the_queue_is_refused_and_a_gap_in_the_take(tmp_path: Path) -> None:
+    """Memory is bounded; what was accepted is in the take, and the caller counts the rest."""
     async with recording_lab(tmp_path, max_queued_bytes=MIB) as lab:
         await lab.takes.start("lab", "walk")
         accepted = []
@@ -72,6 +74,7 @@ async def test_what_does_not_fit_into_the_queue_is_refused_and_a_gap_in_the_take
 
 
 async def test_a_take_that_ends_on_a_full_disk_counts_what_is_missing(tmp_path: Path) -> None:
+    """The end does not wait for room; the loss is counted, and belongs to that take only."""
     async with recording_lab(tmp_path) as lab:
         losses = Losses(logging.getLogger("gateway"), "lab to takes")
         lab.output.count_losses("lab", losses)
@@ -82,28 +85,20 @@ async def test_a_take_that_ends_on_a_full_disk_counts_what_is_missing(tmp_path: 
             await wait_until_async(lambda: not lab.output.health().connected)
             assert len(frames(lab.path("walk.lcmlog"))) == 7  # of 16 kB; the eighth does not fit
             stopped = await lab.takes.stop("lab")
+        assert lab.output.health().connected  # whether the problem persists is not known
+        await lab.takes.start("lab", "next")
+        next_one = lab.publish()
+        await lab.takes.stop("lab")
+        assert lab.output.health().connected
+    assert frames(lab.path("next.lcmlog")) == [next_one]
     found = frames(lab.path("walk.lcmlog"))
     assert found == published[: len(found)]
     assert stopped.num_lost == len(published) - len(found) > 0
     assert amounts(losses.report()) == {"not written": (stopped.num_lost, stopped.num_lost)}
 
 
-async def test_a_take_can_start_after_one_that_ended_on_a_full_disk(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path) as lab:
-        await lab.takes.start("lab", "walk")
-        with files_of_at_most(100_000):
-            for _ in range(100):
-                lab.publish(size=1000)
-            await wait_until_async(lambda: not lab.output.health().connected)
-            await lab.takes.stop("lab")
-        await lab.takes.start("lab", "next")
-        published = lab.publish()
-        await lab.takes.stop("lab")
-        assert lab.output.health().connected
-    assert frames(lab.path("next.lcmlog")) == [published]
-
-
 async def test_a_folder_that_does_not_exist_is_created_at_the_start_only(tmp_path: Path) -> None:
+    """A folder that is missing later is a disk that is not mounted: its mount point must stay empty."""
     lab = RecordingLab(tmp_path / "disk" / "takes")
     lab.output.start()
     try:
@@ -122,6 +117,7 @@ async def test_a_folder_that_does_not_exist_is_created_at_the_start_only(tmp_pat
 
 
 async def test_a_file_instead_of_the_folder_is_reported(tmp_path: Path) -> None:
+    """The problem says what to choose instead."""
     (tmp_path / "takes").write_text("no folder")
     lab = RecordingLab(tmp_path / "takes")
     lab.output.start()
@@ -130,6 +126,7 @@ async def test_a_file_instead_of_the_folder_is_reported(tmp_path: Path) -> None:
 
 
 async def test_the_folder_of_the_user_is_created(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a setting, takes are where systemd lets the service write."""
     monkeypatch.setenv("STATE_DIRECTORY", str(tmp_path / "state"))
     async with recording_lab(None) as lab:
         await lab.takes.start("lab", "walk")
@@ -139,6 +136,7 @@ async def test_the_folder_of_the_user_is_created(tmp_path: Path, monkeypatch: py
 async def test_a_take_whose_file_is_removed_continues_in_a_new_one(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """Messages must not go on into a file that has no name any more."""
     async with recording_lab(tmp_path) as lab:
         await lab.takes.start("lab", "walk")
         lab.publish()
@@ -159,6 +157,7 @@ async def test_a_take_whose_file_is_removed_continues_in_a_new_one(
 async def test_stopping_a_take_while_segments_wait_for_a_full_disk_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The segments wait before the take does; the peer learns the reason instead of "no answer"."""
     monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.2)
     async with recording_lab(tmp_path, keep_last_s=60) as lab:
         await lab.takes.start("lab", "walk")
@@ -174,6 +173,7 @@ async def test_stopping_a_take_while_segments_wait_for_a_full_disk_says_so(
 async def test_a_disk_that_does_not_respond_is_reported_and_delays_nobody(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """The event loop goes on, and the take that was not started does not appear later."""
     monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.2)
     async with recording_lab(tmp_path) as lab:
         lab.path("").mkdir()
@@ -183,6 +183,7 @@ async def test_a_disk_that_does_not_respond_is_reported_and_delays_nobody(
                 await lab.takes.start("lab", "walk")
             assert refused.value.code == "disk"
             assert not lab.publishers["3d"].wanted
+        await lab.takes.written()
         await lab.takes.start("lab", "run")
     assert [path.name for path in lab.path("").glob("*.lcmlog")] == ["run.lcmlog"]
 
@@ -207,79 +208,32 @@ async def until_problem(lab: RecordingLab, text: str) -> None:
     await wait_until_async(has_it)
 
 
-# Limits --------------------------------------------------------------------------------------
+async def test_two_gateways_do_not_share_a_folder(tmp_path: Path) -> None:
+    """Each would delete the segments of the other one as left behind."""
+    async with recording_lab(tmp_path):
+        other = RecordingLab(tmp_path)
+        other.output.start()
+        await until_problem(other, "another gateway records in")
+        other.output.close()
 
 
-def old_take(folder: Path, name: str, num_bytes: int, age_s: float) -> Path:
-    folder.mkdir(exist_ok=True)
-    path = folder / f"{name}.lcmlog"
-    path.write_bytes(bytes(num_bytes))
-    at_s = time.time() - age_s
-    os.utime(path, (at_s, at_s))
-    return path
-
-
-async def test_the_oldest_takes_are_deleted_first(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO)
-    paths = [
-        old_take(tmp_path / source, name, MIB // 2, age_s)
-        for source, name, age_s in (
-            ("lab", "a", 400),
-            ("lab", "b", 300),
-            ("hall", "c", 200),
-            ("lab", "d", 100),
-        )
-    ]
-    (tmp_path / "lab" / "a.c3d").write_bytes(bytes(10))
-    (tmp_path / "lab" / "notes.txt").write_text("not ours")
-    async with recording_lab(tmp_path, max_bytes=MIB + MIB // 4):
-        await wait_until_async(lambda: not paths[1].exists())
-    assert [path.exists() for path in paths] == [False, False, True, True]
-    assert not (tmp_path / "lab" / "a.c3d").exists()
-    assert (tmp_path / "lab" / "notes.txt").exists()
-    assert [each for each in caplog.messages if "deleted" in each] == [
-        f"takes: deleted {tmp_path}/lab/a, the oldest one: the folder has {2 * MIB + 10} bytes, and "
-        f"takes.max_bytes is {MIB + MIB // 4}",
-        f"takes: deleted {tmp_path}/lab/b, the oldest one: the folder has {MIB + MIB // 2} bytes, and "
-        f"takes.max_bytes is {MIB + MIB // 4}",
-    ]
-
-
-async def test_old_takes_are_deleted_by_their_age(tmp_path: Path) -> None:
-    old, new = old_take(tmp_path / "lab", "a", 10, 3 * 86_400), old_take(tmp_path / "lab", "b", 10, 86_400)
-    async with recording_lab(tmp_path, max_age_days=2):
-        await wait_until_async(lambda: not old.exists())
-    assert new.exists()
-
-
-async def test_a_take_ends_if_nothing_else_can_be_deleted(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    old = old_take(tmp_path / "lab", "old", 1000, 1000)
-    async with recording_lab(tmp_path, max_bytes=MIB) as lab:
-        losses = Losses(logging.getLogger("gateway"), "lab to takes")
-        lab.output.count_losses("lab", losses)
+async def test_the_end_of_the_output_ends_the_take(tmp_path: Path) -> None:
+    """What was published before the end is in the file, written by the thread that ends, too."""
+    async with recording_lab(tmp_path, keep_last_s=10) as lab:
         await lab.takes.start("lab", "walk")
-        published = []
-        while lab.path("walk.lcmlog").stat().st_size <= MIB:
-            published.append(lab.publish(size=1000))
-            await lab.takes.written()  # what waits when the take ends is counted as not written
-        await wait_until_async(lambda: lab.takes.running("lab") is None)
-        at = time.time() - 60
-        os.utime(lab.path("walk.lcmlog"), (at, at))
-        await asyncio.sleep(0.2)  # it must not be deleted either
-    assert not old.exists()
+        published = [lab.publish(size=1000) for _ in range(200)]
     assert frames(lab.path("walk.lcmlog")) == published
-    assert amounts(losses.report()) == {"folder full": (1, 0)}
-    assert any("walk ends, because the folder" in each for each in caplog.messages)
+    assert not (tmp_path / ROLLING / "lab").exists()
 
 
-async def test_links_count_once(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path, max_bytes=MIB, keep_last_s=60) as lab:
-        lab.publish(size=15_000)
-        for number in range(5):
-            await lab.takes.save("lab", 60, 0, f"fall {number}")
-            at = time.time() - 60 * number - 60
-            os.utime(next(lab.path(f"fall {number}").iterdir()), (at, at))
-        await asyncio.sleep(0.2)
-        assert len((await lab.takes.list("lab")).takes) == 5
+async def test_segments_of_a_gateway_that_was_killed_become_a_take(tmp_path: Path) -> None:
+    """The next start finds them, before the first message is recorded."""
+    left_behind = tmp_path / ROLLING / "lab" / "lab-000000.lcmlog"
+    left_behind.parent.mkdir(parents=True)
+    left_behind.write_bytes(encode_event(0, 5, b"MOCAP_LAB_3D", bytes(16)))
+    async with recording_lab(tmp_path) as lab:
+        await wait_until_async(lambda: not left_behind.exists())
+        await lab.takes.written()
+        [take] = (await lab.takes.list("lab")).takes
+    assert take.name.startswith("lab-20")
+    assert frames(lab.path(take.name)) == [bytes(16)]

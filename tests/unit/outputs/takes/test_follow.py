@@ -4,38 +4,32 @@ import asyncio
 import logging
 from collections.abc import AsyncIterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import rtc3d
 
-from gateway.outputs.takes import follow
 from gateway.outputs.takes.follow import END_S, LOST_S, event_ids
 from gateway.takes.reader import TakeReader
-from tests.recording_output import RecordingLab, recording_lab
+from tests.recording_output import Clock, RecordingLab, still_lab
 from tests.unit.messages.samples import component_message
 from tests.vectors import LONG_EVENTS
 from tests.waiting import wait_until_async
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
+def clock() -> Clock:
     """The clock of the followers."""
-    clock = SimpleNamespace(now_s=100.0)
-    monkeypatch.setattr(follow, "time", SimpleNamespace(monotonic=lambda: clock.now_s))
-    return clock
+    return Clock()
 
 
 class Followed:
     """A source whose takes follow its server; its clock is the test's."""
 
-    def __init__(self, lab: RecordingLab, clock: SimpleNamespace) -> None:
+    def __init__(self, lab: RecordingLab, clock: Clock) -> None:
         self.lab = lab
         self.clock = clock
         self.follower = lab.output._follower("lab")
-        self.follower._monotonic = lambda: clock.now_s
-        self.follower._since_s = clock.now_s
 
     def show(self, is_running: bool | None, after_s: float = 0.0) -> None:
         self.clock.now_s += after_s
@@ -62,12 +56,13 @@ def frames_of(lab: RecordingLab, name: str) -> list[bytes]:
 
 
 @pytest.fixture
-async def measured(tmp_path: Path, clock: SimpleNamespace) -> AsyncIterator[Followed]:
-    async with recording_lab(tmp_path, follow="measurement") as lab:
+async def measured(tmp_path: Path, clock: Clock) -> AsyncIterator[Followed]:
+    async with still_lab(tmp_path, clock, follow="measurement") as lab:
         yield Followed(lab, clock)
 
 
 async def test_each_measurement_has_a_take_from_its_first_frame_on(measured: Followed) -> None:
+    """The first frame matters most, and two measurements are two takes."""
     names = []
     for _ in range(2):
         measured.show(True)
@@ -88,6 +83,7 @@ async def test_each_measurement_has_a_take_from_its_first_frame_on(measured: Fol
 async def test_a_stall_a_reconnection_or_a_short_no_data_does_not_split_a_take(
     measured: Followed, gap: bool | None, gap_s: float
 ) -> None:
+    """One movement in two files is hard to use."""
     measured.show(True)
     for _ in range(5):
         measured.show(gap)
@@ -99,6 +95,7 @@ async def test_a_stall_a_reconnection_or_a_short_no_data_does_not_split_a_take(
 
 
 async def test_a_measurement_that_does_not_come_back_ends(measured: Followed) -> None:
+    """Otherwise, a server that is switched off would have a take for ever."""
     measured.show(True)
     measured.show(None)
     measured.wait(LOST_S + 0.1)
@@ -106,6 +103,7 @@ async def test_a_measurement_that_does_not_come_back_ends(measured: Followed) ->
 
 
 async def test_a_stopped_take_is_not_started_again_before_the_next_measurement(measured: Followed) -> None:
+    """The user has stopped it on purpose."""
     measured.show(True)
     await measured.lab.takes.stop("lab")
     measured.wait(1.0)
@@ -119,6 +117,7 @@ async def test_a_stopped_take_is_not_started_again_before_the_next_measurement(m
 
 
 async def test_the_take_of_a_peer_goes_on(measured: Followed, caplog: pytest.LogCaptureFixture) -> None:
+    """What a peer has started, only a peer stops."""
     caplog.set_level(logging.INFO)
     await measured.lab.takes.start("lab", "of a peer")
     measured.show(True)
@@ -131,6 +130,7 @@ async def test_the_take_of_a_peer_goes_on(measured: Followed, caplog: pytest.Log
 async def test_a_take_that_cannot_start_is_tried_again_and_logged_once(
     measured: Followed, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """It begins as soon as the disk allows; the log does not fill meanwhile."""
     folder = measured.lab.directory / "lab"
     folder.write_text("in the way")
     measured.show(True)
@@ -150,7 +150,8 @@ async def test_a_take_that_cannot_start_is_tried_again_and_logged_once(
 
 
 async def test_a_take_follows_a_recording_under_the_same_name(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path, follow="recording") as lab:
+    """Both files of a recording are found by one name, and the peer learns of each take."""
+    async with still_lab(tmp_path, follow="recording") as lab:
         output = lab.output
         assert await output.follow_recording("lab", start=True, name="walk") == {"take": "walk"}
         published = lab.publish()
@@ -170,7 +171,8 @@ async def test_a_take_follows_a_recording_under_the_same_name(tmp_path: Path) ->
 
 @pytest.mark.parametrize("setting", ["none", "measurement"])
 async def test_without_the_setting_no_take_follows_a_recording(tmp_path: Path, setting: str) -> None:
-    async with recording_lab(tmp_path, follow=setting) as lab:
+    """Nothing is recorded that was not asked for."""
+    async with still_lab(tmp_path, follow=setting) as lab:
         assert await lab.output.follow_recording("lab", start=True, name="walk") == {}
         assert lab.takes.running("lab") is None
 
@@ -189,9 +191,10 @@ def event_message(*ids: int) -> bytes:
     return encoded
 
 
-async def test_events_start_and_stop_takes(tmp_path: Path, clock: SimpleNamespace) -> None:
+async def test_events_start_and_stop_takes(tmp_path: Path, clock: Clock) -> None:
+    """The event that starts a take is in it; the ids are unsigned."""
     settings: dict[str, Any] = {"follow": "events", "start_event_id": 5, "stop_event_id": 0xFFFF_FFFE}
-    async with recording_lab(tmp_path, **settings) as lab:
+    async with still_lab(tmp_path, clock, **settings) as lab:
         followed = Followed(lab, clock)
         publisher = lab.publishers["event"]
         assert publisher.wanted
@@ -208,9 +211,10 @@ async def test_events_start_and_stop_takes(tmp_path: Path, clock: SimpleNamespac
         assert frames_of(lab, name) == [start, both]
 
 
-async def test_one_event_can_start_and_stop_in_turns(tmp_path: Path, clock: SimpleNamespace) -> None:
+async def test_one_event_can_start_and_stop_in_turns(tmp_path: Path, clock: Clock) -> None:
+    """A remote control with one button."""
     settings: dict[str, Any] = {"follow": "events", "start_event_id": 5, "stop_event_id": 5}
-    async with recording_lab(tmp_path, **settings) as lab:
+    async with still_lab(tmp_path, clock, **settings) as lab:
         followed = Followed(lab, clock)
         for is_running in (True, False, True, False):
             lab.publishers["event"].publish(event_message(5))
@@ -220,6 +224,7 @@ async def test_one_event_can_start_and_stop_in_turns(tmp_path: Path, clock: Simp
 
 
 def test_the_ids_of_events_are_read_from_a_message() -> None:
+    """They are read without decoding each message."""
     assert event_ids(component_message(LONG_EVENTS)) == [0x123456, 2]
     assert event_ids(event_message()) == []
     assert event_ids(event_message(-1)) == [0xFFFF_FFFF]

@@ -1,173 +1,279 @@
-"""The last seconds, kept in segments and saved by links."""
+"""The last seconds, kept in segments and saved by links; the clock is the test's, so hours take no time."""
 
-import asyncio
-import itertools
+import logging
+import os
+from collections.abc import Callable
 from pathlib import Path
+from typing import NoReturn
 
 import pytest
 
 from gateway.errors import QueryError
-from gateway.messages.decode import decode
-from gateway.outputs.contract import ServerParameters
+from gateway.losses import Losses
 from gateway.outputs.takes import segments
-from gateway.outputs.takes.folder import ROLLING
+from gateway.outputs.takes.disk import Disk
+from gateway.outputs.takes.header import FileHeader, SourceDescription
+from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.takes.event_log import EventLogReader
-from gateway.takes.reader import log_paths
-from tests.recording_output import RecordingLab, frames, recording_lab
-from tests.waiting import wait_until_async
+from gateway.takes.reader import TakeReader
+from tests.recording_output import Clock
+
+CHANNEL = b"MOCAP_LAB_3D"
+
+
+def message(number: int) -> bytes:
+    """Return a message with this ``utime``."""
+    return bytes(8) + number.to_bytes(8, "big") + b"content"
+
+
+def numbers(path: Path) -> list[int]:
+    """Return the numbers of the messages in a take, or in one of its files."""
+    return [event.utime for event in TakeReader(path).events() if event.channel == CHANNEL.decode()]
+
+
+class Rolling:
+    """The rolling segments of a source that sends message 0, 1, 2, … at each second of the clock."""
+
+    def __init__(self, folder: Path, keep_s: float = 60.0) -> None:
+        self.takes = folder / "lab"
+        self.clock = Clock()
+        self.disk = Disk()
+        self.path = folder / ".rolling" / "lab"
+        description = SourceDescription("lab", "MOCAP", "")
+        self.segments = RollingSegments(
+            self.path,
+            keep_s,
+            header=FileHeader(description, None),
+            disk=self.disk,
+            losses=Losses(logging.getLogger("gateway"), "lab to takes"),
+            monotonic=self.clock,
+        )
+        self.num_messages = 0
+
+    def write(self, num_messages: int) -> None:
+        """Write the next messages; the clock stands at the next second afterwards."""
+        for _ in range(num_messages):
+            self.segments.write([(CHANNEL, message(self.num_messages))])
+            self.num_messages += 1
+            self.clock.now_s += 1.0
+
+    def save(self, last_s: float, name: str = "fall", *, goes_on: bool = False) -> Save:
+        """Save the last seconds."""
+        return self.segments.save(
+            self.takes / name, self.clock() - last_s, has_free_name=False, goes_on=goes_on
+        )
+
+    @property
+    def files(self) -> list[Path]:
+        """The segments on the disk, the oldest first."""
+        return sorted(self.path.glob("*"))
+
+
+@pytest.fixture(autouse=True)
+def _quick_disk(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hours of segments are hundreds of files, and no test needs them after a power failure."""
+    monkeypatch.setattr(os, "fsync", lambda _descriptor: None)
 
 
 @pytest.fixture
-def short_segments(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(segments, "SEGMENT_S", 0.05)
+def rolling(tmp_path: Path) -> Rolling:
+    return Rolling(tmp_path)
 
 
-def segment_paths(lab: RecordingLab) -> list[Path]:
-    return sorted((lab.directory / ROLLING / "lab").glob("*"))
+def test_for_hours_what_is_kept_is_the_last_minute_rounded_up_to_a_segment(rolling: Rolling) -> None:
+    """Less would break the promise of keep_last_s, and more would fill the disk."""
+    for _ in range(30):
+        rolling.write(7)
+        kept = [number for path in rolling.files for number in numbers(path)]
+        assert kept == list(range(kept[0], rolling.num_messages))
+    for _ in range(360):
+        rolling.write(1)
+        rolling.clock.now_s += 9
+        assert 60 <= rolling.segments.kept_s() <= 80
+        assert len(rolling.files) <= 9
 
 
-async def publish_until(lab: RecordingLab, num_segments: int, published: list[bytes]) -> None:
-    """Publish until so many segments were begun."""
-    seen: set[Path] = set()
-    while len(seen) < num_segments:
-        published.append(lab.publish())
-        seen |= set(segment_paths(lab))
-        await asyncio.sleep(0.001)
+@pytest.mark.parametrize(
+    ("last_s", "first"),
+    [(0.5, 30), (4.9, 30), (5, 20), (5.1, 20), (14.9, 20), (15.1, 10), (25.1, 0), (1e9, 0)],
+)
+def test_a_saved_take_begins_with_the_segment_in_which_its_time_lies(
+    rolling: Rolling, last_s: float, first: int
+) -> None:
+    """A segment that ends after the beginning has wanted messages, even if it begins long before."""
+    rolling.write(35)
+    rolling.save(last_s)
+    assert numbers(rolling.takes / "fall") == list(range(first, 35))
 
 
-@pytest.mark.usefixtures("short_segments")
-async def test_a_saved_take_has_everything_until_save_and_nothing_after_it(tmp_path: Path) -> None:
-    published: list[bytes] = []
-    async with recording_lab(tmp_path, keep_last_s=60) as lab:
-        lab.output.publish_parameters("lab", ServerParameters(b"<a/>", 1, 1))
-        await publish_until(lab, 4, published)
-        saved = await lab.takes.save("lab", 60, 0, "fall")
-        lab.publish()
-    assert not saved.is_running
-    assert frames(lab.path("fall")) == published
-    logs = log_paths(lab.path("fall"))
-    assert [path.name for path in logs] == [f"fall-{number:03}.lcmlog" for number in range(1, len(logs) + 1)]
-    assert len(logs) >= 4
-    for log in logs:  # each is a complete recording
-        first, second, *_ = EventLogReader(log).events()
-        assert [decode(event.message).__class__.__name__ for event in (first, second)] == [
-            "take_t",
-            "parameters_t",
-        ]
-        assert decode(second.message).xml == "<a/>"
-    assert saved.num_bytes == sum(log.stat().st_size for log in logs)
+def test_a_saved_take_ends_at_once_and_its_segments_are_shared(rolling: Rolling) -> None:
+    """What comes later is in a new segment, and no byte is copied."""
+    rolling.write(25)
+    save = rolling.save(60)
+    rolling.write(1)
+    logs = sorted(save.folder.iterdir())
+    assert [path.name for path in logs] == [f"fall-00{number}.lcmlog" for number in (1, 2, 3)]
+    assert [path.stat().st_ino for path in logs] == [path.stat().st_ino for path in rolling.files[:3]]
+    assert [numbers(path) for path in rolling.files] == [
+        *([*range(10)], [*range(10, 20)], [*range(20, 25)], [25]),
+    ]
+    for log in logs:
+        assert next(EventLogReader(log).events()).channel == "MOCAP_LAB_TAKE"
 
 
-@pytest.mark.usefixtures("short_segments")
-async def test_saving_makes_links(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path, keep_last_s=60) as lab:
-        await publish_until(lab, 3, [])
-        await lab.takes.save("lab", 60, 0, "fall")
-        links = {path.stat().st_ino for path in log_paths(lab.path("fall"))}
-        assert links <= {path.stat().st_ino for path in segment_paths(lab)}
+def test_takes_that_go_on_get_each_segment_until_their_end(rolling: Rolling) -> None:
+    """Two takes that overlap have the same segments, and each ends at its own time."""
+    rolling.write(5)
+    first = rolling.save(60, "first", goes_on=True)
+    rolling.write(20)
+    second = rolling.save(1, "second", goes_on=True)
+    rolling.write(12)
+    rolling.segments.end_save(first)
+    rolling.write(3)
+    rolling.segments.end_save(first)  # again, which must not end the present segment
+    rolling.write(3)
+    rolling.segments.end_save(second)
+    rolling.write(30)
+    assert numbers(first.folder) == list(range(37))
+    assert numbers(second.folder) == list(range(20, 43))
+    assert [numbers(path)[0] for path in rolling.files] == [0, 10, 20, 30, 37, 43, 53, 63]
 
 
-@pytest.mark.usefixtures("short_segments")
-async def test_a_saved_take_goes_on_for_some_seconds(tmp_path: Path) -> None:
-    published: list[bytes] = []
-    async with recording_lab(tmp_path, keep_last_s=60) as lab:
-        await publish_until(lab, 2, published)
-        saved = await lab.takes.save("lab", 60, 0.5, "fall")
-        assert saved.is_running
-        while [take.is_running for take in (await lab.takes.list("lab")).takes] == [True]:
-            published.append(lab.publish())
-            await asyncio.sleep(0.001)
-    found = frames(lab.path("fall"))
-    assert found == published[: len(found)]
-    assert len(published) - len(found) < 30
-    assert len(log_paths(lab.path("fall"))) > 3
+def test_a_save_outlives_its_segments(rolling: Rolling) -> None:
+    """Deleting what has expired, and the end of the gateway, leave what was saved."""
+    rolling.write(15)
+    ended = rolling.save(60, "ended")
+    rolling.save(60, "going on", goes_on=True)
+    rolling.write(300)
+    rolling.disk.failed(rolling.path, OSError(28, "No space left on device"))
+    rolling.segments.close()
+    assert not rolling.disk.problem  # whether it persists is not known
+    rolling.segments.close()
+    assert numbers(ended.folder) == list(range(15))
+    assert numbers(rolling.takes / "going on") == list(range(315))
+    assert not rolling.path.exists()
 
 
-@pytest.mark.usefixtures("short_segments")
-async def test_only_the_last_seconds_are_kept_and_saved(tmp_path: Path) -> None:
-    published: list[bytes] = []
-    async with recording_lab(tmp_path, keep_last_s=0.2) as lab:
-        await publish_until(lab, 20, published)
-        assert len(segment_paths(lab)) < 12
-        kept_s = (await lab.takes.list("lab")).kept_s
-        await lab.takes.save("lab", 60, 0, "all")
-        await lab.takes.save("lab", 0.05, 0, "some")
-        await publish_until(lab, 20, [])
-    everything, some = frames(lab.path("all")), frames(lab.path("some"))
-    assert 0.2 <= kept_s < 2
-    assert everything == published[-len(everything) :]
-    assert some == published[-len(some) :]
-    assert 0 < len(some) < len(everything) < len(published)
+@pytest.mark.parametrize(("keep_s", "length"), [(5.0, 10), (60.0, 10), (3600.0, 10), (7200.0, 20)])
+def test_segments_are_longer_if_there_would_be_too_many(tmp_path: Path, keep_s: float, length: int) -> None:
+    """Each take that is saved has a link to each segment, so their number is limited."""
+    rolling = Rolling(tmp_path, keep_s)
+    rolling.write(length + 1)
+    assert [numbers(path) for path in rolling.files] == [[*range(length)], [length]]
 
 
-@pytest.mark.usefixtures("short_segments")
-async def test_any_number_of_takes_can_be_saved_beside_a_running_one(tmp_path: Path) -> None:
-    published: list[bytes] = []
-    async with recording_lab(tmp_path, keep_last_s=60) as lab:
-        lab.publish()
-        await lab.takes.start("lab", "walk")
-        for number in range(5):
-            await publish_until(lab, 1, published)
-            await lab.takes.save("lab", 60, 30, f"fall {number}")
-        names = {take.name for take in (await lab.takes.list("lab")).takes if take.is_running}
-        assert names == {"walk", *(f"fall {number}" for number in range(5))}
-    assert frames(lab.path("walk.lcmlog")) == published
-    assert all(frames(lab.path(f"fall {number}"))[1:] == published for number in range(5))
+def test_keeping_less_deletes_at_once(rolling: Rolling) -> None:
+    """A user who lowers keep_last_s wants the room now, and not with the next segment."""
+    rolling.write(55)
+    rolling.segments.keep(15.0)
+    assert [numbers(path)[0] for path in rolling.files] == [30, 40, 50]
+    rolling.write(20)
+    assert [numbers(path)[0] for path in rolling.files] == [50, 60, 70]
 
 
-async def test_saving_needs_something_that_is_kept(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path) as lab:
-        lab.publish()
-        with pytest.raises(QueryError, match="keep_last_s is 0"):
-            await lab.takes.save("lab", 60)
-    async with recording_lab(tmp_path, keep_last_s=10) as lab:
-        with pytest.raises(QueryError, match="no messages are kept yet") as nothing:
-            await lab.takes.save("lab", 60)
-        assert nothing.value.code == "nothing-yet"
-        lab.publish()
-        for last_s, after_s in ((0.0, 0.0), (-1.0, 0.0), (float("nan"), 0.0), (1.0, -1.0), (1.0, 1e9)):
-            with pytest.raises(QueryError, match="expected last above 0"):
-                await lab.takes.save("lab", last_s, after_s)
-        await lab.takes.save("lab", 60, 0, "fall")
-        with pytest.raises(QueryError, match="there is a take 'fall'"):
-            await lab.takes.save("lab", 60, 0, "fall")
-        with pytest.raises(QueryError, match="there is a take 'fall'"):
-            await lab.takes.start("lab", "fall")
+@pytest.mark.parametrize(("complete", "left"), [(0, 1), (1, 1), (2, 2), (5, 3)])
+def test_making_room_deletes_the_older_half(rolling: Rolling, complete: int, left: int) -> None:
+    """The present segment stays; of the others, half and at least one must go, or the disk stays full."""
+    rolling.write(10 * complete + 1)
+    before = rolling.files
+    assert rolling.segments.shorten() is bool(complete)
+    assert rolling.files == before[-left:]
 
 
-async def test_an_orderly_end_deletes_the_segments(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path, keep_last_s=10) as lab:
-        lab.publish()
-        await wait_until_async(lambda: segment_paths(lab))
-    assert segment_paths(lab) == []
+def test_a_take_has_at_most_the_number_of_files_that_names_allow(
+    rolling: Rolling, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A take that goes on for hours ends with a warning, in good order, and the segments go on."""
+    monkeypatch.setattr(segments, "_MAX_FILES", 3)
+    rolling.write(1)
+    save = rolling.save(60, goes_on=True)
+    rolling.write(60)
+    assert numbers(save.folder) == list(range(30))
+    assert [each for each in caplog.messages if "has 3 files" in each] == [
+        f"takes: {save.folder} ends, because it has 3 files"
+    ]
 
 
-async def test_segments_of_a_gateway_that_was_killed_become_a_take(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path, keep_last_s=10) as lab:
-        published = [lab.publish() for _ in range(10)]
-        await lab.takes.save("lab", 10, 0, "fall")
-        [segment] = log_paths(lab.path("fall"))
-    left_behind = tmp_path / ROLLING / "lab" / segment.name
-    left_behind.parent.mkdir(parents=True)
-    segment.rename(left_behind)
-    segment.parent.rmdir()
-    async with recording_lab(tmp_path) as lab:
-        await wait_until_async(lambda: not left_behind.exists())
-        [take] = (await lab.takes.list("lab")).takes
-    assert take.name.startswith("lab-20")
-    assert frames(lab.path(take.name)) == published
+def no_links(*_arguments: object, **_options: object) -> NoReturn:
+    raise PermissionError(1, "Operation not permitted")
 
 
-@pytest.mark.usefixtures("short_segments")
-async def test_a_segment_that_is_removed_is_replaced(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path, keep_last_s=10) as lab:
-        published: list[bytes] = []
-        await publish_until(lab, 2, published)
-        for path in segment_paths(lab):
-            path.unlink()
-        for _ in itertools.repeat(None, 100):
-            published.append(lab.publish())
-            await asyncio.sleep(0.005)
-        await lab.takes.save("lab", 10, 0, "fall")
-    found = frames(lab.path("fall"))
-    assert found == published[-len(found) :]
+def test_a_save_that_fails_leaves_nothing(rolling: Rolling, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half a take under the wanted name would be taken for a whole one."""
+    rolling.write(15)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "link", no_links)
+        with pytest.raises(PermissionError):
+            rolling.save(60)
+    assert not (rolling.takes / "fall").exists()
+    rolling.save(60)
+    assert numbers(rolling.takes / "fall") == list(range(15))
+
+
+def test_a_segment_that_cannot_be_linked_or_deleted_is_a_problem_of_the_disk(
+    rolling: Rolling, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The recording goes on without it, and the user learns why a part is missing."""
+    rolling.write(10)
+    save = rolling.save(60, goes_on=True)
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "link", no_links)
+        rolling.segments.log_for(10)  # begins another segment
+    assert f"{save.folder} cannot be written: Operation not permitted" in rolling.disk.problem
+    rolling.write(20)
+    assert not rolling.disk.problem
+    oldest = rolling.files[0]
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", no_links)
+        rolling.segments.shorten()
+    assert f"{oldest} cannot be written" in rolling.disk.problem
+    assert numbers(save.folder) == [*range(10), *range(20, 30)]
+
+
+def remove_oldest(rolling: Rolling) -> list[int]:
+    rolling.files[0].unlink()
+    return list(range(10, 25))
+
+
+def remove_present(rolling: Rolling) -> list[int]:
+    rolling.segments.sync()
+    rolling.files[-1].unlink()
+    rolling.segments.sync()  # finds that it is gone
+    return [*range(20), *range(22, 25)]
+
+
+@pytest.mark.parametrize("remove", [remove_oldest, remove_present])
+def test_a_segment_that_somebody_removes_costs_only_itself(
+    rolling: Rolling, remove: Callable[[Rolling], list[int]]
+) -> None:
+    """The others are saved, and messages do not go on into a file that has no name."""
+    rolling.write(22)
+    expected = remove(rolling)
+    rolling.write(3)
+    rolling.save(60)
+    assert numbers(rolling.takes / "fall") == expected
+
+
+def test_a_name_that_is_taken_gets_a_number_or_is_refused(rolling: Rolling) -> None:
+    """A take is never mixed with another one, be that a folder or a file."""
+    rolling.takes.mkdir()
+    (rolling.takes / "fall-2.lcmlog").touch()
+    rolling.write(1)
+    names = [
+        rolling.segments.save(rolling.takes / "fall", 0.0, has_free_name=True, goes_on=False).name
+        for _ in range(3)
+    ]
+    assert names == ["fall", "fall-3", "fall-4"]
+    for name in ("fall", "fall-2"):
+        with pytest.raises(QueryError, match=f"there is a take '{name}'"):
+            rolling.save(60, name)
+
+
+def test_nothing_can_be_saved_before_the_first_message(rolling: Rolling) -> None:
+    """The peer learns that it is too early; an empty take would look like a loss."""
+    assert rolling.segments.kept_s() == 0.0
+    with pytest.raises(QueryError, match="no messages are kept yet") as caught:
+        rolling.save(60)
+    assert caught.value.code == "nothing-yet"
+    rolling.write(3)
+    assert rolling.segments.kept_s() == 3.0

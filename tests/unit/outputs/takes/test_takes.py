@@ -1,9 +1,11 @@
-"""Takes that peers start, stop, list and read."""
+"""Takes that peers start, stop, save, list and read, without threads: the disk answers at once."""
 
 import asyncio
-from collections.abc import Coroutine
+import math
+from collections.abc import Callable, Coroutine
+from concurrent.futures import Future
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import lcm
 import pytest
@@ -12,23 +14,33 @@ from gateway.errors import QueryError
 from gateway.messages.decode import decode
 from gateway.messages.topics import Topic
 from gateway.outputs.contract import ServerFile, ServerParameters
+from gateway.outputs.takes import recorded_takes
 from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.recorded_takes import MAX_SAVES
-from gateway.outputs.takes.stored import MAX_PIECE_BYTES, StoredTake
-from gateway.takes.reader import log_paths
-from tests.recording_output import RecordingLab, events, frames, recording_lab
-from tests.waiting import wait_until_async
+from gateway.outputs.takes.segments import RollingSegments, Save
+from gateway.outputs.takes.stored import StoredTake
+from tests.recording_output import (
+    Clock,
+    RecordingLab,
+    events,
+    frames,
+    still_lab,
+)
+from tests.virtual_time import run_in_virtual_time
+
+MIB = 1024 * 1024
 
 
 async def test_a_take_has_everything_that_is_published_between_start_and_stop(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path) as lab:
+    """No message more or less, in LCM's own format, and the peer learns what is on the disk."""
+    async with still_lab(tmp_path) as lab:
         lab.publish()
         started = await lab.takes.start("lab", "walk 1")
         published = [lab.publish(key) for _ in range(50) for key in ("3d", "event")]
         stopped = await lab.takes.stop("lab")
         lab.publish()
-    path = lab.path("walk 1.lcmlog")
-    assert frames(path) == published
+        path = lab.path("walk 1.lcmlog")
+        assert frames(path) == published
     assert (started.name, started.is_running) == ("walk 1", True)
     assert (stopped.name, stopped.is_running, stopped.num_lost) == ("walk 1", False, 0)
     assert (stopped.num_bytes, stopped.begin_utime) == (path.stat().st_size, started.begin_utime)
@@ -37,7 +49,8 @@ async def test_a_take_has_everything_that_is_published_between_start_and_stop(tm
 
 
 async def test_a_take_begins_with_its_description_and_the_newest_parameters(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path) as lab:
+    """A file explains itself: whoever reads it needs no other one."""
+    async with still_lab(tmp_path) as lab:
         lab.takes.server = lambda source: f"{source}:3020"
         lab.output.publish_parameters("lab", ServerParameters(b"<old/>", 1, 4))
         lab.output.publish_parameters("lab", ServerParameters(b"<new/>\0", 1, 5))
@@ -45,7 +58,6 @@ async def test_a_take_begins_with_its_description_and_the_newest_parameters(tmp_
         lab.publish()
         lab.output.publish_parameters("lab", ServerParameters(b"<changed/>", 1, 6))
         lab.publish()
-        await lab.takes.stop("lab")
     take, new, first, changed, second = events(lab.path("walk.lcmlog"))
     description = decode(take.message)
     assert (description.name, description.source, description.channels) == ("walk", "lab", "MOCAP_LAB")
@@ -57,57 +69,74 @@ async def test_a_take_begins_with_its_description_and_the_newest_parameters(tmp_
     assert times == sorted(times)
 
 
-async def test_frames_never_overtake_long_parameters(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path) as lab:
+async def test_parameters_stay_in_order_although_long_ones_are_encoded_elsewhere(tmp_path: Path) -> None:
+    """Short parameters that overtake long ones would be replaced by what they have replaced."""
+    async with still_lab(tmp_path) as lab:
         await lab.takes.start("lab", "walk")
         before = lab.publish()
         long = lab.output.publish_parameters("lab", ServerParameters(b"<!--" + b" " * 100_000 + b"-->", 1, 1))
         short = lab.output.publish_parameters("lab", ServerParameters(b"<short/>", 1, 2))
         assert long is not None
         assert short is not None
-        await long
-        between = lab.publish()
-        await short
+        await asyncio.gather(long, short)
+        assert lab.output.publish_parameters("lab", ServerParameters(b"<later/>", 1, 3)) is None
         after = lab.publish()
-        await lab.takes.stop("lab")
     found = [event.message for event in events(lab.path("walk.lcmlog"))[1:]]
-    first, long_ones, second, short_ones, last = found
-    assert [first, second, last] == [before, between, after] or [first, short_ones, last] == [
-        *(before, between, after)
-    ]
-    assert decode(long_ones).parameters_version == 1
+    assert [found[0], found[-1]] == [before, after]
+    assert [decode(message).parameters_version for message in found[1:-1]] == [1, 2, 3]
+
+
+async def test_parameters_that_do_not_fit_into_the_queue_follow_later(tmp_path: Path) -> None:
+    """Without them, the labels of all that follows would be wrong; and they follow once only."""
+    async with still_lab(tmp_path, max_queued_bytes=2000) as lab:
+        await lab.takes.start("lab", "walk")
+        lab.output.publish_parameters("lab", ServerParameters(b"<!--" + b" " * 5000 + b"-->", 1, 1))
+        lab.output.maintain()
+        lab.output.publish_parameters("lab", ServerParameters(b"<!--" + b" " * 1500 + b"-->", 1, 2))
+        lab.output.publish_parameters("lab", ServerParameters(b"<!--" + b" " * 1501 + b"-->", 1, 3))
+        await lab.takes.written()
+        for _ in range(3):
+            lab.output.maintain()
+            await lab.takes.written()
+    found = [decode(event.message).parameters_version for event in events(lab.path("walk.lcmlog"))[1:]]
+    assert found == [2, 3]
 
 
 async def test_only_one_take_of_a_source_runs(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path) as lab:
+    """What is not possible is refused with a reason, and harms neither a file nor the running take."""
+    async with still_lab(tmp_path) as lab:
         with pytest.raises(QueryError, match="no take of source 'lab' is running") as nothing:
             await lab.takes.stop("lab")
         assert nothing.value.code == "nothing-yet"
         await lab.takes.start("lab", "walk")
         with pytest.raises(QueryError, match="take 'walk' of source 'lab' is running already"):
             await lab.takes.start("lab", "run")
+        published = lab.publish()
         await lab.takes.stop("lab")
         with pytest.raises(QueryError, match="there is a take 'walk' of this source already"):
             await lab.takes.start("lab", "walk")
         await lab.takes.start("lab", "run")
         with pytest.raises(QueryError, match="no source 'hall'"):
             await lab.takes.start("hall")
+    assert frames(lab.path("walk.lcmlog")) == [published]
 
 
 async def test_takes_without_a_name_get_one_of_source_and_time(tmp_path: Path) -> None:
-    names = []
-    async with recording_lab(tmp_path) as lab:
+    """Three takes in the same second have different names."""
+    async with still_lab(tmp_path) as lab:
+        names = []
         for _ in range(3):
             names.append((await lab.takes.start("lab")).name)
             await lab.takes.stop("lab")
-    assert len(set(names)) == 3
     assert all(name.startswith("lab-20") for name in names)
     assert {path.stem for path in lab.path("").iterdir()} == set(names)
+    assert len(set(names)) == 3
 
 
 @pytest.mark.parametrize("name", ["a/b", "..", ".x", " x", "x" * 101, "a\nb", "a\0b", "a*b", "/etc/x"])
 async def test_names_that_are_no_names_of_files_are_refused(tmp_path: Path, name: str) -> None:
-    async with recording_lab(tmp_path, keep_last_s=10) as lab:
+    """Peers must not write outside the folder."""
+    async with still_lab(tmp_path, keep_last_s=10) as lab:
         lab.publish()
         for call in (
             lab.takes.start("lab", name),
@@ -120,27 +149,54 @@ async def test_names_that_are_no_names_of_files_are_refused(tmp_path: Path, name
 
 
 async def test_names_may_have_letters_of_any_script(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path) as lab:
-        for name in ("Käfig 1", "歩行_2", "a+b-c.d"):
+    """Names are for people."""
+    async with still_lab(tmp_path) as lab:
+        for name in ("Käfig 1", "歩行_2", "a+b-c.d", "x" * 100):
             await lab.takes.start("lab", name)
             await lab.takes.stop("lab")
             assert lab.path(f"{name}.lcmlog").is_file()
 
 
+async def test_takes_are_listed_and_read(tmp_path: Path) -> None:
+    """The list tells which takes are complete; reading one gives the bytes on the disk."""
+    async with still_lab(tmp_path, Clock(), keep_last_s=60) as lab:
+        await lab.takes.start("lab", "walk")
+        for _ in range(100):
+            lab.publish(size=1000)
+        await lab.takes.stop("lab")
+        await lab.takes.save("lab", 60, 0, "fall")
+        lab.publish()
+        await lab.takes.save("lab", 60, 30, "long fall")
+        await lab.takes.start("lab", "run")
+        found = await lab.takes.list("lab")
+        assert found.running is not None
+        assert (found.running.name, found.running.is_running) == ("run", True)
+        running = {take.name: take.is_running for take in found.takes}
+        assert running == {"walk": False, "fall": False, "long fall": True, "run": True}
+        [walk] = [take for take in found.takes if take.name == "walk"]
+        pieces: list[bytes] = []
+        while (piece := await lab.takes.read("lab", "walk", sum(map(len, pieces)))).content:
+            assert piece.num_bytes == walk.num_bytes
+            pieces.append(piece.content)
+        assert b"".join(pieces) == lab.path("walk.lcmlog").read_bytes()
+        assert len(pieces) > 1
+        for name, offset, text in (("jump", 0, "has no take 'jump'"), ("walk", -1, "an offset of 0 or more")):
+            with pytest.raises(QueryError, match=text):
+                await lab.takes.read("lab", name, offset)
+
+
 async def test_a_take_that_ends_while_it_is_listed_is_not_running(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    async with recording_lab(tmp_path) as lab:
+    """The disk is read without blocking the event loop, so anything may have changed since."""
+    async with still_lab(tmp_path) as lab:
         await lab.takes.start("lab", "walk")
-        loop, take_at = asyncio.get_running_loop(), TakesFolder.take_at
+        take_at = TakesFolder.take_at
         ends: list[Coroutine[Any, Any, StoredTake]] = []
-
-        async def end() -> None:
-            ends.append(lab.takes.end("lab"))
 
         def end_and_read(folder: TakesFolder, path: Path) -> StoredTake:
             if not ends:
-                asyncio.run_coroutine_threadsafe(end(), loop).result()
+                ends.append(lab.takes.end("lab"))
             return take_at(folder, path)
 
         monkeypatch.setattr(TakesFolder, "take_at", end_and_read)
@@ -148,52 +204,33 @@ async def test_a_take_that_ends_while_it_is_listed_is_not_running(
         assert (await ends[0]).name == "walk"
 
 
-async def test_takes_are_listed_and_read_in_pieces(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path, keep_last_s=60) as lab:
+async def test_a_take_that_could_not_start_in_time_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The peer was told that there is none; it would be recorded for ever, as nobody knows of it."""
+
+    async def too_late(_created: Future[None], *_others: object) -> NoReturn:
+        raise QueryError("the disk did not respond", code="disk")
+
+    async with still_lab(tmp_path) as lab:
+        with monkeypatch.context() as patch:
+            patch.setattr(recorded_takes, "disk_result", too_late)
+            with pytest.raises(QueryError, match="did not respond"):
+                await lab.takes.start("lab", "walk")
+        assert [*lab.path("").iterdir()] == []
+        assert not lab.publishers["3d"].wanted
+        assert lab.takes.running("lab") is None
         await lab.takes.start("lab", "walk")
-        for _ in range(100):
-            lab.publish(size=1000)
-        await lab.takes.stop("lab")
-        await lab.takes.save("lab", 60, 0, "fall")
-        lab.publish()
-        await lab.takes.save("lab", 60, 0, "fall again")
-        await lab.takes.start("lab", "run")
-        found = await lab.takes.list("lab")
-        assert found.running is not None
-        assert (found.running.name, found.running.is_running) == ("run", True)
-        assert {take.name: take.is_running for take in found.takes} == {
-            "walk": False,
-            "fall": False,
-            "fall again": False,
-            "run": True,
-        }
-        assert found.kept_s > 0
-        for name in ("walk", "fall again"):
-            [take] = [take for take in found.takes if take.name == name]
-            pieces: list[bytes] = []
-            while True:
-                piece = await lab.takes.read("lab", name, sum(map(len, pieces)))
-                assert piece.num_bytes == take.num_bytes
-                pieces.append(piece.content)
-                if not piece.content:
-                    break
-            assert len(pieces[0]) == MAX_PIECE_BYTES
-            log = lab.path(name) if name == "fall again" else lab.path("walk.lcmlog")
-            assert b"".join(pieces) == b"".join(path.read_bytes() for path in log_paths(log))
-        with pytest.raises(QueryError, match="has no take 'jump'"):
-            await lab.takes.read("lab", "jump", 0)
-        assert (await lab.takes.read("lab", "walk", 1 << 60)).content == b""
 
 
 async def test_components_and_the_prefix_can_be_chosen(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path, components=["event"], prefix="HALL") as lab:
+    """Status and poses are always recorded; each publisher has a channel of its own."""
+    async with still_lab(tmp_path, components=["event"], prefix="HALL") as lab:
         pose = lab.output.publisher(Topic("lab", ("6d", "3d"), "rtc3d.tool_pose_t"))
         status = lab.output.publisher(Topic("lab", ("status",), "rtc3d.status_t"))
         await lab.takes.start("lab", "walk")
-        assert [publisher.wanted for publisher in (*lab.publishers.values(), pose, status)] == [
-            *([False] * 4),
-            *([True] * 3),
-        ]
+        wanted = [publisher.wanted for publisher in (*lab.publishers.values(), pose, status)]
+        assert wanted == [*([False] * 4), *([True] * 3)]
         lab.publish("3d")
         event = lab.publish("event")
         pose.publish(event)
@@ -205,34 +242,57 @@ async def test_components_and_the_prefix_can_be_chosen(tmp_path: Path) -> None:
     assert channels == ["HALL_LAB_TAKE", "HALL_LAB_EVENT", "HALL_LAB_6D_3D", "HALL_LAB_6D_3D_2"]
 
 
-async def test_a_file_of_the_server_gets_the_name_of_its_take(tmp_path: Path) -> None:
-    spool = tmp_path / "spool"
-    spool.mkdir()
-    file = spool / "lab-1.c3d"
+def of_running(lab: RecordingLab) -> Coroutine[Any, Any, Any]:
+    return lab.takes.start("lab", "walk")
+
+
+async def _stopped(lab: RecordingLab) -> None:
+    await lab.takes.start("lab", "walk")
+    await lab.takes.stop("lab")
+
+
+async def _saved(lab: RecordingLab) -> None:
+    lab.publish()
+    await lab.takes.save("lab", 10, 0, "walk")
+
+
+async def _being_saved(lab: RecordingLab) -> None:
+    lab.publish()
+    await lab.takes.save("lab", 10, 600, "earlier")
+    await lab.takes.save("lab", 10, 600, "walk")
+
+
+@pytest.mark.parametrize(
+    ("before", "after_s", "name"),
+    [
+        (of_running, 1000.0, "walk.c3d"),
+        (_being_saved, 100.0, "walk.c3d"),
+        (_stopped, 60.0, "walk.c3d"),
+        (_stopped, 60.1, None),
+        (_saved, 60.0, "walk.c3d"),
+        (_saved, 60.1, None),
+    ],
+)
+async def test_a_file_of_the_server_gets_the_name_of_its_take(
+    tmp_path: Path, before: Callable[[RecordingLab], Any], after_s: float, name: str | None
+) -> None:
+    """It arrives some seconds after the take has ended; later, it belongs to something else."""
+    file = tmp_path / "lab-1.c3d"
     file.write_bytes(b"c3d")
-    takes = tmp_path / "takes"
-    takes.mkdir()
-    async with recording_lab(takes) as lab:
-        lab.output.announce_file("lab", ServerFile(file, 3))  # no take is running
-        await lab.takes.start("lab", "walk")
+    clock = Clock()
+    async with still_lab(tmp_path / "takes", clock, keep_last_s=60) as lab:
+        lab.output.announce_file("lab", ServerFile(file, 3))  # before any take
+        await before(lab)
+        clock.now_s += after_s
         lab.output.announce_file("lab", ServerFile(file, 3))
-        await wait_until_async(lab.path("walk.c3d").exists)
-        await lab.takes.stop("lab")
-        lab.output.announce_file("lab", ServerFile(file, 3))
-        await wait_until_async(lab.path("walk-2.c3d").exists)
-    assert lab.path("walk.c3d").samefile(file)
-    assert sorted(path.name for path in lab.path("").iterdir()) == ["walk-2.c3d", "walk.c3d", "walk.lcmlog"]
-
-
-async def test_the_end_of_the_output_ends_the_take(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path) as lab:
-        await lab.takes.start("lab", "walk")
-        published = [lab.publish(size=1000) for _ in range(200)]
-    assert frames(lab.path("walk.lcmlog")) == published
+        found = [path for path in lab.path("").iterdir() if path.suffix == ".c3d"]
+        assert [path.name for path in found] == ([] if name is None else [name])
+        assert all(path.samefile(file) for path in found)
 
 
 async def test_withdrawing_a_source_ends_its_take(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path) as lab:
+    """A source of the same name that is added later has nothing to do with it."""
+    async with still_lab(tmp_path) as lab:
         await lab.takes.start("lab", "walk")
         published = [lab.publish()]
         lab.output.withdraw("lab")
@@ -243,27 +303,134 @@ async def test_withdrawing_a_source_ends_its_take(tmp_path: Path) -> None:
     assert frames(lab.path("walk.lcmlog")) == published
 
 
-async def test_two_gateways_do_not_share_a_folder(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path):
-        other = RecordingLab(tmp_path)
-        other.output.start()
-        await wait_until_async(
-            lambda: _maintained(other).takes.problem.startswith("another gateway records in")
-        )
-        other.output.close()
+# Saving --------------------------------------------------------------------------------------
 
 
-def _maintained(lab: RecordingLab) -> RecordingLab:
-    lab.output.maintain()
-    return lab
+def test_a_saved_take_goes_on_for_some_seconds_from_the_command_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The time that the disk needs is part of the seconds, not added to them."""
+
+    async def save() -> None:
+        clock = Clock()
+        slow = RollingSegments.save
+
+        def save_slowly(*arguments: Any, **options: Any) -> Save:
+            clock.now_s += 2.0
+            return slow(*arguments, **options)
+
+        monkeypatch.setattr(RollingSegments, "save", save_slowly)
+        async with still_lab(tmp_path, clock, keep_last_s=60) as lab:
+            published = [lab.publish()]
+            saved = await lab.takes.save("lab", 60, 5, "fall")
+            assert saved.is_running
+            published.append(lab.publish())
+            await asyncio.sleep(2.9)
+            assert [take.is_running for take in (await lab.takes.list("lab")).takes] == [True]
+            await asyncio.sleep(0.2)
+            lab.publish()
+            assert [take.is_running for take in (await lab.takes.list("lab")).takes] == [False]
+            await lab.takes.written()
+            assert frames(lab.path("fall")) == published
+
+    run_in_virtual_time(save())
 
 
-async def test_takes_that_are_being_saved_are_bounded(tmp_path: Path) -> None:
-    async with recording_lab(tmp_path, keep_last_s=60) as lab:
+def test_a_save_that_was_ended_does_not_end_again(tmp_path: Path) -> None:
+    """Its timer would claim a C3D file that arrives long after the take."""
+
+    async def save_and_end() -> None:
+        async with still_lab(tmp_path, keep_last_s=60) as lab:
+            lab.publish()
+            saved = await lab.takes.save("lab", 60, 30, "fall")
+            recording, recorder = lab.takes.recording("lab"), lab.takes._started_recorder()
+            recording.end_takes(recorder)
+            assert not recording.saves
+            await asyncio.sleep(59)
+            assert recording.take_of_c3d() == lab.path(saved.name)
+            await asyncio.sleep(2)
+            assert recording.take_of_c3d() is None
+
+    run_in_virtual_time(save_and_end())
+
+
+async def test_the_seconds_that_are_saved_are_counted_from_the_command_on(tmp_path: Path) -> None:
+    """A peer asks for what is just over, by the clock of this computer."""
+    clock = Clock()
+    async with still_lab(tmp_path, clock, keep_last_s=60) as lab:
+        published = []
+        for _ in range(30):
+            published.append(lab.publish())
+            await lab.takes.written()
+            clock.now_s += 1
+        assert (await lab.takes.list("lab")).kept_s == 30.0
+        await lab.takes.save("lab", 1, 0, "some")
+        await lab.takes.save("lab", math.inf, 0, "all")
         lab.publish()
-        for _ in range(MAX_SAVES):
-            await lab.takes.save("lab", 30, 60)
-        with pytest.raises(QueryError, match="16 takes of source 'lab' are being saved already") as caught:
+        await lab.takes.written()
+        assert frames(lab.path("some")) == published[20:]
+        assert frames(lab.path("all")) == published
+
+
+async def test_takes_can_be_saved_beside_a_running_one_up_to_a_limit(tmp_path: Path) -> None:
+    """Each has its own part of what is published; more than the limit would link every segment too often."""
+    async with still_lab(tmp_path, keep_last_s=60) as lab:
+        published = [lab.publish()]
+        await lab.takes.start("lab", "walk")
+        for number in range(MAX_SAVES):
+            published.append(lab.publish())
+            await lab.takes.save("lab", 60, 30, f"fall {number}")
+        with pytest.raises(QueryError, match="are being saved already") as caught:
             await lab.takes.save("lab", 30, 60)
         assert caught.value.code == "refused"
-        await lab.takes.save("lab", 30)
+        await lab.takes.save("lab", 30, 0, "at once")
+    assert frames(lab.path("walk.lcmlog")) == published[1:]
+    assert all(frames(lab.path(f"fall {number}")) == published for number in range(MAX_SAVES))
+
+
+async def test_saving_needs_something_that_is_kept(tmp_path: Path) -> None:
+    """The peer learns whether to change the configuration, to wait, or to ask otherwise."""
+    async with still_lab(tmp_path / "off") as lab:
+        lab.publish()
+        with pytest.raises(QueryError, match="keep_last_s is 0") as nothing:
+            await lab.takes.save("lab", 60)
+        assert nothing.value.code == "nothing-yet"
+    async with still_lab(tmp_path, keep_last_s=10) as lab:
+        lab.publish()
+        for last_s, after_s in ((0.0, 0.0), (-1.0, 0.0), (math.nan, 0.0), (1.0, -1.0), (1.0, 3600.1)):
+            with pytest.raises(QueryError, match="expected last above 0"):
+                await lab.takes.save("lab", last_s, after_s)
+        await lab.takes.save("lab", 0.1, 3600, "fall")
+        with pytest.raises(QueryError, match="there is a take 'fall'"):
+            await lab.takes.start("lab", "fall")
+
+
+async def test_a_publisher_that_closes_frees_its_channel(tmp_path: Path) -> None:
+    """A tool whose label comes back continues on the channel that it had."""
+    async with still_lab(tmp_path) as lab:
+        await lab.takes.start("lab", "walk")
+        for _ in range(2):
+            pose = lab.output.publisher(Topic("lab", ("6d", "probe"), "rtc3d.tool_pose_t"))
+            pose.publish(bytes(16))
+            pose.close()
+    assert [event.channel for event in events(lab.path("walk.lcmlog"))[1:]] == ["MOCAP_LAB_6D_PROBE"] * 2
+
+
+async def test_whoever_publishes_learns_when_messages_are_wanted(tmp_path: Path) -> None:
+    """Only then are frames encoded for this output."""
+    async with still_lab(tmp_path) as lab:
+        seen: list[bool] = []
+        lab.output.watch_wanted("lab", lambda: seen.append(lab.publishers["3d"].wanted))
+        await lab.takes.start("lab", "walk")
+        await lab.takes.stop("lab")
+        assert seen == [True, False]
+
+
+async def test_the_end_of_the_gateway_forgets_the_timers_of_saves(tmp_path: Path) -> None:
+    """They would fire while the output closes in another thread."""
+    async with still_lab(tmp_path, keep_last_s=60) as lab:
+        lab.publish()
+        await lab.takes.save("lab", 60, 600, "fall")
+        [timer] = lab.takes.recording("lab").saves.values()
+        await lab.output.stop_queries()
+        assert timer.cancelled()

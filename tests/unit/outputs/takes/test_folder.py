@@ -1,0 +1,311 @@
+"""The folder of takes: which are deleted first, what a list has, and when the folder is checked."""
+
+import logging
+import os
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from gateway.errors import QueryError
+from gateway.outputs.takes import folder as folder_module
+from gateway.outputs.takes.disk_calls import Host
+from gateway.outputs.takes.folder import ROLLING, TakesFolder, add_c3d
+from gateway.outputs.takes.folder_watch import FolderWatch
+from gateway.outputs.takes.settings import TakesSettings
+from gateway.outputs.takes.stored import MAX_PIECE_BYTES, StoredTake
+from gateway.takes.event_log import encode_event
+from tests.recording_output import Clock, NoThread
+
+NOW_S = 1_700_000_000.0
+DAY_S = 86_400.0
+
+
+@pytest.fixture
+def takes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> TakesFolder:
+    monkeypatch.setattr(folder_module, "time", SimpleNamespace(time=lambda: NOW_S))
+    return TakesFolder(tmp_path)
+
+
+def stored(path: Path, content: bytes | int, age_s: float = 1000.0) -> Path:
+    """Create a file that was written last so long ago."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(bytes(content) if isinstance(content, int) else content)
+    os.utime(path, (NOW_S - age_s, NOW_S - age_s))
+    return path
+
+
+def left(takes: TakesFolder, max_bytes: int, *protected: str, max_age_s: float | None = None) -> list[str]:
+    """Apply the limits; return the takes that are left, as SOURCE/NAME."""
+    paths = {takes.directory / name for name in protected}
+    takes.delete_old(max_bytes=max_bytes, max_age_s=max_age_s, protected=paths)
+    return sorted(f"{entry.source}/{entry.path.name}" for entry in takes.entries())
+
+
+# Limits --------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("max_bytes", "expected"),
+    [
+        (4000, ["hall/c", "lab/a", "lab/b", "lab/d"]),
+        (3999, ["hall/c", "lab/a", "lab/d"]),  # b is the oldest, though not the first by name
+        (2999, ["hall/c", "lab/d"]),
+        (0, ["hall/c", "lab/d"]),  # the newest of each source stays
+    ],
+)
+def test_the_oldest_takes_of_all_sources_are_deleted_until_the_rest_fits(
+    takes: TakesFolder, max_bytes: int, expected: list[str]
+) -> None:
+    """Deleting too much, or the newest take, would lose what the user has just recorded."""
+    for name, age_s in (("lab/a", 300), ("lab/b", 400), ("hall/c", 200), ("lab/d", 100)):
+        stored(takes.directory / f"{name}.lcmlog", 1000, age_s)
+    assert left(takes, max_bytes) == expected
+
+
+def test_what_is_still_too_much_is_returned(takes: TakesFolder) -> None:
+    """By it, the running take ends before the disk is full."""
+    stored(takes.directory / "lab/running.lcmlog", 700)
+    stored(takes.directory / "lab/old.lcmlog", 1000)
+    running = {takes.directory / "lab/running"}
+    assert takes.delete_old(max_bytes=500, max_age_s=None, protected=running) == 200
+    assert takes.delete_old(max_bytes=700, max_age_s=None, protected=running) == 0
+
+
+@pytest.mark.parametrize(("age_s", "is_kept"), [(4.9, True), (5.1, False)])
+def test_a_take_that_was_just_written_is_not_deleted(takes: TakesFolder, age_s: float, is_kept: bool) -> None:
+    """It may have been started after the running takes were noted."""
+    stored(takes.directory / "lab/fresh.lcmlog", 1000, age_s)
+    assert ("lab/fresh" in left(takes, 0, "lab/other")) is is_kept
+
+
+def test_takes_are_deleted_by_age_unless_they_are_running(takes: TakesFolder) -> None:
+    """max_age_days holds for the newest take of a source, too, but never for one that is running."""
+    for name, age_s in (("old", 2 * DAY_S + 1), ("running", 3 * DAY_S), ("new", 2 * DAY_S - 1)):
+        stored(takes.directory / f"lab/{name}.lcmlog", 10, age_s)
+    stored(takes.directory / "hall/old.lcmlog", 10, 5 * DAY_S)
+    assert left(takes, 10**6, "lab/running", max_age_s=2 * DAY_S) == ["lab/new", "lab/running"]
+
+
+def links(takes: TakesFolder, name: str, *segments: Path, age_s: float = 1000.0) -> None:
+    """Save segments as a take; its age is theirs."""
+    for number, segment in enumerate(segments, start=1):
+        path = takes.directory / "lab" / name / f"{name}-{number:03}.lcmlog"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        os.link(segment, path)
+        os.utime(path, (NOW_S - age_s, NOW_S - age_s))
+
+
+def test_files_with_several_names_count_once(takes: TakesFolder) -> None:
+    """Deleting one of two takes that share their segments makes no room."""
+    shared, own = (stored(takes.directory / "origin" / each, 1000) for each in ("1", "2"))
+    links(takes, "first", shared, age_s=900)
+    links(takes, "second", shared, age_s=900)
+    links(takes, "third", own, age_s=100)
+    stored(takes.directory / "hall/newest.lcmlog", 10, 50)
+    shared.unlink()
+    own.unlink()
+    assert len(left(takes, 2010)) == 4
+    assert left(takes, 2009) == ["hall/newest", "lab/third"]
+
+
+def test_deleting_a_take_whose_segments_are_still_kept_makes_no_room(takes: TakesFolder) -> None:
+    """The rolling segments have the same bytes: counting them as free would let the disk fill."""
+    kept = stored(takes.directory / ROLLING / "lab" / "1.lcmlog", 1000)
+    links(takes, "saved", kept, age_s=900)
+    stored(takes.directory / "lab/other.lcmlog", 600, 500)
+    stored(takes.directory / "lab/newest.lcmlog", 100, 100)
+    assert takes.delete_old(max_bytes=1150, max_age_s=None, protected=set()) == 0
+    assert [entry.path.name for entry in takes.entries()] == ["newest"]
+    assert kept.exists()
+
+
+def test_c3d_files_belong_to_their_take_and_other_files_to_nobody(
+    takes: TakesFolder, caplog: pytest.LogCaptureFixture
+) -> None:
+    """The C3D files count and go with the take; what a user has put there stays."""
+    caplog.set_level(logging.INFO)
+    lab = takes.directory / "lab"
+    stored(lab / "a-2.lcmlog", 100, 900)  # a take of its own, not the second C3D file of "a"
+    stored(lab / "a.lcmlog", 100, 800)
+    stored(lab / "newest.lcmlog", 100, 100)
+    for name in ("a.c3d", "a-3.c3d", "a-2.c3d", "walk.c3d", "notes.txt"):
+        stored(lab / name, 50)
+    assert takes.delete_old(max_bytes=399, max_age_s=None, protected=set()) == 0
+    assert {path.name for path in lab.iterdir()} == {
+        *("a.lcmlog", "a.c3d", "a-3.c3d", "newest.lcmlog", "walk.c3d", "notes.txt")
+    }
+    assert f"deleted {lab}/a-2, the oldest one: the folder has 450 bytes, and takes.max_bytes is 399" in (
+        caplog.text
+    )
+    takes.delete_old(max_bytes=150, max_age_s=None, protected=set())
+    assert {path.name for path in lab.iterdir()} == {"newest.lcmlog", "walk.c3d", "notes.txt"}
+
+
+# Lists and pieces ----------------------------------------------------------------------------
+
+
+def log(*utimes: int) -> bytes:
+    return b"".join(encode_event(number, utime, b"C", bytes(1000)) for number, utime in enumerate(utimes))
+
+
+def test_a_list_has_the_newest_take_first_with_its_time_and_length(takes: TakesFolder) -> None:
+    """A saved take begins in its first file and ends in its last one, whatever the order on the disk."""
+    stored(takes.directory / "lab/walk.lcmlog", log(1_000_000, 3_500_000), 50)
+    for number in (2, 1, 3):
+        stored(
+            takes.directory / f"lab/fall/fall-00{number}.lcmlog", log(number * 10**7, number * 10**7 + 5), 99
+        )
+    stored(takes.directory / "lab/empty.lcmlog", b"", 70)
+    assert takes.takes("lab", {"walk"}) == [
+        StoredTake("walk", len(log(1, 2)), 1_000_000, 2.5, is_running=True),
+        StoredTake("empty", 0, 0, 0.0),
+        StoredTake("fall", 3 * len(log(1, 2)), 10_000_000, 20.000005),
+    ]
+    assert takes.take_at(takes.directory / "lab/fall").seconds == 20.000005
+    stored(takes.directory / "lab/walk.lcmlog", log(1_000_000, 3_500_000, 4_000_000), 49)
+    assert takes.take_at(takes.directory / "lab/walk").seconds == 3.0
+    with pytest.raises(QueryError, match="somebody has removed it"):
+        takes.take_at(takes.directory / "lab/wal")
+
+
+def test_a_long_take_is_measured_by_its_end(takes: TakesFolder) -> None:
+    """Only the last part is read; reading all of a folder of takes would take minutes."""
+    stored(takes.directory / "lab/long.lcmlog", log(*range(0, 10**9, 10**6)))
+    [take] = takes.takes("lab", ())
+    assert take.seconds == 999.0
+
+
+@pytest.mark.parametrize("offset", [0, 1, 999, 1000, 1001, 2500, 3_000_999, 3_001_000, 10**9])
+def test_the_files_of_a_saved_take_are_read_as_one(takes: TakesFolder, offset: int) -> None:
+    """A peer that puts the pieces together has every byte once, in order."""
+    sizes = (1000, 0, 1500, 3_000_000 - 1500)
+    content = os.urandom(sum(sizes))
+    start = 0
+    for number, size in enumerate(sizes):
+        stored(takes.directory / f"lab/fall/fall-{number:03}.lcmlog", content[start : start + size])
+        start += size
+    piece = takes.read("lab", "fall", offset)
+    assert piece == ("fall", len(content), offset, content[offset : offset + MAX_PIECE_BYTES])
+
+
+def test_a_c3d_file_gets_the_next_free_number(takes: TakesFolder) -> None:
+    """No recording of the server replaces another one."""
+    take = stored(takes.directory / "lab/walk.lcmlog", 1).with_suffix("")
+    file = stored(takes.directory / "spool.c3d", b"c3d")
+    names = [add_c3d(take, file).name for _ in range(3)]
+    assert names == ["walk.c3d", "walk-2.c3d", "walk-3.c3d"]
+    assert (takes.directory / "lab/walk-3.c3d").samefile(file)
+
+
+def test_what_a_killed_gateway_has_left_behind_becomes_a_take(takes: TakesFolder) -> None:
+    """The last seconds before a crash may be the most interesting ones."""
+    for number in (2, 1):
+        stored(takes.directory / ROLLING / "lab" / f"x-00000{number}.lcmlog", log(number))
+    takes.recover()
+    [take] = (takes.directory / "lab").iterdir()
+    assert [path.read_bytes() for path in sorted(take.iterdir())] == [log(1), log(2)]
+    assert not (takes.directory / ROLLING / "lab").exists()
+
+
+# When the folder is checked ------------------------------------------------------------------
+
+
+class SlowThread(NoThread):
+    """A thread whose present call takes ``age_s`` already."""
+
+    def __init__(self) -> None:
+        super().__init__("slow")
+        self.age_s = 0.0
+
+    @property
+    def call_age_s(self) -> float:
+        return self.age_s
+
+
+class Watched:
+    """A watched folder; each call of ``open`` takes ``check_s`` by the clock."""
+
+    def __init__(self, directory: Path, monkeypatch: pytest.MonkeyPatch, **settings: object) -> None:
+        self.clock = Clock()
+        self.thread = SlowThread()
+        self.settings = TakesSettings.model_validate(
+            {"enabled": True, "directory": str(directory), **settings}
+        )
+        self.watch = FolderWatch(self.settings, Host(self.clock, lambda _name: self.thread))
+        self.check_s = 1.0
+        self.num_checks = 0
+        original: Callable[[], str] = self.watch.folder.open
+
+        def open_slowly() -> str:
+            self.num_checks += 1
+            self.clock.now_s += self.check_s
+            return original()
+
+        monkeypatch.setattr(self.watch.folder, "open", open_slowly)
+
+    def check(self, after_s: float = 0.0) -> int:
+        """Ask for a check; return how many were made so far."""
+        self.clock.now_s += after_s
+        self.watch.check(self.settings, frozenset())
+        return self.num_checks
+
+
+def test_after_a_slow_check_the_disk_rests(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With thousands of takes, a check every second would keep a disk busy."""
+    watched = Watched(tmp_path, monkeypatch)
+    assert [watched.check(), watched.check(49.9), watched.check(0.2), watched.check(1.0)] == [1, 1, 2, 2]
+    assert watched.watch.is_checked
+    watched.watch.close()
+
+
+def test_after_a_problem_the_folder_is_checked_again_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The former gateway may just be ending; two that share a folder would delete each other's segments."""
+    former, watched = TakesFolder(tmp_path), Watched(tmp_path, monkeypatch)
+    assert former.open() == ""
+    assert watched.check() == 1
+    assert "another gateway records" in watched.watch.problem
+    former.close()
+    assert former.open() == f"{tmp_path} is closed"  # a late check must not lock it again
+    assert watched.check() == 2
+    assert watched.watch.problem == ""
+    watched.watch.close()
+
+
+def test_a_lock_that_somebody_deletes_is_taken_again(tmp_path: Path) -> None:
+    """Otherwise, another gateway could lock a new file of that name, and both would delete segments."""
+    folder, other = TakesFolder(tmp_path), TakesFolder(tmp_path)
+    assert folder.open() == ""
+    for path in tmp_path.iterdir():
+        path.unlink()
+    assert folder.open() == ""
+    assert "another gateway records" in other.open()
+    folder.close()
+    assert other.open() == ""
+    other.close()
+
+
+def test_a_disk_that_does_not_respond_is_a_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A network drive that hangs makes no error; only the time shows it."""
+    watched = Watched(tmp_path, monkeypatch)
+    assert "is not checked yet" in watched.watch.problem
+    watched.check()
+    watched.thread.age_s = 4.9
+    assert watched.watch.problem == ""
+    watched.thread.age_s = 5.1
+    assert "does not respond" in watched.watch.problem
+    watched.watch.close()
+
+
+def test_the_limits_of_the_settings_are_applied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Days and bytes mean what they say."""
+    watched = Watched(tmp_path, monkeypatch, max_age_days=2, max_bytes=1024 * 1024)
+    monkeypatch.setattr(folder_module, "time", SimpleNamespace(time=lambda: NOW_S))
+    old = stored(tmp_path / "lab/a.lcmlog", 10, 2.1 * DAY_S)
+    new = stored(tmp_path / "lab/b.lcmlog", 1024 * 1024 + 5, 1.9 * DAY_S)
+    watched.check()
+    assert (old.exists(), new.exists(), watched.watch.excess_bytes) == (False, True, 5)
+    watched.watch.close()

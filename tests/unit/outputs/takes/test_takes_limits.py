@@ -1,0 +1,143 @@
+"""The limits of the folder of takes, its checks, and settings that change; the disk answers at once."""
+
+import os
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.outputs.takes.disk_calls import Host
+from gateway.outputs.takes.folder import ROLLING
+from gateway.takes.reader import log_paths
+from tests.recording_output import Clock, NoThread, RecordingLab, settings_in, still_host, still_lab
+
+MIB = 1024 * 1024
+
+
+class FolderThread(NoThread):
+    """The thread that checks the folder; while it ``is_stuck``, it makes no call."""
+
+    is_stuck = False
+
+    def submit(self, call: Callable[[], Any]) -> Future[Any]:
+        return Future() if self.is_stuck else super().submit(call)
+
+
+def host_with(folder_thread: FolderThread) -> Host:
+    """Return a host without threads, where this one checks the folder."""
+
+    def thread(name: str) -> NoThread:
+        return folder_thread if name == "takes-folder" else NoThread(name)
+
+    still = still_host(Clock())
+    return Host(still.monotonic, thread, still.recorder)
+
+
+async def test_a_take_ends_when_the_folder_is_full_and_nothing_can_be_deleted(tmp_path: Path) -> None:
+    """Rather a take that ends in good order than a full disk; a take that is started then goes on."""
+    folder_thread = FolderThread("takes-folder")
+    lab = RecordingLab(tmp_path, host=host_with(folder_thread), max_bytes=MIB)
+    lab.output.start()
+    await lab.takes.start("lab", "walk")
+    while lab.path("walk.lcmlog").stat().st_size <= MIB:
+        lab.publish(size=1000)
+        await lab.takes.written()
+    lab.output.maintain()
+    assert lab.takes.running("lab") is not None
+    folder_thread.is_stuck = True
+    lab.output.maintain()
+    assert lab.takes.running("lab") is None
+    [loss] = lab.takes.recording("lab").losses.report()
+    assert (loss.cause, loss.messages, loss.frames) == ("folder full", 1, 0)
+    assert "walk ends, because the folder" in loss.text
+    await lab.takes.start("lab", "run")
+    lab.output.maintain()  # what was too much is known from before
+    assert lab.takes.running("lab") is not None
+    lab.output.close()
+
+
+async def test_the_older_half_of_the_segments_makes_room_if_no_take_does(tmp_path: Path) -> None:
+    """With long keep_last_s, the segments alone can be more than the limit."""
+    clock = Clock()
+    async with still_lab(tmp_path, clock, keep_last_s=3600, max_bytes=MIB) as lab:
+        for _ in range(8):
+            for _ in range(10):
+                lab.publish(size=1000)
+            await lab.takes.written()
+            clock.now_s += 10
+        segments = tmp_path / ROLLING / "lab"
+        before = sorted(segments.iterdir())
+        for _ in range(2):
+            lab.output.maintain()
+        assert sorted(segments.iterdir()) == before[4:]
+        assert sum(path.stat().st_size for path in segments.iterdir()) <= MIB
+        lab.output.maintain()
+        assert sorted(segments.iterdir()) == before[4:]
+
+
+@pytest.mark.parametrize(
+    ("changes", "kept_s"),
+    [
+        ({"keep_last_s": 30.0}, 25.0),
+        ({"keep_last_s": 10.0}, 15.0),
+        ({"prefix": "HALL"}, 0.0),
+        ({"components": ["event"]}, 0.0),
+        ({"directory": "other"}, 0.0),
+        ({"keep_last_s": 0.0}, 0.0),
+    ],
+)
+async def test_a_reload_keeps_the_segments_if_their_files_stay_the_same(
+    tmp_path: Path, changes: dict[str, Any], kept_s: float
+) -> None:
+    """The last seconds must survive a change of limits, but not be mixed with other channels."""
+    clock = Clock()
+    async with still_lab(tmp_path / "takes", clock, keep_last_s=60) as lab:
+        for _ in range(25):
+            lab.publish()
+            await lab.takes.written()
+            clock.now_s += 1
+        before = [*(tmp_path / "takes" / ROLLING / "lab").iterdir()]
+        if "directory" in changes:
+            changes = {"directory": str(tmp_path / "other")}
+        base = settings_in(tmp_path / "takes", keep_last_s=60)
+        lab.takes.change(type(base).model_validate(base.model_dump() | changes))
+        await lab.takes.written()
+        assert (await lab.takes.list("lab")).kept_s == kept_s
+        assert all(not path.exists() for path in before) is (kept_s == 0.0)
+        lab.publish("event")
+        await lab.takes.written()
+        folders = [tmp_path / "takes" / ROLLING / "lab", tmp_path / "other" / ROLLING / "lab"]
+        num_segments = sum(len(log_paths(folder)) for folder in folders if folder.exists())
+        assert (num_segments > 0) is (changes.get("keep_last_s") != 0.0)
+
+
+async def test_a_take_can_start_before_the_folder_was_checked(tmp_path: Path) -> None:
+    """A measurement may begin with the gateway; creating the file shows whether the disk works."""
+    folder_thread = FolderThread("takes-folder")
+    folder_thread.is_stuck = True
+    lab = RecordingLab(tmp_path, host=host_with(folder_thread))
+    lab.output.start()
+    assert not lab.output.health().connected
+    assert (await lab.takes.start("lab", "walk")).is_running
+    lab.output.close()
+
+
+async def test_running_takes_are_not_deleted_however_old_they_are(tmp_path: Path) -> None:
+    """A take whose server pauses for a day is still being written."""
+    async with still_lab(tmp_path, Clock(), max_age_days=1, keep_last_s=60) as lab:
+        lab.publish()
+        await lab.takes.start("lab", "walk")
+        await lab.takes.save("lab", 60, 600, "fall")
+        at_s = time.time() - 3 * 86_400
+        for path in (*lab.path("fall").iterdir(), lab.path("walk.lcmlog")):
+            os.utime(path, (at_s, at_s))
+        lab.output.maintain()
+        assert lab.path("walk.lcmlog").exists()
+        assert [*lab.path("fall").iterdir()]
+        await lab.takes.stop("lab")
+        os.utime(lab.path("walk.lcmlog"), (at_s, at_s))
+        lab.output.maintain()
+        assert not lab.path("walk.lcmlog").exists()
