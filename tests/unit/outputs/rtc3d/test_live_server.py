@@ -1,14 +1,20 @@
 """The RT server of a live source: when its measurement ends, who is served, and what is counted."""
 
 import asyncio
+import weakref
 from collections.abc import Callable, Coroutine
 from functools import wraps
 from typing import Any
 
 import pytest
 
+from gateway.outputs.rtc3d.live_scene import LiveScene
 from gateway.outputs.rtc3d.live_server import SLOW_CLIENT
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.rtc3d.frames import split_frame
+from gateway.rtc3d.parameters import SECTIONS, General
 from tests.losses import amounts
+from tests.unit.outputs.rtc3d.live_client import body, markers
 from tests.unit.outputs.rtc3d.scripted_server import Client, ScriptedServer, number_in, parameters, settle
 from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, NO_DATA, XML
 from tests.virtual_time import run_in_virtual_time
@@ -236,7 +242,8 @@ async def test_a_request_for_one_frame_is_wanted_until_it_is_answered() -> None:
     server.arrive(2)  # in the queue when the last request ended
     await settle()
     assert [number_in(data) for kind, data in client.receive() if kind == DATA] == [1]
-    await client.ask("SendCurrentFrame 3D")
+    [ok] = await client.ask("SendCurrentFrame 3D")  # not answered with an old frame
+    assert ok[0] == COMMAND
     server.arrive(3)
     assert [number_in(data) for kind, data in client.receive() if kind == DATA] == [3]
 
@@ -249,6 +256,60 @@ async def test_maintenance_corrects_what_another_server_of_the_source_said() -> 
     server.state.wanted = False
     server.maintain()
     assert server.changes == [True, True]
+
+
+@in_virtual_time
+async def test_a_frame_is_sent_when_it_arrives_even_if_others_came_in_the_same_moment() -> None:
+    """The times of frames grow with each of them, so they can be ahead of the clock."""
+    server = ScriptedServer()
+    client = await streaming(server)
+    server._live_scene._arrivals.newest_us = 10**12
+    server.arrive(2)
+    assert [number_in(data) for _, data in client.receive()] == [2]
+
+
+# Scenes -------------------------------------------------------------------------------------
+
+
+def test_a_choice_of_components_stays_a_bit_longer_than_its_client() -> None:
+    """A client that asks for one frame after the other must not begin anew each time."""
+    scene = LiveScene("lab")
+    kept = [weakref.ref(scene.frames([kind])) for kind in WIRE_ORDER[:3]]
+    assert [each() is None for each in kept] == [True, False, False]
+    scene.stop()
+    assert [each() for each in kept] == [None] * 3
+    held = scene.frames([])
+    scene.stop()  # a new measurement begins with new frames
+    assert scene.frames([]) is not held
+
+
+def test_a_scene_says_when_the_first_of_several_frames_is_due_and_that_there_are_some() -> None:
+    """Clients with several choices share one timer."""
+    scene = LiveScene("lab")
+    scene.start()
+    scene._announced_hz = {ComponentType.TOOLS: 100.0}
+    choices = [
+        scene.frames([ComponentType.MARKERS]),
+        scene.frames([ComponentType.MARKERS, ComponentType.TOOLS]),
+    ]
+    scene.add(split_frame(body(markers(1, 10)), "big"), 1, frozenset(WIRE_ORDER), 50)
+    assert scene.advance(50) == 50 + 100_000
+    assert scene.advance(100_050) == 50 + 300_000
+    assert scene.has_new_frames
+    scene.advance(100_051)
+    assert scene.has_new_frames  # until somebody has taken them
+    assert [each.next_frame for each in choices] == [1, 0]
+
+
+def test_the_whole_parameters_are_the_servers_own_bytes() -> None:
+    """Even if a client names all sections; changed parameters replace them."""
+    scene = LiveScene("lab")
+    for label in ("heel", "toe"):
+        new = parameters(label)
+        scene.set_parameters(new.xml, new.parsed)
+        for sections in ((), tuple(SECTIONS)):
+            assert scene.parameters_xml(sections, General()) is new.xml
+        assert label.encode() in scene.parameters_xml(["3d"], General())
 
 
 # Limits -------------------------------------------------------------------------------------
