@@ -365,6 +365,15 @@ def test_the_first_frame_that_begins_before_its_samples_is_left_out() -> None:
         assert source.numbers() == sent
 
 
+def test_a_frame_is_not_left_out_for_a_stream_that_is_silent() -> None:
+    """Nobody knows whether it begins again."""
+    source = Source()
+    source.play()
+    source.frames.forget()
+    source.arrive(30_000 + 250_000, markers(4, 280_000))
+    assert source.numbers() == [[4]]
+
+
 def test_a_stream_that_has_begun_may_skip_a_frame() -> None:
     """Lost samples do not cost the frame."""
     source = Source()
@@ -382,9 +391,10 @@ def test_nothing_from_before_a_pause_is_sent_after_it() -> None:
     source.arrive(40_001, markers(5, 50_000))  # a frame that waits
     source.add(40_002, analog(6, 60_000), stream=FAST)  # not looked at yet
     source.frames.forget()
+    assert source.frames.update(40_003) is None
     assert source.frames.update(400_000) is None
     assert source.numbers() == []
-    source.forget()
+    source.arrivals.frames.clear()
     source.arrive(500_000, markers(7, 70_000))
     source.frames.update(800_000)
     assert source.numbers() == []  # as the samples have yet to begin
