@@ -2,7 +2,6 @@
 
 import itertools
 import json
-import math
 import os
 import subprocess
 import time
@@ -197,17 +196,6 @@ def test_events_have_their_own_time_between_the_frames(tmp_path: Path) -> None:
     assert [after - before for before, after in zip(pressed, released, strict=False)] == pytest.approx(
         [0.3] * min(len(pressed), len(released)), abs=0.015
     )
-
-
-def test_positions_are_in_the_frame_of_the_source(tmp_path: Path) -> None:
-    transform = {"translation_m": [100.0, 0.0, 0.0]}
-    with running(tmp_path, transform=transform, frame_id="world") as lab:
-        receiver = lab.receive("lab_3d")
-        wait_until(has(receiver, "lab_3d", 10), TIMEOUT_S)
-    assert "<frame_id>world</frame_id>" in receiver.xml["lab_3d"]
-    xs = [values[0] for _, values in receiver.samples["lab_3d"] if not math.isnan(values[0])]
-    assert xs
-    assert all(90 < x < 110 for x in xs)
 
 
 def test_a_stream_on_demand_runs_only_while_somebody_receives(tmp_path: Path) -> None:

@@ -81,7 +81,11 @@ def test_items_beyond_the_parameters_get_topics_before_they_are_wanted() -> None
         assert not source.publisher.prepare(layout, ALL)
         source.sender.run()
     assert len(source.sender.offered_bytes) == num_calls + 2
+    source.subscribe()
+    source.send(tools_frame((1, 0, 0), (2, 0, 0)))
+    assert source.sent == {"wand/pose": [1], "tool_2/pose": [1], "/tf": [1]}
     assert source.node.open == {"/tf", "/mocap/lab/wand/pose", "/mocap/lab/tool_2/pose"}
+    source.subscribe(is_there=False)
     source.publisher.set_parameters(parameters(("cup",), version=2))
     source.publisher.prepare(two, ALL)
     source.sender.run()
@@ -160,7 +164,13 @@ def test_a_subscriber_that_came_before_its_topic_is_noticed() -> None:
     source.publisher.check_subscribers()
     assert not source.publisher.wants(ALL)
     assert source.num_changes == 2
-    source.topics._by_component[MARKERS][0].wanted = True  # between the declaration and the list of topics
+    [topic] = source.topics._by_component[MARKERS]
+    topic.wanted = True  # noted in another thread, which has not got further
+    source.node.matching.add("/mocap/lab/markers")
+    source.publisher.check_subscribers()
+    assert source.publisher.wants([MARKERS])
+    source.subscribe(is_there=False)
+    topic.wanted = True  # between the declaration and the list of topics
     source.topics.open_for({ANALOG: 1}, source.publisher._parameters)
     assert source.publisher.wants([MARKERS])
 

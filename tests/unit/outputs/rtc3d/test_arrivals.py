@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from gateway.outputs.rtc3d.arrivals import Arrival, Arrivals, Kept, StreamRate
+from gateway.outputs.rtc3d.frame_bytes import encode_joined
 from gateway.outputs.rtc3d.live_frames import KEPT_EVENTS, LiveFrames
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import split_frame
@@ -265,6 +266,14 @@ def test_a_joined_packet_names_the_components_of_all_its_streams() -> None:
     source.play()
     assert source.packets()[-1].components == (MARKERS, ANALOG)
     assert source.numbers() == [[1, 1], [2, 2], [3, 3]]
+
+
+def test_of_a_component_in_two_frames_the_first_counts() -> None:
+    """The frame that sets the rate comes first, and its markers belong to its time stamp."""
+    source = Source()
+    arrivals = [source.add(1, markers(1, 10)), source.add(2, markers(2, 20), analog(2, 20), stream=FAST)]
+    joined = encode_joined(arrivals, frozenset(BOTH), [], "big")
+    assert joined == body(markers(1, 10), analog(2, 20))
 
 
 @pytest.mark.parametrize(

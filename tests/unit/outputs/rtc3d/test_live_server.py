@@ -1,6 +1,7 @@
 """The RT server of a live source: when its measurement ends, who is served, and what is counted."""
 
 import asyncio
+import re
 import weakref
 from collections.abc import Callable, Coroutine
 from functools import wraps
@@ -13,6 +14,7 @@ from gateway.outputs.rtc3d.live_server import SLOW_CLIENT
 from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.parameters import SECTIONS, General
+from gateway.rtc3d.parameters_xml import parse_parameters
 from tests.losses import amounts
 from tests.unit.outputs.rtc3d.live_client import body, markers
 from tests.unit.outputs.rtc3d.scripted_server import Client, ScriptedServer, number_in, parameters, settle
@@ -242,8 +244,8 @@ async def test_a_request_for_one_frame_is_wanted_until_it_is_answered() -> None:
     server.arrive(2)  # in the queue when the last request ended
     await settle()
     assert [number_in(data) for kind, data in client.receive() if kind == DATA] == [1]
-    [ok] = await client.ask("SendCurrentFrame 3D")  # not answered with an old frame
-    assert ok[0] == COMMAND
+    client = await server.greeted()
+    assert await client.ask("SendCurrentFrame 3D") == [(COMMAND, b"OK-SendCurrentFrame 3D")]  # no old frame
     server.arrive(3)
     assert [number_in(data) for kind, data in client.receive() if kind == DATA] == [3]
 
@@ -299,6 +301,16 @@ def test_a_scene_says_when_the_first_of_several_frames_is_due_and_that_there_are
     scene.advance(100_051)
     assert scene.has_new_frames  # until somebody has taken them
     assert [each.next_frame for each in choices] == [1, 0]
+
+
+def test_frames_wait_only_for_components_that_the_parameters_have() -> None:
+    """A rate without any item announces nothing."""
+    scene = LiveScene("lab")
+    for num_markers, announced in ((1, {ComponentType.MARKERS: 100.0}), (0, {})):
+        xml = parameters("heel").xml.replace(b"<Markers>1<", f"<Markers>{num_markers}<".encode())
+        xml = xml if num_markers else re.sub(b"<Marker>.*</Marker>", b"", xml)
+        scene.set_parameters(xml, parse_parameters(xml).parameters)
+        assert scene._announced_hz == announced
 
 
 def test_the_whole_parameters_are_the_servers_own_bytes() -> None:
