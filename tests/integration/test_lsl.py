@@ -209,7 +209,8 @@ def test_a_stream_on_demand_runs_only_while_somebody_receives(tmp_path: Path) ->
         wait_until(has(again, "lab_3d", 10), TIMEOUT_S)
 
 
-def test_a_receiver_continues_when_the_process_for_lsl_has_ended(tmp_path: Path) -> None:
+def test_the_process_for_lsl_is_replaced_when_it_ends_and_ends_with_the_gateway(tmp_path: Path) -> None:
+    """A receiver goes on by itself, and no process is left behind, however the gateway ends."""
     with simulator(*SCENE) as (port, _):
         lab = Lab(tmp_path, port)
         gateway = lab.start()
@@ -220,19 +221,13 @@ def test_a_receiver_continues_when_the_process_for_lsl_has_ended(tmp_path: Path)
         wait_until(lambda: "the process for LSL ended by SIGKILL" in lab.log, TIMEOUT_S)
         count = len(receiver.samples["lab_3d"])
         wait_until(has(receiver, "lab_3d", count + 100), TIMEOUT_S)
-        lab.close()
-
-
-def test_the_process_for_lsl_ends_with_the_gateway(tmp_path: Path) -> None:
-    with simulator(*SCENE) as (port, _):
-        lab = Lab(tmp_path, port)
         for end in ("terminate", "kill"):
-            gateway = lab.start()
-            lab.receive("lab_3d")
+            wait_until(lambda gateway=gateway: children(gateway.pid))  # type: ignore[misc]
             [process] = children(gateway.pid)
             getattr(gateway, end)()
             gateway.wait(30)
             wait_until(lambda process=process: not Path(f"/proc/{process}/cmdline").exists())  # type: ignore[misc]
+            gateway = lab.start() if end == "terminate" else gateway
         lab.close()
 
 
