@@ -6,7 +6,6 @@ import struct
 from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
 from gateway.outputs.rtc3d.output import Rtc3dOutput
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
-from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.simulator.faults.server_faults import Rename
@@ -54,13 +53,6 @@ async def test_clients_get_changed_parameters() -> None:
         async with asyncio.timeout(TIMEOUT_S):
             while b"<Label>m1</Label>" in (await client.ask("SendParameters 3D"))[1]:
                 pass
-
-
-async def test_without_parameters_a_client_gets_an_error_in_plain_words() -> None:
-    async with serving_gateway(Nothing(), is_streaming=False) as gateway, connected(gateway) as client:
-        reply = await client.ask("SendParameters")
-        assert reply == (ERROR, b"Error-The server of source lab has given no parameters")
-        assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
 
 
 class Nothing:
@@ -127,18 +119,6 @@ async def test_the_server_sends_frames_only_while_a_client_asks_for_some() -> No
                 frames += await client.frames(1)
             assert numbers(frames) == sorted(set(numbers(frames)))
             await until(lambda: status.state is StreamState.IDLE)
-
-
-async def test_after_a_pause_the_current_frame_is_a_new_one() -> None:
-    async with playing() as (_, gateway), connected(gateway) as client:
-        await client.ask("StreamFrames 3D")
-        last = numbers(await client.frames(10))[-1]
-        await client.ask_while_streaming("StreamFrames Stop")
-        frames = gateway.source.fan_out.frames[ComponentType.MARKERS]
-        await until(lambda: gateway.source.fan_out.frames[ComponentType.MARKERS] > frames + 50)
-        async with connected(gateway) as other:
-            await other.ask("SendCurrentFrame 3D")
-            assert numbers(await other.frames(1))[0] > last + 50
 
 
 async def test_a_hundred_clients_share_one_session_with_the_server() -> None:
