@@ -313,6 +313,7 @@ def test_sources_are_declared_whether_they_come_before_the_session_or_after(
     assert "/mocap/hall/cup/pose" in lab.node.open
     hall.close()
     lab.output.withdraw("hall")
+    assert lab.output.topic_names("hall") == {}
     lab.sender.run()
     assert "/mocap/hall/cup/pose" not in lab.node.open
     lab.source("hall", "cup")  # again, under the same name
