@@ -412,6 +412,15 @@ def test_nothing_from_before_a_pause_is_sent_after_it() -> None:
     assert source.numbers() == [[8, 8]]
 
 
+def test_a_frame_that_waits_is_forgotten_in_a_pause() -> None:
+    """No timer is set for it any more."""
+    source = Source()
+    source.play()
+    assert source.arrive(40_000, markers(4, 40_000)) is not None
+    source.frames.forget()
+    assert source.frames.update(40_001) is None
+
+
 # What is not known yet ----------------------------------------------------------------------
 
 
