@@ -56,13 +56,20 @@ RIGS: Final = {"example": ExampleRig} | {name: rig for name in OUTPUTS if (rig :
 """The rig of each output that takes whole frames."""
 
 
-def rigs(is_chosen: Callable[[type[FrameRig]], bool] = lambda _: True) -> pytest.MarkDecorator:
-    """Run a test with the rigs for which ``is_chosen``."""
-    chosen = [pytest.param(rig, id=name) for name, rig in RIGS.items() if is_chosen(rig)]
+def rigs(
+    is_chosen: Callable[[type[FrameRig]], bool] = lambda _: True, *, are_real: bool = False
+) -> pytest.MarkDecorator:
+    """Run a test with the rigs for which ``is_chosen``; light ones replace others unless ``are_real``."""
+    chosen = [
+        pytest.param(rig if are_real else rig.light or rig, id=name)
+        for name, rig in RIGS.items()
+        if is_chosen(rig)
+    ]
     return pytest.mark.parametrize("lab", chosen, indirect=True)
 
 
 every_rig = rigs()
+every_real_rig = rigs(are_real=True)
 can_be_cut = rigs(lambda rig: rig.listens or rig.has_router)
 has_router = rigs(lambda rig: rig.has_router)
 listens = rigs(lambda rig: rig.listens)

@@ -87,6 +87,9 @@ class FrameRig(ABC):
     converts: ClassVar[bool] = True
     """Whether peers get poses in metres and in the source's frame, not what the server sent."""
 
+    light: "ClassVar[type[FrameRig] | None]" = None
+    """A rig without processes for tests that look at frames and states, not at the network; None for this."""
+
     output: Output
 
     @abstractmethod

@@ -5,12 +5,13 @@ import re
 import socket
 import tempfile
 from pathlib import Path
-from typing import Final
+from typing import ClassVar, Final
 
 from gateway.outputs.contract import Output
 from gateway.outputs.lsl.output import LslOutput
 from gateway.outputs.lsl.settings import LslSettings
 from tests.contract.frame_rigs import SOURCES, FrameRig, Received
+from tests.contract.memory_lsl import MemoryRig
 from tests.lsl_receiver import LslReceiver, lsl_config
 
 _PER_TOOL: Final = 8
@@ -22,6 +23,8 @@ _REQUEST: Final = (
 
 class Rig(FrameRig):
     """LSL on this computer, apart from all other programs that use it."""
+
+    light: ClassVar[type[FrameRig]] = MemoryRig
 
     def __init__(self) -> None:
         self._folder = tempfile.TemporaryDirectory()

@@ -14,7 +14,7 @@ from gateway.rtc3d.components import ITEM_DTYPES, WIRE_ORDER, ComponentType
 from tests.contract.frame_lab import (
     Lab,
     can_be_cut,
-    every_rig,
+    every_real_rig,
     has_router,
     lab,
     listens,
@@ -102,7 +102,7 @@ async def test_a_lost_router_is_reported_and_frames_leave_again_once_it_is_back(
 # Peers ------------------------------------------------------------------------------------------------
 
 
-@every_rig
+@every_real_rig
 async def test_a_peer_that_never_reads_holds_up_nobody(lab: Lab) -> None:
     await lab.start()
     await asyncio.to_thread(lab.rig.stall)

@@ -12,6 +12,7 @@ from gateway.rtc3d.components import WIRE_ORDER
 from tests.contract.frame_lab import (
     RIGS,
     Lab,
+    every_real_rig,
     every_rig,
     is_exact,
     knows_peers,
@@ -42,7 +43,7 @@ def test_every_output_of_whole_frames_has_a_rig() -> None:
 # Sending -------------------------------------------------------------------------------------
 
 
-@every_rig
+@every_real_rig
 async def test_frames_arrive_in_order_under_the_name_of_their_source(lab: Lab) -> None:
     await lab.start()
     sent: dict[str, list[float]] = {source: [] for source in SOURCES}
@@ -208,7 +209,7 @@ async def test_a_closed_output_stays_closed(lab: Lab) -> None:
     assert not lab.output.health().connected
 
 
-@every_rig
+@every_real_rig
 async def test_an_output_can_be_replaced_by_one_with_the_same_settings(lab: Lab) -> None:
     """A reload closes the former one first: it has the port."""
     await lab.start()

@@ -6,7 +6,6 @@ import struct
 from gateway.config.settings import ReconnectSettings, SourceSettings, StreamSettings
 from gateway.outputs.rtc3d.output import Rtc3dOutput
 from gateway.outputs.rtc3d.settings import Rtc3dSettings
-from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.rtc3d.parameters_xml import parse_parameters
 from gateway.simulator.faults.server_faults import Rename
@@ -54,22 +53,6 @@ async def test_clients_get_changed_parameters() -> None:
         async with asyncio.timeout(TIMEOUT_S):
             while b"<Label>m1</Label>" in (await client.ask("SendParameters 3D"))[1]:
                 pass
-
-
-async def test_a_client_that_comes_before_the_server_is_known_waits_for_the_parameters() -> None:
-    async with (
-        Simulator(CountingScene()) as simulator,
-        serving_gateway(simulator, is_streaming=False) as gateway,
-        connected(gateway) as client,
-    ):
-        assert (await client.ask("SendParameters"))[0] == XML
-
-
-async def test_without_parameters_a_client_gets_an_error_in_plain_words() -> None:
-    async with serving_gateway(Nothing(), is_streaming=False) as gateway, connected(gateway) as client:
-        reply = await client.ask("SendParameters")
-        assert reply == (ERROR, b"Error-The server of source lab has given no parameters")
-        assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
 
 
 class Nothing:
@@ -138,28 +121,6 @@ async def test_the_server_sends_frames_only_while_a_client_asks_for_some() -> No
             await until(lambda: status.state is StreamState.IDLE)
 
 
-async def test_after_a_pause_the_current_frame_is_a_new_one() -> None:
-    async with playing() as (_, gateway), connected(gateway) as client:
-        await client.ask("StreamFrames 3D")
-        last = numbers(await client.frames(10))[-1]
-        await client.ask_while_streaming("StreamFrames Stop")
-        frames = gateway.source.fan_out.frames[ComponentType.MARKERS]
-        await until(lambda: gateway.source.fan_out.frames[ComponentType.MARKERS] > frames + 50)
-        async with connected(gateway) as other:
-            await other.ask("SendCurrentFrame 3D")
-            assert numbers(await other.frames(1))[0] > last + 50
-
-
-async def test_frames_that_nobody_asks_for_are_not_counted_as_sent() -> None:
-    async with playing() as (_, gateway), connected(gateway) as client:
-        [(_, status)] = gateway.source.fan_out.outputs
-        assert not status.messages
-        await client.ask("StreamFrames 3D")
-        await client.frames(10)
-        [(_, status)] = gateway.source.fan_out.outputs
-        assert status.messages["frame"] >= 10
-
-
 async def test_a_hundred_clients_share_one_session_with_the_server() -> None:
     async with playing() as (simulator, gateway):
         num_connections = len(simulator.connections)
@@ -213,23 +174,6 @@ async def test_recordings_are_passed_on_to_the_server_with_remote_control() -> N
 
 
 # Ports and reloads --------------------------------------------------------------------------
-
-
-async def test_a_port_in_use_is_a_problem_until_it_is_free() -> None:
-    async with Simulator(CountingScene()) as simulator:
-        occupant = await asyncio.start_server(lambda *_: None, "127.0.0.1", 0)
-        port = occupant.sockets[0].getsockname()[1]
-        output = Rtc3dOutput(Rtc3dSettings(enabled=True, ports={"lab": port}))
-        output.watch_wanted("lab", lambda: None)
-        output.announce("lab")
-        output.start()
-        await until(lambda: f"port {port}" in output.health().problem and "cannot" in output.health().problem)
-        assert "choose an address of this machine and a free port" in output.health().problem
-        occupant.close()
-        await occupant.wait_closed()
-        await until(lambda: output.health().connected)
-        await asyncio.to_thread(output.close)
-        assert simulator.is_listening
 
 
 def source(name: str, server: Simulator) -> SourceSettings:

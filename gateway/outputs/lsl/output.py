@@ -63,9 +63,11 @@ class LslOutput(Output):
         self._sent_s = 0.0
         self._defects = DefectLog(logger, self.name)
         self._ended = threading.Event()
+        self._is_started = False
 
     def start(self) -> None:
         """Start the process for LSL."""
+        self._is_started = True
         self._submit(self._restart)
 
     def publisher(self, topic: Topic) -> Publisher:  # noqa: ARG002 - no topic is published
@@ -126,7 +128,7 @@ class LslOutput(Output):
 
     def maintain(self) -> None:
         """Start the process again if it has ended, and open the streams that had to wait."""
-        if self._processes.is_due:
+        if self._is_started and self._processes.is_due:
             self._submit(self._restart)
         for publisher in self._publishers.values():
             if publisher.streams.waiting:

@@ -89,13 +89,16 @@ def test_what_loses_messages_gets_a_warning_until_it_loses_no_more() -> None:
         return message
 
     first, second, third = status(0, 5, 7), status(1_000_000, 5, 9), status(2_000_000, 6, 9)
-    late = status(60_000_000, 100, 100)
+    late, restarted = status(5_000_001, 100, 100), status(3_000_000, 0, 1)
     assert [_levels(now, before) for now, before in ((first, None), (second, first), (third, second))] == [
         [(0, "streaming"), (0, "connected")],
         [(0, "streaming"), (1, "connected; messages lost: 2")],
         [(1, "streaming; messages lost: 1"), (0, "connected")],
     ]
-    assert _levels(late, third) == [(0, "streaming"), (0, "connected")]
+    for now, before in ((late, third), (restarted, third)):
+        assert _levels(now, before) == [(0, "streaming"), (0, "connected")]
+    just_known = status(5_000_000, 7, 9)
+    assert _levels(just_known, third) == [(1, "streaming; messages lost: 1"), (0, "connected")]
 
 
 def _levels(status: object, previous: object) -> list[tuple[int, str]]:
@@ -109,6 +112,9 @@ def _levels(status: object, previous: object) -> list[tuple[int, str]]:
         ({"state": "no measurement"}, 1, "no measurement"),
         ({"state": "stalled"}, 2, "stalled"),
         ({"state": "connecting"}, 2, "connecting"),
+        ({"state": "no measurement", "problem": "frames come"}, 1, "no measurement"),
+        ({"state": "stalled", "problem": "frames come", "last_error": "late"}, 2, "stalled: late"),
+        ({"state": "idle", "last_error": "late"}, 0, "idle"),
         ({"problem": "frames come, and all are rejected: x"}, 2, "frames come, and all are rejected: x"),
     ],
 )
@@ -116,3 +122,14 @@ def test_the_level_of_a_stream(fields: dict[str, str], level: int, message: str)
     status = rtc3d.status_t()
     status.streams = [statuses.stream(**fields)]
     assert _levels(status, None) == [(level, message)]
+
+
+def test_what_a_stream_cannot_do_and_what_is_unknown_of_the_frame_are_shown() -> None:
+    """Nodes cannot use positions without a unit; no names need no status of their own."""
+    status = rtc3d.status_t()
+    status.source, status.frame_id, status.metres_per_unit = "lab", "hall", 0.0
+    status.streams = [statuses.stream("3d", limitations=["no clock", "no parameters"])]
+    stream, frame = diagnostics_of(status, None, {"6d": {}, "force": {}})
+    assert (frame.level, frame.message) == (1, "hall: the server's unit of length is unknown")
+    shown = {key: text for key, text in stream.values.items() if "limitation" in key}
+    assert shown == {"limitation 1": "no clock", "limitation 2": "no parameters"}

@@ -26,6 +26,8 @@ VALID_PART = re.compile("[A-Za-z][A-Za-z0-9]*(_[A-Za-z0-9]+)*")
         ("手", "tool"),
         ("*/**", "tool"),
         ("x" * 300, "x" * 48),
+        ("x" * 47 + " y", "x" * 47),
+        ("e\u0301te\u0301", "ete"),
     ],
 )
 def test_a_name(label: str, name: str) -> None:

@@ -13,11 +13,8 @@ import zenoh.ext
 
 from gateway.errors import OutputError
 from gateway.messages.coordinate_frame import CoordinateFrame
-from gateway.messages.topics import Topic
-from gateway.outputs.ros2.output import Ros2Output
-from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import ForceChannel, Plate
+from gateway.rtc3d.parameters import Plate
 from tests.ros_lab import (
     ALL,
     ONE_TOOL,
@@ -52,76 +49,6 @@ def test_topics_follow_from_the_parameters(lab: RosLab) -> None:
     assert lab.output.topic_names("lab") == {
         "6d": {"Left Foot": "Left_Foot"},
         "force": {"left": "force_1", "plate 2": "force_2"},
-    }
-
-
-def test_items_that_the_parameters_lack_have_topics_before_anybody_subscribes(lab: RosLab) -> None:
-    publisher = lab.source(given=parameters(markers=1))
-    layout = frame_of((ComponentType.MARKERS, [(0, 0, 0, 0)]), ONE_TOOL).layout
-    assert not publisher.prepare(layout, frozenset({ComponentType.MARKERS}))
-    assert not publisher.prepare(layout, ALL)
-    assert not publisher.prepare(tools_frame((0, 0, 0), (0, 0, 0)).layout, ALL)
-    wait_until(lambda: {"/mocap/lab/tool_1/pose", "/mocap/lab/tool_2/pose"} <= lab.topics())
-    lab.output.publish_parameters("lab", parameters(("wand",), markers=1, version=2))
-    wait_until(lambda: "/mocap/lab/wand/pose" in lab.topics())
-    assert "/mocap/lab/tool_2/pose" not in lab.topics()
-    assert not publisher.prepare(tools_frame((0, 0, 0), (0, 0, 0)).layout, ALL)
-    wait_until(lambda: "/mocap/lab/tool_2/pose" in lab.topics())
-
-
-def test_only_frames_with_a_component_that_somebody_subscribes_to_are_wanted(lab: RosLab) -> None:
-    publisher = lab.source(given=parameters(("wand",), channels=("Fx",)))
-    analog = frame_of((ComponentType.ANALOG, [1.0])).layout
-    both = frame_of((ComponentType.ANALOG, [1.0]), ONE_TOOL).layout
-    lab.settle()
-    lab.hear("tf/**")
-    wait_until(lambda: publisher.wants(ALL))
-    assert not publisher.prepare(analog, ALL)
-    assert publisher.prepare(both, ALL)
-    assert not publisher.prepare(both, frozenset({ComponentType.ANALOG}))
-
-
-def test_a_renamed_tool_has_a_new_topic_and_the_others_keep_their_numbers(lab: RosLab) -> None:
-    publisher = lab.source(given=parameters(("wand", "cup")))
-    lab.hear_all()
-    publisher.publish(tools_frame((1, 2, 3), (1, 2, 3)), stamp(), 0, ALL)
-    lab.output.publish_parameters("lab", parameters(("wand", "glass"), version=2))
-    wait_until(lambda: "/mocap/lab/glass/pose" in lab.topics())
-    assert "/mocap/lab/cup/pose" not in lab.topics()
-
-    def arrived() -> bool:
-        publisher.publish(tools_frame((1, 2, 3), (1, 2, 3)), stamp(), 1, ALL)
-        return bool(lab.received["/mocap/lab/glass/pose"])
-
-    wait_until(arrived)
-    assert [each.sequence for each in lab.received["/mocap/lab/wand/pose"][:2]] == [1, 2]
-    assert lab.received["/mocap/lab/glass/pose"][0].sequence == 1
-    assert len(lab.received["/mocap/lab/cup/pose"]) == 1
-
-
-def test_a_source_that_goes_takes_its_topics_with_it(lab: RosLab) -> None:
-    publisher = lab.source(given=parameters(("wand",)))
-    lab.source("hall-2", parameters(("wand",)))
-    wait_until(lambda: {"/mocap/lab/wand/pose", "/mocap/hall_2/wand/pose"} <= lab.topics())
-    publisher.close()
-    lab.output.withdraw("lab")
-    wait_until(lambda: "/mocap/lab/wand/pose" not in lab.topics())
-    assert "/mocap/hall_2/wand/pose" in lab.topics()
-    with pytest.raises(OutputError) as refused:
-        publisher.publish(tools_frame((1, 2, 3)), stamp(), 0, ALL)
-    assert refused.value.cause == "closed"
-    lab.source(given=parameters(("wand",)))
-    wait_until(lambda: "/mocap/lab/wand/pose" in lab.topics())
-
-
-def test_sources_whose_names_ros_cannot_distinguish_get_different_ones(lab: RosLab) -> None:
-    for name in ("1lab", "source_1lab", "-"):
-        lab.source(name, parameters(markers=1))
-    wait_until(lambda: len(lab.topics()) == 5)
-    assert lab.topics() - {"/tf", "/diagnostics"} == {
-        "/mocap/source_1lab/markers",
-        "/mocap/source_1lab_2/markers",
-        "/mocap/source/markers",
     }
 
 
@@ -194,15 +121,6 @@ def test_poses_and_transforms_of_visible_tools(lab: RosLab, byte_order: str) -> 
     assert lab.received["/mocap/lab/cup/pose"][0].gid != received.gid
 
 
-def test_nothing_is_published_while_all_tools_are_out_of_view(lab: RosLab) -> None:
-    publisher = lab.source(given=parameters(("wand",), markers=1))
-    lab.hear_all()
-    publisher.publish(tools_frame(None), stamp(), 0, ALL)
-    publisher.publish(frame_of((ComponentType.MARKERS, [(1, 2, 3, 0)])), stamp(), 1, ALL)
-    wait_until(lambda: lab.received["/mocap/lab/markers"])
-    assert set(lab.received) == {"/mocap/lab/markers"}
-
-
 def test_markers_are_a_cloud_in_metres(lab: RosLab) -> None:
     publisher = lab.source(given=parameters(markers=2))
     lab.hear_all()
@@ -244,28 +162,6 @@ def test_the_source_s_frame_and_transform_apply(lab: RosLab) -> None:
     assert wrench.header.frame_id == "world"
 
 
-def test_forces_are_in_newtons_and_newton_metres(lab: RosLab) -> None:
-    def plate(force: str, moment: str) -> Plate:
-        units = [force] * 3 + [moment] * 3
-        return Plate("1", channels=tuple(ForceChannel(str(n), unit=unit) for n, unit in enumerate(units)))
-
-    plates = (plate("N", "Nmm"), plate("kN", "Nm"), plate("", ""))
-    publisher = lab.source(given=parameters(plates=plates))
-    lab.hear_all()
-    load = (1.0, 2.0, 3.0, 4000.0, 0.0, 0.0)
-    nan = (math.nan,) * 6
-    publisher.publish(frame_of((ComponentType.FORCE, [load, load, nan])), stamp(), 0, ALL)
-    publisher.publish(frame_of((ComponentType.FORCE, [load, load, load])), stamp(), 1, ALL)
-    wait_until(lambda: lab.received["/mocap/lab/force_3/wrench"])
-    found = [lab.received[f"/mocap/lab/force_{n}/wrench"][0].message.wrench for n in (1, 2, 3)]
-    assert [(each.force.x, each.force.z, each.torque.x) for each in found] == [
-        (1.0, 3.0, 4.0),
-        (1000.0, 3000.0, 4000.0),
-        (1.0, 3.0, 4000.0),
-    ]
-    assert len(lab.received["/mocap/lab/force_3/wrench"]) == 1  # not the missing load
-
-
 def test_channels_have_their_labels_even_if_the_server_names_only_some(lab: RosLab) -> None:
     publisher = lab.source(given=parameters(channels=("Fx", "a,b")))
     lab.hear_all()
@@ -274,40 +170,6 @@ def test_channels_have_their_labels_even_if_the_server_names_only_some(lab: RosL
     array = lab.received["/mocap/lab/analog"][0].message
     assert array.layout.dim[0].label == "Fx,a_b,channel 3"
     assert array.data.tolist() == [1.0, 2.0, -3.0]
-
-
-def test_only_the_given_components_are_published_and_each_as_often_as_it_occurs(lab: RosLab) -> None:
-    publisher = lab.source(given=parameters(markers=1, channels=("Fx",)))
-    lab.hear_all()
-    frame = frame_of(
-        (ComponentType.MARKERS, [(1, 2, 3, 0)]),
-        (ComponentType.ANALOG, [1.0]),
-        (ComponentType.EVENT, []),
-        (ComponentType.MARKERS, [(4, 5, 6, 0), (7, 8, 9, 0)]),
-    )
-    publisher.publish(frame, stamp(), 0, frozenset({ComponentType.MARKERS}))
-    wait_until(lambda: len(lab.received["/mocap/lab/markers"]) == 2)
-    assert [each.message.width for each in lab.received["/mocap/lab/markers"]] == [1, 2]
-    assert not lab.received["/mocap/lab/analog"]
-
-
-def test_frames_of_no_and_of_fewer_items(lab: RosLab) -> None:
-    publisher = lab.source(
-        given=parameters(("wand", "cup"), markers=1, channels=("Fx",), plates=(Plate("1"),))
-    )
-    lab.hear_all()
-    kinds = (ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.ANALOG, ComponentType.FORCE)
-    publisher.publish(frame_of(*((kind, []) for kind in kinds)), stamp(), 0, ALL)
-    publisher.publish(tools_frame((0, 0, 0)), stamp(), 1, ALL)
-    wait_until(lambda: lab.received["/tf"])
-    assert lab.received["/mocap/lab/markers"][0].message.width == 0
-    assert lab.lost() == {}
-
-
-def test_the_clock_is_not_for_ros(lab: RosLab) -> None:
-    publisher = lab.output.publisher(Topic("lab", ("clock",), "rtc3d.clock_t"))
-    publisher.publish(b"anything")
-    assert not publisher.wanted
 
 
 # Subscribers ---------------------------------------------------------------------------------
@@ -407,23 +269,3 @@ def test_after_closing_the_node_is_gone(lab: RosLab) -> None:
     lab.output.withdraw("lab")
     lab.output.maintain()
     assert not lab.output.health().connected
-
-
-def test_an_output_that_was_never_started_has_no_threads_and_can_be_closed() -> None:
-    before = threading.active_count()
-    output = Ros2Output(Ros2Settings(enabled=True))
-    publisher = output.frame_publisher("lab")
-    output.publish_parameters("lab", parameters(("wand",)))
-    assert threading.active_count() == before
-    with pytest.raises(OutputError):
-        publisher.publish(tools_frame((1, 2, 3)), stamp(), 0, ALL)
-    output.close()
-    output.close()
-    assert not output.health().connected
-
-
-def test_a_reload_keeps_an_output_with_the_same_settings() -> None:
-    output = Ros2Output(Ros2Settings(enabled=True))
-    assert output.is_configured_like(Ros2Output(Ros2Settings(enabled=True)))
-    assert not output.is_configured_like(Ros2Output(Ros2Settings(enabled=True, domain_id=1)))
-    assert not output.take_over(Ros2Output(Ros2Settings(enabled=True)))

@@ -16,7 +16,14 @@ def test_the_defaults_are_those_of_ros() -> None:
 
 @pytest.mark.parametrize(
     ("given", "used"),
-    [("mocap", "mocap"), ("/mocap", "mocap"), ("site/hall_2", "site/hall_2"), ("", ""), ("/", "")],
+    [
+        ("mocap", "mocap"),
+        ("/mocap", "mocap"),
+        ("site/hall_2", "site/hall_2"),
+        ("", ""),
+        ("/", ""),
+        ("a" * 100, "a" * 100),
+    ],
 )
 def test_namespaces(given: str, used: str) -> None:
     assert Ros2Settings(namespace=given).namespace == used
@@ -31,7 +38,9 @@ def test_namespaces_that_ros_refuses(namespace: str) -> None:
     assert "expected a ROS namespace such as mocap or site/mocap" in text
 
 
-@pytest.mark.parametrize("connect", ["tcp/[::1]:7447", "tcp/robot.example.org:1", "udp/192.0.2.5:7447"])
+@pytest.mark.parametrize(
+    "connect", ["tcp/[::1]:7447", "tcp/robot.example.org:1", "tls/a:65535", "udp/192.0.2.5:7447"]
+)
 def test_endpoints(connect: str) -> None:
     assert Ros2Settings(connect=connect).connect == connect
 

@@ -4,7 +4,7 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from gateway.outputs.ros2.message_types import HUMBLE, POSE_STAMPED, ROS_TYPES, TF_MESSAGE, RosType
-from gateway.outputs.ros2.wire import Node, QoS, attachment, data_key, gid_of
+from gateway.outputs.ros2.wire import Node, QoS, SeenEntity, attachment, data_key, gid_of, seen_entity
 
 STRING = RosType(
     "std_msgs/msg/String", "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18"
@@ -35,6 +35,23 @@ def test_tokens_in_a_namespace() -> None:
         f"@ros2_lv/0/{SESSION}/0/1/MP/%/%site%mocap/rtc3d_gateway/%tf/tf2_msgs::msg::dds_::TFMessage_/"
         f"{TF_MESSAGE.type_hash}/2::,10:,:,:,,"
     )
+
+
+@pytest.mark.parametrize(
+    ("token", "seen"),
+    [
+        ("@ros2_lv/0/abc/0/0/NN/%/%/talker", SeenEntity("/talker", False)),
+        ("@ros2_lv/0/abc/0/0/NN/%/%a%b/talker", SeenEntity("/a/b/talker", False)),
+        ("@ros2_lv/0/abc/0/1/MS/%/%/arm/%a%tf/T/H/q", SeenEntity("/arm", True, "/a/tf", "T", "H")),
+        ("@ros2_lv/0/abc/0/1/MP/%/%/arm/%tf/T/H", SeenEntity("/arm", False, "/tf", "T", "H")),
+        ("@ros2_lv/0/abc/0/1/MP/%/%/arm/%tf/T", None),
+        ("@ros2_lv/0/abc/0/0/NN/%/%", None),
+        ("", None),
+    ],
+)
+def test_what_a_token_shows(token: str, seen: SeenEntity | None) -> None:
+    """The doctor reads tokens of any program, so other formats must not disturb it."""
+    assert seen_entity(token) == seen
 
 
 def test_an_attachment_by_hand() -> None:

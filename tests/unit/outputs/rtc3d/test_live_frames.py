@@ -34,7 +34,9 @@ def test_some_components_are_cut_out_and_keep_their_bytes() -> None:
     client = source.client()
     client.send("StreamFrames 6D Analog")
     source.arrive(body(markers(7, 10_000), TOOL_OUT_OF_VIEW, analog(70, 10_001), event(7, 10_000, 3)))
-    assert client.bodies == [body(TOOL_OUT_OF_VIEW, analog(70, 10_001))]
+    unknown = bytes.fromhex("0000000c 00000063 01020304")
+    source.arrive(body(TOOL_OUT_OF_VIEW, unknown))
+    assert client.bodies == [body(TOOL_OUT_OF_VIEW, analog(70, 10_001)), body(TOOL_OUT_OF_VIEW)]
 
 
 def test_a_repeated_component_is_passed_on_as_often() -> None:

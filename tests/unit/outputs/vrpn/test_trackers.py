@@ -104,3 +104,11 @@ def test_tools_beyond_the_limit_get_no_tracker() -> None:
     assert len(list(trackers.current)) == MAX_TRACKERS
     trackers.set_tools("lab", ["wand"])
     assert names(trackers, "lab") == ["wand"]
+
+
+def test_the_tool_that_has_been_away_longest_makes_room_first() -> None:
+    """A tool that came back keeps its number longer than one that has only gone."""
+    trackers = Trackers("tool")
+    for tools in (["a"], ["b"], ["a"], [f"tool {number}" for number in range(MAX_TRACKERS - 1)], ["a"]):
+        trackers.set_tools("lab", tools)
+    assert [each.number for each in trackers.current] == [0]

@@ -1,0 +1,354 @@
+"""A source on ROS 2 without Zenoh: its topics, what is wanted, and the numbers of its messages."""
+
+import struct
+from collections.abc import Callable
+
+import pytest
+import zenoh
+
+from gateway.errors import OutputError
+from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.outputs.ros2.source_topics import MAX_PLATES, MAX_TOOLS
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.parameters import ForceChannel, Plate
+from tests.ros_lab import ALL, ONE_TOOL, frame_of, parameters, tools_frame
+from tests.unit.outputs.ros2.scripted_ros import Source
+
+MARKERS, ANALOG, TOOLS, FORCE = (
+    ComponentType.MARKERS,
+    ComponentType.ANALOG,
+    ComponentType.TOOLS,
+    ComponentType.FORCE,
+)
+LOAD = (1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
+NAN = float("nan")
+ONE_MARKER = frame_of((MARKERS, [(1, 2, 3, 0)]))
+ONE_OF_EACH = frame_of((MARKERS, [(1, 2, 3, 0)]), ONE_TOOL, (ANALOG, [1.0]), (FORCE, [LOAD]))
+EACH = parameters(("wand",), markers=1, channels=("Fx",), plates=(Plate("1"),))
+FIVE = ["/tf", "analog", "force_1/wrench", "markers", "wand/pose"]
+
+
+# Which topics are open ----------------------------------------------------------------------
+
+
+def test_parameters_open_and_close_topics_and_keep_those_that_stay() -> None:
+    """A node that subscribes to a topic that stays must notice nothing."""
+    source = Source(parameters(("wand", "cup"), markers=1))
+    assert source.node.open == {"/tf", "/mocap/lab/wand/pose", "/mocap/lab/cup/pose", "/mocap/lab/markers"}
+    source.subscribe()
+    source.send(tools_frame((1, 2, 3), (1, 2, 3)))
+    source.node.events.clear()
+    source.publisher.set_parameters(parameters(("wand", "glass"), markers=1, version=2))
+    source.sender.run()
+    assert sorted(source.node.events) == ["+/mocap/lab/glass/pose", "-/mocap/lab/cup/pose"]
+    source.send(tools_frame((1, 2, 3), (1, 2, 3)))
+    assert source.sent["wand/pose"] == [1, 2]
+    source.send(tools_frame((1, 2, 3), (1, 2, 3)))
+    assert len(source.node.events) == 2  # the same parameters change nothing
+
+
+def test_topics_that_belong_to_parameters_from_before_the_session_are_declared_with_it() -> None:
+    """The router may come later than the parameters."""
+    source = Source(is_declared=False)
+    source.sender.is_full = True
+    source.publisher.set_parameters(EACH)
+    source.declare()
+    assert len(source.node.open) == 5
+    source.declare()
+    assert len(source.node.events) == 5
+
+
+def test_a_frame_uses_the_parameters_that_were_valid_when_it_came() -> None:
+    """Even if the queue was full when they changed."""
+    source = Source(parameters(("wand",)))
+    source.sender.is_full = True
+    source.publisher.set_parameters(parameters(("cup",), version=2))
+    source.sender.is_full = False
+    source.send(tools_frame((1, 2, 3)))
+    assert source.node.open == {"/tf", "/mocap/lab/cup/pose"}
+
+
+def test_items_beyond_the_parameters_get_topics_before_they_are_wanted() -> None:
+    """Nobody could subscribe otherwise; a layout that opens nothing costs the thread nothing."""
+    source = Source(parameters(("wand",)))
+    num_calls = len(source.sender.offered_bytes)
+    two, one = tools_frame((0, 0, 0), (0, 0, 0)).layout, tools_frame((0, 0, 0)).layout
+    assert not source.publisher.prepare(two, frozenset({MARKERS}))
+    source.sender.is_full = True
+    assert not source.publisher.prepare(two, ALL)
+    source.sender.is_full = False
+    for layout in (one, two, two, one):
+        assert not source.publisher.prepare(layout, ALL)
+        source.sender.run()
+    assert len(source.sender.offered_bytes) == num_calls + 2
+    source.subscribe()
+    source.send(tools_frame((1, 0, 0), (2, 0, 0)))
+    assert source.sent == {"wand/pose": [1], "tool_2/pose": [1], "/tf": [1]}
+    assert source.node.open == {"/tf", "/mocap/lab/wand/pose", "/mocap/lab/tool_2/pose"}
+    source.subscribe(is_there=False)
+    source.publisher.set_parameters(parameters(("cup",), version=2))
+    source.publisher.prepare(two, ALL)
+    source.sender.run()
+    assert source.node.open == {"/tf", "/mocap/lab/cup/pose", "/mocap/lab/tool_2/pose"}
+
+
+def test_items_get_topics_under_the_parameters_of_their_frames() -> None:
+    """A full queue may have kept the thread from the newest parameters."""
+    source = Source(parameters(("wand",)))
+    source.sender.is_full = True
+    source.publisher.set_parameters(parameters(("cup",), version=2))
+    source.sender.is_full = False
+    source.publisher.prepare(tools_frame((0, 0, 0), (0, 0, 0)).layout, ALL)
+    source.sender.run()
+    assert source.node.open == {"/tf", "/mocap/lab/cup/pose", "/mocap/lab/tool_2/pose"}
+
+
+def test_thousands_of_items_are_bounded_and_counted() -> None:
+    """The server determines how many there are; just as many as fit are no loss."""
+    plates = tuple(Plate(str(number)) for number in range(MAX_PLATES + 1))
+    tools = tuple(f"tool {number}" for number in range(MAX_TOOLS + 1))
+    source = Source(parameters(tools, plates=plates))
+    assert len(source.node.open) == 1 + MAX_TOOLS + MAX_PLATES
+    source.subscribe()
+    source.send(tools_frame(*[(1, 2, 3)] * MAX_TOOLS))
+    source.send(frame_of((FORCE, [LOAD] * MAX_PLATES)))
+    assert source.lost == {}
+    source.send(tools_frame(*[(1, 2, 3)] * (MAX_TOOLS + 3)))
+    source.send(frame_of((FORCE, [LOAD] * (MAX_PLATES + 5))))
+    assert source.lost == {"too many tools": (3, 1), "too many force plates": (5, 1)}
+    assert len(source.sent) == 1 + MAX_TOOLS + MAX_PLATES
+
+
+def test_names_that_differ_from_labels_are_shown() -> None:
+    """Nodes look for labels; those that are valid names need no explanation."""
+    source = Source(parameters(("wand", "Left Foot"), plates=(Plate("1", "left"),)))
+    assert source.topics.names == {"6d": {"Left Foot": "Left_Foot"}, "force": {"left": "force_1"}}
+    source.publisher.set_parameters(parameters(("wand",), version=2))
+    source.sender.run()
+    assert source.topics.names == {"6d": {}}
+
+
+# What is wanted -----------------------------------------------------------------------------
+
+
+def test_frames_are_wanted_if_any_of_their_components_has_a_subscriber() -> None:
+    """Each change is reported once, because the gateway's stream depends on it."""
+    source = Source(EACH)
+    source.num_changes = 0
+    source.subscribe("/mocap/lab/markers")
+    source.subscribe("/mocap/lab/markers")
+    assert source.num_changes == 1
+    assert source.publisher.wants([MARKERS, TOOLS])
+    assert not source.publisher.wants([TOOLS, FORCE, ANALOG])
+    assert source.publisher.prepare(ONE_OF_EACH.layout, ALL)
+    assert not source.publisher.prepare(ONE_OF_EACH.layout, frozenset({TOOLS}))
+    source.subscribe("/tf")
+    assert source.publisher.wants([TOOLS])
+    source.subscribe("/mocap/lab/markers", is_there=False)
+    assert not source.publisher.wants([MARKERS])
+    source.publisher.update_wanted()
+    assert source.num_changes == 3
+
+
+def test_a_subscriber_that_came_before_its_topic_is_noticed() -> None:
+    """By the topic itself, and by the check that is made again and again."""
+    source = Source()
+    source.node.matching.add("/mocap/lab/markers")
+    source.publisher.set_parameters(parameters(markers=1))
+    source.num_changes = 0
+    source.sender.run()
+    assert not source.publisher.wants(ALL)
+    source.publisher.check_subscribers()
+    assert source.publisher.wants([MARKERS])
+    source.node.matching.clear()
+    source.publisher.check_subscribers()
+    assert not source.publisher.wants(ALL)
+    assert source.num_changes == 2
+    [topic] = source.topics._by_component[MARKERS]
+    topic.wanted = True  # noted in another thread, which has not got further
+    source.node.matching.add("/mocap/lab/markers")
+    source.publisher.check_subscribers()
+    assert source.publisher.wants([MARKERS])
+    source.subscribe(is_there=False)
+    topic.wanted = True  # between the declaration and the list of topics
+    source.topics.open_for({ANALOG: 1}, source.publisher._parameters)
+    assert source.publisher.wants([MARKERS])
+
+
+def test_new_parameters_have_the_items_of_the_next_frame_noted_again() -> None:
+    """Their topics were closed with the former parameters."""
+    source = Source()
+    source.num_changes = 0
+    source.publisher.set_parameters(EACH)
+    assert source.num_changes == 1
+    assert source.sender.offered_bytes[-1] == len(EACH.xml)
+
+
+# Frames -------------------------------------------------------------------------------------
+
+
+def test_only_components_and_topics_that_are_wanted_are_published() -> None:
+    """Encoding for nobody costs time, and numbers count what a topic's subscribers get."""
+    source = Source(EACH)
+    source.send(ONE_OF_EACH)
+    assert source.sent == {}
+    source.subscribe("/mocap/lab/wand/pose")
+    source.send(ONE_OF_EACH)
+    assert source.sent == {"wand/pose": [1]}
+    source.subscribe()
+    source.send(ONE_OF_EACH, frozenset({MARKERS, FORCE}))
+    source.send(ONE_OF_EACH)
+    assert source.sent == {
+        "wand/pose": [1, 2],
+        "/tf": [1],
+        "markers": [1, 2],
+        "force_1/wrench": [1, 2],
+        "analog": [1],
+    }
+    assert source.sender.offered_bytes[-1] == len(ONE_OF_EACH.body)
+    source.subscribe("/mocap/lab/wand/pose", is_there=False)
+    source.send(ONE_OF_EACH)
+    assert (source.sent["/tf"], source.sent["wand/pose"]) == ([1, 2], [1, 2])
+
+
+def test_tools_out_of_view_and_plates_without_values_are_left_out() -> None:
+    """One missing value makes a load useless; an empty /tf says nothing."""
+    source = Source(parameters(("wand", "cup"), plates=(Plate("1"), Plate("2"), Plate("3"))))
+    source.subscribe()
+    source.send(tools_frame(None, None))
+    source.send(tools_frame(None, (1, 2, 3)))
+    source.send(frame_of((FORCE, [(*LOAD[:5], NAN), LOAD])))
+    assert source.sent == {"cup/pose": [1], "/tf": [1], "force_2/wrench": [1]}
+
+
+def test_forces_and_torques_have_units_of_their_own() -> None:
+    """Plates give N and Nmm, or others; ROS wants N and Nm."""
+    channels = tuple(ForceChannel(str(n), unit=unit) for n, unit in enumerate(("kN",) * 3 + ("Nmm",) * 3))
+    source = Source(parameters(plates=(Plate("1", channels=channels),)))
+    source.subscribe()
+    source.send(frame_of((FORCE, [LOAD])))
+    [message] = source.node.messages["/mocap/lab/force_1/wrench"]
+    expected = (1000.0, 2000.0, 3000.0, 0.004, 0.005, 0.006)
+    assert struct.unpack("<6d", message[-48:]) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("counts", [(3, 1, 2), (0, 2)])
+def test_the_number_of_items_can_change_from_frame_to_frame(counts: tuple[int, ...]) -> None:
+    """A message has as many points or values as its frame, whatever came before."""
+    source = Source(EACH)
+    source.subscribe()
+    for count in counts:
+        source.send(frame_of((MARKERS, [(1, 2, 3, 0)] * count), (ANALOG, [1.0] * count)))
+    clouds, arrays = (source.node.messages[f"/mocap/lab/{name}"] for name in ("markers", "analog"))
+    assert len({len(cloud) - 20 * count for cloud, count in zip(clouds, counts, strict=True)}) == 1
+    for array, count in zip(arrays, counts, strict=True):
+        assert array.endswith(struct.pack(f"<I{count}f", count, *[1.0] * count))
+
+
+def test_an_unknown_unit_is_counted_by_the_messages_that_somebody_misses() -> None:
+    """Lengths that are not in metres must not reach robots; analog values do."""
+    frame = CoordinateFrame("lab", None)
+    source = Source(parameters(("wand", "cup"), markers=1, channels=("Fx",), unit="furlong", frame=frame))
+    source.send(ONE_OF_EACH)
+    assert source.lost == {}
+    source.subscribe("/tf", "/mocap/lab/wand/pose", "/mocap/lab/markers", "/mocap/lab/analog")
+    source.send(ONE_OF_EACH)
+    assert source.lost == {"unknown unit": (3, 2)}  # the cloud, the pose, /tf
+    assert source.sent == {"analog": [1]}
+
+
+# Losses -------------------------------------------------------------------------------------
+
+
+def test_frames_that_find_no_place_use_up_the_numbers_of_their_topics() -> None:
+    """ROS notices the gap: of the lost components, with a subscriber, and each frame once."""
+    source = Source(EACH)
+    source.subscribe("/mocap/lab/markers", "/mocap/lab/analog")
+    source.send(ONE_OF_EACH)
+    for lost in (2, 3):
+        source.sender.is_full = True
+        for _ in range(lost):
+            with pytest.raises(OutputError) as refused:
+                source.offer(ONE_OF_EACH, frozenset({MARKERS, FORCE}))
+            assert refused.value.cause == "queue full"
+        source.sender.is_full = False
+        source.offer(ONE_OF_EACH)
+    source.offer(ONE_OF_EACH)
+    source.sender.run()
+    assert source.sent == {"markers": [1, 4, 8, 9], "analog": [1, 2, 3, 4]}
+    source.subscribe("/mocap/lab/force_1/wrench")
+    source.send(ONE_OF_EACH)
+    assert source.sent["force_1/wrench"] == [1]
+
+
+def test_frames_are_refused_while_the_router_is_away() -> None:
+    """Those that waited are counted, and the next ones go on."""
+    source = Source(EACH)
+    source.subscribe("/mocap/lab/markers")
+    source.offer(ONE_MARKER)
+    source.router.is_cut_off = True
+    with pytest.raises(OutputError) as refused:
+        source.offer(ONE_MARKER)
+    assert refused.value.cause == "no router"
+    source.sender.run()
+    assert (source.lost, source.sent) == ({"no router": (1, 1)}, {})
+    source.router.is_cut_off = False
+    source.send(ONE_MARKER)
+    assert source.sent == {"markers": [1]}
+
+
+def test_what_zenoh_refuses_is_counted_unless_the_session_is_gone() -> None:
+    """At the gateway's end, the session closes before the last messages."""
+    source = Source(EACH)
+    source.subscribe("/mocap/lab/markers")
+    source.node.put = failing(zenoh.ZError("no"))
+    source.send(ONE_MARKER)
+    assert source.lost == {"put failed": (1, 1)}
+
+    def cut_off() -> None:
+        source.router.is_cut_off = True
+        raise zenoh.ZError("closed")
+
+    source.node.put = cut_off
+    source.send(ONE_MARKER)
+    assert source.lost == {"put failed": (1, 1)}
+
+
+def failing(error: Exception) -> Callable[[], None]:
+    def put() -> None:
+        raise error
+
+    return put
+
+
+def test_a_defect_is_counted_and_the_next_frame_is_published() -> None:
+    """The thread serves all sources."""
+    source = Source(EACH)
+    source.subscribe("/mocap/lab/markers")
+    source.node.put = failing(ZeroDivisionError("x"))
+    source.send(ONE_MARKER)
+    source.node.put = lambda: None
+    source.send(ONE_MARKER)
+    assert (source.lost, source.sent["markers"]) == ({"ZeroDivisionError": (1, 1)}, [2])
+
+
+def test_a_closed_source_publishes_nothing_more_and_its_topics_go() -> None:
+    """Frames of it may still be in the queue, and subscribers may still come and go."""
+    source = Source(EACH)
+    source.subscribe()
+    source.offer(ONE_OF_EACH)
+    source.num_changes = 0
+    source.publisher.close()
+    assert source.num_changes == 1
+    assert not source.publisher.wants(ALL)
+    source.sender.run()
+    assert source.sent == {}
+    assert source.node.open == {"/tf"}
+    assert source.topics.topics == ()
+    source.subscribe()
+    source.publisher.update_wanted()
+    assert not source.publisher.wants(ALL)
+    with pytest.raises(OutputError) as refused:
+        source.offer(ONE_OF_EACH)
+    assert refused.value.cause == "closed"
+    assert source.topics.wanted == frozenset()

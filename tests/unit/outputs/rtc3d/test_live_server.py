@@ -1,0 +1,394 @@
+"""The RT server of a live source: when its measurement ends, who is served, and what is counted."""
+
+import asyncio
+import re
+import weakref
+from collections.abc import Callable, Coroutine
+from functools import wraps
+from typing import Any
+
+import pytest
+
+from gateway.outputs.rtc3d.live_scene import LiveScene
+from gateway.outputs.rtc3d.live_server import SLOW_CLIENT
+from gateway.rtc3d.components import WIRE_ORDER, ComponentType
+from gateway.rtc3d.frames import split_frame
+from gateway.rtc3d.parameters import SECTIONS, General
+from gateway.rtc3d.parameters_xml import parse_parameters
+from tests.losses import amounts
+from tests.unit.outputs.rtc3d.live_client import body, markers
+from tests.unit.outputs.rtc3d.scripted_server import Client, ScriptedServer, number_in, parameters, settle
+from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, NO_DATA, XML
+from tests.virtual_time import run_in_virtual_time
+
+STREAM = "StreamFrames 3D"
+OK_STREAM = (COMMAND, b"OK-StreamFrames 3D")
+NO_FRAMES = (NO_DATA, b"")
+
+
+def in_virtual_time(test: Callable[..., Coroutine[Any, Any, None]]) -> Callable[..., None]:
+    @wraps(test)
+    def run(*args: Any, **kwargs: Any) -> None:
+        run_in_virtual_time(test(*args, **kwargs))
+
+    return run
+
+
+async def streaming(server: ScriptedServer) -> Client:
+    """Return a client that streams, after the first frame."""
+    server.state.is_streaming = True
+    client = server.client()
+    await client.ask(STREAM)
+    server.arrive(1)
+    await settle()
+    assert [each[0] for each in client.receive()] == [DATA]
+    return client
+
+
+# Measurements -------------------------------------------------------------------------------
+
+
+@in_virtual_time
+async def test_a_client_waits_two_seconds_for_frames_of_a_source_that_is_not_known() -> None:
+    """The gateway may have to start its own stream first, so No Data at once would be wrong."""
+    server = ScriptedServer()
+    client = server.client()
+    assert await client.ask(STREAM) == [OK_STREAM]
+    await asyncio.sleep(0.5)
+    server.state.parameters = parameters("m")
+    server.apply_state()  # what is new of the source does not shorten the wait
+    await asyncio.sleep(1.49)
+    assert client.receive() == []
+    await asyncio.sleep(0.02)
+    assert client.receive() == [NO_FRAMES]
+    assert not server.is_measuring
+    await asyncio.sleep(5)
+    assert client.receive() == []
+
+
+@in_virtual_time
+async def test_a_source_that_turns_out_to_have_no_measurement_ends_the_wait() -> None:
+    """The answer is known then."""
+    server = ScriptedServer()
+    client = server.client()
+    await client.ask(STREAM)
+    server.state.is_measuring = False
+    server.apply_state()
+    assert client.receive() == [NO_FRAMES]
+
+
+@in_virtual_time
+async def test_without_a_measurement_no_data_comes_at_once() -> None:
+    """As a server answers."""
+    server = ScriptedServer()
+    server.state.is_measuring = False
+    client = server.client()
+    assert await client.ask(STREAM) == [OK_STREAM, NO_FRAMES]
+    assert not server.is_measuring
+
+
+@in_virtual_time
+async def test_a_frame_ends_the_wait() -> None:
+    """The time-out of the request must not end the measurement that has begun."""
+    server = ScriptedServer()
+    client = server.client()
+    await client.ask(STREAM)
+    server.arrive(1)
+    await asyncio.sleep(10)
+    assert [each[0] for each in client.receive()] == [DATA]
+    assert server.is_measuring
+
+
+@in_virtual_time
+async def test_while_a_source_streams_a_request_waits_for_its_frames() -> None:
+    """Gaps in a stream are not its end."""
+    server = ScriptedServer()
+    server.state.is_streaming = True
+    client = server.client()
+    await client.ask(STREAM)
+    await asyncio.sleep(10)
+    server.apply_state()
+    await asyncio.sleep(10)
+    assert client.receive() == []
+    assert server.is_measuring
+
+
+@in_virtual_time
+async def test_a_measurement_ends_when_no_frame_has_come_for_a_moment() -> None:
+    """Frames of a backlog come after the source has ended; each of them postpones No Data."""
+    server = ScriptedServer()
+    client = await streaming(server)
+    server.state.is_streaming = False
+    server.apply_state()
+    await asyncio.sleep(0.06)
+    server.arrive(2)
+    await asyncio.sleep(0.06)
+    server.arrive(3)
+    await asyncio.sleep(0.09)
+    assert [number_in(data) for _, data in client.receive()] == [2, 3]
+    await asyncio.sleep(0.2)
+    assert client.receive() == [NO_FRAMES]
+
+    server.arrive(4)
+    await settle()
+    assert [number_in(data) for _, data in client.receive()] == [4]
+    server.apply_state()
+    await asyncio.sleep(0.2)
+    assert client.receive() == [NO_FRAMES]
+
+
+@in_virtual_time
+async def test_a_source_that_has_been_silent_ends_at_once() -> None:
+    """Clients must not wait for what is known."""
+    server = ScriptedServer()
+    client = await streaming(server)
+    await asyncio.sleep(0.11)
+    server.state.is_streaming = False
+    server.apply_state()
+    assert client.receive() == [NO_FRAMES]
+
+
+@in_virtual_time
+async def test_closing_ends_everything_and_nobody_wants_frames() -> None:
+    """A source must not go on sending for clients that are gone."""
+    server = ScriptedServer()
+    await server.listen()
+    client = await streaming(server)
+    await server.close()
+    assert client.receive() == [NO_FRAMES]
+    assert client.line.is_closed
+    assert server.changes == [True, False]
+
+
+# Parameters ---------------------------------------------------------------------------------
+
+
+@in_virtual_time
+async def test_a_request_for_parameters_waits_until_they_are_there() -> None:
+    """A client that comes with the gateway's start would otherwise get an error."""
+    server = ScriptedServer()
+    client = server.client()
+    assert await client.ask("SendParameters 3D", "Version 1.0") == []
+    await asyncio.sleep(0.9)
+    server.state.parameters = parameters("heel")
+    server.apply_state()
+    await settle()
+    (kind, xml), version = client.receive()
+    assert (kind, version) == (XML, (COMMAND, b"OK-Version 1.0"))
+    assert b"heel" in xml
+
+
+@in_virtual_time
+async def test_a_request_for_parameters_does_not_wait_for_ever() -> None:
+    """The server may be away."""
+    server = ScriptedServer()
+    client = server.client()
+    assert await client.ask("SendParameters") == []
+    await asyncio.sleep(1)
+    [(kind, text)] = client.receive()
+    assert (kind, text) == (ERROR, b"Error-The server of source lab has given no parameters")
+
+
+@pytest.mark.parametrize("known", ["is_streaming", "is_measuring"])
+@in_virtual_time
+async def test_anything_that_is_known_of_the_source_ends_the_wait(known: str) -> None:
+    """A source that answers and gives no parameters will give none later."""
+    server = ScriptedServer()
+    setattr(server.state, known, known == "is_streaming")
+    assert (await server.client().ask("SendParameters"))[0][0] == ERROR
+
+
+@in_virtual_time
+async def test_the_newest_parameters_are_served_even_before_the_next_maintenance() -> None:
+    """Parameters and frames of one moment belong together."""
+    server = ScriptedServer()
+    client = server.client()
+    for label in ("heel", "toe"):
+        server.state.parameters = parameters(label)
+        [(_, xml)] = await client.ask("SendParameters 3D")
+        assert label.encode() in xml
+    await client.ask(STREAM)
+    server.state.parameters = parameters("knee")
+    server.arrive(1)
+    assert server.scene.parameters is server.state.parameters.parsed
+
+
+# Which frames are wanted --------------------------------------------------------------------
+
+
+@in_virtual_time
+async def test_frames_are_wanted_while_any_client_asks_for_some() -> None:
+    """The gateway's own stream depends on it; each change is reported once."""
+    server = ScriptedServer()
+    first, second = server.client(), server.client()
+    await first.ask("Version 1.0")
+    assert server.changes == []
+    await first.ask(STREAM)
+    await second.ask(STREAM)
+    await first.ask("StreamFrames Stop")
+    assert server.changes == [True]
+    second.line.abort()
+    await settle()
+    assert server.changes == [True, False]
+
+
+@in_virtual_time
+async def test_a_request_for_one_frame_is_wanted_until_it_is_answered() -> None:
+    """Otherwise the source would send for nobody."""
+    server = ScriptedServer()
+    client = server.client()
+    await client.ask("SendCurrentFrame 3D")
+    assert server.changes == [True]
+    server.arrive(1)
+    assert server.changes == [True, False]
+    server.arrive(2)  # in the queue when the last request ended
+    await settle()
+    assert [number_in(data) for kind, data in client.receive() if kind == DATA] == [1]
+    client = await server.greeted()
+    assert await client.ask("SendCurrentFrame 3D") == [(COMMAND, b"OK-SendCurrentFrame 3D")]  # no old frame
+    server.arrive(3)
+    assert [number_in(data) for kind, data in client.receive() if kind == DATA] == [3]
+
+
+@in_virtual_time
+async def test_maintenance_corrects_what_another_server_of_the_source_said() -> None:
+    """After a change of the port, the former server says last that nothing is wanted."""
+    server = ScriptedServer()
+    await streaming(server)
+    server.state.wanted = False
+    server.maintain()
+    assert server.changes == [True, True]
+
+
+@in_virtual_time
+async def test_a_frame_is_sent_when_it_arrives_even_if_others_came_in_the_same_moment() -> None:
+    """The times of frames grow with each of them, so they can be ahead of the clock."""
+    server = ScriptedServer()
+    client = await streaming(server)
+    server._live_scene._arrivals.newest_us = 10**12
+    server.arrive(2)
+    assert [number_in(data) for _, data in client.receive()] == [2]
+
+
+# Scenes -------------------------------------------------------------------------------------
+
+
+def test_a_choice_of_components_stays_a_bit_longer_than_its_client() -> None:
+    """A client that asks for one frame after the other must not begin anew each time."""
+    scene = LiveScene("lab")
+    kept = [weakref.ref(scene.frames([kind])) for kind in WIRE_ORDER[:3]]
+    assert [each() is None for each in kept] == [True, False, False]
+    scene.stop()
+    assert [each() for each in kept] == [None] * 3
+    held = scene.frames([])
+    scene.stop()  # a new measurement begins with new frames
+    assert scene.frames([]) is not held
+
+
+def test_a_scene_says_when_the_first_of_several_frames_is_due_and_that_there_are_some() -> None:
+    """Clients with several choices share one timer."""
+    scene = LiveScene("lab")
+    scene.start()
+    scene._announced_hz = {ComponentType.TOOLS: 100.0}
+    choices = [
+        scene.frames([ComponentType.MARKERS]),
+        scene.frames([ComponentType.MARKERS, ComponentType.TOOLS]),
+    ]
+    scene.add(split_frame(body(markers(1, 10)), "big"), 1, frozenset(WIRE_ORDER), 50)
+    assert scene.advance(50) == 50 + 100_000
+    assert scene.advance(100_050) == 50 + 300_000
+    assert scene.has_new_frames
+    scene.advance(100_051)
+    assert scene.has_new_frames  # until somebody has taken them
+    assert [each.next_frame for each in choices] == [1, 0]
+
+
+def test_frames_wait_only_for_components_that_the_parameters_have() -> None:
+    """A rate without any item announces nothing."""
+    scene = LiveScene("lab")
+    for num_markers, announced in ((1, {ComponentType.MARKERS: 100.0}), (0, {})):
+        xml = parameters("heel").xml.replace(b"<Markers>1<", f"<Markers>{num_markers}<".encode())
+        xml = xml if num_markers else re.sub(b"<Marker>.*</Marker>", b"", xml)
+        scene.set_parameters(xml, parse_parameters(xml).parameters)
+        assert scene._announced_hz == announced
+
+
+def test_the_whole_parameters_are_the_servers_own_bytes() -> None:
+    """Even if a client names all sections; changed parameters replace them."""
+    scene = LiveScene("lab")
+    for label in ("heel", "toe"):
+        new = parameters(label)
+        scene.set_parameters(new.xml, new.parsed)
+        for sections in ((), tuple(SECTIONS)):
+            assert scene.parameters_xml(sections, General()) is new.xml
+        assert label.encode() in scene.parameters_xml(["3d"], General())
+
+
+# Limits -------------------------------------------------------------------------------------
+
+
+@in_virtual_time
+async def test_clients_that_are_too_many_are_turned_away() -> None:
+    """The limit counts exactly, and those that are served notice nothing."""
+    server = ScriptedServer(max_clients=2)
+    first, second = await server.greeted(), await server.greeted()
+    third = server.client()
+    await settle()
+    assert third.receive() == [(ERROR, b"Error-This gateway serves 2 clients at most; closing")]
+    assert (first.line.is_closed, second.line.is_closed, third.line.is_closed) == (False, False, True)
+    second.line.close()
+    await settle()
+    fourth = await server.greeted()
+    assert not fourth.line.is_closed
+
+
+@in_virtual_time
+async def test_the_oldest_silent_connection_makes_room_for_a_client() -> None:
+    """Half-open connections must not lock clients out; each makes room only once."""
+    server = ScriptedServer(max_clients=3)
+    good = await server.greeted()
+    silent = [server.client(), server.client()]
+    newest = [server.client(), server.client()]
+    assert [each.line.is_aborted for each in (good, *silent, *newest)] == [False, True, True, False, False]
+    await settle()
+    assert len(server.connections) == 3
+
+
+@pytest.mark.parametrize(("max_clients", "most"), [(8, 4 * 2**20), (1000, 512 * 2**20 // 1000)])
+@in_virtual_time
+async def test_what_waits_for_all_clients_together_has_a_limit(max_clients: int, most: int) -> None:
+    """The gateway's memory is bounded however many clients do not read."""
+    assert ScriptedServer(max_clients).client().line.high_water == most
+
+
+# Losses -------------------------------------------------------------------------------------
+
+
+@in_virtual_time
+async def test_each_lost_frame_of_a_client_is_counted_once() -> None:
+    """Losses are per source: those of its clients add up, whether they are still there or not."""
+    server = ScriptedServer()
+    first, second = await server.greeted(), await server.greeted()
+    first.connection.session.frames_dropped = 5
+    server.maintain()
+    server.maintain()
+    assert amounts(server.losses.report()) == {SLOW_CLIENT: (5, 5)}
+    second.connection.session.frames_dropped = 2
+    second.line.close()
+    await settle()
+    assert amounts(server.losses.report()) == {SLOW_CLIENT: (7, 7)}
+    first.connection.session.frames_dropped = 6
+    server.reading_resumed(first.connection)
+    server.maintain()
+    assert amounts(server.losses.report()) == {SLOW_CLIENT: (8, 8)}
+
+
+@in_virtual_time
+async def test_frames_that_lack_events_are_counted_once() -> None:
+    """They are losses of a client that asks for few frames."""
+    server = ScriptedServer()
+    client = await server.greeted()
+    for count in (3, 3, 4):
+        client.connection.session.frames_without_events = count
+        server.maintain()
+    assert amounts(server.losses.report()) == {SLOW_CLIENT: (4, 4)}

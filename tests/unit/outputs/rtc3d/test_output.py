@@ -1,0 +1,356 @@
+"""The output for RTC3D clients: its ports, what it hands to its thread, and what it says of itself."""
+
+import asyncio
+import logging
+from collections.abc import Callable, Coroutine, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from gateway.errors import GatewayError, OutputError
+from gateway.losses import Losses
+from gateway.messages.stamp import Stamp
+from gateway.outputs.contract import CONTROL_OPTION, ServerFile, ServerParameters
+from gateway.outputs.rtc3d import output as output_module
+from gateway.outputs.rtc3d.live_server import SourceState
+from gateway.outputs.rtc3d.output import Rtc3dOutput
+from gateway.outputs.rtc3d.publisher import QUEUE_FULL
+from gateway.outputs.rtc3d.settings import Rtc3dSettings
+from gateway.rtc3d.components import ComponentType
+from gateway.rtc3d.frames import split_frame
+from tests.unit.outputs.rtc3d.live_client import body, markers
+from tests.unit.outputs.rtc3d.scripted_server import settle
+from tests.unit.outputs.rtc3d.test_live_server import in_virtual_time
+
+LAB, HALL = 3120, 3121
+FRAME = split_frame(body(markers(1, 10_000)), "big")
+COMPONENTS = frozenset({ComponentType.MARKERS})
+
+
+class Thread:
+    """A LoopThread that runs everything in the test's own event loop."""
+
+    is_full = False
+
+    def __init__(self, _name: str) -> None:
+        self.num_bytes = 0
+
+    def offer(self, call: Callable[[], None], num_bytes: int = 0) -> bool:
+        if not self.is_full:
+            self.num_bytes += num_bytes
+            asyncio.get_running_loop().call_soon(call)
+        return not self.is_full
+
+    def run(self, coroutine: Coroutine[Any, Any, None]) -> asyncio.Task[None]:
+        return asyncio.get_running_loop().create_task(coroutine)
+
+    def close(self, last: Callable[[], Coroutine[Any, Any, None]], _timeout_s: float) -> None:
+        self.run(last())
+
+
+class Server:
+    """A LiveServer that opens no port; ``events`` says when ports are opened and closed."""
+
+    events: list[str]
+    busy: set[int]
+    attempts_s: list[float]
+    opened: dict[str, "Server"]
+
+    def __init__(
+        self,
+        state: SourceState,
+        host: str,
+        port: int,
+        max_clients: int,
+        wanted_changed: Callable[[], None],
+        control: Callable[[str, bool, str], Coroutine[Any, Any, None]],
+    ) -> None:
+        self.state, self.host, self.port, self.max_clients = state, host, port, max_clients
+        self.wanted_changed, self.control = wanted_changed, control
+        self.taken: list[tuple[int, frozenset[ComponentType]]] = []
+        self.files: list[Path] = []
+        self.num_applied = self.num_maintained = 0
+
+    async def listen(self) -> None:
+        self.attempts_s.append(asyncio.get_running_loop().time())
+        if self.port in self.busy:
+            raise GatewayError(f"port {self.port} is in use")
+        self.events.append(f"open {self.host} {self.port}")
+        self.opened[self.state.source] = self
+
+    async def close(self) -> None:
+        await asyncio.sleep(0.5)
+        self.events.append(f"close {self.host} {self.port}")
+
+    def apply_state(self) -> None:
+        self.num_applied += 1
+
+    def maintain(self) -> None:
+        self.num_maintained += 1
+
+    def take(self, frame: object, stream: int, wanted: frozenset[ComponentType]) -> None:
+        assert frame is FRAME
+        self.taken.append((stream, wanted))
+        if stream == 13:
+            raise ZeroDivisionError
+
+    def send_file(self, path: Path) -> None:
+        self.files.append(path)
+
+
+@pytest.fixture(autouse=True)
+def _scripted(monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, value in (("events", []), ("busy", set()), ("attempts_s", []), ("opened", {})):
+        monkeypatch.setattr(Server, name, value, raising=False)
+    monkeypatch.setattr(Thread, "is_full", False)
+    monkeypatch.setattr(output_module, "LiveServer", Server)
+    monkeypatch.setattr(output_module, "LoopThread", Thread)
+
+
+def settings(ports: Mapping[str, int], **values: Any) -> Rtc3dSettings:
+    return Rtc3dSettings(enabled=True, ports=dict(ports), **values)
+
+
+async def started(ports: Mapping[str, int], *sources: str, **values: Any) -> Rtc3dOutput:
+    output = Rtc3dOutput(settings(ports, **values))
+    for source in sources or ports:
+        output.announce(source)
+    output.start()
+    await settle()
+    return output
+
+
+def take_over(output: Rtc3dOutput, ports: Mapping[str, int], **values: Any) -> bool:
+    return output.take_over(Rtc3dOutput(settings(ports, **values)))
+
+
+# Ports --------------------------------------------------------------------------------------
+
+
+@in_virtual_time
+async def test_the_ports_of_announced_sources_are_open() -> None:
+    """Clients must not reach a source that is not there yet."""
+    output = Rtc3dOutput(settings({"lab": LAB, "hall": HALL}))
+    output.announce("lab")
+    assert (output.health().connected, output.health().problem) == (False, "rtc3d is not open")
+    output.start()
+    assert output.health().problem == f"port {LAB} is not open yet"
+    await settle()
+    assert (Server.events, output.health().connected) == ([f"open 127.0.0.1 {LAB}"], True)
+    output.announce("hall")
+    await settle()
+    assert Server.events[1:] == [f"open 127.0.0.1 {HALL}"]
+    output.withdraw("lab")
+    await asyncio.sleep(1)
+    assert Server.events[2:] == [f"close 127.0.0.1 {LAB}"]
+    output.announce("lab")
+    await settle()
+    assert Server.events[3:] == [f"open 127.0.0.1 {LAB}"]
+
+
+@in_virtual_time
+async def test_closing_closes_every_port_for_good() -> None:
+    """An output that is closed cannot be started again."""
+    output = await started({"lab": LAB, "hall": HALL})
+    output.close()
+    output.start()
+    await asyncio.sleep(1)
+    assert sorted(Server.events[2:]) == [f"close 127.0.0.1 {LAB}", f"close 127.0.0.1 {HALL}"]
+    assert output.health().problem == "rtc3d is not open"
+    never_started = Rtc3dOutput(settings({"lab": LAB}))
+    never_started.close()
+    never_started.start()
+    assert never_started._thread is None
+
+
+def test_a_port_for_an_unknown_source_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+    """Nobody could connect, and the name is probably mistyped."""
+
+    async def start() -> None:
+        await started({"lab": LAB, "lap": HALL}, "lab")
+
+    in_virtual_time(start)()
+    assert [each.args for each in caplog.records if each.levelno == logging.WARNING] == [("lap",)]
+
+
+@in_virtual_time
+async def test_a_port_in_use_is_tried_again_until_it_is_free() -> None:
+    """The waits double from 0.2 s up to 1 s; meanwhile, the health says why."""
+    Server.busy.add(LAB)
+    output = await started({"lab": LAB, "hall": HALL})
+    assert output.health().problem == f"RTC3D clients cannot connect: port {LAB} is in use"
+    await asyncio.sleep(4)
+    times = [round(time_s - 1000, 1) for time_s in Server.attempts_s]
+    assert times == [0.0, 0.0, 0.2, 0.6, 1.4, 2.4, 3.4]
+    Server.busy.clear()
+    await asyncio.sleep(1)
+    assert (output.health().connected, output.health().problem) == (True, "")
+    output.show_streaming("lab", is_streaming=True)
+    await settle()
+    assert Server.opened["lab"].num_applied == 1
+
+
+@in_virtual_time
+async def test_a_reload_touches_only_what_has_changed() -> None:
+    """Clients of the other sources stay connected."""
+    output = await started({"lab": LAB, "hall": HALL})
+    assert not take_over(output, {"lab": LAB, "hall": HALL})
+    assert take_over(output, {"lab": LAB, "hall": HALL}, max_clients=7)
+    await settle()
+    assert [server.max_clients for server in Server.opened.values()] == [7, 7]
+    assert take_over(output, {"lab": LAB, "hall": 3122}, max_clients=7)
+    await asyncio.sleep(1)
+    assert take_over(output, {"lab": LAB})
+    await asyncio.sleep(1)
+    assert Server.events[2:] == [
+        f"close 127.0.0.1 {HALL}",
+        "open 127.0.0.1 3122",
+        "close 127.0.0.1 3122",
+    ]
+    assert output.is_configured_like(Rtc3dOutput(Rtc3dSettings()))
+
+
+@in_virtual_time
+async def test_ports_that_are_exchanged_are_closed_before_they_are_opened() -> None:
+    """Otherwise each source would find the other's port in use."""
+    output = await started({"lab": LAB, "hall": HALL})
+    take_over(output, {"lab": HALL, "hall": LAB})
+    await asyncio.sleep(2)
+    closed, opened = Server.events[2:4], Server.events[4:]
+    assert {each.split()[0] for each in closed} == {"close"}
+    assert sorted(opened) == [f"open 127.0.0.1 {LAB}", f"open 127.0.0.1 {HALL}"]
+
+
+@in_virtual_time
+async def test_another_address_closes_all_ports_first() -> None:
+    """The ports stay the same, so they have to be free again."""
+    output = await started({"lab": LAB})
+    take_over(output, {"lab": LAB}, host="::1")
+    await asyncio.sleep(2)
+    assert Server.events[1:] == [f"close 127.0.0.1 {LAB}", f"open ::1 {LAB}"]
+
+
+@in_virtual_time
+async def test_a_port_that_never_opened_is_given_up() -> None:
+    """A source that is withdrawn must not be tried for ever."""
+    Server.busy.add(LAB)
+    output = await started({"lab": LAB})
+    output.withdraw("lab")
+    await asyncio.sleep(10)
+    assert len(Server.attempts_s) == 1
+    assert output.health().connected
+
+
+# What the thread gets -----------------------------------------------------------------------
+
+
+@in_virtual_time
+async def test_the_server_hears_of_every_change_of_its_source() -> None:
+    """Clients get No Data and new parameters in time."""
+    output = await started({"lab": LAB, "hall": HALL})
+    server, state = Server.opened["lab"], Server.opened["lab"].state
+    parameters = ServerParameters(b"<Parameters/>", 1, 1)
+    for number, change in enumerate(
+        (
+            lambda: output.show_streaming("lab", is_streaming=True),
+            lambda: output.show_measurement("lab", is_running=False),
+            lambda: output.publish_parameters("lab", parameters),
+            output.maintain,
+        ),
+        start=1,
+    ):
+        change()
+        await settle()
+        assert (server.num_applied, server.num_maintained) == (number, number)
+    assert (state.is_streaming, state.is_measuring, state.parameters) == (True, False, parameters)
+    losses = Losses(logging.getLogger(__name__), "lab")
+    output.count_losses("lab", losses)
+    assert (state.losses, Server.opened["hall"].state.losses) == (losses, None)
+
+
+@in_virtual_time
+async def test_files_reach_the_source_of_the_server_even_if_the_queue_is_full(tmp_path: Path) -> None:
+    """A file is announced only once."""
+    output = await started({"lab": LAB, "hall": HALL})
+    Thread.is_full = True
+    output.announce_file("lab", ServerFile(tmp_path, 1))
+    output.announce_file("elsewhere", ServerFile(tmp_path, 1))
+    await settle()
+    assert (Server.opened["lab"].files, Server.opened["hall"].files) == ([tmp_path], [])
+
+
+@in_virtual_time
+async def test_frames_are_handed_over_while_any_client_wants_some() -> None:
+    """A frame that nobody wants costs the thread nothing; the stream is that of the session."""
+    output = await started({"lab": LAB})
+    publisher, server = output.frame_publisher("lab"), Server.opened["lab"]
+    stamp = Stamp(0, 0, 5, 1)
+    publisher.publish(FRAME, stamp, 1, COMPONENTS)
+    assert not publisher.wants(COMPONENTS)
+    assert not publisher.prepare(FRAME.layout, COMPONENTS)
+    server.state.wanted = True
+    assert publisher.wants(COMPONENTS)
+    assert publisher.prepare(FRAME.layout, COMPONENTS)
+    publisher.publish(FRAME, stamp, 2, COMPONENTS)
+    await settle()
+    assert server.taken == [(5, COMPONENTS)]
+    assert output._thread is not None
+    assert output._thread.num_bytes == len(FRAME.body)  # type: ignore[attr-defined]
+    Thread.is_full = True
+    with pytest.raises(OutputError) as caught:
+        publisher.publish(FRAME, stamp, 3, COMPONENTS)
+    assert caught.value.cause == QUEUE_FULL
+    publisher.close()
+    assert not publisher.wants(COMPONENTS)
+    with pytest.raises(OutputError) as caught:
+        publisher.publish(FRAME, stamp, 4, COMPONENTS)
+    assert caught.value.cause == "closed"
+    unstarted = Rtc3dOutput(settings({"lab": LAB}))
+    unstarted._state("lab").wanted = True
+    unstarted.frame_publisher("lab").publish(FRAME, stamp, 1, COMPONENTS)
+
+
+@in_virtual_time
+async def test_a_defect_in_one_frame_does_not_end_the_thread() -> None:
+    """The next frame may be different; frames of closed ports are nothing."""
+    output = await started({"lab": LAB})
+    server = Server.opened["lab"]
+    output._take("lab", FRAME, 13, COMPONENTS)
+    output._take("lab", FRAME, 1, COMPONENTS)
+    output._take("elsewhere", FRAME, 1, COMPONENTS)
+    assert [stream for stream, _ in server.taken] == [13, 1]
+    output.withdraw("lab")
+    await asyncio.sleep(1)
+    output._take("lab", FRAME, 2, COMPONENTS)
+    assert [stream for stream, _ in server.taken] == [13, 1]
+
+
+@in_virtual_time
+async def test_recordings_are_passed_on_to_the_source() -> None:
+    """The name belongs to the start only."""
+    asked: list[tuple[str, Sequence[str], Mapping[str, str]]] = []
+
+    class Queries:
+        async def answer(self, source: str, path: Sequence[str], options: Mapping[str, str]) -> None:
+            asked.append((source, path, dict(options)))
+
+    changes: list[int] = []
+    output = Rtc3dOutput(settings({"lab": LAB}))
+    output.serve_queries(Queries())  # type: ignore[arg-type]
+    output.watch_wanted("lab", lambda: changes.append(1))
+    output.announce("lab")
+    output.start()
+    await settle()
+    control = Server.opened["lab"].control
+    await control("lab", True, "walk")
+    await control("lab", True, "")
+    await control("lab", False, "walk")
+    assert asked == [
+        ("lab", ("recording",), {CONTROL_OPTION: "start", "name": "walk"}),
+        ("lab", ("recording",), {CONTROL_OPTION: "start"}),
+        ("lab", ("recording",), {CONTROL_OPTION: "stop"}),
+    ]
+    Server.opened["lab"].wanted_changed()
+    await settle()
+    assert changes == [1]
