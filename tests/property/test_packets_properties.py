@@ -94,16 +94,6 @@ def test_any_split_of_a_stream_gives_the_same_packets(packet_list: list[Packet],
     assert reader.buffered_bytes == 0
 
 
-@given(packet_lists)
-def test_a_stream_fed_byte_by_byte_gives_the_same_packets(packet_list: list[Packet]) -> None:
-    reader = new_reader()
-    read = []
-    for byte in stream_of(packet_list):
-        read += reader.feed(bytes([byte]))
-    assert with_whole_files(read) == (packet_list, b"")
-    assert reader.buffered_bytes == 0
-
-
 @settings(max_examples=300)
 @given(pieces(any_streams))
 def test_every_byte_is_returned_or_buffered_until_an_error(stream: list[bytes]) -> None:
