@@ -20,6 +20,9 @@ from gateway.rtc3d.parameters import (
     Parameters6D,
     ParametersAnalog,
     ParametersEvents,
+    ParametersForce,
+    Plate,
+    Point,
     Tool,
 )
 from gateway.rtc3d.parameters_xml import (
@@ -263,7 +266,8 @@ class TestEncoding:
     def test_repeated_elements_are_numbered_and_no_others(self) -> None:
         """§6: an id counts the items of a list from 1, unless the server has its own."""
         root = etree.fromstring(encode_parameters(ALL))
-        numbered = set(["Marker", "Tool", "Channel", "Plate", "Corner", "Row", "Col", "Event", "Param", "ExpValue"])
+        numbered = {"Marker", "Tool", "Channel", "Plate", "Corner", "Row", "Col"}
+        numbered |= {"Event", "Param", "ExpValue"}
         assert {element.tag for element in root.iter() if "id" in element.attrib} == numbered
         for element in root.iter():
             counts = Counter(child.tag for child in element)
