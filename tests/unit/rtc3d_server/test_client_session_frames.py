@@ -9,6 +9,7 @@ from tests.unit.rtc3d_server.scripted_client import ScriptedClient
 from tests.unit.rtc3d_server.wire import (
     ANALOG,
     COMMAND,
+    ERROR,
     EVENT,
     MARKERS,
     NO_DATA,
@@ -190,6 +191,26 @@ def test_events_before_the_request_are_not_sent(client: ScriptedClient) -> None:
     assert [event[0] for event in events.items] == [143]
 
 
+def test_a_stream_of_events_alone_loses_no_frames_while_the_client_does_not_read(
+    client: ScriptedClient,
+) -> None:
+    """Its frames exist only if there are events, and these come with the next frame."""
+    client.send("StreamFrames Events")
+    client.session.drop_due_frames(100_000)
+    assert client.session.frames_dropped == 0
+    frames = client.frames_until(140_000)
+    assert [[event[0] for event in events.items] for [events] in frames] == [[1], [2]]
+
+
+def test_dropped_frames_are_counted_once_and_never_before_they_are_due(client: ScriptedClient) -> None:
+    """The count is in the log and in the statistics of the server."""
+    client.send("StreamFrames 3D")
+    for elapsed_us, dropped in ((0, 1), (0, 1), (5_000, 1), (10_000, 2), (95_000, 10), (40_000, 10)):
+        client.session.drop_due_frames(elapsed_us)
+        assert client.session.frames_dropped == dropped
+    assert client.numbers_until(100_000) == [11]
+
+
 # SendCurrentFrame ---------------------------------------------------------------------------
 
 
@@ -233,6 +254,42 @@ def test_the_current_frame_of_components_that_the_scene_lacks_is_empty(client: S
     client.send("SendCurrentFrame Force")
 
     assert client.frames_until(0) == [[]]
+
+
+def test_a_frame_of_a_slow_stream_does_not_make_older_frames_current(client: ScriptedClient) -> None:
+    """SendCurrentFrame waits for a frame newer than any that the client has (§5.3.4)."""
+    client.send("StreamFrames FrequencyDivisor:10 3D")
+    client.frames_until(0)
+    client.elapsed_us = 95_000
+    client.send("SendCurrentFrame Analog")
+    assert [frame[0].timestamp_us for frame in client.frames_until(95_000)] == [95_000]
+    client.session.scene_changed(0)  # the stream continues with a frame that is older than the analog one
+    client.send("SendCurrentFrame 3D")
+    assert client.session.due_us == 100_000
+
+
+def test_stop_keeps_the_events_of_a_request_that_waits(client: ScriptedClient) -> None:
+    """Events since the first request belong to the next frame, whatever becomes of the stream."""
+    client.send("SendCurrentFrame 3D Events")
+    client.frames_until(0)
+    client.send("StreamFrames Frequency:1 3D Events")
+    client.frames_until(5_000)
+    client.elapsed_us = 75_000
+    client.send("SendCurrentFrame 3D Events")
+    client.send("StreamFrames Stop")
+    [[_, events]] = client.frames_until(80_000)
+    assert [event[0] for event in events.items] == [1]
+
+
+def test_no_more_than_1000_requests_wait(client: ScriptedClient) -> None:
+    """They may wait for components that never come, and take memory."""
+    for _ in range(1000):
+        assert client.send("SendCurrentFrame 3D")[0][0] == COMMAND
+    assert client.send("SendCurrentFrame 3D")[0] == (
+        ERROR,
+        b"Error-1000 requests for the current frame wait already",
+    )
+    assert len(client.frames_until(0)) == 1000
 
 
 def test_polling_gets_each_event_once(client: ScriptedClient) -> None:
