@@ -1,16 +1,10 @@
 """The simulator's streams, checked by frame numbers and values, without timing."""
 
 import asyncio
-import os
-from collections.abc import Awaitable
-from pathlib import Path
 
-import ezc3d
 import numpy as np
 import pytest
 
-from gateway.rtc3d_server.scene import Scene
-from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.simulator import Simulator
 from tests.integration.raw_client import connected, numbers
 from tests.integration.served import Served
@@ -18,16 +12,12 @@ from tests.unit.rtc3d_server.counting_scene import CountingScene
 from tests.unit.rtc3d_server.wire import (
     ANALOG,
     COMMAND,
-    DATA,
     EVENT,
-    FORCE,
     MARKERS,
     NO_DATA,
     TOOLS,
     XML,
-    WireComponent,
     command,
-    components_in,
 )
 
 FAST_HZ = 1000.0
@@ -156,44 +146,3 @@ async def test_once_all_connections_get_the_scene_from_its_first_frame_to_its_en
         assert await first.read() == (NO_DATA, b"")
         assert await first.ask("SendCurrentFrame") == (COMMAND, b"OK-SendCurrentFrame")
         assert await first.read() == (NO_DATA, b"")
-
-
-# Real recordings ----------------------------------------------------------------------------
-
-
-async def played_once(scene: Scene, components: str) -> dict[int, list[WireComponent]]:
-    """Return all components that one pass of the scene sends, by component type."""
-    by_type: dict[int, list[WireComponent]] = {}
-    async with Simulator(scene, once=True) as simulator, connected(simulator) as client:
-        await client.ask(f"StreamFrames {components}")
-        while (reply := await client.read())[0] == DATA:
-            for component in components_in(reply[1]):
-                by_type.setdefault(component.type, []).append(component)
-    return by_type
-
-
-@pytest.mark.takes
-@pytest.mark.parametrize("name", ["qualisys.c3d", "optotrak.c3d"])
-async def test_a_real_recording_arrives_as_ezc3d_reads_it(name: str) -> None:
-    folder = os.environ.get("RTC3D_TAKES")
-    if not folder:
-        pytest.skip("RTC3D_TAKES names no folder with recordings")
-    path = Path(folder) / name
-    read = ezc3d.c3d(str(path), extract_forceplat_data=True)["data"]
-    takes: list[Awaitable[dict[int, list[WireComponent]]]] = [
-        played_once(C3dScene(path), components) for components in ("3D", "Analog Force")
-    ]
-    points, fast = await asyncio.gather(*takes)
-
-    markers = np.array([component.items for component in points[MARKERS]], np.float32)
-    missing = np.isnan(read["points"][:3]).any(axis=0).T
-    assert markers.shape == (read["points"].shape[2], read["points"].shape[1], 4)
-    assert np.array_equal(markers[..., :3][~missing], read["points"][:3].T[~missing].astype(np.float32))
-    assert np.isnan(markers[missing, :3]).all()
-    assert (markers[missing, 3] == 999.0).all()
-    if read["analogs"].size:
-        analog = np.array([component.items for component in fast[ANALOG]], np.float32)[..., 0]
-        assert np.array_equal(analog, read["analogs"][0].T.astype(np.float32))
-    for number, plate in enumerate(read["platform"]):
-        force = np.array([component.items[number] for component in fast[FORCE]], np.float32)
-        assert np.array_equal(force, np.concatenate([plate["force"], plate["moment"]]).T.astype(np.float32))
