@@ -27,8 +27,6 @@ from tests.unit.rtc3d_server.wire import (
     NO_DATA,
     TOOLS,
     XML,
-    ByteOrder,
-    WireComponent,
     command,
     components_in,
     packet,
@@ -171,21 +169,6 @@ async def test_each_packet_is_sent_with_one_send(served: Served) -> None:
 
 
 # Many clients -------------------------------------------------------------------------------
-
-
-async def test_64_clients_get_every_frame() -> None:
-    async def play(simulator: Simulator, number: int) -> list[list[WireComponent]]:
-        async with connected(simulator) as client:
-            byte_order: ByteOrder = "little" if number % 2 else "big"
-            await client.ask(f"SetByteOrder {byte_order}Endian")
-            await client.ask("StreamFrames All")
-            return await client.frames(40, byte_order)
-
-    async with Simulator(CountingScene()) as simulator:
-        streams = await asyncio.gather(*(play(simulator, number) for number in range(64)))
-
-    assert all(consecutive(frames) for frames in streams)
-    assert simulator.frames_sent >= 64 * 40
 
 
 async def test_a_client_that_does_not_read_delays_no_other_and_continues_when_it_reads(
