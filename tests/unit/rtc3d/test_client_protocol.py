@@ -107,6 +107,10 @@ STOP_OK = ok("OK-StreamFrames Stop")
             "requested, streaming, streaming, streaming",
         ),
         ([SendCurrentFrame(), FRAME], "idle, idle"),
+        (
+            [STREAM, "give up", Version(), error("Error-Version?")],
+            "requested, requested, requested, requested",
+        ),
         ([SendCurrentFrame(), NO_DATA], "idle, idle"),
         (
             [STREAM, FRAME + ok("OK"), SendCurrentFrame(), NO_DATA],

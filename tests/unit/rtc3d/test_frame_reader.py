@@ -80,6 +80,14 @@ def test_the_number_of_remembered_layouts_is_bounded() -> None:
         assert len(reader._templates) <= len(reader._layouts) <= 64
 
 
+def test_a_layout_that_repeats_is_recognised_by_its_template() -> None:
+    """Reading every frame field by field would take ten times as long."""
+    reader = reader_after(MARKERS_FRAME)
+    assert reader._templates == {}
+    reader.read(MARKERS_FRAME)
+    assert list(reader._templates) == [len(MARKERS_FRAME)]
+
+
 def test_layouts_of_one_connection_are_not_those_of_another() -> None:
     """So they are forgotten with the connection."""
     first, second = (reader_after(MARKERS_FRAME).read(MARKERS_FRAME).layout for _ in range(2))

@@ -352,4 +352,6 @@ def test_names_in_a_section_are_readable_in_any_encoding(encoding: str) -> None:
     ],
 )
 def test_a_section_that_cannot_be_taken_from_the_reply_is_none(xml: bytes) -> None:
+    """The gateway then asks the server for it; a part of what was asked for is not enough."""
     assert extract_sections(xml, ["3d"]) is None
+    assert extract_sections(WHOLE, ["3d", "force"]) is None

@@ -145,6 +145,10 @@ LATE: Final = {
         [LITTLE, error("Version must be sent first")],
         [f"{LITTLE}: refused"],
     ),
+    "that follow the frames of a request, which were its answer": (
+        [STREAM, FRAME, STOP, ok("OK"), ok("OK")],
+        [f"{STREAM}: answered", f"{STOP}: maybe", f"{STOP}: answered"],
+    ),
     "to a ninth command, of which eight are remembered": (
         [*(step for _ in range(9) for step in (Version(), GIVE_UP)), LITTLE, *[ok("OK")] * 9],
         [*[f"{LITTLE}: maybe"] * 8, f"{LITTLE}: answered"],
@@ -163,6 +167,10 @@ PARAMETERS: Final = {
     "with more sections than requested": (
         [ALL, xml("The_3D", "The_6D"), SendParameters(("general",)), xml("The_3D", "The_6D")],
         [f"{ALL}: answered", "SendParameters General: answered"],
+    ),
+    "without a section that the server lacks": (
+        [ONLY_6D, GIVE_UP, SendParameters(("general", "3d")), xml("The_3D")],
+        ["SendParameters General 3D: answered"],
     ),
     "without those that were given up": (
         [ONLY_3D, GIVE_UP, ONLY_6D, xml("The_6D")],
