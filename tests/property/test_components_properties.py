@@ -186,7 +186,7 @@ def assert_consistent(component: Component, order: ByteOrder) -> None:
     assert len(big_endian_content(component)) == len(content)
 
 
-@settings(max_examples=300)
+@settings(max_examples=200)
 @given(any_bodies, orders)
 def test_any_bytes_are_a_consistent_frame_or_raise_frame_error(body: bytes, order: ByteOrder) -> None:
     split = split_or_none(body, order)
@@ -202,7 +202,7 @@ def test_any_bytes_are_a_consistent_frame_or_raise_frame_error(body: bytes, orde
         assert known_bytes + split.layout.num_extra_bytes == len(body)
 
 
-@settings(max_examples=300)
+@settings(max_examples=200)
 @given(any_bodies, orders)
 def test_any_bytes_make_sense_in_the_detected_byte_order_or_raise_frame_error(
     body: bytes, expected: ByteOrder
@@ -217,7 +217,7 @@ def test_any_bytes_make_sense_in_the_detected_byte_order_or_raise_frame_error(
         assert found == expected or not makes_sense[expected]
 
 
-@settings(max_examples=300)
+@settings(max_examples=200)
 @given(any_bodies, st.data(), orders)
 def test_earlier_frames_do_not_change_how_a_frame_is_read(
     body: bytes, data: st.DataObject, order: ByteOrder

@@ -41,14 +41,15 @@ def test_a_failure_is_loud_once_and_its_recovery_too(clock: Clock, caplog: pytes
     """What fails for hours must not fill the log, but its begin and its end must be there."""
     failures = FailureLog(LOGGER, "lab")
     failures.recovered("streaming")
-    assert (logged(caplog), failures.failing) == ([], False)
+    is_failing = [failures.failing]
+    assert logged(caplog) == []
     for _ in range(3):
         failures.failed("no answer; check the cable")
         clock.now_s += 1.5
-    assert failures.failing
+    is_failing.append(failures.failing)
     failures.recovered("streaming")
     failures.recovered("streaming")
-    assert not failures.failing
+    assert [*is_failing, failures.failing] == [False, True, False]
     assert logged(caplog) == [
         ("WARNING", "lab: no answer; check the cable"),
         ("DEBUG", "lab: no answer; check the cable (failure 2 in a row)"),
@@ -82,10 +83,10 @@ def test_intermittent_failures_are_over_after_the_hold_time_without_one(
         failures.recovered("sending")
     clock.now_s = 7.9
     failures.recovered("sending")
-    assert failures.failing
+    is_failing = [failures.failing]
     clock.now_s = 8.0
     failures.recovered("sending")
-    assert not failures.failing
+    assert [*is_failing, failures.failing] == [True, False]
     assert [level for level, _ in logged(caplog)] == ["WARNING", "DEBUG", "DEBUG", "DEBUG", "INFO"]
     assert caplog.messages[-1] == "lab: sending, after 8.0 s and 4 failures"
 
@@ -102,10 +103,10 @@ def test_the_hold_time_doubles_while_failures_come_back_soon(
         failures.failed("closed")
         clock.now_s += hold_s - 0.1
         failures.recovered("streaming")
-        assert failures.failing, hold_s
+        is_failing = [failures.failing]
         clock.now_s += 0.1
         failures.recovered("streaming")
-        assert not failures.failing, hold_s
+        assert [*is_failing, failures.failing] == [True, False], hold_s
         clock.now_s += pause_s
 
 

@@ -65,8 +65,8 @@ def test_numbers_within_their_limits(
     """The limits protect from typing errors, and a number in quotes or a switch is no number."""
     for value in accepted:
         assert getattr(SourceSettings.model_validate(source(**{key: value})), key) == value
-    for value in refused:
-        assert of_source(**{key: value}) == [(key, f"found {describe(value)}; expected {expected}")]
+    for other in refused:
+        assert of_source(**{key: other}) == [(key, f"found {describe(other)}; expected {expected}")]
 
 
 def test_a_switch_must_be_true_or_false() -> None:

@@ -235,7 +235,7 @@ def test_a_frame_in_two_reads_is_the_same_frame_and_packets_follow_it(first: int
 def test_frames_are_received_in_parts_while_there_are_more() -> None:
     """A burst is handled in several turns of the event loop, in order and without loss."""
     protocol = protocol_after(STREAM)
-    frames, _ = protocol.receive(FRAME * 5 + ok("OK"), 2)
+    frames, events = protocol.receive(FRAME * 5 + ok("OK"), 2)
     counts = [len(frames)]
     while protocol.has_more:
         frames, events = protocol.receive(b"", 2)

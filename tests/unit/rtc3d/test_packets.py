@@ -73,12 +73,11 @@ def test_no_more_packets_are_returned_than_wanted_and_none_is_lost(most: int) ->
     """A burst of frames is processed in parts, so that the event loop stays responsive."""
     reader = PacketReader(max_packet_bytes=LIMIT)
     stream = b"".join(encode_packet(3, bytes([number])) for number in range(7))
-    batches = [reader.feed(stream[:-4], most)]
-    while reader.has_more:
-        batches.append(reader.feed(b"", most))
-    batches.append(reader.feed(stream[-4:] + header(7, 1), most))
-    while reader.has_more:
-        batches.append(reader.feed(b"", most))
+    batches = []
+    for data in (stream[:-4], stream[-4:] + header(7, 1)):
+        batches.append(reader.feed(data, most))
+        while reader.has_more:
+            batches.append(reader.feed(b"", most))
     assert [packet.body[0] for batch in batches for packet in batch] == list(range(7))
     assert [len(batch) for batch in batches[: 6 // most]] == [most] * (6 // most)
     assert error_of(reader).offset == len(stream)
@@ -89,7 +88,7 @@ def test_bytes_that_arrive_while_packets_wait_come_after_them() -> None:
     reader = PacketReader()
     assert reader.feed(encode_packet(1, b"a") + encode_packet(1, b"b"), 1) == [Packet(1, b"a")]
     assert reader.feed(encode_packet(1, b"c")) == [Packet(1, b"b"), Packet(1, b"c")]
-    assert not reader.has_more
+    assert reader.has_more is False
 
 
 # Bounds of the size field ---------------------------------------------------------------------

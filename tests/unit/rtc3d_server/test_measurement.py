@@ -90,10 +90,10 @@ def test_the_scene_of_the_start_is_played_even_while_another_one_is_shown(clock:
     measurement.change_scene(CountingScene(rate_hz=50.0))
     clock.now_us += 250_000
     measurement.advance()
-    assert measurement.advance_us == 350_000
+    advance_us = [measurement.advance_us]
     measurement.stop()
     measurement.advance()
-    assert measurement.advance_us is None
+    assert [*advance_us, measurement.advance_us] == [350_000, None]
     assert scene.calls == ["start", "advance 0", "advance 250000", "stop"]
 
 
