@@ -235,6 +235,19 @@ def test_a_frame_of_a_slow_stream_does_not_make_older_frames_current(client: Scr
     assert client.session.due_us == 100_000
 
 
+def test_the_next_frame_is_due_for_the_stream_or_for_a_request_whichever_is_first(
+    client: ScriptedClient,
+) -> None:
+    """The server's timer waits for this time, so a later one would delay frames."""
+    client.send("StreamFrames Analog")
+    client.frames_until(0)
+    client.send("SendCurrentFrame 3D")
+    assert client.session.due_us == 1_000
+    client.send("StreamFrames Frequency:1 Analog")
+    client.frames_until(1_000)
+    assert client.session.due_us == 10_000
+
+
 def test_stop_keeps_the_events_of_a_request_that_waits(client: ScriptedClient) -> None:
     """Events since the first request belong to the next frame, whatever becomes of the stream."""
     client.send("SendCurrentFrame 3D Events")

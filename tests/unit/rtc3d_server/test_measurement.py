@@ -82,6 +82,15 @@ def test_a_measurement_that_plays_once_begins_a_second_after_the_last_request(cl
     assert measurement.elapsed_us() == 10 * (LEAD_US // 2) - MAX_LEAD_US
 
 
+def test_a_request_during_a_measurement_does_not_postpone_it(clock: Clock) -> None:
+    """Time stamps would jump back for all who stream already."""
+    measurement = measurement_of(CountingScene(num_frames=1000), once=True)
+    measurement.start()
+    clock.now_us += LEAD_US + 500_000
+    measurement.postpone()
+    assert measurement.elapsed_us() == 500_000
+
+
 def test_the_scene_of_the_start_is_played_even_while_another_one_is_shown(clock: Clock) -> None:
     """A fault changes what clients see; the recording goes on behind it."""
     scene = LoggingScene()
@@ -95,6 +104,10 @@ def test_the_scene_of_the_start_is_played_even_while_another_one_is_shown(clock:
     measurement.advance()
     assert [*advance_us, measurement.advance_us] == [350_000, None]
     assert scene.calls == ["start", "advance 0", "advance 250000", "stop"]
+    other = LoggingScene()
+    measurement.change_scene(other)
+    measurement.start()  # plays the scene that is shown now
+    assert other.calls == ["start", "advance 0"]
 
 
 @pytest.mark.usefixtures("clock")
