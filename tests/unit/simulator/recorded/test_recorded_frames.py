@@ -153,6 +153,13 @@ def test_a_pass_does_not_end_in_the_first_frame_of_the_next_one() -> None:
     assert numbers(client.frames_until(1))[-1] == {"3d": 1}
 
 
+def test_a_pass_that_ends_in_a_pause_is_played_to_its_end() -> None:
+    """Nothing follows that could set the rate, so the last samples must not wait for it."""
+    client = Client(lab(0.1, pause=(0.05, 0.1)))
+    client.send("StreamFrames 3D Analog")
+    assert only("analog", client.frames_until(1))[-30:] == list(range(71, 101))
+
+
 def test_components_may_begin_later() -> None:
     client = Client(lab(1, pause=(0, 0.5)))
     client.send("StreamFrames All")
