@@ -91,7 +91,8 @@ def lcm_content(component: Component) -> bytes:
 
 def with_sequence(message: bytes, sequence: int) -> bytes:
     """Return a component's message with another sequence number."""
-    return message[:_SEQUENCE_OFFSET] + sequence.to_bytes(8, "big") + message[_SEQUENCE_OFFSET + 8 :]
+    number = sequence.to_bytes(8, "big", signed=True)
+    return message[:_SEQUENCE_OFFSET] + number + message[_SEQUENCE_OFFSET + 8 :]
 
 
 def message_timestamp_us(message: bytes) -> int:

@@ -4,6 +4,7 @@ import asyncio
 import logging
 import struct
 from collections import Counter
+from dataclasses import replace
 
 import pytest
 
@@ -26,8 +27,6 @@ from tests.unit.rtc3d_server.wire import (
     NO_DATA,
     TOOLS,
     XML,
-    ByteOrder,
-    WireComponent,
     command,
     components_in,
     packet,
@@ -55,43 +54,13 @@ async def test_a_client_can_follow_the_order_of_the_specification(served: Served
         assert parameters.general is not None
         assert parameters.general.name == "RTC3D simulator"
         assert (parameters.general.address, parameters.general.port) == ("127.0.0.1", simulator.port)
-        assert parameters.markers == simulator.scene.parameters.markers
-        assert parameters.tools == simulator.scene.parameters.tools
-        assert parameters.analog == simulator.scene.parameters.analog
-        assert parameters.force == simulator.scene.parameters.force
-        assert parameters.events == simulator.scene.parameters.events
+        assert replace(parameters, general=None) == simulator.scene.parameters
         assert await client.ask("StreamFrames") == (COMMAND, b"OK-StreamFrames")
         for components in await client.frames(20):
-            assert [component.type for component in components if component.type != EVENT] == [
-                MARKERS,
-                TOOLS,
-                ANALOG,
-                FORCE,
-            ]
-            assert [len(component.items) for component in components if component.type != EVENT] == [
-                20,
-                2,
-                8,
-                2,
-            ]
+            sizes = [(each.type, len(each.items)) for each in components if each.type != EVENT]
+            assert sizes == [(MARKERS, 20), (TOOLS, 2), (ANALOG, 8), (FORCE, 2)]
         client.send(command("Bye"))
         assert packets_in(await client.rest())[-1] == (COMMAND, b"bye")
-
-
-async def test_ndis_client_can_request_little_endian_first_and_events_in_the_current_frame(
-    served: Served,
-) -> None:
-    scene = CountingScene()
-    async with Simulator(scene) as simulator, served(simulator) as server, connected(server) as client:
-        assert await client.ask("SetByteOrder LittleEndian") == (COMMAND, b"OK-SetByteOrder LittleEndian")
-        sent = "SendCurrentFrame 3D 6D Analog Force Events "
-        for _ in range(10):
-            assert await client.ask(sent) == (COMMAND, b"OK-SendCurrentFrame 3D 6D Analog Force Events")
-            [components] = await client.frames(1, "little")
-            assert [component.type for component in components][:3] == [MARKERS, TOOLS, ANALOG]
-            assert components[0].items[0][0] == components[0].frame_number - 1
-        client.send(command("Bye"))
-        assert await client.rest() == packet(COMMAND, b"bye")
 
 
 async def test_nothing_follows_bye() -> None:
@@ -102,20 +71,6 @@ async def test_nothing_follows_bye() -> None:
                 await client.frames(5)
                 client.send(command("Bye"), command("Version 1.0"))
                 assert packets_in(await client.rest())[-1] == (COMMAND, b"bye")
-
-
-@pytest.mark.parametrize("ending", ["", "\0", "\n", "\r\n", " \n\0"])
-@pytest.mark.parametrize("words", ["streamframes allframes analog", "STREAMFRAMES ALLFRAMES ANALOG "])
-async def test_commands_can_have_any_ending_and_any_case(served: Served, words: str, ending: str) -> None:
-    async with (
-        Simulator(CountingScene()) as simulator,
-        served(simulator) as server,
-        connected(server) as client,
-    ):
-        assert await client.ask(words + ending) == (COMMAND, f"OK-{words.strip()}".encode())
-        frames = await client.frames(30)
-        assert {component.type for frame in frames for component in frame} == {ANALOG}
-        assert consecutive(frames)
 
 
 async def test_commands_can_arrive_in_pieces_or_several_at_once(served: Served) -> None:
@@ -148,37 +103,26 @@ async def test_a_client_that_closes_its_sending_half_gets_all_answers(served: Se
         assert sorted(kinds) == [ERROR, *[COMMAND] * 301, DATA]
 
 
-@pytest.mark.parametrize(
-    "bad",
-    [
-        command("Version 1.1"),
-        command("Fly"),
-        command(""),
-        command("StreamFrames Frequency:fast"),
-        packet(ERROR, b"Error"),
-        packet(XML, b"<RT_Parameters/>"),
-        packet(DATA, b"\0\0\0\1"),
-        packet(NO_DATA),
-        packet(5, b"c3d"),
-        packet(77, b"?"),
-    ],
-)
-async def test_invalid_packets_get_an_error_packet_and_the_connection_stays_open(
-    served: Served, bad: bytes
-) -> None:
+async def test_invalid_packets_get_an_error_packet_and_the_connection_stays_open(served: Served) -> None:
+    """A client's mistake must not cost it the frames of its other requests."""
     async with (
         Simulator(CountingScene()) as simulator,
         served(simulator) as server,
         connected(server) as client,
     ):
-        client.send(bad)
-        packet_type, text = await client.read()
-        assert packet_type == ERROR
-        assert len(text) > len("Error-")
+        for bad in (
+            *(command("Version 1.1"), command("Fly"), command(""), command("StreamFrames Frequency:fast")),
+            *(packet(ERROR, b"Error"), packet(XML, b"<RT_Parameters/>"), packet(DATA, b"\0\0\0\1")),
+            *(packet(NO_DATA), packet(5, b"c3d"), packet(77, b"?")),
+        ):
+            client.send(bad)
+            packet_type, text = await client.read()
+            assert packet_type == ERROR
+            assert len(text) > len("Error-")
         assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
 
 
-@pytest.mark.parametrize("size", [0, 7, 64 * 1024 + 1, 0xFFFFFFFF])
+@pytest.mark.parametrize("size", [7, 64 * 1024 + 1])
 async def test_a_size_out_of_bounds_gets_an_error_packet_and_ends_the_connection(
     served: Served, size: int
 ) -> None:
@@ -194,38 +138,6 @@ async def test_a_size_out_of_bounds_gets_an_error_packet_and_ends_the_connection
         assert reply == (COMMAND, b"OK-Version 1.0")
         assert packet_type == ERROR
         assert str(size).encode() in text
-
-
-async def test_the_recording_packet_gets_no_reply() -> None:
-    event = struct.pack(">IIIiqI", 1, 48, EVENT, -1, 0, 1) + struct.pack(">iqiii", 1, 0, -1, -1, -1)
-    async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
-        client.send(packet(DATA, event))
-        assert await client.ask("Version 1.0") == (COMMAND, b"OK-Version 1.0")
-        [connection] = simulator.connections
-        assert connection.session.is_recording
-
-
-async def test_packets_in_three_sends_with_a_line_feed_after_the_body_are_accepted() -> None:
-    """As the MATLAB toolbox for the Wave writes them (field note 17)."""
-    event = struct.pack("<IIIiqI", 1, 48, EVENT, -1, 0, 1) + struct.pack("<iqiii", 1, 0, -1, -1, -1)
-    async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
-
-        async def send(packet_type: int, body: bytes) -> None:
-            for part in (struct.pack(">I", 8 + len(body)), struct.pack(">I", packet_type), body):
-                client.send(part)
-                await asyncio.sleep(0.01)  # so that each part is a segment of its own
-
-        await send(COMMAND, b"SetByteOrder LittleEndian\n")
-        assert await client.read() == (COMMAND, b"OK-SetByteOrder LittleEndian")
-        await send(DATA, event + b"\n")
-        await send(COMMAND, b"Recording Stop\n")
-        [connection] = simulator.connections
-        assert await client.read() == (COMMAND, b"OK-Recording Stop")
-        await send(DATA, event + b"\n")
-        await send(COMMAND, b"StreamFrames AllFrames\n")
-        assert await client.read() == (COMMAND, b"OK-StreamFrames AllFrames")
-        assert connection.session.is_recording
-        await client.frames(3, "little")
 
 
 async def test_commands_are_logged_as_debug(caplog: pytest.LogCaptureFixture) -> None:
@@ -257,21 +169,6 @@ async def test_each_packet_is_sent_with_one_send(served: Served) -> None:
 
 
 # Many clients -------------------------------------------------------------------------------
-
-
-async def test_64_clients_get_every_frame() -> None:
-    async def play(simulator: Simulator, number: int) -> list[list[WireComponent]]:
-        async with connected(simulator) as client:
-            byte_order: ByteOrder = "little" if number % 2 else "big"
-            await client.ask(f"SetByteOrder {byte_order}Endian")
-            await client.ask("StreamFrames All")
-            return await client.frames(40, byte_order)
-
-    async with Simulator(CountingScene()) as simulator:
-        streams = await asyncio.gather(*(play(simulator, number) for number in range(64)))
-
-    assert all(consecutive(frames) for frames in streams)
-    assert simulator.frames_sent >= 64 * 40
 
 
 async def test_a_client_that_does_not_read_delays_no_other_and_continues_when_it_reads(
@@ -330,6 +227,9 @@ async def test_sent_frames_are_counted_for_each_client_and_in_total() -> None:
         num_frames = 0
         for sent in ("StreamFrames 3D Events", "StreamFrames All"):
             async with connected(simulator) as client:
+                general = parse_parameters((await client.ask("SendParameters General"))[1]).parameters.general
+                assert general is not None
+                assert (general.frames_sent, general.frames_per_s) == (0, 0.0)
                 await client.ask(sent)
                 frames = await client.frames(150)
                 client.send(command("StreamFrames Stop"), command("SendParameters General"))
@@ -346,14 +246,6 @@ async def test_sent_frames_are_counted_for_each_client_and_in_total() -> None:
 
         assert simulator.components_sent == received
         assert simulator.frames_sent == num_frames
-
-
-async def test_before_its_first_frame_a_clients_statistics_are_zero() -> None:
-    async with Simulator(CountingScene()) as simulator, connected(simulator) as client:
-        general = parse_parameters((await client.ask("SendParameters General"))[1]).parameters.general
-
-    assert general is not None
-    assert (general.frames_sent, general.frames_per_s) == (0, 0.0)
 
 
 async def test_closing_sends_no_data_and_frees_the_port() -> None:

@@ -1,27 +1,45 @@
-"""Faults of the whole server from a client's side; which connections faults affect, when and how often."""
+"""Faults of the whole server and of its sockets from a client's side."""
 
 import asyncio
 import contextlib
-import logging
 import socket
 import struct
 
+import numpy as np
 import pytest
 
 from gateway.rtc3d.parameters_xml import parse_parameters
+from gateway.rtc3d_server.client_connection import ClientConnection
 from gateway.simulator.faults.base import Fault
 from gateway.simulator.faults.kinds import KINDS
-from gateway.simulator.faults.momentary_faults import Garbage, Undersize
-from gateway.simulator.faults.reply_faults import MissingAcknowledgements, ReplyText
+from gateway.simulator.faults.momentary_faults import Cut
+from gateway.simulator.faults.reply_faults import LateAcknowledgements
 from gateway.simulator.faults.server_faults import ChangeScene, NoMeasurement, Rename, Restart
-from gateway.simulator.faults.stream_faults import Delay, HalfOpen
+from gateway.simulator.faults.stream_faults import Delay, HalfOpen, Merge, Split
 from gateway.simulator.scene_settings import SceneSettings
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from tests.integration.faulty import FAST_HZ, NEVER_MS, VERSION, clear_and_check, only_connection, playing
+from tests.integration.faulty import (
+    FAST_HZ,
+    NEVER_MS,
+    VERSION,
+    clear_and_check,
+    only_connection,
+    playing,
+    waiting_bytes,
+)
 from tests.integration.raw_client import TIMEOUT_S, RawClient, connected, consecutive, numbers, until
 from tests.unit.rtc3d_server.counting_scene import CountingScene
-from tests.unit.rtc3d_server.wire import COMMAND, DATA, NO_DATA, WireComponent, command
+from tests.unit.rtc3d_server.wire import (
+    COMMAND,
+    DATA,
+    NO_DATA,
+    XML,
+    WireComponent,
+    command,
+    components_in,
+    packets_in,
+)
 
 # The server ---------------------------------------------------------------------------------
 
@@ -107,7 +125,9 @@ async def test_a_server_that_is_about_to_come_back_can_be_restarted_again(rounds
         await until(lambda: simulator.is_listening)
 
 
-async def test_a_restarted_server_plays_its_recording_again() -> None:
+async def test_a_restarted_server_plays_its_recording_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With ``once``, each measurement waits for the first request for frames again."""
+    monkeypatch.setattr("gateway.rtc3d_server.measurement.LEAD_US", 10_000)
     async with Simulator(CountingScene(FAST_HZ, num_frames=30), once=True) as simulator:
         for _ in range(2):
             async with connected(simulator) as client:
@@ -142,8 +162,10 @@ async def test_a_measurement_does_not_start_while_the_server_is_away() -> None:
 
 
 async def test_a_server_whose_port_was_taken_comes_back_when_it_is_free(
-    caplog: pytest.LogCaptureFixture,
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Another program may have taken the port meanwhile; the simulator says so and tries again."""
+    monkeypatch.setattr("gateway.simulator.faults.control._RETRY_S", 0.01)
     async with playing() as (simulator, client):
         restart = simulator.faults.begin(Restart(away_s=600))
         await client.rest()
@@ -214,82 +236,86 @@ async def test_names_can_change_while_frames_continue() -> None:
         assert simulator.scene is scene
 
 
-# Which connections, when and how often ------------------------------------------------------
+# The byte stream ----------------------------------------------------------------------------
 
 
-async def test_active_faults_are_listed_in_the_order_in_which_they_act() -> None:
-    async with playing() as (simulator, _):
-        delay = simulator.faults.begin(Delay())
-        simulator.faults.begin(ReplyText())
-        simulator.faults.begin(Undersize())
-        simulator.faults.begin(NoMeasurement())
-        assert simulator.faults.active == [NoMeasurement(), ReplyText(), Delay()]
-        simulator.faults.end(delay)
-        assert simulator.faults.active == [NoMeasurement(), ReplyText()]
-        await simulator.faults.clear()
-        assert simulator.faults.active == []
+async def test_split_packets_come_in_several_segments() -> None:
+    async with playing(100) as (simulator, client):
+        simulator.faults.begin(Split(pieces=10, pause_ms=0.1))
+        await client.ask("StreamFrames 3D")
+        frames = await client.frames(20)
+        assert client.segments_received() > 2 * 21
+        assert consecutive(frames)
 
 
-async def test_a_fault_can_affect_one_connection_only() -> None:
-    async with playing() as (simulator, first), connected(simulator) as second:
-        await until(lambda: len(simulator.connections) == 2)
-        simulator.faults.begin(ReplyText(form="echo", connection=2))
-        assert await first.ask("Version 1.0") == VERSION
-        assert await second.ask("Version 1.0") == (COMMAND, b"Version 1.0")
-        simulator.faults.begin(Undersize(connection=2))
-        assert await second.exactly(8) == struct.pack(">II", 0, DATA)
-        assert await first.ask("Version 1.0") == VERSION
-        async with connected(simulator) as third:
-            assert await third.ask("Version 1.0") == VERSION
-
-
-async def test_a_fault_affects_later_connections_too() -> None:
-    async with playing() as (simulator, _):
-        simulator.faults.begin(ReplyText(form="echo"))
-        async with connected(simulator) as second:
-            assert await second.ask("Version 1.0") == (COMMAND, b"Version 1.0")
-
-
-async def test_a_fault_ends_after_its_duration(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "gateway.simulator")
+async def test_merged_packets_come_in_one_segment() -> None:
     async with playing() as (simulator, client):
-        fault = simulator.faults.begin(MissingAcknowledgements(for_s=0.01))
-        await fault.ended.wait()
-        assert await client.ask("Version 1.0") == VERSION
-    messages = [message for message in caplog.messages if message.startswith("Fault")]
-    assert messages == [
-        "Fault begins: missing_acknowledgements,for_s=0.01",
-        "Fault ends: missing_acknowledgements,for_s=0.01 (happened 0 times so far)",
-    ]
-
-
-async def test_planned_faults_happen_as_often_as_times_allows(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "gateway.simulator")
-    async with playing() as (simulator, client):
-        simulator.faults.play(
-            [
-                Undersize(every_s=0.01, times=4),
-                ReplyText(form="echo", at_s=0, times=2),
-                Garbage(at_s=600),
-                Restart(at_s=600),
-            ]
-        )
-        assert await client.exactly(4 * 8) == struct.pack(">II", 0, DATA) * 4
-        assert await client.ask("Version 1.0") == (COMMAND, b"Version 1.0")
-        assert await client.ask("Version 1.0") == (COMMAND, b"Version 1.0")
-        assert await client.ask("Version 1.0") == VERSION
+        simulator.faults.begin(Merge(window_ms=50))
+        await client.ask("StreamFrames 3D")
+        assert consecutive(await client.frames(200))
+        assert client.segments_received() < 100
         await clear_and_check(simulator, client)
-    assert caplog.messages.count("Fault: undersize,every_s=0.01,times=4") == 4
-    assert "garbage" not in caplog.text
 
 
-async def test_a_repeated_fault_begins_again_after_its_end(caplog: pytest.LogCaptureFixture) -> None:
-    caplog.set_level(logging.INFO, "gateway.simulator")
-    async with playing() as (simulator, _):
-        simulator.faults.play([Delay(every_s=0.02, for_s=0.01)])
-        await until(lambda: caplog.text.count("Fault begins") >= 3)
-    begun_and_ended = [message.split()[1] for message in caplog.messages if message.startswith("Fault")]
-    assert begun_and_ended[:4] == ["begins:", "ends:", "begins:", "ends:"]
+async def test_a_cut_ends_a_connection_within_a_packet() -> None:
+    async with playing() as (simulator, client):
+        await client.ask("StreamFrames 3D")
+        simulator.faults.begin(Cut())
+        rest = await client.rest()
+        while len(rest) >= 8 and len(rest) >= (size := struct.unpack_from(">I", rest)[0]):
+            rest = rest[size:]
+        assert len(rest) > 8
+        async with connected(simulator) as again:
+            assert await again.ask("Version 1.0") == VERSION
+
+
+async def test_a_cut_can_be_a_reset() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(Cut(reset=True))
+        with pytest.raises(ConnectionResetError):
+            await client.rest()
+
+
+async def test_a_half_open_server_accepts_clients_but_neither_reads_nor_writes() -> None:
+    async with playing() as (simulator, client):
+        await client.ask("StreamFrames 3D")
+        frames = await client.frames(5)
+        half_open = simulator.faults.begin(HalfOpen())
+        async with connected(simulator) as other:
+            other.send(command("Version 1.0"))
+            client.send(command("SendParameters General"))
+            await until(
+                lambda: waiting_bytes(simulator) == len(command("Version 1.0SendParameters General")) + 8
+            )
+            await until(lambda: half_open.num_happened > 50)
+            assert not connection_with(simulator, 1).transport.is_reading()
+
+            await simulator.faults.clear()
+
+            assert await other.read() == VERSION
+        while (reply := await client.read())[0] == DATA:
+            frames.append(components_in(reply[1]))
+        assert reply[0] == XML
+        frames += await client.frames(5)
+        assert np.diff(numbers(frames)).max() > 40
+        await until(lambda: len(simulator.connections) == 1)
+        await clear_and_check(simulator, client)
+
+
+def connection_with(simulator: Simulator, number: int) -> ClientConnection:
+    [connection] = [c for c in simulator.connections if c.number == number]
+    return connection
+
+
+async def test_bye_is_answered_before_the_connection_ends_despite_any_delay() -> None:
+    async with playing() as (simulator, client):
+        simulator.faults.begin(Delay(delay_ms=NEVER_MS))
+        simulator.faults.begin(LateAcknowledgements(delay_ms=NEVER_MS))
+        client.send(command("Version 1.0"), command("Bye"))
+        assert packets_in(await client.rest()) == [VERSION, (COMMAND, b"bye")]
+
+
+# Any fault ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

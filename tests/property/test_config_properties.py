@@ -23,8 +23,8 @@ GATEWAY_YAML = yaml.safe_dump(yaml.safe_load((ROOT / "config" / "gateway.yaml").
 
 # The elements of YAML files, and texts that are difficult for parsers.
 PIECES = [
-    *("sources", "name", "host", "streams", "components", "rate", "zenoh", "config", "lcm", "url", "enabled"),
-    *(
+    *["sources", "name", "host", "streams", "components", "rate", "zenoh", "config", "lcm", "url", "enabled"],
+    *[
         "lab",
         "all",
         "3d",
@@ -40,7 +40,7 @@ PIECES = [
         "2026-99-99",
         "<<",
         "=",
-    ),
+    ],
     *(": ", "- ", "? ", ", ", "[", "]", "{", "}", "\n", "\n  ", "\t", "# ", "---\n", "...\n", "%YAML 1.1\n"),
     *(
         "&a ",
@@ -103,7 +103,7 @@ SOURCES = st.builds(
 SETTINGS = st.builds(
     make_settings,
     sources=st.lists(
-        SOURCES, min_size=1, max_size=3, unique_by=lambda source: topics.lcm_channel("", source.name)
+        SOURCES, min_size=1, max_size=2, unique_by=lambda source: topics.lcm_channel("", source.name)
     ).map(tuple),
     zenoh=st.builds(
         ZenohSettings,
@@ -128,7 +128,8 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @given(settings=SETTINGS)
 def test_written_settings_are_read_back(file: Path, settings: Settings) -> None:
-    file.write_text(yaml.safe_dump(settings.model_dump(mode="json")), encoding="utf-8")
+    values = settings.model_dump(mode="json")
+    file.write_text(yaml.dump(values, Dumper=yaml.CSafeDumper), encoding="utf-8")
     assert load(file) == settings
 
 

@@ -3,7 +3,7 @@ import struct
 from hypothesis import given
 from hypothesis import strategies as st
 
-from gateway.messages.encode import MESSAGE_TYPES, encode_message
+from gateway.messages.encode import encode_message
 from gateway.messages.stamp import Stamp
 from gateway.rtc3d.components import Component, ComponentType
 from gateway.rtc3d.frames import split_frame
@@ -30,14 +30,8 @@ words = st.integers(0, 2**32 - 1) | st.sampled_from(ODD_FLOATS)
 kinds = st.sampled_from(ComponentType)
 
 
-def survives_python(word: int) -> bool:
-    """Return whether a Python float keeps the bits. CPython makes signalling NaNs quiet."""
-    bits = struct.pack(">I", word)
-    return struct.pack(">f", *struct.unpack(">f", bits)) == bits
-
-
 @st.composite
-def word_lists(draw: st.DrawFn, kind: ComponentType, words: st.SearchStrategy[int] = words) -> list[int]:
+def word_lists(draw: st.DrawFn, kind: ComponentType) -> list[int]:
     size = WORDS[kind] * draw(st.integers(0, 5))
     return draw(st.lists(words, min_size=size, max_size=size))
 
@@ -78,28 +72,6 @@ def test_both_byte_orders_give_the_same_message_bit_for_bit(
         ">qqqii", stamp.utime, stamp.capture_utime, sequence, stamp.session, stamp.parameters_version
     )
     assert big[8:] == ours + struct.pack(">iqi", frame_number, timestamp_us, count) + items
-
-
-@given(st.data(), kinds, int32s, int64s, stamps, int64s)
-def test_lcm_gen_decodes_and_encodes_a_message_to_the_same_bytes(
-    data: st.DataObject,
-    kind: ComponentType,
-    frame_number: int,
-    timestamp_us: int,
-    stamp: Stamp,
-    sequence: int,
-) -> None:
-    values = data.draw(word_lists(kind, words.filter(survives_python)))
-    message = encode_message(component(kind, frame_number, timestamp_us, values, "big"), stamp, sequence)
-    decoded = MESSAGE_TYPES[kind].decode(message)
-    assert (decoded.utime, decoded.capture_utime) == (stamp.utime, stamp.capture_utime)
-    assert (decoded.session, decoded.parameters_version) == (stamp.session, stamp.parameters_version)
-    assert (decoded.sequence, decoded.frame_number, decoded.timestamp) == (
-        sequence,
-        frame_number,
-        timestamp_us,
-    )
-    assert decoded.encode() == message
 
 
 @given(int64s, int64s, int32s, int32s, st.lists(st.integers(-2, 2) | int64s, min_size=1))

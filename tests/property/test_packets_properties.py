@@ -3,7 +3,7 @@ from hypothesis import strategies as st
 from hypothesis.strategies import SearchStrategy
 
 from gateway.errors import PacketError
-from gateway.rtc3d.packets import FilePiece, Packet, PacketReader, decode_text, encode_packet
+from gateway.rtc3d.packets import FilePiece, Packet, PacketReader, decode_text
 from tests.strategies import damaged, pieces_of
 
 LIMIT = 64
@@ -78,11 +78,6 @@ any_streams = (
 )
 
 
-@given(packets)
-def test_a_packet_is_encoded_as_size_type_and_body(packet: Packet) -> None:
-    assert encode_packet(packet.type, packet.body) == wire(packet)
-
-
 @given(packet_lists, st.data())
 def test_any_split_of_a_stream_gives_the_same_packets(packet_list: list[Packet], data: st.DataObject) -> None:
     reader = new_reader()
@@ -92,38 +87,6 @@ def test_any_split_of_a_stream_gives_the_same_packets(packet_list: list[Packet],
     assert with_whole_files(read) == (packet_list, b"")
     assert reader.error is None
     assert reader.buffered_bytes == 0
-
-
-@given(packet_lists)
-def test_a_stream_fed_byte_by_byte_gives_the_same_packets(packet_list: list[Packet]) -> None:
-    reader = new_reader()
-    read = []
-    for byte in stream_of(packet_list):
-        read += reader.feed(bytes([byte]))
-    assert with_whole_files(read) == (packet_list, b"")
-    assert reader.buffered_bytes == 0
-
-
-@settings(max_examples=300)
-@given(pieces(any_streams))
-def test_every_byte_is_returned_or_buffered_until_an_error(stream: list[bytes]) -> None:
-    reader = new_reader()
-    fed = returned = 0
-    is_in_file = False
-    for piece in stream:
-        after_error = reader.error is not None
-        read = reader.feed(piece)
-        fed += len(piece)
-        for packet in read:
-            returned += len(packet.body) if is_in_file else 8 + len(packet.body)
-            is_in_file = isinstance(packet, FilePiece) and not packet.is_last
-        if reader.error is None:
-            # The header of a file of which nothing else has arrived is neither returned nor buffered.
-            assert reader.buffered_bytes in {fed - returned, fed - returned - 8}
-            assert reader.buffered_bytes < LIMIT
-        else:
-            assert reader.buffered_bytes == 0
-        assert not (after_error and read)
 
 
 @settings(max_examples=300)

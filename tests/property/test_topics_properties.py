@@ -23,11 +23,6 @@ def test_a_label_can_be_read_back_from_its_key(label: str) -> None:
     assert unquote(chunk) == label or (label, chunk) == ("", "%")
 
 
-@given(labels, labels)
-def test_different_labels_have_different_keys(one: str, other: str) -> None:
-    assert (escape_key_chunk(one) == escape_key_chunk(other)) == (one == other)
-
-
 @given(st.from_regex(r"[A-Za-z0-9_]{1,16}", fullmatch=True), labels, labels)
 def test_any_label_gives_a_valid_lcm_channel(prefix: str, source: str, label: str) -> None:
     channel = lcm_channel(prefix, source, "6d", label)

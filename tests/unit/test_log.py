@@ -1,23 +1,28 @@
+"""Logging of failures, defects and repeated events: what is loud, what is hidden, and for how long."""
+
 import asyncio
 import logging
-import re
 from collections.abc import Iterator
 
 import pytest
 
-from gateway.log import (
-    FIELDS,
-    HOLD_S,
-    MAX_HOLD_S,
-    MAX_REPEATS,
-    DefectLog,
-    EventLog,
-    FailureLog,
-    log_fields,
-)
+from gateway.log import FIELDS, HOLD_S, MAX_HOLD_S, MAX_REPEATS, DefectLog, EventLog, FailureLog, log_fields
 from gateway.service.log_format import ContextFilter
 
 LOGGER = logging.getLogger("tests.failures")
+
+
+class Clock:
+    """Replaces the clock of gateway.log."""
+
+    now_s = 0.0
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    clock = Clock()
+    monkeypatch.setattr("gateway.log.monotonic", lambda: clock.now_s)
+    return clock
 
 
 @pytest.fixture(autouse=True)
@@ -25,94 +30,132 @@ def _every_level(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.DEBUG, LOGGER.name)
 
 
-def levels(caplog: pytest.LogCaptureFixture) -> list[int]:
-    return [record.levelno for record in caplog.records]
+def logged(caplog: pytest.LogCaptureFixture) -> list[tuple[str, str]]:
+    return [(record.levelname, record.message) for record in caplog.records]
 
 
-def test_the_first_failure_is_a_warning_with_subject_and_text(caplog: pytest.LogCaptureFixture) -> None:
-    FailureLog(LOGGER, "lab").failed("no answer; check the cable")
-    assert caplog.record_tuples == [(LOGGER.name, logging.WARNING, "lab: no answer; check the cable")]
+# Failures -------------------------------------------------------------------------------------
 
 
-def test_repeats_are_logged_as_debug_with_a_count(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failure_is_loud_once_and_its_recovery_too(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+    """What fails for hours must not fill the log, but its begin and its end must be there."""
     failures = FailureLog(LOGGER, "lab")
+    failures.recovered("streaming")
+    is_failing = [failures.failing]
+    assert logged(caplog) == []
     for _ in range(3):
-        failures.failed("no answer")
-    assert levels(caplog) == [logging.WARNING, logging.DEBUG, logging.DEBUG]
-    assert caplog.messages[1:] == [
-        "lab: no answer (failure 2 in a row)",
-        "lab: no answer (failure 3 in a row)",
+        failures.failed("no answer; check the cable")
+        clock.now_s += 1.5
+    is_failing.append(failures.failing)
+    failures.recovered("streaming")
+    failures.recovered("streaming")
+    assert [*is_failing, failures.failing] == [False, True, False]
+    assert logged(caplog) == [
+        ("WARNING", "lab: no answer; check the cable"),
+        ("DEBUG", "lab: no answer; check the cable (failure 2 in a row)"),
+        ("DEBUG", "lab: no answer; check the cable (failure 3 in a row)"),
+        ("INFO", "lab: streaming, after 4.5 s and 3 failures"),
     ]
 
 
-def test_recovery_is_logged_with_the_duration_and_failure_count(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    failures = FailureLog(LOGGER, "lab")
-    failures.failed("no answer")
-    failures.failed("no answer")
-    failures.recovered("streaming")
-    assert levels(caplog)[-1] == logging.INFO
-    assert re.fullmatch(r"lab: streaming, after \d+\.\d s and 2 failures", caplog.messages[-1])
-
-
-def test_recovery_is_not_logged_if_nothing_failed(caplog: pytest.LogCaptureFixture) -> None:
-    failures = FailureLog(LOGGER, "lab")
-    failures.recovered("streaming")
-    failures.failed("no answer")
-    failures.recovered("streaming")
-    failures.recovered("streaming")
-    assert levels(caplog) == [logging.WARNING, logging.INFO]
-
-
-def test_success_is_always_logged_and_ends_a_failure(caplog: pytest.LogCaptureFixture) -> None:
+def test_success_is_always_logged_and_ends_a_failure(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+    """Each connection is logged, and a new failure after it is loud again."""
     failures = FailureLog(LOGGER, "lab")
     failures.succeeded("streaming")
-    failures.failed("no answer")
-    failures.succeeded("streaming")
-    failures.succeeded("streaming")
-    assert levels(caplog) == [logging.INFO, logging.WARNING, logging.INFO, logging.INFO]
-    assert caplog.messages[0] == caplog.messages[3] == "lab: streaming"
-    assert re.fullmatch(r"lab: streaming, after \d+\.\d s and 1 failure", caplog.messages[2])
-
-
-def test_a_failure_after_recovery_is_a_warning_again(caplog: pytest.LogCaptureFixture) -> None:
-    failures = FailureLog(LOGGER, "lab")
     for _ in range(2):
         failures.failed("no answer")
-        failures.recovered("streaming")
-    assert levels(caplog) == [logging.WARNING, logging.INFO] * 2
-
-
-def test_failing_is_true_from_failure_to_recovery() -> None:
-    failures = FailureLog(LOGGER, "lab")
-    values = [failures.failing]
-    failures.failed("no answer")
-    values.append(failures.failing)
-    failures.recovered("streaming")
-    values.append(failures.failing)
-    assert values == [False, True, False]
+        clock.now_s += 1.0
+        failures.succeeded("streaming")
+    assert logged(caplog) == [
+        ("INFO", "lab: streaming"),
+        *[("WARNING", "lab: no answer"), ("INFO", "lab: streaming, after 1.0 s and 1 failure")] * 2,
+    ]
 
 
 def test_intermittent_failures_are_over_after_the_hold_time_without_one(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    clock: Clock, caplog: pytest.LogCaptureFixture
 ) -> None:
-    now_s = 0.0
-    monkeypatch.setattr("gateway.log.monotonic", lambda: now_s)
+    """A link that loses every other packet is one failure, not a thousand."""
     failures = FailureLog(LOGGER, "lab", hold_s=5.0)
     for second in range(4):
-        now_s = float(second)
+        clock.now_s = float(second)
         failures.failed("too large")
         failures.recovered("sending")
-    assert levels(caplog) == [logging.WARNING, *[logging.DEBUG] * 3]
-    assert failures.failing
-    now_s = 8.0
+    clock.now_s = 7.9
     failures.recovered("sending")
+    is_failing = [failures.failing]
+    clock.now_s = 8.0
+    failures.recovered("sending")
+    assert [*is_failing, failures.failing] == [True, False]
+    assert [level for level, _ in logged(caplog)] == ["WARNING", "DEBUG", "DEBUG", "DEBUG", "INFO"]
     assert caplog.messages[-1] == "lab: sending, after 8.0 s and 4 failures"
-    assert not failures.failing
 
 
-# Fields --------------------------------------------------------------------------------------
+@pytest.mark.parametrize(
+    ("pause_s", "holds_s"), [(MAX_HOLD_S - 1, [5, 10, 20, 40, 60, 60]), (MAX_HOLD_S, [5, 5, 5])]
+)
+def test_the_hold_time_doubles_while_failures_come_back_soon(
+    clock: Clock, pause_s: float, holds_s: list[float]
+) -> None:
+    """The wait ends at a minute, and starts again after a minute without a failure."""
+    failures = FailureLog(LOGGER, "lab", HOLD_S)
+    for hold_s in holds_s:
+        failures.failed("closed")
+        clock.now_s += hold_s - 0.1
+        failures.recovered("streaming")
+        is_failing = [failures.failing]
+        clock.now_s += 0.1
+        failures.recovered("streaming")
+        assert [*is_failing, failures.failing] == [True, False], hold_s
+        clock.now_s += pause_s
+
+
+@pytest.mark.usefixtures("clock")
+def test_failures_that_come_and_go_are_logged_some_times(caplog: pytest.LogCaptureFixture) -> None:
+    """The recovery of a hidden failure is hidden, too."""
+    failures = FailureLog(LOGGER, "lab")
+    for _ in range(100):
+        failures.failed("no router")
+        failures.recovered("connected")
+    assert [level for level, _ in logged(caplog)] == [
+        *["WARNING", "INFO"] * MAX_REPEATS,
+        *["DEBUG"] * 2 * (100 - MAX_REPEATS),
+    ]
+
+
+# Events ---------------------------------------------------------------------------------------
+
+
+def test_an_event_is_loud_some_times_in_five_minutes(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+    """The window slides: after it, as many are loud again as are older, and the next says what was hidden."""
+    events = EventLog(LOGGER, "lab")
+    for _ in range(MAX_REPEATS):
+        events.log(logging.WARNING, "renamed", "renamed")
+        clock.now_s += 10.0  # at 0, 10, 20, 30 and 40 s
+    for now_s in (299.9, 300.0, 300.1, 310.0):
+        clock.now_s = now_s
+        events.log(logging.WARNING, "renamed", "renamed")
+    events.log(logging.INFO, "changed", "changed")
+    assert logged(caplog)[MAX_REPEATS:] == [
+        ("DEBUG", "lab: renamed"),
+        ("WARNING", "lab: renamed (1 more like this since the last one)"),
+        ("DEBUG", "lab: renamed"),
+        ("WARNING", "lab: renamed (1 more like this since the last one)"),
+        ("INFO", "lab: changed"),
+    ]
+    assert {level for level, _ in logged(caplog)[:MAX_REPEATS]} == {"WARNING"}
+
+
+@pytest.mark.usefixtures("clock")
+def test_a_kind_of_event_can_have_its_own_number(caplog: pytest.LogCaptureFixture) -> None:
+    """Some are worth one line only."""
+    events = EventLog(LOGGER, "lab")
+    for _ in range(3):
+        events.log(logging.WARNING, "late", "late", most=1)
+    assert [level for level, _ in logged(caplog)] == ["WARNING", "DEBUG", "DEBUG"]
+
+
+# Fields ---------------------------------------------------------------------------------------
 
 
 class Collector(logging.Handler):
@@ -139,6 +182,7 @@ def fields(record: logging.LogRecord) -> dict[str, str]:
 
 
 def test_records_have_the_fields_that_are_set_and_no_others(records: list[logging.LogRecord]) -> None:
+    """Blocks nest, and what they set ends with them."""
     LOGGER.warning("before")
     with log_fields(source="lab"):
         with log_fields(stream="3d", peer="192.0.2.20:3020"):
@@ -156,6 +200,8 @@ def test_records_have_the_fields_that_are_set_and_no_others(records: list[loggin
 async def test_tasks_and_callbacks_inherit_the_fields_of_the_code_that_starts_them(
     records: list[logging.LogRecord],
 ) -> None:
+    """Two sources run in one loop, and their records must not be mixed up."""
+
     async def run(source: str) -> None:
         with log_fields(source=source):
             asyncio.get_running_loop().call_soon(LOGGER.warning, "callback")
@@ -163,15 +209,18 @@ async def test_tasks_and_callbacks_inherit_the_fields_of_the_code_that_starts_th
             LOGGER.warning("task")
 
     await asyncio.gather(run("hall"), run("lab"))
-    logged = [(fields(record)["source"], record.getMessage()) for record in records]
-    assert sorted(logged) == [("hall", "callback"), ("hall", "task"), ("lab", "callback"), ("lab", "task")]
+    found = [(fields(record)["source"], record.getMessage()) for record in records]
+    assert sorted(found) == [("hall", "callback"), ("hall", "task"), ("lab", "callback"), ("lab", "task")]
+
+
+# Defects --------------------------------------------------------------------------------------
 
 
 def test_a_defect_is_an_error_with_its_traceback_once_for_each_place(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    caplog.set_level(logging.DEBUG)
-    defects = DefectLog(logging.getLogger("test"), "lab")
+    """A defect that every frame meets is reported, and does not fill the disk."""
+    defects = DefectLog(LOGGER, "lab")
     for text in ("one", "two", "3"):
         try:
             number = int(text)
@@ -187,71 +236,8 @@ def test_a_defect_is_an_error_with_its_traceback_once_for_each_place(
     assert again.message.endswith("'two'; report this with the log (again)")
 
 
-# What comes again and again ------------------------------------------------------------------
-
-
-class Clock:
-    """Replaces the clock of gateway.log."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.now_s = 0.0
-        monkeypatch.setattr("gateway.log.monotonic", lambda: self.now_s)
-
-
-def test_an_event_is_logged_some_times_and_then_as_debug(caplog: pytest.LogCaptureFixture) -> None:
-    events = EventLog(LOGGER, "lab")
-    for _ in range(3 * MAX_REPEATS):
-        events.log(logging.WARNING, "renamed", "renamed")
-    events.log(logging.INFO, "changed", "changed")
-    assert levels(caplog) == [
-        *[logging.WARNING] * MAX_REPEATS,
-        *[logging.DEBUG] * 2 * MAX_REPEATS,
-        logging.INFO,
-    ]
-
-
-def test_the_next_loud_event_says_how_many_were_hidden(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = Clock(monkeypatch)
-    events = EventLog(LOGGER, "lab")
-    for _ in range(MAX_REPEATS + 3):
-        events.log(logging.INFO, "renamed", "renamed")
-    clock.now_s = 600.0
-    for _ in range(2):
-        events.log(logging.INFO, "renamed", "renamed")
-    assert caplog.messages[-2:] == ["lab: renamed (3 more like this since the last one)", "lab: renamed"]
-
-
-def test_failures_that_come_and_go_are_logged_some_times(caplog: pytest.LogCaptureFixture) -> None:
-    failures = FailureLog(LOGGER, "lab")
-    for _ in range(100):
-        failures.failed("no router")
-        failures.recovered("connected")
-    assert levels(caplog) == [
-        *[logging.WARNING, logging.INFO] * MAX_REPEATS,
-        *[logging.DEBUG] * 2 * (100 - MAX_REPEATS),
-    ]
-
-
-def test_the_hold_time_grows_while_failures_come_back_soon(
-    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    clock = Clock(monkeypatch)
-    failures = FailureLog(LOGGER, "lab", HOLD_S)
-    for second in range(3600):
-        clock.now_s = float(second)
-        if second % 20 == 0:
-            failures.failed("closed")
-        failures.recovered("streaming")
-    loud = [record for record in caplog.records if record.levelno > logging.DEBUG]
-    assert len(loud) == 5
-    clock.now_s += MAX_HOLD_S
-    failures.recovered("streaming")
-    assert not failures.failing
-
-
 def test_a_log_of_defects_can_continue_a_former_one(caplog: pytest.LogCaptureFixture) -> None:
+    """After a reload of the configuration, known defects are still known."""
     former = DefectLog(LOGGER, "lab")
     logs = [former, DefectLog(LOGGER, "lab (3d)", former)]
     for defects in logs:
@@ -259,5 +245,5 @@ def test_a_log_of_defects_can_continue_a_former_one(caplog: pytest.LogCaptureFix
             int("x")
         except ValueError as defect:
             defects.log(defect)
-    assert levels(caplog) == [logging.ERROR, logging.DEBUG]
+    assert [level for level, _ in logged(caplog)] == ["ERROR", "DEBUG"]
     assert [defects.count for defects in logs] == [2, 2]

@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import given, settings
 from jsonschema import Draft202012Validator
 
 from gateway.config.schema import schema_text
@@ -20,10 +20,6 @@ def test_the_shipped_schema_is_current() -> None:
     assert shipped == schema_text(MODEL), "rtc3d-gateway config schema > config/gateway.schema.json"
 
 
-def test_the_schema_is_valid() -> None:
-    Draft202012Validator.check_schema(json.loads(schema_text(MODEL)))
-
-
 @pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.yaml")), ids=lambda path: path.name)
 def test_shipped_configurations_name_and_match_the_schema(path: Path) -> None:
     text = path.read_text(encoding="utf-8")
@@ -31,9 +27,11 @@ def test_shipped_configurations_name_and_match_the_schema(path: Path) -> None:
     VALIDATOR.validate(yaml.safe_load(text))
 
 
+@settings(max_examples=20)  # the validator takes 15 ms for each
 @given(SETTINGS)
-def test_valid_settings_match_the_schema(settings: Settings) -> None:
-    VALIDATOR.validate(settings.model_dump(mode="json"))
+def test_valid_settings_match_the_schema(configuration: Settings) -> None:
+    """An editor must not mark what the gateway accepts."""
+    VALIDATOR.validate(configuration.model_dump(mode="json"))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from typing import Any
 import pytest
 
 from gateway.config.environment import variable_name
-from gateway.config.secrets import find_secrets, mask_secrets, mask_secrets_in_text
+from gateway.config.secrets import find_secrets, mask_secrets
 from gateway.config.show import shown_configuration
 from gateway.errors import ConfigError
 from gateway.outputs.zenoh.config import zenoh_reason
@@ -209,8 +209,3 @@ def test_a_link_that_fails_is_told_without_its_key(caplog: pytest.LogCaptureFixt
         assert "geheim" not in output.health().problem + caplog.text
     finally:
         output.close()
-
-
-def test_texts_without_secrets_stay() -> None:
-    text = "tls/lab:7447#so_sndbuf=1, https://lab/a@b and a:b@c, password"
-    assert mask_secrets_in_text(text) == text

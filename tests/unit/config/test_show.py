@@ -94,11 +94,3 @@ def test_unusual_keys_and_values_are_quoted(file: Path) -> None:
     file.write_text(FILE.replace("mode: client", inline), encoding="utf-8")
     values = yaml.safe_load(shown_configuration(read(file, {})))
     assert values["zenoh"]["config"]["metadata"] == metadata
-
-
-def test_comments_are_aligned_except_after_long_lines(file: Path) -> None:
-    lines = shown_configuration(read(file, {})).splitlines()
-    parts = [line.partition("  # ")[0].rstrip() for line in lines if "  # " in line]
-    columns = [line.index("# ") for line in lines if "  # " in line]
-    assert {column for column, part in zip(columns, parts, strict=True) if len(part) <= 48} == {50}
-    assert all(column == len(part) + 2 for column, part in zip(columns, parts, strict=True) if len(part) > 48)

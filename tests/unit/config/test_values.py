@@ -1,6 +1,11 @@
+"""Single values of the configuration: what each type accepts, and the error of everything else."""
+
+from typing import Any
+
 import pytest
 
-from gateway.config.settings import SourceSettings, StreamSettings
+from gateway.config.section import Section
+from gateway.config.settings import MetricsSettings, SourceSettings, SpoolSettings, StreamSettings
 from gateway.config.words import describe
 from gateway.outputs.lcm.settings import DEFAULT_LCM_URL, LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
@@ -9,127 +14,108 @@ from gateway.rtc3d.components import WIRE_ORDER, ComponentType
 from tests.settings import mistakes, source
 
 MARKERS, TOOLS, ANALOG = ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.ANALOG
+HERTZ = "expected a number of frames per second above 0, up to 1000000"
+WHOLE = "expected a whole number from 1 to 1000000"
+FORMS = "expected all, {frequency_hz: 60} or {divisor: 4}"
+COMPONENTS = "3d, 6d, analog, force or event"
+
+
+def of_source(**values: Any) -> list[tuple[str, str]]:
+    return mistakes(SourceSettings, source(**values))
 
 
 @pytest.mark.parametrize(
-    ("port", "found"),
+    ("key", "accepted", "refused", "expected"),
     [
-        ("abc", "'abc'"),
-        ("3020", "'3020'"),
-        (0, "0"),
-        (-1, "-1"),
-        (65536, "65536"),
-        (True, "true"),
-        (3020.0, "3020.0"),
-        (None, "nothing"),
-        ([], "an empty list"),
-        ({"a": 1}, "a mapping"),
+        (
+            "port",
+            [1, 65535],
+            ["abc", "3020", 0, -1, 65536, True, 3020.0, None, [], {"a": 1}],
+            "a whole number from 1 to 65535",
+        ),
+        *(
+            (
+                key,
+                [0.001, 5, 86400],
+                [0, 0.0009, -1, True, "2", float("nan"), float("inf"), 10**400, 86401, None],
+                "a number of seconds from 0.001 to 86400",
+            )
+            for key in ("connect_timeout_s", "reply_timeout_s", "stall_timeout_s")
+        ),
+        *(
+            (
+                key,
+                [1024, 2**32 - 1],
+                [1023, 2**32, 1e6, True, "16 MiB"],
+                "a whole number of bytes from 1024 to 4294967295",
+            )
+            for key in ("max_packet_bytes", "max_c3d_bytes")
+        ),
+        (
+            "parameters_interval_s",
+            [0, 0.1, 86400],
+            [0.05, 0.0999, -1, 86401, True, float("nan")],
+            "0 for never, or a number of seconds from 0.1 to 86400",
+        ),
     ],
 )
-def test_invalid_ports_are_refused(port: object, found: str) -> None:
-    assert mistakes(SourceSettings, source(port=port)) == [
-        ("port", f"found {found}; expected a whole number from 1 to 65535")
-    ]
+def test_numbers_within_their_limits(
+    key: str, accepted: list[float], refused: list[object], expected: str
+) -> None:
+    """The limits protect from typing errors, and a number in quotes or a switch is no number."""
+    for value in accepted:
+        assert getattr(SourceSettings.model_validate(source(**{key: value})), key) == value
+    for other in refused:
+        assert of_source(**{key: other}) == [(key, f"found {describe(other)}; expected {expected}")]
 
 
-@pytest.mark.parametrize("value", [0, -1, True, "2", float("nan"), float("inf"), 10**400, 86401, None])
-@pytest.mark.parametrize("key", ["connect_timeout_s", "reply_timeout_s", "stall_timeout_s"])
-def test_invalid_times_are_refused(key: str, value: object) -> None:
-    [(location, text)] = mistakes(SourceSettings, source(**{key: value}))
-    assert location == key
-    assert text.endswith("; expected a number of seconds from 0.001 to 86400")
-
-
-def test_an_integer_number_of_seconds_is_accepted() -> None:
-    assert SourceSettings.model_validate(source(stall_timeout_s=5)).stall_timeout_s == 5.0
-
-
-@pytest.mark.parametrize("value", [1023, 2**32, 1e6, True, "16 MiB"])
-def test_limits_outside_the_size_field_are_refused(value: object) -> None:
-    [(_, text)] = mistakes(SourceSettings, source(max_c3d_bytes=value))
-    assert text.endswith("; expected a whole number of bytes from 1024 to 4294967295")
-
-
-@pytest.mark.parametrize("value", [1, 0, "yes", None])
-def test_a_switch_must_be_true_or_false(value: object) -> None:
-    assert mistakes(ZenohSettings, {"express": value}) == [
-        ("express", f"found {describe(value)}; expected true or false")
-    ]
+def test_a_switch_must_be_true_or_false() -> None:
+    """YAML has many words for both; a wrong one must not switch anything."""
+    for value in (1, 0, "yes", None):
+        error = f"found {describe(value)}; expected true or false"
+        assert mistakes(ZenohSettings, {"express": value}) == [("express", error)]
 
 
 @pytest.mark.parametrize(
     "host",
     [
-        "lab",
-        "ndi-3.example.org.",
-        "192.0.2.20",
-        "2001:db8::1",
-        "fe80::1%eth0",
-        "fe80::1%2",
-        "rt_server",
-        "bücher.example",
-        "3d.lab",
-        "a" * 63,
-        ".".join(["a" * 63] * 3 + ["a" * 61]),  # 253 characters
+        *("lab", "ndi-3.example.org.", "192.0.2.20", "2001:db8::1", "fe80::1%eth0", "fe80::1%2", "rt_server"),
+        *("bücher.example", "3d.lab", "a" * 63, ".".join(["a" * 63] * 3 + ["a" * 61])),  # 253 characters
     ],
 )
 def test_host_names_and_addresses_are_accepted(host: str) -> None:
+    """Whatever a name server or the system takes for a host."""
     assert SourceSettings.model_validate(source(host=host)).host == host
 
 
 @pytest.mark.parametrize(
     "host",
     [
-        "",
-        "192.0.2.300",
-        "192.0.2",
-        "192.0.2.20:3020",
-        "tcp://lab",
-        "a b",
-        "a..b",
-        "a" * 64,
-        "lab\n",
-        "lab\0",
-        "lab\x1b[31m",
-        "lab\udc80",
-        "a." * 127,
-        "ü" * 63,  # a label of more than 63 characters in IDNA
-        ".".join(["ü" * 50] * 5),  # a name of more than 253 in IDNA
-        ".lab",
-        "lab..",
-        "127.1",  # what the resolver takes for numbers
-        "2130706433",
-        "0x7f.1",
-        "127.0.0.0x1",
-        "0177.0.0.1",
-        "１２７.０.０.１",
-        "fe80::1%",
-        "fe80::1%eth 0",
-        "fe80::1%eth0\n",
-        "fe80::1%eth0%1",
+        *("", "192.0.2.300", "192.0.2", "192.0.2.20:3020", "tcp://lab", "a b", "a..b", "a" * 64, "a." * 127),
+        *("lab\n", "lab\0", "lab\x1b[31m", "lab\udc80", ".lab", "lab.."),
+        *("ü" * 63, ".".join(["ü" * 50] * 5)),  # too long in IDNA: a label, a name
+        # what the resolver takes for numbers
+        *("127.1", "2130706433", "0x7f.1", "127.0.0.0x1", "0177.0.0.1", "１２７.０.０.１"),
+        *("fe80::1%", "fe80::1%eth 0", "fe80::1%eth0\n", "fe80::1%eth0%1", "192.0.2.20%eth0"),
         "fe80::1%an-interface-with-a-long-name",
-        "192.0.2.20%eth0",
     ],
 )
 def test_invalid_hosts_are_refused(host: str) -> None:
-    [(location, text)] = mistakes(SourceSettings, source(host=host))
+    """A typing error is reported at the start, not by a name server a minute later."""
+    [(location, text)] = of_source(host=host)
     assert location == "host"
     assert text.endswith("; expected a host name or an IP address; the port has its own key")
 
 
-def test_the_error_for_a_number_as_name_suggests_quotes() -> None:
-    assert mistakes(SourceSettings, source(name=5)) == [
-        (
-            "name",
-            "found 5 (use quotes to make it text); expected 1 to 24 of the letters A to Z and a to z, "
-            "digits, '_' and '-'",
-        )
-    ]
-
-
-@pytest.mark.parametrize("name", ["", "a b", "a/b", "a.b", "é", "lab\n", "a" * 25])
-def test_names_that_do_not_fit_keys_and_channels_are_refused(name: str) -> None:
-    assert [location for location, _ in mistakes(SourceSettings, source(name=name))] == ["name"]
+def test_names_that_do_not_fit_keys_and_channels_are_refused() -> None:
+    """A name is part of Zenoh keys and LCM channels; the hint helps who writes a number."""
+    for name in ("", "a b", "a/b", "a.b", "é", "lab\n", "a" * 25):
+        assert [location for location, _ in of_source(name=name)] == ["name"]
+    [(_, text)] = of_source(name=5)
+    assert text == (
+        "found 5 (use quotes to make it text); "
+        "expected 1 to 24 of the letters A to Z and a to z, digits, '_' and '-'"
+    )
 
 
 @pytest.mark.parametrize(
@@ -143,34 +129,23 @@ def test_names_that_do_not_fit_keys_and_channels_are_refused(name: str) -> None:
     ],
 )
 def test_rates_are_accepted_in_three_forms(value: object, rate: Rate) -> None:
+    """They are those of StreamFrames (§5.3.5)."""
     assert StreamSettings.model_validate({"rate": value}).rate == rate
 
 
 @pytest.mark.parametrize(
     ("value", "location", "text"),
     [
-        ("fast", "rate", "found 'fast'; expected all, {frequency_hz: 60} or {divisor: 4}"),
-        (60, "rate", "found 60; expected all, {frequency_hz: 60} or {divisor: 4}"),
-        (None, "rate", "found nothing; expected all, {frequency_hz: 60} or {divisor: 4}"),
-        ({"hz": 60}, "rate", "found a mapping; expected all, {frequency_hz: 60} or {divisor: 4}"),
-        (
-            {"frequency_hz": 0},
-            "rate.frequency_hz",
-            "found 0; expected a number of frames per second above 0, up to 1000000",
-        ),
-        (
-            {"frequency_hz": "60"},
-            "rate.frequency_hz",
-            "found '60'; expected a number of frames per second above 0, up to 1000000",
-        ),
-        (
-            {"frequency_hz": float("inf")},
-            "rate.frequency_hz",
-            "found inf; expected a number of frames per second above 0, up to 1000000",
-        ),
-        ({"divisor": 0}, "rate.divisor", "found 0; expected a whole number from 1 to 1000000"),
-        ({"divisor": 1.5}, "rate.divisor", "found 1.5; expected a whole number from 1 to 1000000"),
-        ({"divisor": True}, "rate.divisor", "found true; expected a whole number from 1 to 1000000"),
+        ("fast", "rate", f"found 'fast'; {FORMS}"),
+        (60, "rate", f"found 60; {FORMS}"),
+        (None, "rate", f"found nothing; {FORMS}"),
+        ({"hz": 60}, "rate", f"found a mapping; {FORMS}"),
+        ({"frequency_hz": 0}, "rate.frequency_hz", f"found 0; {HERTZ}"),
+        ({"frequency_hz": "60"}, "rate.frequency_hz", f"found '60'; {HERTZ}"),
+        ({"frequency_hz": float("inf")}, "rate.frequency_hz", f"found inf; {HERTZ}"),
+        ({"divisor": 0}, "rate.divisor", f"found 0; {WHOLE}"),
+        ({"divisor": 1.5}, "rate.divisor", f"found 1.5; {WHOLE}"),
+        ({"divisor": True}, "rate.divisor", f"found true; {WHOLE}"),
         (
             {"divisor": 2, "divisors": 2},
             "rate.divisors",
@@ -184,6 +159,7 @@ def test_rates_are_accepted_in_three_forms(value: object, rate: Rate) -> None:
     ],
 )
 def test_other_rates_are_refused(value: object, location: str, text: str) -> None:
+    """The error is at the innermost key that is wrong."""
     assert mistakes(StreamSettings, {"rate": value}) == [(location, text)]
 
 
@@ -198,46 +174,79 @@ def test_other_rates_are_refused(value: object, location: str, text: str) -> Non
     ],
 )
 def test_components_are_kept_in_wire_order(value: object, components: tuple[ComponentType, ...]) -> None:
+    """So that equal choices are equal, however they are written."""
     assert StreamSettings.model_validate({"components": value}).components == components
 
 
 @pytest.mark.parametrize(
     ("value", "location", "text"),
     [
-        (
-            [],
-            "components",
-            "found an empty list; expected a list of 3d, 6d, analog, force or event, or [all]",
-        ),
-        ("all", "components", "found 'all'; expected a list of 3d, 6d, analog, force or event, or [all]"),
-        (None, "components", "found nothing; expected a list of 3d, 6d, analog, force or event, or [all]"),
+        ([], "components", f"found an empty list; expected a list of {COMPONENTS}, or [all]"),
+        ("all", "components", f"found 'all'; expected a list of {COMPONENTS}, or [all]"),
+        (None, "components", f"found nothing; expected a list of {COMPONENTS}, or [all]"),
         (["all", "3d"], "components.0", "found 'all' beside other components; expected [all] alone"),
         (["3d", "6d", "3d"], "components.2", "found '3d' twice; expected each component once"),
-        (
-            ["3d", "Events"],
-            "components.1",
-            "found 'Events' (did you mean 'event'?); expected 3d, 6d, analog, force or event",
-        ),
-        (["markers"], "components.0", "found 'markers'; expected 3d, 6d, analog, force or event"),
-        ([1], "components.0", "found 1; expected 3d, 6d, analog, force or event"),
+        (["3d", "Events"], "components.1", f"found 'Events' (did you mean 'event'?); expected {COMPONENTS}"),
+        (["markers"], "components.0", f"found 'markers'; expected {COMPONENTS}"),
+        ([1], "components.0", f"found 1; expected {COMPONENTS}"),
     ],
 )
 def test_other_components_are_refused(value: object, location: str, text: str) -> None:
+    """The error is at the item that is wrong, and says which components there are."""
     assert mistakes(StreamSettings, {"components": value}) == [(location, text)]
 
 
-@pytest.mark.parametrize("prefix", ["mocap", "a/b", "hall-2/mocap.x", "überlab"])
-def test_a_key_prefix_can_have_several_chunks(prefix: str) -> None:
-    assert ZenohSettings.model_validate({"prefix": prefix}).prefix == prefix
+def test_max_rates_are_those_of_components() -> None:
+    """A limit for a component that does not exist would do nothing, unnoticed."""
+    assert LcmSettings(max_rate_hz={MARKERS: 60.0}).max_rate_hz == {MARKERS: 60.0}
+    assert LcmSettings.model_validate({"max_rate_hz": {"3d": 60, "analog": 0.5}}).max_rate_hz == {
+        MARKERS: 60.0,
+        ANALOG: 0.5,
+    }
+    for value, error in (
+        ({"3d": 0}, ("max_rate_hz.3d", f"found 0; {HERTZ}")),
+        ({"3D": 60}, ("max_rate_hz", f"found '3D' (did you mean '3d'?); expected {COMPONENTS}")),
+        ([60], ("max_rate_hz", "found a list; expected a mapping such as {3d: 60}, or {}")),
+    ):
+        assert mistakes(LcmSettings, {"max_rate_hz": value}) == [error]
 
 
 @pytest.mark.parametrize(
-    "prefix", ["", "/a", "a/", "a//b", "*", "a/**", "a$*", "a#", "a?b", "a b", "a\tb", "a\x07b", "a" * 129]
+    ("section", "key", "accepted", "refused", "expected"),
+    [
+        (
+            ZenohSettings,
+            "prefix",
+            ["mocap", "a/b", "hall-2/mocap.x", "überlab", "a" * 128],
+            ["", "/a", "a/", "a//b", "*", "a/**", "a$*", "a#", "a?b", "a b", "a\tb", "a\x07b", "a" * 129],
+            "expected a Zenoh key of at most 128 characters",
+        ),
+        (
+            LcmSettings,
+            "url",
+            [DEFAULT_LCM_URL, "udpm://?ttl=1", "mpudpm://", "memq://", "tcpq://lab:7700", "file:///tmp/x@y"],
+            [
+                *("", "udpm", "udpm:", "239.255.76.67:7667", "UDPM://", "zmq://x", "udpm://a b", "udpm://\n"),
+                *("tcpq://me@lab", "tcpq://a..b:7700", "tcpq://127.1:7700"),
+            ],
+            "expected a URL that begins with udpm://, mpudpm://, memq://, tcpq:// or file://, without a user",
+        ),
+        (LcmSettings, "prefix", ["MOCAP", "a_1", "A" * 16], ["", "A-B", "Ä", "A" * 17], "expected "),
+        (SpoolSettings, "max_files", [1, 100_000], [0, 100_001, 1.0], "expected a whole number of files"),
+        (SpoolSettings, "directory", ["/var/lib"], ["", "var", "/a\nb"], "expected a folder's absolute path"),
+        (MetricsSettings, "port", [1, 65535], [0, 65536, "9464"], "expected a whole number from 1 to 65535"),
+    ],
 )
-def test_invalid_key_prefixes_are_refused(prefix: str) -> None:
-    [(location, text)] = mistakes(ZenohSettings, {"prefix": prefix})
-    assert location == "prefix"
-    assert text.startswith(f"found {describe(prefix)}; expected a Zenoh key")
+def test_values_of_other_sections(
+    section: type[Section], key: str, accepted: list[object], refused: list[object], expected: str
+) -> None:
+    """What the library or the system behind the key cannot use is refused at the start."""
+    for value in accepted:
+        assert getattr(section.model_validate({key: value}), key) == value
+    for value in refused:
+        [(location, text)] = mistakes(section, {key: value})
+        assert location == key
+        assert text.startswith(f"found {describe(value)}; {expected}")
 
 
 def test_keys_of_zenoh_itself_are_accepted() -> None:
@@ -266,49 +275,3 @@ def test_configurations_that_zenoh_refuses_are_refused(config: object, text: str
     assert location == "config"
     assert found.startswith(text)
     assert ".rs" not in found
-
-
-@pytest.mark.parametrize(
-    "url",
-    [
-        DEFAULT_LCM_URL,
-        "udpm://?ttl=1",
-        "mpudpm://",
-        "memq://",
-        "tcpq://lab:7700",
-        "file:///tmp/x@y?mode=w",
-    ],
-)
-def test_urls_of_all_lcm_providers_are_accepted(url: str) -> None:
-    assert LcmSettings(url=url).effective_url == url
-
-
-@pytest.mark.parametrize(
-    "url",
-    [
-        "",
-        "udpm",
-        "udpm:",
-        "239.255.76.67:7667",
-        "UDPM://",
-        "zmq://x",
-        "udpm://a b",
-        "udpm://\n",
-        "tcpq://me@lab",
-        "tcpq://a..b:7700",
-        "tcpq://127.1:7700",
-    ],
-)
-def test_other_lcm_urls_are_refused(url: str) -> None:
-    assert mistakes(LcmSettings, {"url": url}) == [
-        (
-            "url",
-            f"found {describe(url)}; expected a URL that begins with udpm://, mpudpm://, memq://, tcpq:// "
-            "or file://, without a user name",
-        )
-    ]
-
-
-@pytest.mark.parametrize("prefix", ["", "A-B", "Ä", "A" * 17])
-def test_invalid_channel_prefixes_are_refused(prefix: str) -> None:
-    assert [location for location, _ in mistakes(LcmSettings, {"prefix": prefix})] == ["prefix"]

@@ -39,6 +39,24 @@ def test_a_reading_has_both_clocks() -> None:
     assert before_utime - 1000 <= utime <= now_utime() + 1000
 
 
+@pytest.mark.interpreted
+def test_the_offset_is_that_of_the_reading_that_was_interrupted_least(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The process may be stopped between the two clocks; such a reading would look like a step."""
+    delays_us = iter([500, 40_000, 2, 900, 70])
+    now_us = 1_000_000
+
+    def wall() -> int:
+        nonlocal now_us
+        now_us += next(delays_us)
+        return 5_000_000_000 + now_us
+
+    monkeypatch.setattr("gateway.messages.host_time.now_steady_us", lambda: now_us)
+    monkeypatch.setattr("gateway.messages.host_time.now_utime", wall)
+    assert HostClock().offset_us == 5_000_000_002
+
+
 def test_the_clocks_do_not_drift_apart_while_nobody_sets_the_wall_clock() -> None:
     clock = HostClock()
     offsets_us = {utime - steady_us for utime, steady_us in (clock.read() for _ in range(10_000))}

@@ -58,20 +58,6 @@ from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS
             "outputs: zenoh ok; lcm no multicast: ip route add",
         ),
     ],
-    ids=[
-        "markers",
-        "tools",
-        "analog",
-        "force",
-        "events",
-        "pose",
-        "pose out of view",
-        "command",
-        "reply to a command",
-        "clock",
-        "status while streaming",
-        "status while waiting",
-    ],
 )
 def test_a_summary_shows_what_matters_first(message: bytes, line: str) -> None:
     assert summarise(decode(message)) == line
@@ -100,28 +86,22 @@ def test_the_summary_of_a_status_says_what_was_lost_and_why() -> None:
     )
 
 
-def test_a_summary_without_visible_markers_has_no_position() -> None:
-    message = rtc3d.markers_t()
-    assert summarise(message).endswith("0 markers, 0 missing")
-
-
-def test_positions_and_orientations_have_no_rounding_errors_and_large_numbers_no_exponent() -> None:
+def test_small_and_large_numbers_are_shown_without_rounding_errors() -> None:
+    """A person compares the line with a ruler, and a robot's controller."""
+    assert summarise(rtc3d.markers_t()).endswith("0 markers, 0 missing")
     pose = rtc3d.tool_pose_t()
     pose.visible = True
-    pose.position_m, pose.orientation_xyzw = (
-        [2.15, -1.6e-17, 12345.678],
-        [-3e-9, 1.6e-17, 0.70710678, -0.7071],
-    )
+    pose.position_m = [2.15, -1.6e-17, 12345.678]
+    pose.orientation_xyzw = [-3e-9, 1.6e-17, 0.70710678, -0.7071]
     assert summarise(pose).endswith("position (2.15, 0, 12346) m, orientation xyzw (0, 0, 0.7071, -0.7071)")
-
-
-def test_small_values_of_channels_are_shown() -> None:
     message = rtc3d.analog_t()
     message.num_channels, message.voltages = 3, [1.6e-7, -0.00012345, 2e9]
     assert summarise(message).endswith("voltages 1.6e-07, -0.0001234, 2e+09")
 
 
-def test_a_summary_shows_four_channels_at_most() -> None:
+@pytest.mark.parametrize(("num_channels", "shown"), [(4, "1, 2, 3, 4"), (5, "1, 2, 3, 4, …")])
+def test_a_summary_shows_four_channels_at_most(num_channels: int, shown: str) -> None:
+    """A line stays a line for a server with a thousand channels."""
     message = rtc3d.analog_t()
-    message.num_channels, message.voltages = 5, [1.0, 2.0, 3.0, 4.0, 5.0]
-    assert summarise(message).endswith("5 channels, voltages 1, 2, 3, 4, …")
+    message.num_channels, message.voltages = num_channels, [1.0, 2.0, 3.0, 4.0, 5.0][:num_channels]
+    assert summarise(message).endswith(f"{num_channels} channels, voltages {shown}")

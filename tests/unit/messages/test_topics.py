@@ -21,11 +21,6 @@ def test_keys_and_channels_are_as_documented(path: tuple[str, ...], key: str, ch
     assert lcm_channel("MOCAP", "lab", *path) == channel
 
 
-def test_a_prefix_is_not_changed() -> None:
-    assert zenoh_key("site/hall 2", "lab", "3d") == "site/hall 2/lab/3d"
-    assert lcm_channel("Hall_2", "lab", "3d") == "Hall_2_LAB_3D"
-
-
 @pytest.mark.parametrize(
     ("label", "chunk"),
     [
@@ -57,15 +52,6 @@ def test_characters_that_zenoh_refuses_in_a_label_are_percent_escaped(label: str
 )
 def test_characters_that_lcm_refuses_in_a_label_become_one_underscore(label: str, part: str) -> None:
     assert lcm_channel("MOCAP", "lab", "6d", label) == f"MOCAP_LAB_6D_{part}"
-
-
-def test_dashes_of_a_source_become_underscores_only_in_channels() -> None:
-    assert zenoh_key("mocap", "hall-2", "3d") == "mocap/hall-2/3d"
-    assert lcm_channel("MOCAP", "hall-2", "3d") == "MOCAP_HALL_2_3D"
-
-
-def test_a_channel_is_cut_to_the_limit_of_lcm() -> None:
-    assert lcm_channel("MOCAP", "lab", "6d", 100 * "a") == "MOCAP_LAB_6D_" + 50 * "A"
 
 
 @pytest.mark.parametrize(

@@ -1,31 +1,20 @@
 """Client protocols in a given state, and packets for them to receive."""
 
-from gateway.rtc3d.client_protocol import (
-    Answered,
-    ClientProtocol,
-    ProtocolEvent,
-)
-from gateway.rtc3d.commands import (
-    AllFrames,
-    Command,
-    StreamFrames,
-)
+from gateway.rtc3d.client_protocol import ClientProtocol
+from gateway.rtc3d.commands import AllFrames, Command, StreamFrames
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.frames import Frame
 from tests.servers import ok, packet
 from tests.vectors import FULL_FRAME
 
 STREAM = StreamFrames(AllFrames(), (ComponentType.MARKERS,))
+FRAME = packet(3, FULL_FRAME["big"])
+NO_DATA = packet(4)
 
 
 def xml(*sections: str) -> bytes:
     """Return an XML packet with these elements of §6, all empty."""
     inside = "".join(f"<{section}/>" for section in sections)
     return packet(2, f"<RT_Parameters Ver='1.00'>{inside}</RT_Parameters>")
-
-
-FRAME = packet(3, FULL_FRAME["big"])
-NO_DATA = packet(4)
 
 
 def protocol_after(*commands: Command) -> ClientProtocol:
@@ -37,9 +26,3 @@ def protocol_after(*commands: Command) -> ClientProtocol:
     protocol.send(commands[-1])
     protocol.bytes_to_send()
     return protocol
-
-
-def answers(received: tuple[list[Frame], list[ProtocolEvent]]) -> list[Command]:
-    """Return the commands that were answered in what ``receive`` returned."""
-    _, events = received
-    return [event.command for event in events if isinstance(event, Answered)]

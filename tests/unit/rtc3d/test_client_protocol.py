@@ -1,124 +1,306 @@
-"""The client's side of a connection: what it sends, its states, its events."""
+"""The client's side of a connection: what it sends, its states, its frames and its events."""
 
+import struct
+
+import numpy as np
 import pytest
 
 from gateway.errors import ClosedError, LinkError
 from gateway.rtc3d.client_protocol import (
+    Answered,
+    ByteOrderMismatch,
     ClientProtocol,
+    FrameRejected,
+    Refused,
     StreamCorrupted,
     UnexpectedPacket,
 )
 from gateway.rtc3d.commands import (
     Bye,
+    Command,
+    SendCurrentFrame,
     SendParameters,
     SetByteOrder,
     StopStreaming,
+    StreamFrames,
     Version,
 )
+from gateway.rtc3d.components import ComponentType, encode_component
+from gateway.rtc3d.frames import encode_frame, split_frame
+from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.protocol_state import ProtocolState
 from tests.servers import error, ok, packet
 from tests.unit.rtc3d.protocols import FRAME, NO_DATA, STREAM, protocol_after
-from tests.vectors import START_RECORDING, STOP_RECORDING
+from tests.vectors import EMPTY_FRAME, FULL_FRAME, START_RECORDING, STOP_RECORDING, ByteOrder
+
+ANALOG_ONLY = encode_frame([encode_component(ComponentType.ANALOG, 1, 0, np.zeros(1, ">f4"))])
+
+# Sending --------------------------------------------------------------------------------------
 
 
-def test_a_command_is_sent_as_a_packet_of_type_1() -> None:
+def test_a_command_is_sent_once_as_a_packet_of_type_1() -> None:
+    """The bytes are those of the specification's example, and are not sent again."""
     protocol = ClientProtocol()
     protocol.send(Version())
     assert protocol.bytes_to_send() == b"\x00\x00\x00\x13\x00\x00\x00\x01Version 1.0"
     assert protocol.bytes_to_send() == b""
 
 
-def test_the_states_of_a_connection_through_a_measurement() -> None:
-    protocol = ClientProtocol()
-    seen = [protocol.state]
-
-    def note(data: bytes = b"") -> None:
-        protocol.receive(data)
-        seen.append(protocol.state)
-
-    protocol.send(STREAM)
-    note()
-    note(ok(f"OK-{STREAM}"))
-    note(NO_DATA)
-    note(FRAME)
-    note(NO_DATA)
-    protocol.send(StopStreaming())
-    note(ok("OK-StreamFrames Stop"))
-    protocol.send(Bye())
-    note()
-    protocol.end()
-    note()
-    assert seen == [
-        ProtocolState.IDLE,
-        ProtocolState.REQUESTED,
-        ProtocolState.REQUESTED,
-        ProtocolState.NO_MEASUREMENT,
-        ProtocolState.STREAMING,
-        ProtocolState.NO_MEASUREMENT,
-        ProtocolState.STOPPED,
-        ProtocolState.CLOSING,
-        ProtocolState.CLOSED,
-    ]
-
-
-def test_after_a_refused_request_for_frames_the_connection_is_idle() -> None:
-    protocol = protocol_after(STREAM)
-    protocol.receive(error("err-unknown parameter 3D"))
-    assert protocol.state is ProtocolState.IDLE
-
-
 def test_recording_control_is_the_data_frame_of_field_note_16() -> None:
+    """It is the only data frame that a client sends, in the byte order that was agreed."""
     protocol = ClientProtocol()
     protocol.send_recording(start=False)
     assert protocol.bytes_to_send() == STOP_RECORDING
-
-
-def test_recording_control_has_the_agreed_byte_order() -> None:
     protocol = protocol_after(SetByteOrder("little"))
     protocol.receive(ok("OK-SetByteOrder LittleEndian"))
     protocol.send_recording(start=True)
     assert protocol.bytes_to_send() == START_RECORDING
 
 
-def test_nothing_can_be_sent_after_bye_or_the_end() -> None:
-    protocol = protocol_after(Bye())
-    with pytest.raises(ClosedError, match="closing"):
+def test_a_command_that_cannot_be_sent_is_named_with_the_reason() -> None:
+    """Two commands at once could not be told apart by their replies, and after Bye nobody answers."""
+    protocol = protocol_after(Version())
+    with pytest.raises(LinkError) as waiting:
+        protocol.send(SetByteOrder("little"))
+    protocol.send(Bye())
+    with pytest.raises(ClosedError) as closing:
         protocol.send(Version())
     protocol.end()
-    with pytest.raises(ClosedError, match="closed"):
-        protocol.send(Bye())
+    with pytest.raises(ClosedError) as closed:
+        protocol.send_recording(start=True)
+    assert [str(caught.value) for caught in (waiting, closing, closed)] == [
+        "SetByteOrder LittleEndian not sent: Version 1.0 has not been answered yet",
+        "Version 1.0 not sent: the connection is closing",
+        "recording control not sent: the connection is closed",
+    ]
 
 
-def test_a_second_command_cannot_be_sent_while_one_is_pending() -> None:
-    protocol = protocol_after(Version())
-    with pytest.raises(LinkError, match=r"Version 1\.0 has not been answered yet"):
-        protocol.send(SendParameters())
+# States ---------------------------------------------------------------------------------------
+
+STOP_OK = ok("OK-StreamFrames Stop")
 
 
-@pytest.mark.parametrize("reply", [b"", ok("bye"), ok("OK-Bye"), FRAME + ok("bye")])
-def test_any_answer_to_bye_or_none_leaves_the_connection_closing(reply: bytes) -> None:
-    protocol = protocol_after(Bye())
+@pytest.mark.parametrize(
+    ("steps", "states"),
+    [
+        (
+            [STREAM, ok("OK"), NO_DATA, FRAME, NO_DATA, FRAME, StopStreaming(), STOP_OK, FRAME, Bye(), "end"],
+            "requested, requested, no measurement, streaming, no measurement, streaming, streaming, stopped, "
+            "stopped, closing, closed",
+        ),
+        (
+            [STREAM, FRAME, StopStreaming(), STOP_OK, STREAM, FRAME],
+            "requested, streaming, streaming, stopped, requested, streaming",
+        ),
+        ([STREAM, error("no"), FRAME], "requested, idle, streaming"),
+        ([STREAM, error("no"), NO_DATA], "requested, idle, no measurement"),
+        (
+            [STREAM, ok("OK"), FRAME, StopStreaming(), error("no"), FRAME],
+            "requested, requested, streaming, streaming, streaming, streaming",
+        ),
+        (
+            [STREAM, ok("OK"), FRAME, StopStreaming(), "give up", FRAME],
+            "requested, requested, streaming, streaming, idle, streaming",
+        ),
+        (
+            [STREAM, FRAME, StreamFrames(), error("no")],
+            "requested, streaming, streaming, streaming",
+        ),
+        ([SendCurrentFrame(), FRAME], "idle, idle"),
+        (
+            [STREAM, "give up", Version(), error("Error-Version?")],
+            "requested, requested, requested, requested",
+        ),
+        ([SendCurrentFrame(), NO_DATA], "idle, idle"),
+        (
+            [STREAM, FRAME + ok("OK"), SendCurrentFrame(), NO_DATA],
+            "requested, streaming, streaming, no measurement",
+        ),
+        ([Bye(), ok("bye"), FRAME, NO_DATA], "closing, closing, closing, closing"),
+        (["end", NO_DATA], "closed, closed"),
+    ],
+)
+def test_the_state_follows_what_the_server_sends(steps: list[Command | bytes | str], states: str) -> None:
+    """Status messages and reconnections depend on it; frames show the truth where replies do not."""
+    protocol, seen = ClientProtocol(), []
+    for step in steps:
+        if isinstance(step, bytes):
+            protocol.receive(step)
+        elif step == "end":
+            protocol.end()
+        elif step == "give up":
+            protocol.give_up()
+        elif not isinstance(step, str):
+            protocol.send(step)
+        seen.append(protocol.state.value)
+    assert ", ".join(seen) == states
+
+
+# Frames ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("frames_before_ok", [0, 1, 2])
+def test_stream_frames_may_be_acknowledged_before_between_or_after_frames(frames_before_ok: int) -> None:
+    """Field note 3: the request counts as answered once, and no frame is lost."""
+    protocol = protocol_after(STREAM)
+    before = FRAME * frames_before_ok
+    frames, events = protocol.receive(before + ok(f"OK-{STREAM}") + FRAME * (2 - frames_before_ok))
+    answered = [event.command for event in events if isinstance(event, Answered)]
+    assert (len(frames), answered) == (2, [STREAM])
+
+
+def test_the_current_frame_is_the_answer_alone_while_nothing_is_streamed() -> None:
+    """Published as a streamed frame, it would count as the stream's first one."""
+    for body in (FULL_FRAME["big"], ANALOG_ONLY, EMPTY_FRAME["big"]):
+        command = SendCurrentFrame((ComponentType.MARKERS,))
+        protocol = protocol_after(command)
+        assert protocol.receive(packet(3, body)) == ([], [Answered(command, Packet(3, body))])
+
+
+def test_a_streamed_frame_answers_if_it_has_a_requested_component() -> None:
+    """Frames of a running stream arrive between the request and its answer."""
+    markers_only = packet(3, struct.pack(">IIIiqI", 1, 24, 1, 5, 0, 0))
+    for requested, answers in (
+        ((ComponentType.ANALOG,), [False, True]),
+        ((ComponentType.ANALOG, ComponentType.MARKERS), [True, False]),
+        ((), [True, False]),
+    ):
+        protocol = protocol_after(STREAM)
+        protocol.receive(FRAME)
+        protocol.send(SendCurrentFrame(requested))
+        received = [protocol.receive(body) for body in (markers_only, FRAME)]
+        assert [len(frames) for frames, _ in received] == [1, 1]
+        assert [bool(events) for _, events in received] == answers
+
+
+def test_a_frame_without_components_answers_any_request() -> None:
+    """A server that has none of the components may say so with an empty frame."""
+    protocol = protocol_after(STREAM)
+    protocol.receive(FRAME)
+    protocol.send(SendCurrentFrame((ComponentType.ANALOG,)))
+    _, [answered] = protocol.receive(packet(3, EMPTY_FRAME["big"]))
+    assert isinstance(answered, Answered)
+
+
+@pytest.mark.parametrize(
+    ("reply", "sent", "is_mismatch"),
+    [
+        (ok("OK"), "big", True),
+        (ok("OK"), "little", False),
+        (error("no"), "big", False),
+        (error("no"), "little", True),
+    ],
+)
+def test_the_first_frame_with_components_decides_the_byte_order(
+    reply: bytes, sent: ByteOrder, is_mismatch: bool
+) -> None:
+    """A server may acknowledge a byte order and ignore it (field note 4); an empty frame shows neither."""
+    protocol = protocol_after(SetByteOrder("little"))
     protocol.receive(reply)
-    assert protocol.state is ProtocolState.CLOSING
+    protocol.send(STREAM)
+    protocol.receive(packet(3, EMPTY_FRAME["big"]))
+    assert protocol.byte_order is None
+    frames, events = protocol.receive(packet(3, FULL_FRAME[sent]) * 2)
+    assert [frame.components for frame in frames] == [split_frame(FULL_FRAME[sent], sent).components] * 2
+    assert events == [ByteOrderMismatch(sent)] * is_mismatch
+    assert protocol.byte_order == sent
+
+
+@pytest.mark.parametrize("order", ["big", "little"])
+def test_a_frame_that_contradicts_itself_is_rejected_and_the_next_one_returned(order: ByteOrder) -> None:
+    """The event says how many components the frame announces in the byte order of this connection."""
+    protocol = protocol_after(STREAM)
+    good = packet(3, FULL_FRAME[order])
+    protocol.receive(good)
+    frames, [rejected] = protocol.receive(packet(3, FULL_FRAME[order][:-4]) + good)
+    assert len(frames) == 1
+    assert isinstance(rejected, FrameRejected)
+    assert rejected.num_components == 5
+    assert "type 5" in str(rejected.error)
+
+
+@pytest.mark.parametrize("first", [1, 7, 8, 12, len(FRAME) - 1])
+def test_a_frame_in_two_reads_is_the_same_frame_and_packets_follow_it(first: int) -> None:
+    """TCP cuts anywhere; the offset of a later fault still counts every byte."""
+    protocol = protocol_after(STREAM)
+    protocol.receive(FRAME)
+    assert protocol.receive(FRAME[:first]) == ([], [])
+    frames, [corrupted] = protocol.receive(FRAME[first:] + FRAME + bytes(8))
+    expected = split_frame(FULL_FRAME["big"], "big").components
+    assert [frame.components for frame in frames] == [expected] * 2
+    assert isinstance(corrupted, StreamCorrupted)
+    assert corrupted.error.offset == 3 * len(FRAME)
+
+
+def test_frames_are_received_in_parts_while_there_are_more() -> None:
+    """A burst is handled in several turns of the event loop, in order and without loss."""
+    protocol = protocol_after(STREAM)
+    frames, events = protocol.receive(FRAME * 5 + ok("OK"), 2)
+    counts = [len(frames)]
+    while protocol.has_more:
+        frames, events = protocol.receive(b"", 2)
+        counts.append(len(frames))
+    assert counts == [2, 2, 1]
+    assert [type(event) for event in events] == [UnexpectedPacket]
+
+
+# Events ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("command", "packet_type", "body"),
+    [
+        (Version(), 1, b"OK-Version 1.0"),
+        (SendParameters(), 2, b"<RT_Parameters/>"),
+        (SendCurrentFrame(), 3, FULL_FRAME["big"]),
+        (SendCurrentFrame(), 4, b"No data"),
+        (StreamFrames(), 1, b"ok-streamframes"),
+        (StreamFrames(), 3, FULL_FRAME["big"]),
+        (StreamFrames(), 4, b""),
+    ],
+)
+def test_an_answer_carries_the_command_and_the_whole_packet(
+    command: Command, packet_type: int, body: bytes
+) -> None:
+    """Whoever asked needs the content of the reply, whatever its type is."""
+    _, events = protocol_after(command).receive(packet(packet_type, body))
+    assert events == [Answered(command, Packet(packet_type, body))]
+
+
+@pytest.mark.parametrize("packet_type", [0, 1, 2, 6, 77])
+def test_a_packet_that_answers_nothing_is_passed_on_whole(packet_type: int) -> None:
+    """The log shows what a server sends unasked."""
+    _, events = ClientProtocol().receive(packet(packet_type, b"what is it"))
+    assert events == [UnexpectedPacket(Packet(packet_type, b"what is it"))]
+
+
+@pytest.mark.parametrize(
+    ("reply", "text"),
+    [
+        ("err-no such command", "err-no such command"),
+        ("", "no reason given"),
+        ("x" * 301, "x" * 300),
+        ("a\x1bb", r"a\x1bb"),
+    ],
+)
+def test_a_refusal_carries_at_most_300_bytes_of_the_servers_text(reply: str, text: str) -> None:
+    """The text goes into logs and status messages, so it is bounded and printable."""
+    _, [refused] = protocol_after(Version()).receive(error(reply))
+    assert isinstance(refused, Refused)
+    assert (refused.command, str(refused.error)) == (Version(), text)
 
 
 def test_a_c3d_file_is_returned_in_the_pieces_in_which_it_arrives() -> None:
+    """Frames go on between the packets of a file, and the pieces keep their order."""
     protocol, file = ClientProtocol(), packet(5, b"C3D")
     frames, pieces = protocol.receive(FRAME + file[:10])
     later_frames, later_pieces = protocol.receive(file[10:] + FRAME)
     assert [len(frames), len(later_frames)] == [1, 1]
-    assert [repr(piece) for piece in pieces + later_pieces] == [
-        "FilePiece(b'C3', 0, 3)",
-        "FilePiece(b'D', 2, 3)",
-    ]
-
-
-def test_a_packet_of_unknown_type_is_unexpected() -> None:
-    _, [event] = ClientProtocol().receive(packet(77, b"?"))
-    assert isinstance(event, UnexpectedPacket)
+    assert list(map(repr, pieces + later_pieces)) == ["FilePiece(b'C3', 0, 3)", "FilePiece(b'D', 2, 3)"]
 
 
 def test_a_size_out_of_bounds_closes_the_connection_after_the_frames_before_it() -> None:
+    """What follows cannot be read, so nothing more is taken from this connection."""
     protocol = protocol_after(STREAM)
     frames, events = protocol.receive(FRAME + b"HTTP/1.1 400 Bad Request\r\n")
     assert len(frames) == 1
@@ -128,10 +310,12 @@ def test_a_size_out_of_bounds_closes_the_connection_after_the_frames_before_it()
     assert protocol.receive(FRAME) == ([], [])
 
 
-def test_the_error_of_a_corrupt_stream_has_its_offset() -> None:
-    protocol = protocol_after(STREAM)
-    protocol.receive(FRAME)
-    frames, [corrupted] = protocol.receive(FRAME + FRAME + bytes(8))
-    assert len(frames) == 2
+@pytest.mark.parametrize(("packet_type", "limit"), [(2, 100), (5, 200)])
+def test_packets_are_bounded_by_the_limit_of_their_type(packet_type: int, limit: int) -> None:
+    """The limits of the configuration reach the reader, each for its own type."""
+    protocol = ClientProtocol(max_packet_bytes=100, max_c3d_bytes=200)
+    protocol.receive(packet(packet_type, bytes(limit - 8)))
+    assert protocol.state is ProtocolState.IDLE
+    _, [corrupted] = protocol.receive(packet(packet_type, bytes(limit - 7)))
     assert isinstance(corrupted, StreamCorrupted)
-    assert corrupted.error.offset == 3 * len(FRAME)
+    assert corrupted.error.size == limit + 1

@@ -11,7 +11,7 @@ from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, encode_componen
 from gateway.rtc3d.frame_reader import FrameReader
 from gateway.rtc3d.frames import split_frame
 from tests.unit.rtc3d.wire import bodies_of_both_orders, frame
-from tests.vectors import EMPTY_FRAME, FULL_FRAME, MARKERS, ByteOrder
+from tests.vectors import MARKERS, ByteOrder
 
 MARKERS_FRAME = frame("big", MARKERS.wire["big"])
 
@@ -56,22 +56,6 @@ def test_a_frame_that_differs_in_anything_else_does_not_have_the_layout(offset: 
         reader_after(MARKERS_FRAME, MARKERS_FRAME).read(bytes(body))
 
 
-@pytest.mark.parametrize("order", ["big", "little"])
-def test_frames_with_and_without_extra_bytes_are_read_alike(order: ByteOrder) -> None:
-    bodies = [FULL_FRAME[order], FULL_FRAME[order] + b"\n", FULL_FRAME[order] + b"\0\0"]
-    reader = FrameReader(order)
-    for body in [*bodies, *bodies, *reversed(bodies)]:
-        read = reader.read(bytes(bytearray(body)))
-        assert read.layout.fields == split_frame(body, order).layout.fields
-        assert read.components == split_frame(FULL_FRAME[order], order).components
-        assert read.layout.num_extra_bytes == len(body) - len(FULL_FRAME[order])
-
-
-def test_the_extra_bytes_of_frames_with_one_layout_may_differ() -> None:
-    reader = reader_after(MARKERS_FRAME + b"\n", MARKERS_FRAME + b"\n")
-    assert reader.read(MARKERS_FRAME + b"\0").layout is reader.read(MARKERS_FRAME + b"\n").layout
-
-
 def test_two_layouts_of_the_same_size_are_distinguished() -> None:
     bodies = [
         frame("big", encode_component(kind, 1, 1, np.zeros(count, ITEM_DTYPES[kind])))
@@ -86,25 +70,6 @@ def test_two_layouts_of_the_same_size_are_distinguished() -> None:
     assert read[0] is not read[1]
 
 
-def test_any_number_of_layouts_can_be_read() -> None:
-    bodies = [
-        frame("big", encode_component(ComponentType.ANALOG, 1, 1, np.zeros(count, ">f4")))
-        for count in range(100)
-    ]
-    reader = reader_after(*bodies)
-    assert [reader.read(body).layout.components[0].num_items for body in bodies] == list(range(100))
-
-
-def test_a_frame_in_the_other_byte_order_is_an_error() -> None:
-    with pytest.raises(FrameError):
-        reader_after(FULL_FRAME["big"]).read(FULL_FRAME["little"])
-
-
-def test_a_frame_too_short_for_its_component_count_is_an_error() -> None:
-    with pytest.raises(FrameError, match="too short"):
-        reader_after(EMPTY_FRAME["big"]).read(b"\0\0\0")
-
-
 def test_the_number_of_remembered_layouts_is_bounded() -> None:
     """A server that varies its frames, by mistake or on purpose, must not fill the memory."""
     reader = FrameReader("big")
@@ -113,6 +78,14 @@ def test_the_number_of_remembered_layouts_is_bounded() -> None:
         for _ in range(3):
             reader.read(frame("big", encode_component(ComponentType.MARKERS, 1, 1, markers)))
         assert len(reader._templates) <= len(reader._layouts) <= 64
+
+
+def test_a_layout_that_repeats_is_recognised_by_its_template() -> None:
+    """Reading every frame field by field would take ten times as long."""
+    reader = reader_after(MARKERS_FRAME)
+    assert reader._templates == {}
+    reader.read(MARKERS_FRAME)
+    assert list(reader._templates) == [len(MARKERS_FRAME)]
 
 
 def test_layouts_of_one_connection_are_not_those_of_another() -> None:

@@ -4,8 +4,10 @@ import pytest
 
 from gateway.rtc3d.components import Component
 from gateway.rtc3d.frames import split_frame
-from tests.vectors import EMPTY_FRAME, FRAME_WITH_UNKNOWN, FULL_FRAME, ByteOrder
+from tests.vectors import COMPONENTS, EMPTY_FRAME, FRAME_WITH_UNKNOWN, FULL_FRAME, ByteOrder
 
+both_orders = pytest.mark.parametrize("order", ["big", "little"])
+each_component = pytest.mark.parametrize("vector", COMPONENTS, ids=[vector.name for vector in COMPONENTS])
 bodies_of_both_orders = pytest.mark.parametrize(
     ("body", "order"),
     [

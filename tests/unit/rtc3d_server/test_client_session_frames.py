@@ -9,6 +9,7 @@ from tests.unit.rtc3d_server.scripted_client import ScriptedClient
 from tests.unit.rtc3d_server.wire import (
     ANALOG,
     COMMAND,
+    ERROR,
     EVENT,
     MARKERS,
     NO_DATA,
@@ -40,34 +41,22 @@ def test_a_stream_has_all_components_in_every_frame_by_default(client: ScriptedC
     assert [frame[2].timestamp_us for frame in frames] == list(range(0, 70_000, 10_000))
 
 
-def test_a_stream_of_one_fast_component_has_its_rate(client: ScriptedClient) -> None:
-    client.send("StreamFrames Analog")
-
-    assert client.numbers_until(99_999) == list(range(1, 101))
-
-
-def test_a_divisor_sends_every_nth_frame(client: ScriptedClient) -> None:
-    client.send("StreamFrames FrequencyDivisor:4 3D")
-
-    assert client.numbers_until(200_000) == [1, 5, 9, 13, 17, 21]
-
-
-def test_at_60_of_100_hz_mostly_every_other_frame_is_sent(client: ScriptedClient) -> None:
-    client.send("StreamFrames Frequency:60 3D")
-
-    numbers = client.numbers_until(SECOND_US - 1)
-
-    assert numbers[:7] == [1, 3, 5, 6, 8, 10, 11]
-    assert len(numbers) == 60
-
-
-@pytest.mark.parametrize("frequency", ["100", "100.5", "2000"])
-def test_a_frequency_is_limited_to_the_rate_of_the_slowest_component(
-    client: ScriptedClient, frequency: str
+@pytest.mark.parametrize(
+    ("requested", "until_us", "numbers"),
+    [
+        ("Analog", 99_999, list(range(1, 101))),
+        ("FrequencyDivisor:4 3D", 200_000, [1, 5, 9, 13, 17, 21]),
+        ("Frequency:60 3D", 109_999, [1, 3, 5, 6, 8, 10, 11]),
+        *((f"Frequency:{hz} 3D Analog", 50_000, [1, 2, 3, 4, 5, 6]) for hz in ("100", "100.5", "2000")),
+        ("Force", 50_000, []),  # which the scene lacks
+    ],
+)
+def test_a_stream_has_the_requested_rate(
+    client: ScriptedClient, requested: str, until_us: int, numbers: list[int]
 ) -> None:
-    client.send(f"StreamFrames Frequency:{frequency} 3D Analog")
-
-    assert client.numbers_until(50_000) == [1, 2, 3, 4, 5, 6]
+    """§5.3.5: the slowest component of a request is the limit."""
+    client.send(f"StreamFrames {requested}")
+    assert client.numbers_until(until_us) == numbers
 
 
 @given(rate_hz=st.integers(1, 2000), frequency_hz=st.floats(0.1, 2500), start=st.integers(0, 10**6))
@@ -131,12 +120,6 @@ def test_a_new_byte_order_applies_from_the_next_frame_on(client: ScriptedClient)
     assert [frame[0].items[0][0] for frame in big + little] == [0, 1]
 
 
-def test_a_stream_of_components_that_the_scene_lacks_has_no_frames(client: ScriptedClient) -> None:
-    client.send("StreamFrames Force")
-
-    assert client.frames_until(50_000) == []
-
-
 def test_frames_more_than_a_second_late_are_dropped(client: ScriptedClient) -> None:
     client.send("StreamFrames 3D Events")
 
@@ -190,49 +173,103 @@ def test_events_before_the_request_are_not_sent(client: ScriptedClient) -> None:
     assert [event[0] for event in events.items] == [143]
 
 
+def test_a_stream_of_events_alone_loses_no_frames_while_the_client_does_not_read(
+    client: ScriptedClient,
+) -> None:
+    """Its frames exist only if there are events, and these come with the next frame."""
+    client.send("StreamFrames Events")
+    client.session.drop_due_frames(100_000)
+    assert client.session.frames_dropped == 0
+    frames = client.frames_until(140_000)
+    assert [[event[0] for event in events.items] for [events] in frames] == [[1], [2]]
+
+
+def test_dropped_frames_are_counted_once_and_never_before_they_are_due(client: ScriptedClient) -> None:
+    """The count is in the log and in the statistics of the server."""
+    client.send("StreamFrames 3D")
+    for elapsed_us, dropped in ((0, 1), (0, 1), (5_000, 1), (10_000, 2), (95_000, 10), (40_000, 10)):
+        client.session.drop_due_frames(elapsed_us)
+        assert client.session.frames_dropped == dropped
+    assert client.numbers_until(100_000) == [11]
+
+
 # SendCurrentFrame ---------------------------------------------------------------------------
 
 
-def test_the_current_frame_is_sent_at_once_if_it_is_new(client: ScriptedClient) -> None:
+def test_the_current_frame_is_sent_at_once_if_it_is_new_and_else_when_there_is_a_newer_one(
+    client: ScriptedClient,
+) -> None:
+    """§5.3.4: no client gets the same frame twice."""
     client.elapsed_us = 123_456
     client.send("SendCurrentFrame 3D")
-
     [[markers]] = client.frames_until(123_456)
-
     assert (markers.frame_number, markers.timestamp_us) == (13, 120_000)
-
-
-def test_the_current_frame_waits_until_there_is_a_newer_one(client: ScriptedClient) -> None:
-    client.elapsed_us = 123_456
     client.send("SendCurrentFrame 3D")
-    client.frames_until(123_456)
-    client.send("SendCurrentFrame 3D")
-
     assert client.frames_until(129_999) == []
     assert client.session.due_us == 130_000
     assert client.numbers_until(130_000) == [14]
 
 
-def test_requests_sent_together_are_all_answered_in_order(client: ScriptedClient) -> None:
+def test_all_requests_are_answered_in_order_even_if_the_scene_lacks_their_components(
+    client: ScriptedClient,
+) -> None:
+    """A client counts its answers; what is missing is an empty frame."""
     client.send("SendCurrentFrame 3D")
+    client.send("SendCurrentFrame Force")
     client.send("SendCurrentFrame 6D")
-
-    assert [frame[0].type for frame in client.frames_until(0)] == [MARKERS, TOOLS]
-
-
-def test_a_request_during_a_stream_is_answered_too(client: ScriptedClient) -> None:
+    assert [[each.type for each in frame] for frame in client.frames_until(0)] == [[MARKERS], [], [TOOLS]]
     client.send("StreamFrames 3D")
-    client.frames_until(0)
     client.send("SendCurrentFrame 3D")
-
     assert client.frames_until(9_999) == []
     assert client.numbers_until(10_000) == [2, 2]
 
 
-def test_the_current_frame_of_components_that_the_scene_lacks_is_empty(client: ScriptedClient) -> None:
-    client.send("SendCurrentFrame Force")
+def test_a_frame_of_a_slow_stream_does_not_make_older_frames_current(client: ScriptedClient) -> None:
+    """SendCurrentFrame waits for a frame newer than any that the client has (§5.3.4)."""
+    client.send("StreamFrames FrequencyDivisor:10 3D")
+    client.frames_until(0)
+    client.elapsed_us = 95_000
+    client.send("SendCurrentFrame Analog")
+    assert [frame[0].timestamp_us for frame in client.frames_until(95_000)] == [95_000]
+    client.send("SendCurrentFrame 3D")
+    assert client.session.due_us == 100_000
 
-    assert client.frames_until(0) == [[]]
+
+def test_the_next_frame_is_due_for_the_stream_or_for_a_request_whichever_is_first(
+    client: ScriptedClient,
+) -> None:
+    """The server's timer waits for this time, so a later one would delay frames."""
+    client.send("StreamFrames Analog")
+    client.frames_until(0)
+    client.send("SendCurrentFrame 3D")
+    assert client.session.due_us == 1_000
+    client.send("StreamFrames Frequency:1 Analog")
+    client.frames_until(1_000)
+    assert client.session.due_us == 10_000
+
+
+def test_stop_keeps_the_events_of_a_request_that_waits(client: ScriptedClient) -> None:
+    """Events since the first request belong to the next frame, whatever becomes of the stream."""
+    client.send("SendCurrentFrame 3D Events")
+    client.frames_until(0)
+    client.send("StreamFrames Frequency:1 3D Events")
+    client.frames_until(5_000)
+    client.elapsed_us = 75_000
+    client.send("SendCurrentFrame 3D Events")
+    client.send("StreamFrames Stop")
+    [[_, events]] = client.frames_until(80_000)
+    assert [event[0] for event in events.items] == [1]
+
+
+def test_no_more_than_1000_requests_wait(client: ScriptedClient) -> None:
+    """They may wait for components that never come, and take memory."""
+    for _ in range(1000):
+        assert client.send("SendCurrentFrame 3D")[0][0] == COMMAND
+    assert client.send("SendCurrentFrame 3D")[0] == (
+        ERROR,
+        b"Error-1000 requests for the current frame wait already",
+    )
+    assert len(client.frames_until(0)) == 1000
 
 
 def test_polling_gets_each_event_once(client: ScriptedClient) -> None:
@@ -280,28 +317,13 @@ def test_a_stream_continues_with_the_first_frame_of_the_next_measurement(client:
     assert client.numbers_until(0) == [1]
 
 
-def test_the_events_of_frames_dropped_at_the_start_of_a_measurement_are_not_lost(
-    client: ScriptedClient,
-) -> None:
+def test_a_new_measurement_starts_over_and_loses_no_events(client: ScriptedClient) -> None:
+    """Frame numbers start again, and the first frame in time has the events of those that were late."""
     client.send("StreamFrames 3D Events")
-    client.session.measurement_started()
-
-    frames = client.frames_until(3 * SECOND_US)
-
-    assert frames[0][0].frame_number == 202
-    assert frames[0][1].items[0][:2] == (1, 70_000)
-
-
-def test_analog_frame_numbers_start_again_with_each_measurement(client: ScriptedClient) -> None:
-    client.send("StreamFrames Analog")
     client.frames_until(SECOND_US)
     client.session.measurement_stopped()
     client.session.measurement_started()
-
-    frames = client.frames_until(2_000)
-
-    assert [(component.type, component.frame_number) for [component] in frames] == [
-        (ANALOG, 1),
-        (ANALOG, 2),
-        (ANALOG, 3),
-    ]
+    assert client.numbers_until(20_000) == [1, 2, 3]
+    frames = client.frames_until(3 * SECOND_US)
+    assert frames[0][0].frame_number == 202
+    assert frames[0][1].items[0][:2] == (1, 70_000)

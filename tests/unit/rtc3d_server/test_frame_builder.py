@@ -91,6 +91,13 @@ def test_frames_of_events_alone_are_numbered_at_the_measurement_rate() -> None:
     assert built_components(builder, 14) == []
 
 
+def test_events_are_numbered_at_the_measurement_rate_in_frames_of_any_rate() -> None:
+    """An event's number tells to which frame of the measurement it belongs, not to which of the stream."""
+    builder = FrameBuilder(CountingScene(), (ComponentType.ANALOG, ComponentType.EVENT))
+    analog, event = built_components(builder, 75, with_events=True)
+    assert (analog.frame_number, event.frame_number) == (76, 8)
+
+
 def test_events_can_have_the_16_bytes_of_the_specification() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.EVENT,), event_bytes=16)
     data = builder.packet("little", 7, 0)

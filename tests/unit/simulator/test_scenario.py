@@ -51,18 +51,9 @@ seed: 7
     )
 
 
-def test_a_scenario_needs_only_faults(file: Path) -> None:
-    file.write_text("faults: [{fault: cut}]")
-    assert load_scenario(file) == Scenario(scene=SceneSettings(), faults=(Cut(),), seed=1)
-
-
 @pytest.mark.parametrize("path", SCENARIOS, ids=lambda path: path.name)
 def test_every_shipped_scenario_loads(path: Path) -> None:
     assert load_scenario(path).faults
-
-
-def test_one_scenario_is_shipped() -> None:
-    assert [path.name for path in SCENARIOS] == ["bad-day.yaml"]
 
 
 @pytest.mark.parametrize(
@@ -150,11 +141,6 @@ def test_a_scenarios_faults_and_those_of_the_command_line_are_played(
         "Fault: cut",
         "Fault begins: delay,delay_ms=3",
     ]
-
-
-@pytest.mark.parametrize("arguments", [["--fault", "dely"], ["--scenario", "/nowhere.yaml"]])
-def test_an_invalid_fault_or_scenario_is_a_configuration_error(arguments: list[str]) -> None:
-    assert isinstance(simulate(*arguments).exception, ConfigError)
 
 
 def test_options_override_the_scenarios_scene() -> None:

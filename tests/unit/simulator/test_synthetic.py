@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType, Items
+from gateway.rtc3d.server_description import described_labels, num_described_items
 from gateway.simulator.synthetic import BUTTON_EVENT, SyntheticScene
 
 Floats = npt.NDArray[np.floating[Any]]
@@ -107,14 +108,6 @@ def test_a_tool_is_out_of_view_exactly_when_fewer_than_three_of_its_markers_are_
         assert np.array_equal(np.isnan(poses[:, 0]), num_visible < 3)
 
 
-def test_markers_and_tools_are_sometimes_out_of_view(scene: SyntheticScene) -> None:
-    for component in (ComponentType.MARKERS, ComponentType.TOOLS):
-        missing = np.isnan(table(scene.items(component, MINUTE))[..., 0])
-        assert 0.005 < missing.mean() < 0.15
-        assert np.any(missing, axis=0).all()
-        assert not np.all(missing, axis=0).any()
-
-
 def test_missing_markers_and_tools_have_the_bytes_of_the_specification(scene: SyntheticScene) -> None:
     markers = scene.items(ComponentType.MARKERS, MINUTE)
     tools = scene.items(ComponentType.TOOLS, MINUTE)
@@ -122,14 +115,6 @@ def test_missing_markers_and_tools_have_the_bytes_of_the_specification(scene: Sy
     missing_markers = {item.tobytes() for item in markers[np.isnan(markers["x"])]}
     assert missing_markers == {b"\xff" * 12 + bytes.fromhex("4479C000")}  # 999.0
     assert {item.tobytes() for item in tools[np.isnan(tools["x"])]} == {b"\xff" * 32}
-
-
-def test_visible_markers_have_a_small_residual(scene: SyntheticScene) -> None:
-    markers = scene.items(ComponentType.MARKERS, MINUTE)
-    residuals = markers["reliability"][~np.isnan(markers["x"])]
-
-    assert np.all(residuals >= 0)
-    assert residuals.max() < 1.0
 
 
 @given(first=st.integers(0, 10**9), cut=st.integers(0, 40))
@@ -195,12 +180,6 @@ def test_moments_put_the_centre_of_pressure_on_the_plate_from_heel_to_toe(
         assert np.max(np.abs(free_moment_nm)) == pytest.approx(3.0, abs=0.05)
 
 
-def test_a_plate_is_unloaded_between_steps(scene: SyntheticScene) -> None:
-    fz = table(scene.items(ComponentType.FORCE, np.arange(3000)))[..., 2]
-
-    assert np.mean(np.abs(fz) < 5) == pytest.approx(0.4, abs=0.05)
-
-
 def test_a_button_is_pressed_and_released_every_second(scene: SyntheticScene) -> None:
     events = scene.events(0, 3_000_000)
 
@@ -231,49 +210,29 @@ def test_events_do_not_depend_on_how_the_time_is_divided(times_us: list[int]) ->
     assert all(times_us[0] <= event[1] < times_us[-1] for event in whole)
 
 
-@settings(max_examples=50)
-@given(
-    markers=st.integers(0, 30),
-    tools=st.integers(0, 12),
-    analog=st.integers(0, 5),
-    plates=st.integers(0, 3),
-    seed=st.integers(0, 99),
-)
+@settings(max_examples=30)
+@given(*[st.integers(0, most) for most in (30, 12, 5, 3, 99)])
 def test_the_parameters_describe_a_scene_of_any_size(
     markers: int, tools: int, analog: int, plates: int, seed: int
 ) -> None:
+    """Clients allocate by the parameters; labels have a word and a number, and tools name their markers."""
     scene = SyntheticScene(markers=markers, tools=tools, analog=analog, plates=plates, seed=seed)
-    described = scene.parameters
-    assert described.markers is not None
-    assert described.tools is not None
-    assert described.analog is not None
-    assert described.force is not None
     counts = {
-        ComponentType.MARKERS: len(described.markers.markers),
-        ComponentType.TOOLS: len(described.tools.tools),
-        ComponentType.ANALOG: len(described.analog.channels),
-        ComponentType.FORCE: len(described.force.plates),
+        ComponentType.MARKERS: markers,
+        ComponentType.TOOLS: tools,
+        ComponentType.ANALOG: analog,
+        ComponentType.FORCE: plates,
     }
-
-    assert list(counts.values()) == [markers, tools, analog, plates]
+    described = {kind: num_described_items(scene.parameters, kind) for kind in counts}
+    assert described == counts
     assert set(scene.rates_hz) == {component for component, count in counts.items() if count}
     for component in scene.rates_hz:
         items = scene.items(component, np.arange(5, 12))
         assert items.shape == (7, counts[component])
         assert items.dtype == ITEM_DTYPES[component]
-    known = {marker.id for marker in described.markers.markers}
-    assert all(known.issuperset(tool.marker_ids) for tool in described.tools.tools)
-
-
-def test_labels_have_a_word_and_a_number() -> None:
-    parameters = SyntheticScene(markers=2, tools=1, analog=1, plates=1).parameters
-
-    assert parameters.markers is not None
-    assert parameters.tools is not None
-    assert parameters.analog is not None
-    assert parameters.force is not None
-    assert [marker.label for marker in parameters.markers.markers] == ["Marker 1", "Marker 2"]
-    assert parameters.tools.tools[0].label == "Tool 1"
-    assert parameters.tools.tools[0].marker_ids == ("1", "2")
-    assert parameters.analog.channels[0].label == "Analog 1"
-    assert parameters.force.plates[0].label == "Force plate 1"
+    assert described_labels(scene.parameters, ComponentType.MARKERS) == [
+        f"Marker {number}" for number in range(1, markers + 1)
+    ]
+    assert scene.parameters.tools is not None
+    known = {str(number) for number in range(1, markers + 1)}
+    assert all(known.issuperset(tool.marker_ids) for tool in scene.parameters.tools.tools)

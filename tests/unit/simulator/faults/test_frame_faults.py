@@ -9,7 +9,6 @@ from gateway.errors import FrameError
 from gateway.rtc3d.frames import split_frame
 from gateway.simulator.faults.base import LastingConnectionFault
 from gateway.simulator.faults.frame_faults import (
-    ConstantFrameNumbers,
     FrozenTimestamps,
     JumpingTimestamps,
     Occlusion,
@@ -75,10 +74,6 @@ def test_frozen_time_stamps_are_those_of_the_first_frame_since_the_fault_began()
 def test_time_stamps_jump(jump_ms: float, timestamp_us: int) -> None:
     data = changed(JumpingTimestamps(jump_ms=jump_ms), frame(markers()))
     assert data == frame(markers(timestamp_us=timestamp_us))
-
-
-def test_frame_numbers_can_be_constant() -> None:
-    assert changed(ConstantFrameNumbers(frame_number=-3), frame(markers())) == frame(markers(number=-3))
 
 
 def test_events_can_have_16_bytes() -> None:

@@ -1,6 +1,5 @@
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from gateway.rtc3d.components import ComponentType
@@ -8,7 +7,7 @@ from gateway.simulator.recorded.moments import Moment
 from gateway.simulator.recorded.parameters import RecordedParameters
 from gateway.simulator.recorded.take_pass import TakePass
 from gateway.takes.reader import TakeReader
-from tests.takes import START_UTIME, Message, description, frame, markers, parameters, write_take
+from tests.takes import START_UTIME, Message, description, markers, parameters, write_take
 
 FIRST = b"<RT_Parameters><General><Name>first</Name></General></RT_Parameters>"
 SECOND = b"<RT_Parameters><General><Name>second</Name></General></RT_Parameters>"
@@ -71,6 +70,15 @@ def test_each_frame_has_the_parameters_that_were_valid(path: Path) -> None:
     assert found.first_parameters.xml == FIRST
 
 
+def test_a_thousand_versions_of_the_parameters_are_remembered_at_most(path: Path) -> None:
+    """A faulty server can change them all the time; the newest ones are kept."""
+    changes = [parameters(FIRST if number % 2 else SECOND, number) for number in range(1, 1600)]
+    moments, found = read(path, [*changes, markers(3, 0, version=1599), markers(3, 1, version=1)])
+    assert 500 <= len(found._versions) <= 1000
+    assert [moment.parameters.xml for moment in moments] == [FIRST, FIRST]
+    assert (min(found._versions), max(found._versions)) == (1001, 1599)
+
+
 def test_parameters_that_became_void_are_those_of_the_take_no_more(path: Path) -> None:
     moments, _ = read(
         path, [parameters(FIRST, 1), markers(3, 0, version=1), parameters(b"", 2), markers(3, 1, version=2)]
@@ -121,12 +129,3 @@ def test_a_thousand_layouts_are_read_as_they_are(path: Path) -> None:
         each[1][40:] for each in messages
     ]
     assert found.num_malformed == 0
-
-
-def test_the_bits_of_each_nan_are_kept(path: Path) -> None:
-    payload = np.uint32(0x7FA00001).view(np.float32)
-    messages = [frame(ComponentType.ANALOG, [payload, np.nan, -np.nan], number) for number in range(3)]
-    moments, _ = read(path, messages)
-    assert [moment.contents[ComponentType.ANALOG] for moment in moments] == [
-        each[1][40:] for each in messages
-    ]

@@ -76,17 +76,6 @@ def test_a_take_starts_again_after_its_end_as_it_was(path: Path) -> None:
     scene.stop()
 
 
-def test_each_measurement_starts_with_the_first_frame(path: Path) -> None:
-    scene = TakeScene(write_take(path, take_of(2000)))
-    for _ in range(3):
-        scene.start()
-        frames = scene.frames(MARKERS, 24)
-        advance_until(scene, 0, lambda frames=frames: frames.time_us(0) != NOT_YET_US)  # type: ignore[misc]
-        assert frame_numbers(frames, 0, 1) == [0]
-        assert frames.time_us(0) == 0
-        scene.stop()
-
-
 def test_a_take_that_is_read_late_begins_late_and_loses_nothing(path: Path) -> None:
     scene = TakeScene(write_take(path, take_of(100)))
     scene.start()
