@@ -17,7 +17,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
-from tests.integration.commands.test_params_command import run
+from tests.command_process import run
 from tests.networks import free_endpoint, lcm_url, open_zenoh
 from tests.queried_gateway import run_gateway
 from tests.waiting import wait_until_async

@@ -13,7 +13,8 @@ import zenoh
 
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.stream.state import StreamState
-from tests.integration.commands.test_params_command import Lab, lab_without_server, run
+from tests.command_process import run
+from tests.integration.commands.test_params_command import Lab, lab_without_server
 from tests.networks import free_endpoint, lcm_url, open_zenoh
 from tests.queried_gateway import ParameterServer, run_gateway
 from tests.servers import ScriptedServer
