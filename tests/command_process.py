@@ -11,6 +11,7 @@ import os
 import pkgutil
 import sys
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -32,10 +33,11 @@ class Completed(NamedTuple):
     stderr: str
 
 
-def run_command(*arguments: str | Path) -> Completed:
-    """Run rtc3d-gateway to its end."""
+def run_command(*arguments: str | Path, environ: Mapping[str, str] | None = None) -> Completed:
+    """Run rtc3d-gateway to its end, with a width of 200 columns unless ``environ`` has another one."""
+    variables = {**os.environ, "COLUMNS": "200", **(environ or {})}
     with tempfile.TemporaryDirectory() as folder:
-        process = _FORKS.Process(target=_run, args=(list(map(str, arguments)), folder, dict(os.environ)))
+        process = _FORKS.Process(target=_run, args=(list(map(str, arguments)), folder, variables))
         process.start()
         process.join(_TIMEOUT_S)
         if process.exitcode is None:
@@ -46,14 +48,14 @@ def run_command(*arguments: str | Path) -> Completed:
         return Completed(process.exitcode, *texts)
 
 
-async def run(*arguments: str | Path) -> Completed:
+async def run(*arguments: str | Path, environ: Mapping[str, str] | None = None) -> Completed:
     """Run rtc3d-gateway to its end, without blocking the event loop."""
-    return await asyncio.to_thread(run_command, *arguments)
+    return await asyncio.to_thread(run_command, *arguments, environ=environ)
 
 
 def _run(arguments: list[str], folder: str, environ: dict[str, str]) -> None:
     os.environ.clear()
-    os.environ.update(environ | {"COLUMNS": "200"})
+    os.environ.update(environ)
     for number, name in ((1, "stdout"), (2, "stderr")):
         descriptor = os.open(Path(folder) / name, os.O_CREAT | os.O_WRONLY)
         os.dup2(descriptor, number)

@@ -1,11 +1,8 @@
 """The doctor's findings and remedies for Zenoh, LCM and this computer, and the command ``doctor``."""
 
-import asyncio
 import json
-import os
 import re
 import socket
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +17,7 @@ from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests import networks
+from tests.command_process import run
 from tests.findings import Findings, lab, run_doctor
 
 # Zenoh.
@@ -307,22 +305,17 @@ def test_a_clock_whose_state_is_not_reported_is_not_tested(monkeypatch: pytest.M
 
 async def command(*arguments: str) -> tuple[int, str]:
     """Return exit status and stdout of rtc3d-gateway doctor; its Zenoh and LCM stay on this machine."""
-    keys = json.dumps(networks.zenoh_keys("peer"))
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "gateway", "doctor", "--seconds", "0.3", *arguments),
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-        env={
-            **os.environ,
-            "RTC3D_GATEWAY__ZENOH__CONFIG": keys,
+    done = await run(
+        *("doctor", "--seconds", "0.3", *arguments),
+        environ={
+            "RTC3D_GATEWAY__ZENOH__CONFIG": json.dumps(networks.zenoh_keys("peer")),
             "RTC3D_GATEWAY__LCM__URL": "memq://",
             "RTC3D_GATEWAY__METRICS__PORT": str(networks.free_port()),
+            "COLUMNS": "80",
         },
     )
-    out, err = await process.communicate()
-    assert err == b""
-    assert process.returncode is not None
-    return process.returncode, out.decode()
+    assert done.stderr == ""
+    return done.status, done.stdout
 
 
 async def test_the_exit_status_shows_whether_a_check_failed() -> None:
