@@ -8,7 +8,6 @@ from typing import Any
 
 import pytest
 
-from gateway.doctor import clock_check
 from gateway.findings import Finding, MessageLoad, Result
 from gateway.outputs.lcm import checks as lcm_checks
 from gateway.outputs.lcm.settings import LcmSettings
@@ -221,44 +220,6 @@ def test_large_messages_are_charged_per_datagram() -> None:
     assert lcm_checks.charged_bytes(1500) == 2304
 
 
-def test_the_clock_is_read() -> None:
-    is_synchronised, max_error_us = clock_check.read_clock()
-    assert isinstance(is_synchronised, bool)
-    assert max_error_us >= 0
-
-
-def test_a_synchronised_clock_passes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clock_check, "read_clock", lambda: (True, 1234))
-    finding = clock_check.check_clock(["zenoh"])
-    assert (finding.result, finding.found) == (
-        Result.PASSING,
-        "synchronised, with an error of at most 1.2 ms",
-    )
-
-
-def test_an_unsynchronised_clock_fails_if_messages_leave_this_computer(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(clock_check, "read_clock", lambda: (False, 16_000_000))
-    finding = clock_check.check_clock(["zenoh"])
-    assert finding.result is Result.FAILING
-    assert finding.found == (
-        "this computer's clock is not synchronised, so utime cannot be compared with the clocks of other "
-        "computers, which zenoh can reach"
-    )
-    assert finding.remedy == (
-        "Set up chrony or systemd-timesyncd with the lab's time server; `chronyc tracking` or `timedatectl` "
-        "shows the state. In a container, do this on the host."
-    )
-
-
-def test_an_unsynchronised_clock_is_a_warning_if_all_messages_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clock_check, "read_clock", lambda: (False, 16_000_000))
-    finding = clock_check.check_clock([])
-    assert finding.result is Result.WARNING
-    assert finding.found.endswith("; so far, all messages stay on this computer")
-
-
 @pytest.mark.parametrize(
     ("keys", "expected"),
     [
@@ -288,16 +249,6 @@ def test_whether_zenoh_leaves_this_computer(keys: dict[str, Any], expected: bool
 )
 def test_whether_lcm_leaves_this_computer(url: str, expected: bool) -> None:
     assert OUTPUTS["lcm"].leaves_host(LcmSettings(url=url)) is expected
-
-
-def test_a_clock_whose_state_is_not_reported_is_not_tested(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse() -> tuple[bool, int]:
-        raise OSError(1, "adjtimex is not allowed")
-
-    monkeypatch.setattr(clock_check, "read_clock", refuse)
-    assert clock_check.check_clock(["zenoh"]) == Finding(
-        "this computer", "clock", Result.NOT_TESTED, "the kernel does not report it: adjtimex is not allowed"
-    )
 
 
 # The command.
