@@ -1,17 +1,13 @@
 """The doctor's findings and remedies for Zenoh, LCM and this computer, and the command ``doctor``."""
 
-import asyncio
 import json
-import os
 import re
 import socket
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from gateway.doctor import clock_check
 from gateway.findings import Finding, MessageLoad, Result
 from gateway.outputs.lcm import checks as lcm_checks
 from gateway.outputs.lcm.settings import LcmSettings
@@ -20,6 +16,7 @@ from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from tests import networks
+from tests.command_process import run
 from tests.findings import Findings, lab, run_doctor
 
 # Zenoh.
@@ -223,44 +220,6 @@ def test_large_messages_are_charged_per_datagram() -> None:
     assert lcm_checks.charged_bytes(1500) == 2304
 
 
-def test_the_clock_is_read() -> None:
-    is_synchronised, max_error_us = clock_check.read_clock()
-    assert isinstance(is_synchronised, bool)
-    assert max_error_us >= 0
-
-
-def test_a_synchronised_clock_passes(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clock_check, "read_clock", lambda: (True, 1234))
-    finding = clock_check.check_clock(["zenoh"])
-    assert (finding.result, finding.found) == (
-        Result.PASSING,
-        "synchronised, with an error of at most 1.2 ms",
-    )
-
-
-def test_an_unsynchronised_clock_fails_if_messages_leave_this_computer(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(clock_check, "read_clock", lambda: (False, 16_000_000))
-    finding = clock_check.check_clock(["zenoh"])
-    assert finding.result is Result.FAILING
-    assert finding.found == (
-        "this computer's clock is not synchronised, so utime cannot be compared with the clocks of other "
-        "computers, which zenoh can reach"
-    )
-    assert finding.remedy == (
-        "Set up chrony or systemd-timesyncd with the lab's time server; `chronyc tracking` or `timedatectl` "
-        "shows the state. In a container, do this on the host."
-    )
-
-
-def test_an_unsynchronised_clock_is_a_warning_if_all_messages_stay(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(clock_check, "read_clock", lambda: (False, 16_000_000))
-    finding = clock_check.check_clock([])
-    assert finding.result is Result.WARNING
-    assert finding.found.endswith("; so far, all messages stay on this computer")
-
-
 @pytest.mark.parametrize(
     ("keys", "expected"),
     [
@@ -292,37 +251,22 @@ def test_whether_lcm_leaves_this_computer(url: str, expected: bool) -> None:
     assert OUTPUTS["lcm"].leaves_host(LcmSettings(url=url)) is expected
 
 
-def test_a_clock_whose_state_is_not_reported_is_not_tested(monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse() -> tuple[bool, int]:
-        raise OSError(1, "adjtimex is not allowed")
-
-    monkeypatch.setattr(clock_check, "read_clock", refuse)
-    assert clock_check.check_clock(["zenoh"]) == Finding(
-        "this computer", "clock", Result.NOT_TESTED, "the kernel does not report it: adjtimex is not allowed"
-    )
-
-
 # The command.
 
 
 async def command(*arguments: str) -> tuple[int, str]:
     """Return exit status and stdout of rtc3d-gateway doctor; its Zenoh and LCM stay on this machine."""
-    keys = json.dumps(networks.zenoh_keys("peer"))
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "gateway", "doctor", "--seconds", "0.3", *arguments),
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-        env={
-            **os.environ,
-            "RTC3D_GATEWAY__ZENOH__CONFIG": keys,
+    done = await run(
+        *("doctor", "--seconds", "0.3", *arguments),
+        environ={
+            "RTC3D_GATEWAY__ZENOH__CONFIG": json.dumps(networks.zenoh_keys("peer")),
             "RTC3D_GATEWAY__LCM__URL": "memq://",
             "RTC3D_GATEWAY__METRICS__PORT": str(networks.free_port()),
+            "COLUMNS": "80",
         },
     )
-    out, err = await process.communicate()
-    assert err == b""
-    assert process.returncode is not None
-    return process.returncode, out.decode()
+    assert done.stderr == ""
+    return done.status, done.stdout
 
 
 async def test_the_exit_status_shows_whether_a_check_failed() -> None:

@@ -2,8 +2,6 @@
 
 import asyncio
 import json
-import os
-import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 
@@ -18,6 +16,7 @@ from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.stream.state import StreamState
 from tests import servers
+from tests.command_process import run
 from tests.configurations import make_settings
 from tests.diagnosed_servers import MARKERS_XML, parameters, replying, streaming
 from tests.findings import Findings, lab, run_doctor
@@ -215,23 +214,19 @@ async def test_a_source_that_the_running_gateway_does_not_have_is_a_warning() ->
     )
 
 
-async def command(metrics: MetricsSettings, *arguments: str) -> tuple[int | None, Findings, str]:
+async def command(metrics: MetricsSettings, *arguments: str) -> tuple[int, Findings, str]:
     """Return exit status, findings and stderr of rtc3d-gateway doctor --json."""
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "gateway", "doctor", "--json", "--seconds", "0.3", *arguments),
-        stdout=asyncio.subprocess.PIPE,
-        stderr=asyncio.subprocess.PIPE,
-        env={
-            **os.environ,
+    done = await run(
+        *("doctor", "--json", "--seconds", "0.3", *arguments),
+        environ={
             "RTC3D_GATEWAY__ZENOH__ENABLED": "false",
             "RTC3D_GATEWAY__LCM__URL": "memq://",
             "RTC3D_GATEWAY__METRICS__ADDRESS": "0.0.0.0",  # noqa: S104
             "RTC3D_GATEWAY__METRICS__PORT": str(metrics.port),
         },
     )
-    out, err = await process.communicate()
-    findings = [Finding(**each) for each in json.loads(out)["findings"]]
-    return process.returncode, Findings(findings), err.decode()
+    findings = [Finding(**each) for each in json.loads(done.stdout)["findings"]]
+    return done.status, Findings(findings), done.stderr
 
 
 async def test_the_command_opens_no_connection_if_asked_not_to() -> None:

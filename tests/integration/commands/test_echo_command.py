@@ -1,28 +1,28 @@
 """``rtc3d-gateway echo`` as a program of its own: what does not exist, silence, single tools and rates."""
 
 import asyncio
+import itertools
 import json
-import os
-import pty
 import subprocess
 import sys
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from typing import NamedTuple
 
 import pytest
+import pytest_asyncio
 
 from gateway.config.settings import StreamSettings
 from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
-from tests.integration.commands.test_params_command import run
+from tests.command_process import run
 from tests.networks import free_endpoint, lcm_url, open_zenoh
+from tests.pseudo_terminals import in_terminal
 from tests.queried_gateway import run_gateway
 from tests.waiting import wait_until_async
 
-pytestmark = pytest.mark.netns
+pytestmark = [pytest.mark.netns, pytest.mark.asyncio(loop_scope="module")]
 sides = pytest.mark.parametrize("side", ["zenoh", "lcm"])
 
 
@@ -37,9 +37,9 @@ def options(at: Place, side: str) -> list[str]:
     return ["--lcm", "--url", at.url] if side == "lcm" else ["--connect", at.endpoint]
 
 
-@asynccontextmanager
-async def lab(*, tool_poses: bool = False) -> AsyncIterator[Place]:
-    """Run a simulator with two tools, and a gateway with a stream of 3d, 6d and event, which streams."""
+@pytest_asyncio.fixture(scope="module", loop_scope="module")
+async def lab() -> AsyncIterator[Place]:
+    """A gateway with tool poses and one stream of 3d, 6d and event, from a simulator with two tools."""
     place = Place(free_endpoint(), lcm_url())
     scene = SyntheticScene(markers=2, tools=2, analog=0, plates=0, rate_hz=100)
     components = (ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.EVENT)
@@ -49,7 +49,7 @@ async def lab(*, tool_poses: bool = False) -> AsyncIterator[Place]:
             simulator.port,
             listen=place.endpoint,
             lcm_url=place.url,
-            tool_poses=tool_poses,
+            tool_poses=True,
             streams=(StreamSettings(components=components),),
         ) as gateway,
     ):
@@ -59,45 +59,32 @@ async def lab(*, tool_poses: bool = False) -> AsyncIterator[Place]:
         yield place
 
 
-@sides
-async def test_an_unknown_source_is_an_error_with_those_that_exist(side: str) -> None:
-    async with lab() as at:
-        done = await run("echo", "--source", "hall", *options(at, side))
-    assert (done.status, done.stdout) == (3, "")
-    assert done.stderr == "no gateway serves source 'hall'; sources found: lab\n"
+async def test_what_does_not_exist_is_an_error_with_what_exists(lab: Place) -> None:
+    """A typing error in an option must not look like silence; the message helps to correct it."""
+    no_force = "no force from lab; accepted for --component: 3d, 6d, event, status, clock or parameters\n"
+    cases = {
+        ("--source", "hall"): "no gateway serves source 'hall'; sources found: lab\n",
+        ("--component", "force"): no_force,
+        ("--component", "force", "--hz"): no_force,
+        ("--component", "6d/Nothing"): "no gateway has a tool 'Nothing'; tools found: Tool 1, Tool 2\n",
+    }
+    commands = list(itertools.product(cases, ("zenoh", "lcm")))
+    ended = await asyncio.gather(*(run("echo", *case, *options(lab, side)) for case, side in commands))
+    for (case, side), done in zip(commands, ended, strict=True):
+        assert done == (3, "", cases[case]), (case, side)
 
 
-@sides
-@pytest.mark.parametrize("hz", [[], ["--hz"]])
-async def test_a_component_that_no_source_has_is_an_error_with_those_that_exist(
-    side: str, hz: list[str]
-) -> None:
-    async with lab() as at:
-        done = await run("echo", "--component", "force", *hz, *options(at, side))
-    assert (done.status, done.stdout) == (3, "")
-    assert done.stderr == (
-        "no force from lab; accepted for --component: 3d, 6d, event, status, clock or parameters\n"
-    )
-
-
-@sides
-async def test_an_unknown_tool_is_an_error_with_those_that_exist(side: str) -> None:
-    async with lab() as at:
-        done = await run("echo", "--component", "6d/Nothing", *options(at, side))
-    assert (done.status, done.stdout) == (3, "")
-    assert done.stderr == "no gateway has a tool 'Nothing'; tools found: Tool 1, Tool 2\n"
-
-
-@sides
-async def test_silence_of_a_source_is_said_once_with_its_state(side: str) -> None:
-    async with lab() as at:
-        done = await run("echo", "--component", "c3d", "--seconds", "6", *options(at, side))
-    assert (done.status, done.stdout) == (0, "")
-    assert done.stderr.startswith("nothing heard of c3d although a gateway runs (lab: streaming ")
-    assert done.stderr.count("\n") == 1
+async def test_silence_of_a_source_is_said_once_with_its_state(lab: Place) -> None:
+    """The user learns that the gateway runs, and that only this component is silent."""
+    command = ("echo", "--component", "c3d", "--seconds", "9")
+    for done in await asyncio.gather(*(run(*command, *options(lab, side)) for side in ("zenoh", "lcm"))):
+        assert (done.status, done.stdout) == (0, "")
+        assert done.stderr.startswith("nothing heard of c3d although a gateway runs (lab: streaming ")
+        assert done.stderr.count("\n") == 1
 
 
 async def test_without_a_gateway_the_sentence_of_params_is_said_and_later_messages_are_printed() -> None:
+    """Both commands describe the same state alike, and echo goes on."""
     endpoint = free_endpoint()
     router = await asyncio.to_thread(open_zenoh, "router", listen=endpoint)
     process = await asyncio.create_subprocess_exec(
@@ -120,6 +107,7 @@ async def test_without_a_gateway_the_sentence_of_params_is_said_and_later_messag
 
 
 async def test_on_lcm_the_sentence_is_that_of_params_too() -> None:
+    """On LCM only silence shows that there is no gateway."""
     url = lcm_url()
     echo, params = await asyncio.gather(
         run("echo", "--lcm", "--url", url, "--seconds", "8"), run("params", "--lcm", "--url", url)
@@ -129,45 +117,33 @@ async def test_on_lcm_the_sentence_is_that_of_params_too() -> None:
 
 
 @sides
-async def test_the_poses_of_one_tool_are_printed(side: str) -> None:
-    async with lab(tool_poses=True) as at:
-        done = await run("echo", "--component", "6d/Tool 2", "--count", "3", *options(at, side))
+async def test_the_poses_of_one_tool_are_printed(lab: Place, side: str) -> None:
+    """A tool of a name with a space is found on either network; nothing of other tools is printed."""
+    done = await run("echo", "--component", "6d/Tool 2", "--count", "3", *options(lab, side))
     assert (done.status, done.stderr) == (0, "")
     name = "MOCAP_LAB_6D_TOOL_2" if side == "lcm" else "mocap/lab/6d/Tool%202"
     assert [line.split(" ")[0] for line in done.stdout.splitlines()] == [name] * 3
 
 
 @sides
-async def test_rates_are_those_of_the_server(side: str) -> None:
-    async with lab(tool_poses=True) as at:
-        command = ("echo", "--hz", "--json", "--seconds", "3", "--component", "3d")
-        done = await run(*command, *options(at, side))
+async def test_rates_count_the_messages_of_the_component(lab: Place, side: str) -> None:
+    """Ten messages end the command however slow the machine is; only those of 3d are in the figures."""
+    done = await run("echo", "--hz", "--json", "--count", "10", "--component", "3d", *options(lab, side))
     assert (done.status, done.stderr) == (0, "")
-    rows = [json.loads(line) for line in done.stdout.splitlines()]
-    assert len(rows) >= 2
-    assert rows[-1]["window"] > 10
-    assert rows[-1]["rate_hz"] > 0
+    last = json.loads(done.stdout.splitlines()[-1])
+    assert last["window"] == 10
+    assert last["rate_hz"] > 0
 
 
-async def test_on_a_terminal_the_table_of_rates_is_refreshed_in_place() -> None:
-    async with lab(tool_poses=True) as at:
-        reader, writer = pty.openpty()
-        process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "gateway", "echo", "--hz", "--seconds", "3", "--connect", at.endpoint),
-            stdout=writer,
-            env=os.environ | {"COLUMNS": "100", "TERM": "xterm"},
-        )
-        os.close(writer)
-        assert await process.wait() == 0
-        text = os.read(reader, 100_000).decode()
-        os.close(reader)
-    assert "mocap/lab/3d" in text
-    assert "\x1b[1A" in text, "the cursor goes up to write the table again"
+async def test_on_a_terminal_the_table_of_rates_is_refreshed_in_place(lab: Place) -> None:
+    """The cursor goes up to write the table again."""
+    with in_terminal("echo", "--hz", "--connect", lab.endpoint) as terminal:
+        await asyncio.to_thread(terminal.wait_for, lambda text: "mocap/lab/3d" in text and "\x1b[1A" in text)
 
 
-async def test_fewer_messages_than_count_are_status_1_with_hz_too() -> None:
-    async with lab() as at:
-        arguments = ("--component", "status", "--count", "1000", "--seconds", "2", *options(at, "zenoh"))
-        done = await run("echo", "--hz", *arguments)
+async def test_fewer_messages_than_count_are_status_1_with_hz_too(lab: Place) -> None:
+    """A script notices that the data did not come."""
+    arguments = ("--component", "status", "--count", "1000", "--seconds", "1", *options(lab, "zenoh"))
+    done = await run("echo", "--hz", *arguments)
     assert done.status == 1
-    assert "of 1000 messages arrived within 2 s" in done.stderr
+    assert "of 1000 messages arrived within 1 s" in done.stderr

@@ -3,29 +3,29 @@
 import asyncio
 import json
 import os
-import pty
-import sys
 from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 
 import pytest
+import pytest_asyncio
 import zenoh
 
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.stream.state import StreamState
-from tests.integration.commands.test_params_command import Lab, lab_without_server, run
+from tests.command_process import run
+from tests.integration.commands.test_params_command import Lab, lab_without_server
 from tests.networks import free_endpoint, lcm_url, open_zenoh
+from tests.pseudo_terminals import in_terminal
 from tests.queried_gateway import ParameterServer, run_gateway
 from tests.servers import ScriptedServer
 from tests.waiting import wait_until_async
 
-pytestmark = pytest.mark.netns
+pytestmark = [pytest.mark.netns, pytest.mark.asyncio(loop_scope="module")]
 sides = pytest.mark.parametrize("side", ["zenoh", "lcm"])
 
 
-@asynccontextmanager
+@pytest_asyncio.fixture(name="at", scope="module", loop_scope="module")
 async def streaming_lab() -> AsyncIterator[Lab]:
-    """Run a gateway whose newest status says that it streams."""
+    """A gateway whose newest status says that it streams."""
     server, endpoint, url = ParameterServer(), free_endpoint(), lcm_url()
     async with (
         ScriptedServer(server.script) as listening,
@@ -42,10 +42,10 @@ def options(at: Lab, side: str) -> list[str]:
 
 
 @sides
-async def test_a_source_is_listed_with_its_server_and_state(side: str) -> None:
-    async with streaming_lab() as at:
-        done = await run("list", *options(at, side))
-        as_json = await run("list", "--json", *options(at, side))
+async def test_a_source_is_listed_with_its_server_and_state(at: Lab, side: str) -> None:
+    """Scripts read columns or JSON; both name the source, its server and its state."""
+    done = await run("list", *options(at, side))
+    as_json = await run("list", "--json", *options(at, side))
     assert (done.status, done.stderr, done.stdout.count("\n")) == (0, "", 1)
     name, state, components, server, host, version = done.stdout.rstrip("\n").split("\t")
     assert (name, components, server.partition(":")[0]) == (
@@ -81,32 +81,24 @@ async def test_without_a_gateway_the_status_is_3_and_the_sentence_that_of_params
 
 
 @sides
-async def test_a_source_that_does_not_exist_is_status_3_with_those_that_do(side: str) -> None:
-    async with streaming_lab() as at:
-        done = await run("list", "--source", "hall", *options(at, side))
-        other_prefix = await run("list", "--prefix", "other", *options(at, side))
+async def test_a_source_that_does_not_exist_is_status_3_with_those_that_do(at: Lab, side: str) -> None:
+    """A typing error is told apart from a gateway that does not run."""
+    done = await run("list", "--source", "hall", *options(at, side))
+    other_prefix = await run("list", "--prefix", "other", *options(at, side))
     assert (done.status, done.stdout) == (3, "")
     assert done.stderr == "no gateway serves source 'hall'; sources found: lab\n"
     assert other_prefix.status == 3
     assert "no gateway found" in other_prefix.stderr
 
 
-@asynccontextmanager
-async def two_gateways() -> AsyncIterator[Lab]:
-    """Run two gateways that both have a source "lab", of different servers."""
-    server = ParameterServer()
+@sides
+async def test_two_gateways_with_the_same_source_are_both_listed(at: Lab, side: str) -> None:
+    """They disturb each other, so the user must see both, with their servers."""
     async with (
-        streaming_lab() as at,
-        ScriptedServer(server.script) as listening,
+        ScriptedServer(ParameterServer().script) as listening,
         run_gateway(listening.port, router=at.endpoint, lcm_url=at.url) as second,
     ):
         await wait_until_async(lambda: second.sources[0].sequence > 1)
-        yield at
-
-
-@sides
-async def test_two_gateways_with_the_same_source_are_both_listed(side: str) -> None:
-    async with two_gateways() as at:
         done = await run("list", "--json", *options(at, side))
     assert done.status == 0
     sources = json.loads(done.stdout)["sources"]
@@ -115,38 +107,38 @@ async def test_two_gateways_with_the_same_source_are_both_listed(side: str) -> N
     assert "2 gateways serve a source 'lab'" in done.stderr
 
 
-async def test_a_source_whose_gateway_does_not_answer_is_listed_as_such() -> None:
-    async with streaming_lab() as at:
-        ghost = await asyncio.to_thread(open_zenoh, "client", connect=at.endpoint)
-        token = ghost.liveliness().declare_token("mocap/ghost/alive")
-        try:
-            done = await run("list", *options(at, "zenoh"))
-        finally:
-            token.undeclare()
-            ghost.close()
+async def test_a_source_whose_gateway_does_not_answer_is_listed_as_such(at: Lab) -> None:
+    """A gateway that hangs must not vanish from the list."""
+    ghost = await asyncio.to_thread(open_zenoh, "client", connect=at.endpoint)
+    token = ghost.liveliness().declare_token("mocap/ghost/alive")
+    try:
+        done = await run("list", *options(at, "zenoh"))
+    finally:
+        token.undeclare()
+        ghost.close()
     assert done.status == 0
     lines = [line.split("\t") for line in done.stdout.splitlines()]
     assert [line[0] for line in lines] == ["ghost", "lab"]
     assert lines[0][1] == "its gateway does not answer"
 
 
-async def test_hostile_answers_do_not_hide_a_gateway() -> None:
-    async with streaming_lab() as at:
-        evil = await asyncio.to_thread(open_zenoh, "client", connect=at.endpoint)
-        tokens = [evil.liveliness().declare_token(f"mocap/evil{number}/alive") for number in range(3)]
-        payloads = {"evil0": b"\x1b[2J", "evil1": bytes(3_000_000), "evil2": b""}
+async def test_hostile_answers_do_not_hide_a_gateway(at: Lab) -> None:
+    """Other programs on the network can neither hide a gateway nor write to the terminal."""
+    evil = await asyncio.to_thread(open_zenoh, "client", connect=at.endpoint)
+    tokens = [evil.liveliness().declare_token(f"mocap/evil{number}/alive") for number in range(3)]
+    payloads = {"evil0": b"\x1b[2J", "evil1": bytes(3_000_000), "evil2": b""}
 
-        def answer(query: zenoh.Query) -> None:
-            for name, payload in payloads.items():
-                query.reply(f"mocap/{name}/status", payload)
+    def answer(query: zenoh.Query) -> None:
+        for name, payload in payloads.items():
+            query.reply(f"mocap/{name}/status", payload)
 
-        evil.declare_queryable("mocap/*/status", answer)
-        try:
-            done = await run("list", *options(at, "zenoh"))
-        finally:
-            for token in tokens:
-                token.undeclare()
-            evil.close()
+    evil.declare_queryable("mocap/*/status", answer)
+    try:
+        done = await run("list", *options(at, "zenoh"))
+    finally:
+        for token in tokens:
+            token.undeclare()
+        evil.close()
     assert done.status == 0
     lines = dict(line.split("\t", 1) for line in done.stdout.splitlines())
     assert list(lines) == ["evil0", "evil1", "evil2", "lab"]
@@ -156,31 +148,24 @@ async def test_hostile_answers_do_not_hide_a_gateway() -> None:
     assert "\x1b" not in done.stdout
 
 
-async def test_messages_of_other_programs_on_lcm_are_listed_as_unreadable() -> None:
-    async with streaming_lab() as at:
-        other = open_lcm(at.url)
-        task = asyncio.create_task(run("list", *options(at, "lcm")))
-        while not task.done():
-            other.publish("MOCAP_OLD_STATUS", b"another version")
-            other.publish("MOCAP_HALL_LAB_STATUS_X", b"no status")
-            await asyncio.sleep(0.05)
-        done = await task
+async def test_messages_of_other_programs_on_lcm_are_listed_as_unreadable(at: Lab) -> None:
+    """A gateway of another version is seen although its status cannot be read."""
+    other = open_lcm(at.url)
+    task = asyncio.create_task(run("list", *options(at, "lcm")))
+    while not task.done():
+        other.publish("MOCAP_OLD_STATUS", b"another version")
+        other.publish("MOCAP_HALL_LAB_STATUS_X", b"no status")
+        await asyncio.sleep(0.05)
+    done = await task
     lines = dict(line.split("\t", 1) for line in done.stdout.splitlines())
     assert sorted(lines) == ["lab", "old"]
     assert lines["old"].startswith("its status is of another version of rtc3d-gateway")
 
 
-async def test_on_a_terminal_a_table_is_printed() -> None:
-    async with streaming_lab() as at:
-        reader, writer = pty.openpty()
-        process = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-m", "gateway", "list", "--connect", at.endpoint),
-            stdout=writer,
-            env=os.environ | {"COLUMNS": "80", "TERM": "dumb"},
-        )
-        os.close(writer)
-        assert await process.wait() == 0
-        text = os.read(reader, 100_000).decode()
-        os.close(reader)
+async def test_on_a_terminal_a_table_is_printed(at: Lab) -> None:
+    """The columns have titles and fit the terminal."""
+    with in_terminal("list", "--connect", at.endpoint, columns=80, TERM="dumb") as terminal:
+        assert await asyncio.to_thread(terminal.wait_for_end) == 0
+    text = terminal.output.decode()
     assert text.split()[:6] == ["source", "state", "components", "server", "host", "version"]
     assert max(map(len, text.splitlines())) <= 80

@@ -2,9 +2,6 @@
 
 import asyncio
 import json
-import os
-import subprocess
-import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import Any, NamedTuple
@@ -18,6 +15,7 @@ from gateway.outputs.lcm import parameters as lcm_parameters
 from gateway.outputs.lcm.connection import open_lcm
 from gateway.outputs.lcm.settings import lcm_queries_url
 from gateway.outputs.lcm.subscriber import LcmSubscriber
+from tests.command_process import run
 from tests.networks import free_endpoint, free_port, lcm_url, open_zenoh
 from tests.queried_gateway import ParameterServer, ServerOfSections, run_gateway, wait_until_cached
 from tests.servers import ScriptedServer
@@ -25,25 +23,6 @@ from tests.spec_parameters import spec_xml
 from tests.waiting import wait_until_async
 
 pytestmark = pytest.mark.netns
-
-
-class Completed(NamedTuple):
-    status: int
-    stdout: str
-    stderr: str
-
-
-async def run(*arguments: str) -> Completed:
-    """Run the program in another process, without blocking the event loop of this one."""
-    process = await asyncio.create_subprocess_exec(
-        *(sys.executable, "-m", "gateway", *arguments),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        env={**os.environ, "COLUMNS": "200"},
-    )
-    stdout, stderr = await process.communicate()
-    assert process.returncode is not None
-    return Completed(process.returncode, stdout.decode(), stderr.decode())
 
 
 class Lab(NamedTuple):

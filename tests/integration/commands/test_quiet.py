@@ -8,6 +8,7 @@ from typing import Final
 
 import pytest
 
+from tests.command_process import Completed, run_command
 from tests.gateway_process import PROGRAM
 from tests.takes import description, markers, write_take
 
@@ -55,23 +56,19 @@ def test_quiet_commands_show_no_progress(tmp_path: Path, arguments: tuple[str, .
     assert HIDDEN_CURSOR in written_to_the_terminal(tmp_path, *arguments)
 
 
-def doctor(*arguments: str) -> subprocess.CompletedProcess[str]:
-    command = (*PROGRAM, "doctor", "--server", "127.0.0.1:1", "--seconds", "0.1", *arguments)
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+def doctor(*arguments: str) -> Completed:
+    return run_command("doctor", "--server", "127.0.0.1:1", "--seconds", "0.1", *arguments)
 
 
 @pytest.mark.netns
-def test_a_quiet_doctor_prints_only_what_needs_attention() -> None:
+def test_options_of_the_doctor_for_less_and_for_more_text() -> None:
+    """-q prints only what needs attention, -v logs what is done, and neither is the default."""
     shown = doctor("-q")
-    assert shown.returncode == 1
+    assert shown.status == 1
     marks = {
         line.split()[0] for line in shown.stdout.splitlines() if line.startswith("  ") and line[2] != " "
     }
     assert "FAIL" in marks
     assert marks <= {"FAIL", "warn"}
-
-
-@pytest.mark.netns
-def test_a_verbose_doctor_logs_what_it_does() -> None:
     assert "DEBUG" in doctor("-v").stderr
     assert not doctor().stderr

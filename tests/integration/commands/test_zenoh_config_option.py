@@ -2,13 +2,12 @@
 
 import json
 import re
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
+from tests.command_process import run_command
 from tests.networks import free_port
 from tests.secure_zenoh import SecureRouter, make_certificates, run_gateway_with_simulator, run_secure_router
 from tests.waiting import wait_until
@@ -28,23 +27,16 @@ def router(tmp_path_factory: pytest.TempPathFactory, certificates: Path) -> Iter
         yield secure_router
 
 
-def run_command(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run rtc3d-gateway to its end."""
-    return subprocess.run(
-        [sys.executable, "-m", "gateway", *arguments], capture_output=True, text=True, timeout=60, check=False
-    )
-
-
 def test_echo_and_params_work_with_a_viewers_certificate(router: SecureRouter, tmp_path: Path) -> None:
     file = tmp_path / "viewer.json5"
     file.write_text(router.client("viewer"), encoding="utf-8")
     echo = run_command(
         "echo", "--zenoh-config", str(file), "--component", "3d", "--count", "2", "--seconds", "9"
     )
-    assert (echo.returncode, echo.stderr) == (0, "")
+    assert (echo.status, echo.stderr) == (0, "")
     assert len(echo.stdout.splitlines()) == 2
     params = run_command("params", "3d", "--zenoh-config", str(file), "--json")
-    assert (params.returncode, params.stderr) == (0, "")
+    assert (params.status, params.stderr) == (0, "")
     assert '"lab"' in params.stdout
 
 
@@ -52,14 +44,14 @@ def test_connect_replaces_the_address_in_the_file(router: SecureRouter, tmp_path
     file = tmp_path / "viewer.json5"
     file.write_text(router.client("viewer", (f"tls/127.0.0.1:{router.port}", "tls/127.0.0.1:9")))
     arguments = ("params", "3d", "--zenoh-config", str(file))
-    assert run_command(*arguments, "--timeout", "2").returncode == 3
+    assert run_command(*arguments, "--timeout", "2").status == 3
     connect = ("--connect", f"tls/127.0.0.1:{router.port}")
-    assert run_command(*arguments, *connect).returncode == 0
+    assert run_command(*arguments, *connect).status == 0
     assert run_command("list", "--zenoh-config", str(file), *connect).stdout.startswith("lab\t")
     echo = ("echo", "--zenoh-config", str(file), "--component", "3d", "--count", "1", "--seconds", "20")
-    assert run_command(*echo, *connect).returncode == 0
+    assert run_command(*echo, *connect).status == 0
     unknown = run_command(*echo, *connect, "--source", "hall")
-    assert (unknown.returncode, unknown.stderr) == (
+    assert (unknown.status, unknown.stderr) == (
         3,
         "no gateway serves source 'hall'; sources found: lab\n",
     )
@@ -70,7 +62,7 @@ def test_a_file_that_zenoh_rejects_is_named(tmp_path: Path) -> None:
     file.write_text("{ mode: 7 }")
     for command in ("echo", "params", "list"):
         result = run_command(command, "--zenoh-config", str(file))
-        assert result.returncode == 2
+        assert result.status == 2
         assert f"Zenoh does not accept the file {file}" in result.stderr
         assert "Traceback" not in result.stderr
     config = tmp_path / "gateway.yaml"
@@ -83,7 +75,7 @@ def test_a_file_that_zenoh_rejects_is_named(tmp_path: Path) -> None:
 @pytest.mark.parametrize("command", ["echo", "params", "list"])
 def test_a_zenoh_file_is_not_for_lcm(command: str, tmp_path: Path) -> None:
     result = run_command(command, "--lcm", "--zenoh-config", str(tmp_path))
-    assert result.returncode == 2
+    assert result.status == 2
     assert re.search("--zenoh-config (is|are) for", result.stderr)
 
 
@@ -152,4 +144,4 @@ def test_the_commands_show_the_certificate_of_a_gateway_that_listens(
         assert findings["link"]["found"] == "the session is open and connected to 0 routers and 1 peer"
         assert findings["gateway"]["found"] == "a gateway serves lab"
         params = run_command("params", "3d", "--zenoh-config", str(file))
-        assert (params.returncode, params.stderr) == (0, "")
+        assert (params.status, params.stderr) == (0, "")

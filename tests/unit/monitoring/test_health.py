@@ -71,6 +71,13 @@ async def test_a_recent_frame_is_healthy_in_every_state(state: StreamState) -> N
     assert lab.problem() == ""
 
 
+async def test_a_frame_as_old_as_the_limit_is_too_old() -> None:
+    """The page turns unhealthy when the gateway gives up the stream, not later."""
+    lab = Lab(StreamSettings(components=MARKERS))
+    set_state(lab.statuses[0], StreamState.STREAMING, STALL_TIMEOUT_S)
+    assert "no frame for" in lab.problem()
+
+
 async def test_a_stop_of_this_process_does_not_make_frames_older() -> None:
     lab = Lab(StreamSettings(components=MARKERS))
     set_state(lab.statuses[0], StreamState.STREAMING, STALL_TIMEOUT_S - 0.5)

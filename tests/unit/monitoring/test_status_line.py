@@ -56,7 +56,7 @@ def test_streams_with_different_texts_are_listed_by_components() -> None:
 
 
 def test_only_outputs_that_cannot_send_have_a_line() -> None:
-    health = {"zenoh": OutputHealth(False, "no router"), "lcm": OutputHealth(True)}
+    health = {"zenoh": OutputHealth(False, "no router"), "lcm": OutputHealth(True, "was away")}
     assert output_lines(health.items()) == ["zenoh: no router"]
 
 

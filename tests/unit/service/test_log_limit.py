@@ -95,8 +95,9 @@ def test_debug_is_not_limited(lab: Lab) -> None:
 
 def test_suppressed_messages_are_counted_a_minute_later(lab: Lab) -> None:
     lab.log("lab", BURST_LINES + 7)
+    lab.now_s += 1
     lab.log("lab", 3, logging.WARNING)
-    lab.now_s += 59
+    lab.now_s += 58
     lab.limit.report()
     assert "suppressed" not in lab.lines[-1]
     lab.now_s += 1
@@ -141,6 +142,24 @@ def test_a_traceback_counts_as_its_lines_and_its_middle_is_left_out(lab: Lab) ->
     before = len(lab.lines)
     LOGGER.info("further")
     assert len(lab.lines) == before
+
+
+def test_the_lines_of_a_traceback_count_for_all_sources_together(lab: Lab) -> None:
+    """A defect that logs tracebacks cannot fill the log through messages that are few but long."""
+    with log_fields(source="deep"):
+        _log_deep_traceback(50)
+    lab.log("lab", 20)
+    assert len(lab.lines_of("lab")) == OWN_BURST_LINES
+
+
+def test_a_traceback_uses_up_what_its_source_may_log_beside_others(lab: Lab) -> None:
+    """The reserve of each source is counted in lines, too."""
+    lab.log("noisy", 1000)
+    lab.log("louder", 1000)
+    with log_fields(source="lab"):
+        _log_deep_traceback(2)
+    lab.log("lab", 5)
+    assert lab.lines_of("lab") == []
 
 
 def _log_deep_traceback(depth: int) -> None:

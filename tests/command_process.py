@@ -1,0 +1,67 @@
+"""Commands of ``rtc3d-gateway`` in processes of their own that need no start of Python.
+
+They are forked from a process that has imported every command, which saves half a second of CPU each. Like
+programs they have their own signals, streams and exit status. Tests of the start itself, of terminals and
+of encodings start ``PROGRAM`` of tests/gateway_process.py instead.
+"""
+
+import asyncio
+import multiprocessing
+import os
+import pkgutil
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import gateway.cli
+
+_TIMEOUT_S: Final = 60.0
+_FORKS: Final = multiprocessing.get_context("forkserver")
+_FORKS.set_forkserver_preload(
+    [
+        *(f"gateway.cli.{module.name}" for module in pkgutil.iter_modules(gateway.cli.__path__)),
+        *("gateway.doctor.all_checks", "gateway.top.app", "zenoh", "tests.command_process"),
+    ]
+)
+
+
+class Completed(NamedTuple):
+    status: int
+    stdout: str
+    stderr: str
+
+
+def run_command(*arguments: str | Path, environ: Mapping[str, str] | None = None) -> Completed:
+    """Run rtc3d-gateway to its end, with a width of 200 columns unless ``environ`` has another one."""
+    variables = {**os.environ, "COLUMNS": "200", **(environ or {})}
+    with tempfile.TemporaryDirectory() as folder:
+        process = _FORKS.Process(target=_run, args=(list(map(str, arguments)), folder, variables))
+        process.start()
+        process.join(_TIMEOUT_S)
+        if process.exitcode is None:
+            process.kill()
+            process.join()
+        assert process.exitcode is not None
+        texts = [(Path(folder) / name).read_text() for name in ("stdout", "stderr")]
+        return Completed(process.exitcode, *texts)
+
+
+async def run(*arguments: str | Path, environ: Mapping[str, str] | None = None) -> Completed:
+    """Run rtc3d-gateway to its end, without blocking the event loop."""
+    return await asyncio.to_thread(run_command, *arguments, environ=environ)
+
+
+def _run(arguments: list[str], folder: str, environ: dict[str, str]) -> None:
+    os.environ.clear()
+    os.environ.update(environ)
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        descriptor = os.open(Path(folder) / name, os.O_CREAT | os.O_WRONLY)
+        os.dup2(descriptor, number)
+        os.close(descriptor)
+        setattr(sys, name, open(number, "w", encoding="utf-8", closefd=False))  # noqa: SIM115 - until the end
+    sys.argv = ["rtc3d-gateway", *arguments]
+    from gateway.__main__ import main  # noqa: PLC0415 - it must not handle signals of this process
+
+    main()
