@@ -151,24 +151,24 @@ def main() -> None:
     arguments = parser.parse_args()
     if unknown := set(arguments.packages) - set(TESTS):
         parser.error(f"unknown package {', '.join(sorted(unknown))}; known are {', '.join(TESTS)}")
-    mutants: dict[str, list[Mutant]] = {package: [] for package in TESTS}
+    mutants: dict[str, list[Mutant]] = {}
     for mutant in load():
-        if mutant.number in (arguments.mutant or [mutant.number]):
-            mutants[mutant.package].append(mutant)
+        is_package = mutant.package in (arguments.packages or TESTS)
+        if is_package and mutant.number in (arguments.mutant or [mutant.number]):
+            mutants.setdefault(mutant.package, []).append(mutant)
     results: dict[Mutant, Result] = {}
     broken = []
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder, ThreadPoolExecutor(arguments.jobs) as pool:
         runner = Runner(Path(folder), arguments.jobs)
         try:
-            for package in arguments.packages or mutants:
+            for package, own in mutants.items():
                 control = pool.submit(runner.run, package).result()
                 print(f"{package} without a mutant: {control}", flush=True)
                 if control.outcome != "SURVIVED":
                     broken.append(package)
                     continue
                 limit_s = 60 + _LIMIT * control.seconds
-                own = {each: pool.submit(runner.run, package, each, limit_s) for each in mutants[package]}
-                for mutant, done in own.items():
+                for mutant, done in [(each, pool.submit(runner.run, package, each, limit_s)) for each in own]:
                     results[mutant] = done.result()
                     print(f"{mutant}: {results[mutant]}", flush=True)
         except KeyboardInterrupt:  # pytest gets it, too
