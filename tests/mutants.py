@@ -40,9 +40,6 @@ TESTS: Final[dict[str, tuple[str, ...]]] = {
 
 _PYTEST: Final = "tests/with-netns .venv/bin/python -m pytest -x -q -p no:cacheprovider -k"
 
-_LIMIT: Final = 6
-"""Tests hang if they take a minute, and this many times as long as without a mutant."""
-
 
 class Mutant(NamedTuple):
     """One change of meaning: ``old`` occurs once in ``file`` and becomes ``new``."""
@@ -121,7 +118,9 @@ def _run_pytest(copy: Path, arguments: str, stem: str, limit_s: float) -> Result
     env = os.environ | {"PYTHONPATH": f"{copy}:{copy}/lcm_types"}  # also for the processes that tests start
     with tempfile.TemporaryFile("w+") as output:  # no pipe, which a process may hold that a test left
         try:
-            pytest = subprocess.run(command, cwd=copy, env=env, timeout=limit_s, stdout=output, check=False)
+            pytest = subprocess.run(
+                command, cwd=copy, env=env, timeout=limit_s, stdout=output, stderr=output, check=False
+            )
         except subprocess.TimeoutExpired:
             return Result("hung", "all tests together")
         output.seek(0)
@@ -167,7 +166,7 @@ def main() -> None:
                 if control.outcome != "SURVIVED":
                     broken.append(package)
                     continue
-                limit_s = 60 + _LIMIT * control.seconds
+                limit_s = 60 + 6 * control.seconds  # tests that take longer hang
                 for mutant, done in [(each, pool.submit(runner.run, package, each, limit_s)) for each in own]:
                     results[mutant] = done.result()
                     print(f"{mutant}: {results[mutant]}", flush=True)
