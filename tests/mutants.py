@@ -1,227 +1,198 @@
-"""Mutation tests: change the code in thousands of small ways and count the changes that no test notices.
+"""Mutation tests: change what the code means in about a hundred ways, and count what no test notices.
 
-    make mutants PACKAGES="rtc3d publish"
-    make mutants PACKAGES=outputs SAMPLE=300
+    .venv/bin/python -m tests.mutants
+    .venv/bin/python -m tests.mutants stream outputs/zenoh --jobs 4
 
-mutmut makes the mutants and runs, for each, the tests that call the changed function; its settings are in
-pyproject.toml. This script selects the packages, runs each mutant in a network of its own, prints a table
-and writes the diffs of the survivors.
+semantic_mutants.yaml has the mutants: mistakes that a colleague could make and a user would notice. For each,
+the tests nearest to its package run in a copy of the tree and in a network namespace of their own.
 """
 
 import argparse
-import ctypes
-import math
+import itertools
 import os
-import random
-import shutil
+import re
 import subprocess
 import sys
+import tempfile
+import time
 from collections import Counter
-from collections.abc import Iterator
-from multiprocessing import Process
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Final
+from queue import SimpleQueue
+from typing import Final, NamedTuple
 
-import mutmut.__main__
-from mutmut.configuration import config
-from mutmut.mutation.data import SourceFileMutationData
-from mutmut.mutation.diff_apply import get_diff_for_mutant
-from mutmut.runners.harness import PytestRunner
-from mutmut.state import state
-from mutmut.utils.file_utils import walk_mutatable_files
-from mutmut.workers.isolation import ForkServerRunner
-from rich.console import Console
-from rich.table import Table
+import yaml
 
-TESTS: Final = {
-    "rtc3d": ("tests/unit/rtc3d", "tests/unit/rtc3d_server"),
-    "stream": ("tests/unit/stream",),
-    "publish": ("tests/unit/publish",),
-    "outputs": (
-        "tests/unit/outputs",
-        "tests/unit/config/test_loading.py",
-        "tests/unit/config/test_secrets.py",
-        "tests/unit/config/test_settings.py",
-        "tests/unit/config/test_show.py",
-        "tests/unit/config/test_values.py",
-        "tests/contract",
-        "tests/integration/test_parameters_published.py",
-        "tests/integration/test_query_troubles.py",
-        "tests/integration/test_zenoh_queries.py",
-        "tests/integration/test_zenoh_queries_keys.py",
-        "tests/integration/test_zenoh_selectors.py",
-        "tests/integration/test_lcm_queries.py",
-        "tests/integration/commands/test_doctor_outputs.py",
-    ),
+ROOT: Final = Path(__file__).parents[1]
+LEAST_PERCENT: Final = 85
+
+TESTS: Final[dict[str, tuple[str, ...]]] = {
+    "stream": ("unit/stream/test_* unit/test_*source* unit/test_*streams* property/*_clock_*",),
+    "publish": ("unit/publish/test_* property/*_tool_pose* property/*_pacing_*",),
+    "queries": ("unit/queries/test_* unit/test_source*",),
+    "takes": ("unit/takes/test_* property/*takes* property/*_seek_* property/*_components_*",),
+} | {
+    f"outputs/{name}": (f"unit/outputs/{name}/test_* unit/outputs/test_*", f"contract/test_* -k {name}")
+    for name in ("zenoh", "ros2", "rtc3d", "takes", "lcm")
 }
-"""The packages that are mutated, and the tests that should notice."""
+"""The nearest tests of each package, in tests/: patterns of files for one pytest after the other."""
 
-CHILDREN_PER_CORE: Final = 2
-"""How many mutants to run at once, if each can have a network of its own. Most tests only wait."""
+_PYTEST: Final = "tests/with-netns .venv/bin/python -m pytest -x -q -p no:cacheprovider -k"
 
-_CLONE_NEWNET: Final = 0x40000000  # of unshare(2)
 
-OUTPUT: Final = Path("mutants")
-SURVIVORS: Final = OUTPUT / "survivors.diff"
+class Mutant(NamedTuple):
+    """One change of meaning: ``old`` occurs once in ``file`` and becomes ``new``."""
 
-COLUMNS: Final = ("killed", "timeout", "survived", "untested", "error")
-OUTCOMES: Final = {
-    1: "killed",
-    3: "killed",
-    -24: "timeout",
-    -9: "timeout",
-    0: "survived",
-    33: "untested",
-    None: "not run",
-}
-"""What the exit status of a mutant's tests means: pytest's, a signal's, or mutmut's own 33.
+    number: int
+    file: str
+    old: str
+    new: str
+    changes: str
 
-A mutant that is not in the sample has no status. Any other status is an error.
-"""
+    @property
+    def package(self) -> str:
+        return str(Path(self.file).parent).removeprefix("gateway/")
+
+    def __str__(self) -> str:
+        before = (ROOT / self.file).read_text(encoding="utf-8").partition(self.old)[0]
+        return f"{self.number:4} {self.file}:{before.count(chr(10)) + 1}"
+
+    def mutated(self, text: str) -> str:
+        """Return the text of the file with the change. Raises ValueError if it does not fit."""
+        if text.count(self.old) != 1:
+            raise ValueError(f"{self.file} has this {text.count(self.old)} times, not once: {self.old!r}")
+        return text.replace(self.old, self.new)
+
+
+class Result(NamedTuple):
+    """``outcome`` is killed, hung, SURVIVED or error; ``test`` failed first, or says what went wrong."""
+
+    outcome: str
+    test: str = ""
+    seconds: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.outcome} {self.test} ({self.seconds:.0f} s)"
+
+
+class Runner:
+    """Runs tests in copies of the tree; ``jobs`` threads may call ``run`` at once."""
+
+    def __init__(self, folder: Path, jobs: int) -> None:
+        self._times = itertools.count(int(time.time()))  # each text of a file needs another .pyc
+        self._copies: SimpleQueue[Path] = SimpleQueue()
+        copy_files = "git ls-files -z | tar --create --null --files-from=- | tar --extract --directory"
+        for copy in [folder / str(number) for number in range(jobs)]:
+            copy.mkdir()
+            subprocess.run(["sh", "-c", f'{copy_files} "$0"', copy], cwd=ROOT, check=True)
+            (copy / ".venv").symlink_to((ROOT / ".venv").resolve())
+            self._copies.put(copy)
+
+    def run(self, package: str, mutant: Mutant | None = None, limit_s: float = 3600.0) -> Result:
+        """Run the tests of a package, with a mutant or without one, for ``limit_s`` at most."""
+        copy, began_s, result = self._copies.get(), time.monotonic(), Result("SURVIVED")
+        file = copy / ("LICENSE" if mutant is None else mutant.file)
+        original = file.read_text(encoding="utf-8")
+        try:
+            self._write(file, original if mutant is None else mutant.mutated(original))
+            for arguments in TESTS[package]:
+                if result.outcome == "SURVIVED":
+                    result = _run_pytest(copy, arguments, file.stem, began_s + limit_s - time.monotonic())
+            return result._replace(seconds=time.monotonic() - began_s)
+        finally:
+            self._write(file, original)
+            self._copies.put(copy)
+
+    def _write(self, file: Path, text: str) -> None:
+        file.write_text(text, encoding="utf-8")
+        os.utime(file, (written_s := next(self._times), written_s))
+
+
+def _run_pytest(copy: Path, arguments: str, stem: str, limit_s: float) -> Result:
+    """Run one pytest; the files named after the mutant's come first."""
+    patterns, _, selected = arguments.partition(" -k ")
+    files = [file for each in patterns.split() for file in (copy / "tests").glob(f"{each}.py")]
+    files.sort(key=lambda file: (stem not in file.name, file))
+    command = [*_PYTEST.split(), selected, *map(str, files)]
+    env = os.environ | {"PYTHONPATH": f"{copy}:{copy}/lcm_types"}  # also for the processes that tests start
+    with tempfile.TemporaryFile("w+") as output:  # no pipe, which a process may hold that a test left
+        try:
+            pytest = subprocess.run(
+                command, cwd=copy, env=env, timeout=limit_s, stdout=output, stderr=output, check=False
+            )
+        except subprocess.TimeoutExpired:
+            return Result("hung", "all tests together")
+        output.seek(0)
+        text = output.read()
+    failed = re.search(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", text, re.MULTILINE)
+    if pytest.returncode == 0:
+        return Result("SURVIVED")
+    if failed is None:
+        return Result("error", f"pytest ended with status {pytest.returncode}: {text[-500:]}")
+    return Result("hung" if "Failed: Timeout (>" in text else "killed", failed[1])
+
+
+def load() -> list[Mutant]:
+    """Return all mutants. Raises ValueError and SyntaxError, which name the first that does not fit."""
+    entries = yaml.safe_load((ROOT / "tests/semantic_mutants.yaml").read_text(encoding="utf-8"))
+    mutants = [Mutant(number, **entry) for number, entry in enumerate(entries, start=1)]
+    for each in mutants:
+        compile(each.mutated((ROOT / each.file).read_text(encoding="utf-8")), str(each), "exec")
+    return mutants
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(prog="make mutants")
+    parser = argparse.ArgumentParser(prog="python -m tests.mutants")
     parser.add_argument("packages", nargs="*", metavar="PACKAGE", help=f"{', '.join(TESTS)}; default: all")
-    parser.add_argument("--sample", type=int, metavar="N", help="run N random mutants of each package")
-    parser.add_argument("--seed", type=int, default=1, help="another seed selects another sample")
+    parser.add_argument("--mutant", type=int, action="append", metavar="N", help="only this one; repeatable")
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="how many to run at once")
     arguments = parser.parse_args()
-    packages = arguments.packages or list(TESTS)
-    if unknown := set(packages) - set(TESTS):
+    if unknown := set(arguments.packages) - set(TESTS):
         parser.error(f"unknown package {', '.join(sorted(unknown))}; known are {', '.join(TESTS)}")
-    # Results of an earlier run would be kept although the tests have changed.
-    shutil.rmtree(OUTPUT, ignore_errors=True)
-    _run_fast_tests_first()
-    if arguments.sample:
-        _run_only_a_sample(arguments.sample, arguments.seed)
-    num_children = 1  # the mutants share a network, and LCM's multicast reaches every listener in it
-    if os.environ.get("RTC3D_NETNS") == "1":
-        _run_in_own_networks()
-        num_children = CHILDREN_PER_CORE * len(os.sched_getaffinity(0))
-    for package in packages:
-        print(f"Package {package}")
-        run = Process(target=_run, args=(package, num_children))  # mutmut keeps its state in the process
-        run.start()
-        run.join()
-        if run.exitcode != 0:
-            sys.exit(f"mutmut ended with status {run.exitcode}")
-    config().only_mutate = [f"gateway/{package}/*" for package in packages]
-    results = list(_results())
-    _print_table(results)
-    SURVIVORS.write_text("\n".join(_survivors(results)))
-    print(f"The survivors are in {SURVIVORS}.")
+    mutants: dict[str, list[Mutant]] = {}
+    for mutant in load():
+        is_package = mutant.package in (arguments.packages or TESTS)
+        if is_package and mutant.number in (arguments.mutant or [mutant.number]):
+            mutants.setdefault(mutant.package, []).append(mutant)
+    results: dict[Mutant, Result] = {}
+    broken = []
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder, ThreadPoolExecutor(arguments.jobs) as pool:
+        runner = Runner(Path(folder), arguments.jobs)
+        try:
+            for package, own in mutants.items():
+                control = pool.submit(runner.run, package).result()
+                print(f"{package} without a mutant: {control}", flush=True)
+                if control.outcome != "SURVIVED":
+                    broken.append(package)
+                    continue
+                limit_s = 60 + 6 * control.seconds  # tests that take longer hang
+                for mutant, done in [(each, pool.submit(runner.run, package, each, limit_s)) for each in own]:
+                    results[mutant] = done.result()
+                    print(f"{mutant}: {results[mutant]}", flush=True)
+        except KeyboardInterrupt:  # pytest gets it, too
+            pool.shutdown(cancel_futures=True)
+            sys.exit(130)
+    sys.exit(_report(results, broken))
 
 
-def _run(package: str, num_children: int) -> None:
-    config().only_mutate = [f"gateway/{package}/*"]
-    config().pytest_add_cli_args_test_selection = list(TESTS[package])
-    mutmut.__main__.cli(["run", "--max-children", str(num_children)], standalone_mode=False)
-
-
-def _run_fast_tests_first() -> None:
-    """Sort each mutant's tests by duration, because the first failure ends them."""
-    submit = ForkServerRunner.submit
-
-    def sort_and_submit(runner: ForkServerRunner, mutant: str, tests: list[str], *limits: Any) -> None:
-        tests = sorted(tests, key=state().duration_by_test.__getitem__)
-        submit(runner, mutant, list(dict.fromkeys(map(_selectable, tests))), *limits)
-
-    ForkServerRunner.submit = sort_and_submit
-
-
-def _selectable(test: str) -> str:
-    """Return a name by which pytest finds a test; without its parameters if these contain a backslash.
-
-    pytest escapes backslashes and characters outside ASCII when it collects the tests, and again when it
-    looks for the name.
-    """
-    return test.partition("[")[0] if "\\" in test else test
-
-
-def _run_only_a_sample(size: int, seed: int) -> None:
-    """Select mutants uniformly at random; the same code and seed give the same sample."""
-    collect = mutmut.__main__.collect_source_file_mutation_data
-
-    def collect_sample(**names: Any) -> tuple[list[Any], dict[str, SourceFileMutationData]]:
-        mutants, files = collect(**names)
-        mutants.sort(key=lambda mutant: mutant[1])
-        return random.Random(seed).sample(mutants, min(size, len(mutants))), files
-
-    mutmut.__main__.collect_source_file_mutation_data = collect_sample
-
-
-def _run_in_own_networks() -> None:
-    """Run each mutant's tests in a network namespace of their own, set up as tests/with-netns does."""
-    run_tests = PytestRunner.run_tests
-
-    def enter_network_and_run(runner: PytestRunner, **tests: Any) -> int:
-        if ctypes.CDLL(None, use_errno=True).unshare(_CLONE_NEWNET) != 0:
-            raise OSError(ctypes.get_errno(), "unshare")
-        subprocess.run(["ip", "link", "set", "lo", "up", "multicast", "on"], check=True)
-        subprocess.run(["ip", "route", "add", "224.0.0.0/4", "dev", "lo"], check=True)
-        return int(run_tests(runner, **tests))
-
-    PytestRunner.run_tests = enter_network_and_run
-
-
-def _results() -> Iterator[tuple[Path, dict[str, str]]]:
-    """Yield each source file that has mutants, with the outcome of each mutant by name."""
-    for path in sorted(walk_mutatable_files()):
-        data = SourceFileMutationData(path=path)
-        data.load()
-        if data.exit_code_by_key:
-            yield path, {name: OUTCOMES.get(code, "error") for name, code in data.exit_code_by_key.items()}
-
-
-def _print_table(results: list[tuple[Path, dict[str, str]]]) -> None:
-    table = Table("module", "mutants", "run", *COLUMNS, "%")
-    for column in table.columns:
-        column.no_wrap = True
-        column.justify = "left" if column is table.columns[0] else "right"
-    packages: dict[str, Counter[str]] = {}
-    for path, outcomes in results:
-        package = path.parts[1]
-        if packages and package not in packages:
-            table.add_section()
-        counts = Counter(outcomes.values())
-        packages.setdefault(package, Counter()).update(counts)
-        table.add_row(str(path.relative_to("gateway")), *_figures(counts))
-    table.add_section()
-    for package, counts in packages.items():
-        table.add_row(f"[bold]{package}[/bold]", *_figures(counts))
-    table.add_row("[bold]all[/bold]", *_figures(sum(packages.values(), Counter())))
-    Console(width=110).print(table)
-    for package, counts in packages.items():
-        if counts["not run"]:
-            _print_interval(package, counts)
-
-
-def _figures(counts: Counter[str]) -> list[str]:
-    """Return the cells of one row; a mutant whose tests hang is as good as killed."""
-    num_run = counts.total() - counts["not run"]
-    share = f"{_num_killed(counts) / num_run:.1%}" if num_run else ""
-    return [str(counts.total()), str(num_run), *(str(counts[column]) for column in COLUMNS), share]
-
-
-def _num_killed(counts: Counter[str]) -> int:
-    return counts["killed"] + counts["timeout"]
-
-
-def _print_interval(package: str, counts: Counter[str]) -> None:
-    """Print what a sample says about all mutants of a package: Wilson's interval."""
-    size, z = counts.total() - counts["not run"], 1.96
-    share = _num_killed(counts) / size
-    middle = share + z**2 / (2 * size)
-    half = z * math.sqrt(share * (1 - share) / size + z**2 / (4 * size**2))
-    low, high = ((middle + sign * half) / (1 + z**2 / size) for sign in (-1, 1))
-    print(f"{package}: a sample; of all mutants, {low:.1%} to {high:.1%} are killed, with 95 % confidence.")
-
-
-def _survivors(results: list[tuple[Path, dict[str, str]]]) -> Iterator[str]:
-    for path, outcomes in results:
-        for name, outcome in outcomes.items():
-            if outcome not in {"killed", "timeout", "not run"}:
-                yield f"# {name}: {outcome}\n{get_diff_for_mutant(name, path=path)}"
+def _report(results: dict[Mutant, Result], broken: Sequence[str]) -> int:
+    """Print the figures and the survivors; return the exit status."""
+    outcomes = Counter((each.package, result.outcome) for each, result in results.items())
+    outcomes.update(("all", result.outcome) for result in results.values())
+    percent = 0.0
+    print(f"\n{'package':<14} mutants  killed  hung  survived  error      %")
+    for package in (*TESTS, "all"):
+        counts = [outcomes[package, each] for each in ("killed", "hung", "SURVIVED", "error")]
+        if any(counts):
+            percent = 100 * sum(counts[:2]) / sum(counts)  # a mutant that hangs would be noticed, too
+            print("{:<14}{:8}{:8}{:6}{:10}{:7}{:7.1f}".format(package, sum(counts), *counts, percent))
+    for mutant, result in results.items():
+        if result.outcome not in {"killed", "hung"}:
+            print(f"\n{mutant}: {result.outcome}\n{mutant.changes}\n- {mutant.old}\n+ {mutant.new}")
+    if broken:
+        print(f"\nThese fail without a mutant, so their mutants do not count: {', '.join(broken)}")
+    return int(bool(broken or outcomes["all", "error"]) or percent < LEAST_PERCENT)
 
 
 if __name__ == "__main__":
