@@ -9,6 +9,7 @@ import re
 import sys
 from collections.abc import AsyncIterator, Callable, Mapping
 from contextlib import AbstractAsyncContextManager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -47,7 +48,8 @@ class Target(NamedTuple):
     """Whether new clients are served during an attack, not only after it."""
 
 
-class Port(NamedTuple):
+@dataclass
+class Port:
     port: int
 
 
