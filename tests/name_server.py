@@ -7,6 +7,9 @@ from pathlib import Path
 from typing import Final
 
 _ADDRESS: Final = ("127.0.0.53", 53)
+_TIMEOUT_S: Final = 30
+"""How long a program waits for an answer: longer than a busy computer delays what does not wait for it."""
+
 _USE_FILE: Final = 'mount --bind "$1" /etc/resolv.conf && shift && exec "$@"'
 
 
@@ -17,7 +20,7 @@ def dead_name_server(folder: Path) -> Iterator[tuple[str, ...]]:
     The command gets a file /etc/resolv.conf of its own, in a mount namespace.
     """
     file = folder / "resolv.conf"
-    file.write_text(f"nameserver {_ADDRESS[0]}\n")
+    file.write_text(f"nameserver {_ADDRESS[0]}\noptions timeout:{_TIMEOUT_S}\n")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as server:
         server.bind(_ADDRESS)
         yield ("unshare", "--mount", "sh", "-c", _USE_FILE, "with-resolv-conf", str(file))

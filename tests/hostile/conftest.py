@@ -9,15 +9,9 @@ from typing import Any, Final
 import pytest
 
 from tests.gateway_process import simulator
-from tests.hostile.gateway_under_attack import (
-    HEALTHY_SCENE,
-    GatewayUnderAttack,
-    Report,
-    RunningGateway,
-    run_gateway,
-)
+from tests.hostile.gateway_under_attack import HEALTHY_SCENE, GatewayUnderAttack, RunningGateway, run_gateway
 
-_reports: Final[dict[str, Report]] = {}
+_PROPERTY: Final = "the healthy source"
 
 
 @pytest.fixture(scope="session")
@@ -37,13 +31,22 @@ def gateway_under_attack(
     async def run(*arguments: Any, **options: Any) -> AsyncIterator[RunningGateway]:
         async with partial(run_gateway, tmp_path, healthy_server)(*arguments, **options) as gateway:
             yield gateway
-        _reports[request.node.nodeid.rpartition("/")[2]] = gateway.report
+        request.node.user_properties.append((_PROPERTY, str(gateway.report)))
 
     return run
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    if _reports:
+    """Print the figures, which the reports of the tests bring along from the workers of xdist, too."""
+    figures = [
+        f"{report.nodeid.rpartition('/')[2]}: {text}"
+        for reports in terminalreporter.stats.values()
+        for report in reports
+        if getattr(report, "when", "") == "call"
+        for key, text in report.user_properties
+        if key == _PROPERTY
+    ]
+    if figures:
         terminalreporter.section("the healthy source during attacks")
-        for name, report in _reports.items():
-            terminalreporter.write_line(f"{name}: {report}")
+        for line in figures:
+            terminalreporter.write_line(line)

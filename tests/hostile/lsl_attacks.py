@@ -4,8 +4,9 @@ import asyncio
 import contextlib
 import os
 import socket
-from collections.abc import Awaitable, Callable
 from typing import Final
+
+from tests.hostile.port_attacks import Attack
 
 SEARCH_PORT: Final = 16571
 STREAM_PORTS: Final = range(16572, 16582)
@@ -28,10 +29,8 @@ _MISTAKES: Final = (
     b"\r\n" * 1000,
 )
 
-LslAttack = Callable[[], Awaitable[None]]
 
-
-async def endless_line() -> None:
+async def endless_line(_port: int) -> None:
     """Send bytes without the end of a line, which liblsl stores."""
 
     async def send(port: int) -> None:
@@ -49,7 +48,7 @@ async def endless_line() -> None:
             group.create_task(send(port))
 
 
-async def silent_connections() -> None:
+async def silent_connections(_port: int) -> None:
     """Open connections that say nothing, and keep them."""
     with contextlib.ExitStack() as kept:
         for at in range(_NUM_SILENT):
@@ -61,7 +60,7 @@ async def silent_connections() -> None:
         await asyncio.Event().wait()
 
 
-async def stalled_receivers() -> None:
+async def stalled_receivers(_port: int) -> None:
     """Ask for all samples, and never read them."""
     with contextlib.ExitStack() as kept:
         for _ in range(_NUM_RECEIVERS):
@@ -78,7 +77,7 @@ async def stalled_receivers() -> None:
         await asyncio.Event().wait()
 
 
-async def mistakes() -> None:
+async def mistakes(_port: int) -> None:
     """Send requests that are wrong in several ways, half of them half-open, and datagrams of nonsense."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         while True:
@@ -96,10 +95,10 @@ async def mistakes() -> None:
                 await asyncio.sleep(0.005)
 
 
-LSL_ATTACKS: Final[dict[str, LslAttack]] = {
+ATTACKS: Final[dict[str, Attack]] = {
     "endless line": endless_line,
     "silent connections": silent_connections,
     "stalled receivers": stalled_receivers,
     "mistakes": mistakes,
 }
-"""Each goes on until it is cancelled."""
+"""Each goes on until it is cancelled. The ports are always the same."""

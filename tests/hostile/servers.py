@@ -190,11 +190,6 @@ async def damaged_frames(client: Client) -> None:
             await client.drain()
 
 
-async def changing_marker_counts(client: Client) -> None:
-    frames = [markers_frame(n, *[(1.0, 2.0, 3.0)] * (n % 50)) for n in range(1, 1000)]
-    await flood(client, b"".join(frames))
-
-
 async def unfinished_frame(client: Client) -> None:
     client.send(next(good_frames())[:-1])
     await ignore(client)
@@ -272,16 +267,12 @@ SERVERS: Final[dict[str, dict[str, Script]]] = {
     "packets of a stream": {
         "endless-errors": streaming_flood(error("err-" + _CONTROL) * 10),
         "endless-replies": streaming_flood(ok("OK-StreamFrames") * 1000),
-        "endless-no-data": streaming_flood(packet(4) * 1000),
         "endless-types": streaming(endless_packet_types),
         "endless-xml": streaming_flood(packet(2, PARAMETERS) * 10),
         "endless-files": streaming_flood(packet(5, b"no C3D file") * 100),
-        "empty-packets": streaming_flood(packet(3) * 1000),
     },
     "frames": {
         "damaged-frames": streaming(damaged_frames),
-        "changing-counts": streaming(changing_marker_counts),
-        "empty-frames": streaming_flood(packet(3, bytes(4)) * 1000),
         "many-components": streaming_flood(packet(3, b"\xff" * 1000) * 100),
         "extreme-numbers": streaming_flood(EXTREME_FRAMES * 100),
         "huge-frames": streaming_flood(HUGE_FRAME),

@@ -13,8 +13,8 @@ import pytest
 
 from tests.gateway_process import simulator
 from tests.hostile.gateway_under_attack import GatewayUnderAttack
+from tests.hostile.server_floods import EVENT, MARKERS, component, frame
 from tests.hostile.servers import streaming
-from tests.hostile.test_frames import EVENT, MARKERS, component, frame
 from tests.proxy import FuzzingProxy
 from tests.servers import Client, ScriptedServer
 

@@ -22,8 +22,8 @@ from tests.fresh_clones import (
     skip_if_plain,
 )
 
-# The compiled modules take a minute on a busy machine.
-pytestmark = [pytest.mark.wheelhouse, pytest.mark.timeout(600)]
+# The compiled modules take a minute on a busy machine; one worker builds them.
+pytestmark = [pytest.mark.wheelhouse, pytest.mark.timeout(600), pytest.mark.xdist_group("installation")]
 
 _PATH = "/usr/local/bin:/usr/bin:/bin"
 

@@ -22,11 +22,10 @@ import zenoh
 from gateway.messages.topics import lcm_channel
 from gateway.outputs.lcm.connection import open_lcm
 from tests.hostile.foxglove_viewers import ATTACKS as VIEWERS
-from tests.hostile.lsl_attacks import LSL_ATTACKS, LslAttack
+from tests.hostile.lsl_attacks import ATTACKS as LSL_ATTACKS
 from tests.hostile.rtc3d_clients import ATTACKS as RTC3D_CLIENTS
+from tests.hostile.server_floods import FLOODS
 from tests.hostile.servers import SERVERS, streaming
-from tests.hostile.test_parameters import ATTACKS as PARAMETERS
-from tests.hostile.test_parameters import giving
 from tests.hostile.vrpn_clients import ATTACKS as VRPN_CLIENTS
 from tests.hostile.zenoh_peer import KINDS
 from tests.networks import open_zenoh
@@ -144,14 +143,7 @@ async def _held_http_connections(target: Target) -> None:
 
 
 def _on_port_of(output: str, attack: Callable[[int], Awaitable[None]]) -> Attack:
-    return lambda target: attack(target.output_ports[output])
-
-
-def _lsl(attack: LslAttack) -> Attack:
-    async def run(_target: Target) -> None:
-        await attack()
-
-    return run
+    return lambda target: attack(target.output_ports.get(output, 0))  # LSL's ports are always the same
 
 
 async def _reloads(target: Target) -> None:
@@ -164,7 +156,11 @@ ATTACKS: Final[dict[str, Attack]] = {
     **{f"server: {name}": _server(script) for group in SERVERS.values() for name, script in group.items()},
     "server: many-files": _server(streaming(_many_files)),
     "server: large-files": _server(streaming(_large_files)),
-    **{f"parameters: {name}": _server(giving(xml)) for name, xml in PARAMETERS.items()},
+    **{
+        f"{group}: {name}": _server(script)
+        for group, (servers, _) in FLOODS.items()
+        for name, script in servers.items()
+    },
     "asker: all frames as JSON": _questions("mocap/healthy/3d?format=json"),
     "asker: everything": _questions("mocap/healthy/**"),
     "asker: unknown keys": _questions("mocap/healthy/none/of/these?format=none"),
@@ -176,7 +172,7 @@ ATTACKS: Final[dict[str, Attack]] = {
     **{f"RTC3D client: {name}": _on_port_of("rtc3d", attack) for name, attack in RTC3D_CLIENTS.items()},
     **{f"VRPN client: {name}": _on_port_of("vrpn", attack) for name, attack in VRPN_CLIENTS.items()},
     **{f"viewer: {name}": _on_port_of("foxglove", attack) for name, attack in VIEWERS.items()},
-    **{f"LSL: {name}": _lsl(attack) for name, attack in LSL_ATTACKS.items()},
+    **{f"LSL: {name}": _on_port_of("lsl", attack) for name, attack in LSL_ATTACKS.items()},
     "host: HTTP connections": _held_http_connections,
     "host: reloads": _reloads,
 }
