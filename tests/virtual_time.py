@@ -1,34 +1,36 @@
-"""An event loop whose clock jumps to the next timer, so that a test can go through hours without waiting."""
+"""An event loop with virtual time: waiting takes no time, and the order of events is exact."""
 
 import asyncio
 import selectors
-from collections.abc import Coroutine
-from typing import Any, Final, TypeVar
+from collections.abc import Callable, Coroutine
+from typing import Any, TypeVar
 
-_START_S: Final = 1000.0
+EPOCH_UTIME = 1_700_000_000_000_000
+
+STEP_S = 0.01
+_MAX_STEPS = 10_000
+
 _Result = TypeVar("_Result")
 
 
 class _JumpingSelector(selectors.DefaultSelector):
-    """A selector that never waits for a timer, but moves the clock forward by that time."""
+    """Never waits. When the loop would wait, time jumps to the next timer."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.now_s = _START_S
+        self.now_s = 1000.0
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
-        ready = super().select(None if timeout is None else 0)
-        if not ready and timeout is not None:
+        ready = super().select(0)
+        if not ready:
+            if timeout is None:
+                raise AssertionError("no task is ready and no timer is set: the test would never end")
             self.now_s += max(0.0, timeout)
         return ready
 
 
 class VirtualTimeLoop(asyncio.SelectorEventLoop):
-    """An event loop for code that waits on timers only.
-
-    The clock also jumps on while a socket or a thread has yet to answer. Code that waits for these with a
-    time-out needs a real loop.
-    """
+    """An event loop for tests without sockets and threads."""
 
     def __init__(self) -> None:
         self._jumping = _JumpingSelector()
@@ -37,8 +39,40 @@ class VirtualTimeLoop(asyncio.SelectorEventLoop):
     def time(self) -> float:
         return self._jumping.now_s
 
+    def stop_process(self, seconds: float) -> None:
+        """Let time pass as while the process is stopped: no timer is called, and no socket is read."""
+        self._jumping.now_s += seconds
+
 
 def run_in_virtual_time(test: Coroutine[Any, Any, _Result]) -> _Result:
-    """Run a coroutine in a ``VirtualTimeLoop`` and return its result; loop.time() begins at 1000 s."""
+    """Run a coroutine in a VirtualTimeLoop, and return its result; loop.time() begins at 1000 s."""
     with asyncio.Runner(loop_factory=VirtualTimeLoop) as runner:
         return runner.run(test)
+
+
+def stop_process(seconds: float) -> None:
+    """Stop the process in virtual time; see VirtualTimeLoop."""
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, VirtualTimeLoop)
+    loop.stop_process(seconds)
+
+
+def read_clocks() -> tuple[int, int]:
+    """Return the virtual time as HostClock.read does; the steady clock began at EPOCH_UTIME."""
+    steady_us = round(1e6 * asyncio.get_running_loop().time())
+    return EPOCH_UTIME + steady_us, steady_us
+
+
+async def settle() -> None:
+    """Run everything that is ready now."""
+    for _ in range(20):
+        await asyncio.sleep(0)
+
+
+async def until(condition: Callable[[], Any]) -> None:
+    """Let virtual time pass, in steps of 10 ms, until ``condition`` holds."""
+    for _ in range(_MAX_STEPS):
+        if condition():
+            return
+        await asyncio.sleep(STEP_S)
+    raise AssertionError(f"still not true after {_MAX_STEPS * STEP_S:g} s of virtual time")

@@ -7,7 +7,7 @@ from typing import Final
 import pytest
 
 from tests.unit.scripted_sources import Servers, SlowThreads, use_scripted_servers
-from tests.unit.stream.virtual_time import VirtualTimeLoop
+from tests.virtual_time import VirtualTimeLoop
 
 _IN_VIRTUAL_TIME: Final = {
     "test_automatic_streams.py",

@@ -12,7 +12,7 @@ from gateway.config.settings import SourceSettings
 from gateway.stream.supervisor import Supervisor
 from gateway.worker_thread import WorkerThread
 from tests.unit.stream.scripted_server import ScriptedServer
-from tests.unit.stream.virtual_time import read_clocks
+from tests.virtual_time import read_clocks
 
 
 class Servers:

@@ -13,8 +13,8 @@ from tests.servers import error, ok, packet
 from tests.spec_parameters import in_root
 from tests.unit.scripted_sources import Servers
 from tests.unit.stream.scripted_server import Connection, ScriptedServer
-from tests.unit.stream.virtual_time import settle, until
 from tests.unit.test_source import HOST, Lab
+from tests.virtual_time import settle, until
 
 EVERYTHING = "3d 6d analog force event"
 TWO = ["3d 6d force event", "analog"]

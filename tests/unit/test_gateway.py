@@ -27,7 +27,7 @@ from tests.example_output import EXAMPLE, UNREACHABLE, ExampleOutput, ExampleSet
 from tests.servers import c3d_file, packet
 from tests.unit.scripted_sources import Servers, SlowThreads
 from tests.unit.stream.scripted_server import XML, silent_to
-from tests.unit.stream.virtual_time import settle, until
+from tests.virtual_time import settle, until
 
 pytestmark = pytest.mark.usefixtures("servers", "threads")
 REFUSED = "refused"

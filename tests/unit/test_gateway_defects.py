@@ -19,7 +19,6 @@ from gateway.stream.status import StreamStatus
 from gateway.stream.streams import AutomaticStreams
 from gateway.stream.supervisor import Supervisor
 from tests.unit.scripted_sources import Servers
-from tests.unit.stream.virtual_time import settle
 from tests.unit.test_gateway import (
     RecordingOutput,
     connected,
@@ -28,6 +27,7 @@ from tests.unit.test_gateway import (
     settings,
     subscribe,
 )
+from tests.virtual_time import settle
 
 pytestmark = pytest.mark.usefixtures("servers", "threads")
 

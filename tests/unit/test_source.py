@@ -26,7 +26,7 @@ from tests.servers import c3d_file, packet
 from tests.toy_output import ToyOutput, ToyPublisher
 from tests.unit.scripted_sources import Servers
 from tests.unit.stream.scripted_server import ScriptedServer
-from tests.unit.stream.virtual_time import settle, until
+from tests.virtual_time import settle, until
 
 HOST = "192.0.2.20"
 STREAM = "lab (3d 6d analog force event)"

@@ -19,8 +19,8 @@ from tests.unit.publish.test_tool_poses import IN_VIEW, tools_frame
 from tests.unit.queries.fake_source import parameters_xml
 from tests.unit.scripted_sources import Servers
 from tests.unit.stream.scripted_server import XML, Answer, obliging, refusing, silent_to
-from tests.unit.stream.virtual_time import settle
 from tests.unit.test_source import TWO_STREAMS, Lab, running, spool
+from tests.virtual_time import settle
 
 __all__ = ["spool"]  # a fixture
 

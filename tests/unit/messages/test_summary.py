@@ -58,6 +58,7 @@ from tests.vectors import ANALOG, FORCE, LONG_EVENTS, MARKERS, TOOLS
             "outputs: zenoh ok; lcm no multicast: ip route add",
         ),
     ],
+    ids=lambda each: each if isinstance(each, str) else "",  # messages have the time
 )
 def test_a_summary_shows_what_matters_first(message: bytes, line: str) -> None:
     assert summarise(decode(message)) == line

@@ -14,7 +14,7 @@ from gateway.gateway import Gateway
 from gateway.outputs.memory import MemoryOutput
 from gateway.service.daemon import Daemon
 from tests.unit.scripted_sources import Servers, SlowThreads
-from tests.unit.stream.virtual_time import settle, until
+from tests.virtual_time import settle, until
 
 pytestmark = pytest.mark.usefixtures("servers", "threads")
 

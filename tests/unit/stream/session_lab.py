@@ -13,7 +13,7 @@ from gateway.stream.status import StreamStatus
 from tests.servers import packet
 from tests.unit.stream.collected_files import CollectedFiles
 from tests.unit.stream.scripted_server import Connection, ScriptedServer
-from tests.unit.stream.virtual_time import EPOCH_UTIME, read_clocks
+from tests.virtual_time import EPOCH_UTIME, read_clocks
 
 NO_DATA = packet(4)
 

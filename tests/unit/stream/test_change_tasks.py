@@ -23,7 +23,7 @@ from tests.unit.stream.scripted_server import (
     refusing,
     silent_to,
 )
-from tests.unit.stream.virtual_time import settle
+from tests.virtual_time import settle
 
 START, STOP = "StreamFrames AllFrames", "StreamFrames Stop"
 HALF = "StreamFrames FrequencyDivisor:2"

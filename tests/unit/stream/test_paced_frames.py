@@ -6,7 +6,7 @@ from gateway.stream.clock import ServerClock
 from gateway.stream.paced_frames import MAX_TOGETHER, PacedFrames
 from gateway.stream.running_clock import running_clock
 from tests.unit.stream.test_backlog import frames
-from tests.unit.stream.virtual_time import read_clocks, until
+from tests.virtual_time import read_clocks, until
 
 
 class Lab:

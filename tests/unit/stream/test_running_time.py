@@ -6,7 +6,7 @@ import pytest
 
 from gateway.stream.running_clock import running_clock
 from gateway.stream.running_time import running_timeout
-from tests.unit.stream.virtual_time import stop_process
+from tests.virtual_time import stop_process
 
 
 def now_s() -> float:

@@ -19,8 +19,8 @@ from tests.unit.stream.scripted_server import (
     silent_to,
 )
 from tests.unit.stream.session_lab import Lab, lab, now_s
-from tests.unit.stream.virtual_time import settle
 from tests.vectors import STOP_RECORDING
+from tests.virtual_time import settle
 
 __all__ = ["lab"]
 

@@ -14,7 +14,7 @@ from gateway.stream.session import Session
 from gateway.stream.status import StreamStatus
 from tests.servers import packet
 from tests.unit.stream.scripted_server import Connection, ScriptedServer, silent_to
-from tests.unit.stream.virtual_time import read_clocks, settle, until
+from tests.virtual_time import read_clocks, settle, until
 
 
 class Lab:

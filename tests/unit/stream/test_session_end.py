@@ -9,7 +9,7 @@ from gateway.rtc3d.commands import Version
 from gateway.stream.state import StreamState
 from tests.unit.stream.scripted_server import silent_to
 from tests.unit.stream.session_lab import Lab, lab, now_s
-from tests.unit.stream.virtual_time import settle
+from tests.virtual_time import settle
 
 __all__ = ["lab"]
 

@@ -11,7 +11,7 @@ from gateway.stream.state import StreamState
 from tests.servers import ok, packet
 from tests.unit.stream.scripted_server import BROKEN_FRAME, obliging, silent_to
 from tests.unit.stream.session_lab import NO_DATA, Lab, lab, now_s
-from tests.unit.stream.virtual_time import stop_process
+from tests.virtual_time import stop_process
 
 __all__ = ["lab"]
 

@@ -16,7 +16,7 @@ from gateway.stream.status import StreamStatus
 from tests.losses import amounts
 from tests.servers import markers_frame, packet
 from tests.unit.stream.scripted_server import ScriptedServer
-from tests.unit.stream.virtual_time import read_clocks, settle
+from tests.virtual_time import read_clocks, settle
 
 STEP_S = 0.0005
 """How much time passes from one reading of the clock to the next, as if the work between them took it."""

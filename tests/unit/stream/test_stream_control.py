@@ -26,7 +26,7 @@ from tests.unit.stream.scripted_server import (
     refusing,
     silent_to,
 )
-from tests.unit.stream.virtual_time import read_clocks, settle, until
+from tests.virtual_time import read_clocks, settle, until
 
 RATE_XML = packet(2, "<RT_Parameters Ver='1.00'><The_3D><Frequency>200</Frequency></The_3D></RT_Parameters>")
 

@@ -10,7 +10,7 @@ from tests.losses import amounts
 from tests.servers import error, markers_frame, packet
 from tests.unit.stream import session_lab, test_stream_control
 from tests.unit.stream.scripted_server import obliging, refusing
-from tests.unit.stream.virtual_time import settle
+from tests.virtual_time import settle
 
 SERVER = "192.0.2.20:3020"
 TOO_SHORT = packet(3, b"\0\0\0")

@@ -18,7 +18,7 @@ from tests.unit.stream.scripted_server import (
     silent_to,
 )
 from tests.unit.stream.test_supervisor import Lab, running
-from tests.unit.stream.virtual_time import until
+from tests.virtual_time import until
 
 BARE = "StreamFrames"
 FIRST_FORM = "StreamFrames AllFrames"

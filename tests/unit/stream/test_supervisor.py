@@ -24,7 +24,7 @@ from gateway.stream.supervisor import Callbacks, Listener, Supervisor
 from tests.servers import packet
 from tests.unit.stream.collected_files import CollectedFiles
 from tests.unit.stream.scripted_server import ScriptedServer, read_parameters, refusing, silent_to
-from tests.unit.stream.virtual_time import STEP_S, read_clocks, settle, until
+from tests.virtual_time import STEP_S, read_clocks, settle, until
 
 FIRST_DELAY_S, MAX_DELAY_S = 0.2, 10.0
 
