@@ -37,12 +37,16 @@ def main() -> int:
         *("--tx", f"{workers}*popen//python={_WITH_NETNS} {sys.executable}"),
         *("--dist", "worksteal", "--durations", "10", *sys.argv[1:]),
     ]
+    for number in (signal.SIGINT, signal.SIGQUIT, signal.SIGHUP):
+        signal.signal(number, signal.SIG_DFL)  # `&` and nohup ignore them, and the tests would inherit that
     # In a session of its own, pytest receives one signal for each Ctrl-C: that of ``stop``.
     pytest = subprocess.Popen([sys.executable, "-m", "pytest", *arguments], start_new_session=True)
 
+    stop_signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
     def stop(_signal: int, _frame: FrameType | None) -> None:
-        for name in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(name, signal.SIG_IGN)
+        for number in stop_signals:
+            signal.signal(number, signal.SIG_IGN)
         os.kill(pytest.pid, signal.SIGINT)
         kill_later(WORKERS_S, lambda: set(_descendants(os.getpid())) - {pytest.pid})
         kill_later(SUMMARY_S, lambda: {pytest.pid})
@@ -52,8 +56,8 @@ def main() -> int:
         timer.daemon = True
         timer.start()
 
-    for name in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(name, stop)
+    for number in stop_signals:
+        signal.signal(number, stop)
     status = _reap_until(pytest.pid)
     while processes := list(_descendants(os.getpid())):
         _kill(processes)

@@ -21,6 +21,7 @@ from gateway.outputs.zenoh.settings import ZenohSettings
 from gateway.outputs.zenoh.subscriber import ZenohSubscriber
 from gateway.takes.event_log import EventLogReader
 from tests.lcm_relay import LcmRelay
+from tests.needs import need_programs
 from tests.networks import (
     add_multicast_route,
     free_endpoint,
@@ -138,6 +139,7 @@ class LcmRig:
     remedies = ("ip route add 224.0.0.0/4",)
 
     def __init__(self) -> None:
+        need_programs("ip", packages="iproute2")
         self.names = LCM_CHANNELS
         self._url = lcm_url()
         self._subscriber: LcmSubscriber | None = None

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Final
 
 from tests.gateway_process import GatewayProcess, gaps, gateway_process, simulator
+from tests.needs import need_programs
 from tests.waiting import wait_until
 
 RATE_HZ: Final = 200
@@ -45,6 +46,7 @@ class WallClock:
     """The wall clock that a process with ``environ`` sees."""
 
     def __init__(self, folder: Path) -> None:
+        need_programs("gcc", packages="gcc and libc6-dev")
         source, library, self._file = folder / "shim.c", folder / "shim.so", folder / "offset"
         source.write_text(SHIM)
         subprocess.run(["gcc", "-shared", "-fPIC", "-o", library, source, "-ldl"], check=True)

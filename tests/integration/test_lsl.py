@@ -95,8 +95,7 @@ def receive_until_the_clock_is_known(receiver: LslReceiver, rate_hz: int = RATE_
 
 def children(process_id: int) -> list[int]:
     """Return the process for LSL of a gateway."""
-    listed = subprocess.run(["pgrep", "-P", str(process_id)], capture_output=True, text=True, check=False)
-    return [int(line) for line in listed.stdout.split()]
+    return list(map(int, Path(f"/proc/{process_id}/task/{process_id}/children").read_text().split()))
 
 
 def test_a_recording_has_labels_units_rates_and_capture_times(tmp_path: Path) -> None:

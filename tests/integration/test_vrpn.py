@@ -23,6 +23,7 @@ from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
 from gateway.stream.state import StreamState
 from tests.configurations import make_settings
+from tests.needs import need
 from tests.networks import free_port
 from tests.running_gateway import running_gateway
 from tests.tool_server import ToolServer
@@ -95,6 +96,7 @@ class LibVrpn:
 
 @contextlib.asynccontextmanager
 async def libvrpn(address: str) -> AsyncIterator[LibVrpn]:
+    need(Path("/etc/protocols").exists(), "libvrpn reads /etc/protocols: install Debian's netbase")
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "tests.vrpn_oracle", address), stdout=PIPE, limit=1 << 20
     )
