@@ -95,7 +95,8 @@ def receive_until_the_clock_is_known(receiver: LslReceiver, rate_hz: int = RATE_
 
 def children(process_id: int) -> list[int]:
     """Return the process for LSL of a gateway."""
-    return list(map(int, Path(f"/proc/{process_id}/task/{process_id}/children").read_text().split()))
+    threads = Path(f"/proc/{process_id}/task").glob("*/children")
+    return [int(child) for children in threads for child in children.read_text().split()]
 
 
 def test_a_recording_has_labels_units_rates_and_capture_times(tmp_path: Path) -> None:
