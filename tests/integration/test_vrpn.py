@@ -77,6 +77,9 @@ async def served(
         yield Served(gateway, port, memory)
 
 
+HAS_PROTOCOLS = Path("/etc/protocols").exists()
+
+
 class LibVrpn:
     """The real libvrpn in a process of its own."""
 
@@ -97,7 +100,7 @@ class LibVrpn:
 
 @contextlib.asynccontextmanager
 async def libvrpn(address: str) -> AsyncIterator[LibVrpn]:
-    need(Path("/etc/protocols").exists(), "libvrpn reads /etc/protocols: install Debian's netbase")
+    need(HAS_PROTOCOLS, "libvrpn reads /etc/protocols: install Debian's netbase")
     process = await asyncio.create_subprocess_exec(
         *(sys.executable, "-m", "tests.vrpn_oracle", address), stdout=PIPE, limit=1 << 20
     )
