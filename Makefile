@@ -29,7 +29,7 @@ test: .venv/installed
 
 # What is slow by nature: attacks, browsers, installation, systemd, the examples in other languages, and the commands
 # in the documents.
-SLOW_TESTS := $(addprefix tests/,hostile documents systemd packaging languages benchmarks view site)
+SLOW_TESTS := $(addprefix tests/,hostile docs systemd packaging languages benchmarks view site)
 
 test-slow: .venv/installed build/wheelhouse/complete
 	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py $(or $(ARGS),$(SLOW_TESTS))
