@@ -29,10 +29,10 @@ test: .venv/installed
 
 # What is slow by nature: attacks, browsers, installation, systemd, the examples in other languages, and the commands
 # in the documents.
-SLOW_TESTS := $(addprefix tests/,hostile docs systemd packaging languages benchmarks view site)
+SLOW_TESTS := $(addprefix tests/,systemd packaging hostile docs languages benchmarks view site)
 
 test-slow: .venv/installed build/wheelhouse/complete
-	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py $(or $(ARGS),$(SLOW_TESTS))
+	MAKEFLAGS= SYSTEM_PYTHON=$(SYSTEM_PYTHON) exec $(BIN)/python tests/run.py --dist loadgroup $(or $(ARGS),$(SLOW_TESTS))
 
 # The tests of the compiled modules and of what uses them, run with the compiled modules instead of the sources.
 # Tests marked `interpreted` replace what compiled code does not look up, or would wait 14 s because they cannot.

@@ -338,10 +338,14 @@ def test_a_frame_that_is_too_long_is_counted_and_published_without_json(lab: Lab
     lab.subscribe("mocap/**")
     publisher = lab.publisher()
     _, message = markers(MAX_JSON_SOURCE_BYTES // 16)
-    publisher.publish(message)
-    wait_until(lambda: lab.samples)
-    assert str(lab.samples[0].key_expr) == "mocap/lab/3d"
-    assert lab.lost == {"json too long": 1}
+
+    def is_received() -> bool:
+        publisher.publish(message)  # Zenoh drops so long a message if the machine is busy
+        return "json too long" in lab.lost and bool(lab.samples)
+
+    wait_until(is_received)
+    assert {str(sample.key_expr) for sample in lab.samples} == {"mocap/lab/3d"}
+    assert lab.lost.keys() == {"json too long"}
     publisher.publish(markers(1, 100)[1])
     wait_until(lambda: "mocap/lab/3d/json" in {str(sample.key_expr) for sample in lab.samples})
 
