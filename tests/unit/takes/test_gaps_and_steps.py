@@ -128,6 +128,16 @@ def test_after_a_long_pause_the_clock_is_compared_anew() -> None:
     assert [steps_after(pause) for pause in (1, 60, 61)] == [1, 1, 0]
 
 
+def test_of_a_second_that_is_read_in_two_parts_the_earliest_frame_counts() -> None:
+    """Frames that the network delayed must not look like a step of the clock where a batch ends."""
+    steps = ClockSteps()
+    for second in range(40):
+        for part_us, delay_us in ((0, 0), (500_000, 5_000_000 * (second >= 20))):
+            timestamp_us = 1_000_000 * second + part_us
+            steps.add(np.array([10**15 + timestamp_us + delay_us]), np.array([timestamp_us]))
+    assert steps.num_steps == 0
+
+
 def test_listed_steps_are_bounded() -> None:
     """A clock that jumps all night must not fill the memory."""
     delays = [2 * SECOND_US * (window // 5 % 2) for window in range(5 * 104 + 1)]
