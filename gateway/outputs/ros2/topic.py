@@ -9,7 +9,7 @@ import zenoh
 from gateway.outputs.ros2.message_types import RosType
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.ros2.wire import NODE_ID, Node, QoS, attachment, data_key, gid_of
-from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
 
 NODE_NAME: Final = "rtc3d_gateway"
 
@@ -40,8 +40,7 @@ class RosNode:
         def on_status(status: zenoh.MatchingStatus) -> None:
             on_matching(status.matching)
 
-        # Directly in Zenoh's thread: there can be hundreds of topics, and each would have a thread otherwise.
-        publisher.declare_matching_listener(zenoh.handlers.Callback(on_status, indirect=False))
+        publisher.declare_matching_listener(in_zenoh_thread(on_status))
         self._last_entity_id += 1
         qos = QoS(self._is_reliable, settings.depth)
         token = self._node.publisher_token(self._last_entity_id, topic.name, topic.type, type_hash, qos)

@@ -23,7 +23,7 @@ from gateway.outputs.contract import ServerParameters
 from gateway.outputs.encodings import JSON
 from gateway.outputs.pacing import Pacer
 from gateway.outputs.send_thread import SendThread
-from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
 from gateway.rtc3d.components import COMPONENTS_BY_KEY, ComponentType
 from gateway.rtc3d.parameters import Parameters
 from gateway.token_bucket import TokenBucket
@@ -148,7 +148,7 @@ class JsonPublisher:
         publisher = session.declare_publisher(
             self._key, encoding=JSON, congestion_control=zenoh.CongestionControl.DROP
         )
-        publisher.declare_matching_listener(lambda status: self._set_wanted(status.matching))
+        publisher.declare_matching_listener(in_zenoh_thread(lambda status: self._set_wanted(status.matching)))
         self._publisher = publisher
 
     def check_subscribers(self) -> None:

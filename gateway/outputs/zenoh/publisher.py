@@ -9,7 +9,7 @@ import zenoh
 
 from gateway.errors import OutputError
 from gateway.outputs.encodings import LCM
-from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
 from gateway.outputs.zenoh.json_keys import JsonPublisher
 
 BURST_BYTES: Final = 128 * 1024
@@ -79,7 +79,7 @@ class ZenohPublisher:
             congestion_control=zenoh.CongestionControl.DROP,
             express=self._express,
         )
-        publisher.declare_matching_listener(self._on_matching)  # also reports existing subscribers
+        publisher.declare_matching_listener(in_zenoh_thread(self._on_matching))  # also reports existing subscribers
         self._publisher = publisher
         if self.json is not None:
             self.json.declare(session)

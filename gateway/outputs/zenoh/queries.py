@@ -22,7 +22,7 @@ from gateway.outputs.contract import QueryService, ServerParameters
 from gateway.outputs.encodings import JSON, XML, json_bytes
 from gateway.outputs.send_thread import SendThread
 from gateway.outputs.zenoh.answers import MAX_PENDING, ZenohAnswers
-from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.outputs.zenoh.config import in_zenoh_thread, zenoh_reason
 from gateway.outputs.zenoh.settings import ZenohSettings
 
 # Parameters must arrive, even if that takes longer, and messages of streams have priority.
@@ -133,14 +133,14 @@ class ZenohQueries:
 
         def on_matching(status: zenoh.MatchingStatus) -> None:
             if status.matching:
-                self._publish_soon(source)
+                self._call_in_loop(self._publish_soon, source)
 
         queryable = session.declare_queryable(f"{key}/**", on_query)
         publisher = _parameters_publisher(session, f"{key}/parameters")
         # An AdvancedPublisher does not report its subscribers, so a plain publisher on the same key does.
         # Otherwise plain subscribers that connect late would have to wait for the next change.
         subscriber_watch = session.declare_publisher(f"{key}/parameters")
-        subscriber_watch.declare_matching_listener(on_matching)
+        subscriber_watch.declare_matching_listener(in_zenoh_thread(on_matching))
         return _Declared(queryable, publisher, subscriber_watch)
 
     def _call_in_loop(self, call: Callable[..., object], *arguments: Any) -> None:
@@ -172,12 +172,10 @@ class ZenohQueries:
             self._publish_again(source)
 
     def _publish_soon(self, source: str) -> None:
-        """Publish the parameters again, from one of Zenoh's threads."""
-        with self._lock:
-            if source in self._due:
-                return
+        """Publish the parameters again for a new subscriber."""
+        if source not in self._due:
             self._due.add(source)
-        self._call_in_loop(self._publish_due, source)
+            self._publish_due(source)
 
     def _publish_due(self, source: str) -> None:
         """Publish the parameters again, unless that has just been done: a peer can appear again and again."""
@@ -186,8 +184,7 @@ class ZenohQueries:
             self._loop.call_later(wait_s, self._publish_due, source)
             return
         self._published_s[source] = time.monotonic()
-        with self._lock:
-            self._due.discard(source)
+        self._due.discard(source)
         self._publish_again(source)
 
     def _publish_again(self, source: str) -> Future[None] | None:
