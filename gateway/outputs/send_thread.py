@@ -15,7 +15,7 @@ MAX_BYTES: Final = 64 * 1024 * 1024
 
 
 class SendThread:
-    """Makes calls one after the other in its own thread.
+    """Makes calls one after the other in its own thread, which the first call starts.
 
     Two queues: calls that must be made (``submit``) go first, and their callers bound them. Calls that may be
     given up (``offer``) are refused while too many wait.
@@ -32,14 +32,14 @@ class SendThread:
         self._offered_bytes = 0
         self._is_closed = False
         self._last: Callable[[], None]
-        threading.Thread(target=self._run, name=name, daemon=True).start()
+        self._is_running = False
 
     def submit(self, call: Callable[[], None]) -> Future[None]:
         """Queue ``call`` before those that were offered; the future has its result or exception."""
         done: Future[None] = Future()
         with self._changed:
             self._first.append((done, call))
-            self._changed.notify()
+            self._wake()
         return done
 
     def offer(self, call: Callable[[], None], num_bytes: int = 0) -> bool:
@@ -53,7 +53,7 @@ class SendThread:
                 return False
             self._offered.append((num_bytes, call))
             self._offered_bytes += num_bytes
-            self._changed.notify()
+            self._wake()
         return True
 
     def close(self, last: Callable[[], None] = lambda: None) -> None:
@@ -61,7 +61,13 @@ class SendThread:
         with self._changed:
             self._is_closed = True
             self._last = last
-            self._changed.notify()
+            self._wake()
+
+    def _wake(self) -> None:
+        if not self._is_running:
+            threading.Thread(target=self._run, name=self._name, daemon=True).start()
+            self._is_running = True
+        self._changed.notify()
 
     def _run(self) -> None:
         while (call := self._next()) is not None:
