@@ -144,8 +144,10 @@ class ClientConnection(asyncio.BufferedProtocol):
         """See asyncio.Protocol."""
         self.transport = cast(asyncio.Transport, transport)
         self.transport.set_write_buffer_limits(high=self._owner.max_unread_bytes)
-        address, port = transport.get_extra_info("peername")[:2]
-        self.session.name = f"[{address}]:{port}" if ":" in address else f"{address}:{port}"
+        peer = transport.get_extra_info("peername")
+        if peer is not None:  # the client has not reset the connection already
+            address, port = peer[:2]
+            self.session.name = f"[{address}]:{port}" if ":" in address else f"{address}:{port}"
         self.filter = self._owner.new_filter(self)
         self.number = self._owner.connection_opened(self)
 

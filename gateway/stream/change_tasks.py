@@ -59,9 +59,9 @@ class ChangeTasks:
 
     def start(self) -> None:
         """Start to change the stream as needed. Call it after the handshake."""
-        self._start_task(self._apply_changes())
+        self._start_task(self._apply_changes)
         if self._stream.on_demand:
-            self._start_task(self._follow_demand())
+            self._start_task(self._follow_demand)
 
     def lateness_changed(self, halvings: int) -> None:
         """React to late frames: with ``adapt_rate``, start to request the rate halved ``halvings`` times.
@@ -91,13 +91,13 @@ class ChangeTasks:
         for task in self._tasks:
             task.cancel()
 
-    def _start_task(self, work: Coroutine[Any, Any, None]) -> None:
+    def _start_task(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
         self._tasks.append(asyncio.create_task(self._run_until_error(work)))
 
-    async def _run_until_error(self, work: Coroutine[Any, Any, None]) -> None:
+    async def _run_until_error(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Run a task; end the session if it fails, because then nothing changes the stream any more."""
         try:
-            await work
+            await work()  # called here: a task that is cancelled before it starts must leave no coroutine behind
         except LinkError as error:
             logger.debug("%s: %s", self._status.name, error)  # the supervisor reports it
             self._session.fail(error)

@@ -5,6 +5,7 @@ import contextlib
 import logging
 import socket
 from collections.abc import Callable, Coroutine
+from functools import partial
 from pathlib import Path
 from typing import Any, BinaryIO, Final, Protocol
 
@@ -109,10 +110,10 @@ class ClientFilter(ConnectionFilter):
         control = recording_control(packet)
         if control is not None:
             self._greet()
-            self._hold(self._control(packet, control))
+            self._hold(partial(self._control, packet, control))
             return []
         if not self._owner.is_known and asks_for_parameters(packet):
-            self._hold(self._answer_when_known(packet))
+            self._hold(partial(self._answer_when_known, packet))
             return []
         return self._answer_now(packet)
 
@@ -145,15 +146,20 @@ class ClientFilter(ConnectionFilter):
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    def _hold(self, work: Coroutine[Any, Any, list[bytes]]) -> None:
+    def _hold(self, work: Callable[[], Coroutine[Any, Any, list[bytes]]]) -> None:
         """Answer no further packet until this work is done, and has returned the replies to this one."""
         self.connection.hold_commands()
         self._start(self._send_result(work))
 
-    async def _send_result(self, work: Coroutine[Any, Any, list[bytes]]) -> None:
-        for reply in await work:
-            self.send(reply)
-        self.connection.continue_commands()
+    async def _send_result(self, work: Callable[[], Coroutine[Any, Any, list[bytes]]]) -> None:
+        try:
+            for reply in await work():
+                self.send(reply)
+        except Exception as defect:  # noqa: BLE001 - a defect in the gateway must not stop the client
+            self._defects.log(defect)
+            self.send(error_packet("No answer because of a defect in the gateway"))
+        finally:
+            self.connection.continue_commands()
 
     async def _answer_when_known(self, packet: Packet) -> list[bytes]:
         await self._owner.wait_until_known()
@@ -168,10 +174,7 @@ class ClientFilter(ConnectionFilter):
             return self.connection.answer(packet)
         except (QueryError, TimeoutError) as error:
             text = str(error) or f"no answer within {_CONTROL_S:g} s"
-        except Exception as defect:  # noqa: BLE001 - a defect in the gateway must not stop the client
-            self._defects.log(defect)
-            text = "a defect in the gateway"
-        return [error_packet(f"The recording was not {_done(control)}: {text}")]
+            return [error_packet(f"The recording was not {_done(control)}: {text}")]
 
     # Files ----------------------------------------------------------------------------------
 
@@ -190,6 +193,9 @@ class ClientFilter(ConnectionFilter):
                 await self._send_file(self._files[0])
             except OSError as error:
                 self._owner.file_lost(self.connection.name, self._files[0], error.strerror or str(error))
+            except Exception as defect:  # noqa: BLE001 - the next file can still be sent
+                self._defects.log(defect)
+                self._owner.file_lost(self.connection.name, self._files[0], "a defect in the gateway")
             self._files.pop(0)
 
     async def _send_file(self, path: Path) -> None:
@@ -201,7 +207,7 @@ class ClientFilter(ConnectionFilter):
             try:
                 self.connection.write(PACKET_HEADER.pack(PACKET_HEADER_BYTES + num_bytes, PacketType.C3D))
                 await self._send_content(file, num_bytes)
-            except OSError:
+            except Exception:
                 self.connection.transport.abort()
                 raise
             finally:
