@@ -97,7 +97,9 @@ class ChangeTasks:
     async def _run_until_error(self, work: Callable[[], Coroutine[Any, Any, None]]) -> None:
         """Run a task; end the session if it fails, because then nothing changes the stream any more."""
         try:
-            await work()  # called here: a task that is cancelled before it starts must leave no coroutine behind
+            await (
+                work()
+            )  # called here: a task that is cancelled before it starts must leave no coroutine behind
         except LinkError as error:
             logger.debug("%s: %s", self._status.name, error)  # the supervisor reports it
             self._session.fail(error)

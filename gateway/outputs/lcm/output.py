@@ -1,6 +1,8 @@
 """The LCM output: one channel per topic."""
 
 import asyncio
+import logging
+from collections import defaultdict
 from collections.abc import Mapping
 
 import lcm
@@ -14,6 +16,8 @@ from gateway.outputs.lcm.settings import LcmSettings
 from gateway.outputs.lcm.thread_sender import new_sender
 from gateway.outputs.status import OutputHealth
 
+logger = logging.getLogger(__name__)
+
 
 class LcmOutput(Output):
     """Publishes on one LCM URL.
@@ -22,7 +26,7 @@ class LcmOutput(Output):
     """
 
     name = "lcm"
-    drop_causes = ("not open", "send failed")
+    drop_causes = ("not open", "send failed", "closed")
 
     def __init__(self, settings: LcmSettings, shared: lcm.LCM | None = None) -> None:
         self.settings = settings
@@ -31,6 +35,7 @@ class LcmOutput(Output):
         self._shared = shared
         self._channels: set[str] = set()
         self._queries: LcmQueries | None = None
+        self._losses: defaultdict[str, Losses] = defaultdict(lambda: Losses(logger, self.name))  # by source
         self._sender = new_sender(settings.effective_url, shared, self._on_open)
 
     def _on_open(self) -> None:
@@ -46,7 +51,7 @@ class LcmOutput(Output):
         name = lcm_channel(self.settings.prefix, topic.source, *topic.path)
         channel = unique_name(name, self._channels)
         self._channels.add(channel)
-        return LcmPublisher(channel, self._sender.send, self._forget)
+        return LcmPublisher(channel, topic.source, self._sender.send, self._forget)
 
     def _forget(self, publisher: LcmPublisher) -> None:
         self._channels.discard(publisher.channel)
@@ -68,7 +73,8 @@ class LcmOutput(Output):
         )
 
     def count_losses(self, source: str, losses: Losses) -> None:
-        """Count in ``losses`` ignored requests about ``source``, and parameters and replies not sent."""
+        """Count in ``losses`` what is lost later: at the end, and of requests, parameters and replies."""
+        self._losses[source] = losses
         if self._queries is not None:
             self._queries.count_losses(source, losses)
 
@@ -103,5 +109,7 @@ class LcmOutput(Output):
         return None if self._queries is None else self._queries.results
 
     def close(self) -> None:
-        """Release LCM."""
-        self._sender.close()
+        """Release LCM, and count the messages that its peer has not taken."""
+        for source, num_messages in self._sender.close().items():
+            text = f"{num_messages} messages waited when the output was closed; check the peer of lcm.url"
+            self._losses[source].lost("closed", text, messages=num_messages, frames=0)

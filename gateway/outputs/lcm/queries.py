@@ -84,7 +84,7 @@ class LcmQueries:
 
     def _publish_parameters(self, source: str, message: bytes) -> None:
         try:
-            self._sender.send(lcm_channel(self._prefix, source, "PARAMETERS"), message)
+            self._sender.send(lcm_channel(self._prefix, source, "PARAMETERS"), message, source)
         except OutputError as error:
             self._requests.losses[source].lost(error.cause, str(error), frames=0)
 

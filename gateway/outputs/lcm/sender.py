@@ -2,6 +2,7 @@
 
 import logging
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Any, Final
 
@@ -55,7 +56,7 @@ class LcmSender:
             self._opening.succeeded(f"sending {self._what} to {self._url}")
             self._on_open()
 
-    def send(self, channel: str, message: bytes) -> None:
+    def send(self, channel: str, message: bytes, source: str = "") -> None:  # noqa: ARG002 - nothing waits
         """Publish on ``channel``. Raises OutputError on failure; the next message may succeed."""
         if self._lcm is None:
             raise OutputError(self.problem, cause="not open")
@@ -74,22 +75,31 @@ class LcmSender:
         if self._lcm is None and time.monotonic() >= self._retry_at_s:
             self.open()
 
-    def close(self) -> None:
-        """Release LCM. It has no close(): deleting the object frees its sockets and its thread."""
+    def close(self) -> Counter[str]:
+        """Release LCM. It has no close(): deleting the object frees its sockets and its thread.
+
+        Returns that no message was waiting.
+        """
         self._lcm = None
         self.problem = CLOSED
         self._retry_at_s = _NEVER
+        return Counter()
 
 
 class LcmPublisher:
-    """Sends the messages of one topic on ``channel``."""
+    """Sends the messages of one topic of ``source`` on ``channel``."""
 
     wanted = True  # LCM cannot know who is subscribed
 
     def __init__(
-        self, channel: str, send: Callable[[str, bytes], None], forget: Callable[[Any], None]
+        self,
+        channel: str,
+        source: str,
+        send: Callable[[str, bytes, str], None],
+        forget: Callable[[Any], None],
     ) -> None:
         self.channel = channel
+        self._source = source
         self._send = send
         self._forget = forget
         self._is_closed = False
@@ -100,7 +110,7 @@ class LcmPublisher:
             raise OutputError(
                 f"LCM channel {self.channel} is closed; ask for a new publisher", cause="closed"
             )
-        self._send(self.channel, message)
+        self._send(self.channel, message, self._source)
 
     def close(self) -> None:
         """Free the channel's name."""

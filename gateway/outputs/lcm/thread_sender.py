@@ -2,7 +2,7 @@
 
 import logging
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
 from typing import Final
 
@@ -38,7 +38,7 @@ class LcmThreadSender:
         self._is_open = False
         self._full = f"{url} does not take messages fast enough; check the peer of lcm.url"
         self._is_full = False  # the queue, when the last message came
-        self._queue: deque[tuple[str, bytes]] = deque()
+        self._queue: deque[tuple[str, bytes, str]] = deque()
         self._queued_bytes = 0
         self._changed = threading.Condition()  # of the queue
         self._closing = threading.Event()
@@ -57,8 +57,11 @@ class LcmThreadSender:
         self._problem = f"LCM has not opened {self._url} yet; check lcm.url"
         self._thread.start()
 
-    def send(self, channel: str, message: bytes) -> None:
-        """Queue a message. Raises OutputError if LCM is not open, sending fails or the queue is full."""
+    def send(self, channel: str, message: bytes, source: str = "") -> None:
+        """Queue a message about ``source``.
+
+        Raises OutputError if LCM is not open, sending fails or the queue is full.
+        """
         if not self._is_open:
             raise OutputError(self._problem, cause="not open")
         if problem := self._problem:
@@ -69,7 +72,7 @@ class LcmThreadSender:
                 or self._queued_bytes + len(message) > MAX_QUEUED_BYTES
             )
             if not self._is_full:
-                self._queue.append((channel, message))
+                self._queue.append((channel, message, source))
                 self._queued_bytes += len(message)
                 self._changed.notify()
         if self._is_full:
@@ -80,8 +83,11 @@ class LcmThreadSender:
     def maintain(self) -> None:
         """Do nothing: the thread retries by itself."""
 
-    def close(self) -> None:
-        """Send the queued messages and end the thread. If a peer blocks it, wait only for _JOIN_S."""
+    def close(self) -> Counter[str]:
+        """Send the queued messages and end the thread. If a peer blocks it, wait only for _JOIN_S.
+
+        Returns how many messages about each source were not sent.
+        """
         with self._changed:
             self._is_open = False  # send() now raises
             self._closing.set()
@@ -90,17 +96,16 @@ class LcmThreadSender:
             self._thread.join(_JOIN_S)
         with self._changed:
             self._problem = CLOSED
-            num_lost = len(self._queue)
+            lost = Counter(source for _, _, source in self._queue)
             self._queue.clear()
-        if num_lost:
-            logger.warning("lcm: closing with %d messages that %s did not take", num_lost, self._url)
+        return lost
 
     # In the thread.
 
     def _run(self) -> None:
         connection = self._open()
         while connection is not None and (first := self._wait_for_first()) is not None:
-            if self._publish(connection, *first):
+            if self._publish(connection, *first[:2]):
                 self._remove_first()
             elif self._closing.wait(RETRY_S):
                 return
@@ -125,7 +130,7 @@ class LcmThreadSender:
             return connection
         return None
 
-    def _wait_for_first(self) -> tuple[str, bytes] | None:
+    def _wait_for_first(self) -> tuple[str, bytes, str] | None:
         """Return the first message of the queue, once there is one; None if ``close`` was called."""
         with self._changed:
             self._changed.wait_for(lambda: self._queue or self._closing.is_set())
@@ -147,7 +152,7 @@ class LcmThreadSender:
     def _remove_first(self) -> None:
         with self._changed:
             if self._queue:  # close() may have cleared it
-                _, message = self._queue.popleft()
+                _, message, _ = self._queue.popleft()
                 self._queued_bytes -= len(message)
 
     def _set_problem(self, problem: str) -> None:

@@ -74,9 +74,9 @@ def prepare_threads() -> None:
 
 
 def in_zenoh_thread(callback: Callable[[_Event], object]) -> "zenoh.handlers.Callback[_Event]":
-    """Return a handler that calls ``callback`` directly in the thread of Zenoh, so it must be quick and not block.
+    """Return a handler that calls ``callback`` in one of Zenoh's own threads, so it must not block.
 
-    A plain function gets a thread of its own for each declaration, which stays as long as this: 256 tools had 572.
+    A plain function gets one more thread for each declaration: 256 tools had 572 threads.
     """
     return zenoh.handlers.Callback(callback, indirect=False)
 

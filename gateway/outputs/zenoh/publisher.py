@@ -79,7 +79,9 @@ class ZenohPublisher:
             congestion_control=zenoh.CongestionControl.DROP,
             express=self._express,
         )
-        publisher.declare_matching_listener(in_zenoh_thread(self._on_matching))  # also reports existing subscribers
+        publisher.declare_matching_listener(
+            in_zenoh_thread(self._on_matching)
+        )  # also reports existing subscribers
         self._publisher = publisher
         if self.json is not None:
             self.json.declare(session)
