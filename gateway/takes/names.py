@@ -2,6 +2,7 @@
 
 import re
 import time
+from pathlib import Path
 from typing import Final
 
 from gateway.errors import QueryError
@@ -9,6 +10,7 @@ from gateway.errors import QueryError
 MAX_NAME_LENGTH: Final = 100
 
 _NAME: Final = re.compile(r"[\w.+-][\w .+-]*")
+_NUMBER: Final = re.compile(r"(\d+)")
 
 
 def check_name(name: str) -> None:
@@ -28,3 +30,9 @@ def default_name(source: str) -> str:
 def numbered(name: str, number: int) -> str:
     """Return NAME, NAME-2, NAME-3, … for the numbers from 1 on."""
     return name if number == 1 else f"{name}-{number}"
+
+
+def by_number(path: Path) -> tuple[list[str | int], str]:
+    """Return the key that sorts files by name, and the numbers in names by value: 999 before 1000."""
+    parts = _NUMBER.split(path.name)
+    return [int(part) if position % 2 else part for position, part in enumerate(parts)], path.name

@@ -15,6 +15,7 @@ from gateway.messages.decode import message_type
 from gateway.messages.encode import MESSAGE_TYPES, VERSION_OFFSET
 from gateway.safe_text import safe_text
 from gateway.takes.event_log import Event, EventLogReader
+from gateway.takes.names import by_number
 from gateway.takes.source_names import NAMED_WITHIN_EVENTS, SourceNames
 
 SUFFIX: Final = ".lcmlog"
@@ -226,7 +227,7 @@ def log_paths(path: Path) -> list[Path]:
     try:
         if not stat.S_ISDIR(path.stat().st_mode):
             return [path]
-        entries = sorted(path.iterdir())
+        entries = sorted(path.iterdir(), key=by_number)
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise TakeError(f"{safe_text(str(path))} cannot be read: {reason}") from error

@@ -5,11 +5,12 @@ import errno
 import fcntl
 import logging
 import os
+import re
 import shutil
 import stat
 import threading
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import Final
 
@@ -17,14 +18,17 @@ from gateway.errors import QueryError, TakeError
 from gateway.outputs.takes.disk import disk_problem
 from gateway.outputs.takes.stored import MAX_PIECE_BYTES, StoredTake, TakePiece
 from gateway.takes.event_log import EventLogReader
-from gateway.takes.names import check_name, default_name, numbered
+from gateway.takes.names import by_number, check_name, default_name, numbered
 from gateway.takes.new_file import NewFiles
-from gateway.takes.reader import SUFFIX, log_paths
+from gateway.takes.reader import SUFFIX
 
 ROLLING: Final = ".rolling"
 """The folder of the rolling segments, in that of the takes."""
 
 C3D_SUFFIX: Final = ".c3d"
+
+_FURTHER_C3D: Final = re.compile(r" \(\d+\)$|-\d+$")
+"""What follows the name of the take in that of a further C3D file. Earlier gateways wrote "-2"."""
 
 _LOCK: Final = ".rtc3d-gateway.lock"
 _TAIL_BYTES: Final = 256 * 1024
@@ -77,13 +81,16 @@ class TakesFolder:
     Other files do not belong to the gateway: it leaves them alone.
     """
 
-    def __init__(self, directory: Path) -> None:
+    def __init__(self, directory: Path, monotonic: Callable[[], float] = time.monotonic) -> None:
         self.directory = directory
         self._was_open = False
         self._lock: int | None = None
         self._is_closed = False
         self._opening = threading.Lock()
         self._times: dict[tuple[Path, int, int], tuple[int, float]] = {}  # of takes, by path, size and time
+        self._monotonic = monotonic
+        # Of each take: when it was written last, and when that was noticed; None if it was there before.
+        self._noticed: dict[Path, tuple[float, float | None]] | None = None
 
     # The folder itself.
 
@@ -136,7 +143,7 @@ class TakesFolder:
         """Keep the segments that a killed gateway has left behind as a take. Raises OSError."""
         rolling = self.directory / ROLLING
         for folder in sorted(rolling.iterdir()) if rolling.is_dir() else ():
-            segments = log_paths_or_none(folder)
+            segments = [path for path, _ in _files(folder) if path.suffix == SUFFIX]
             if segments:
                 take = self._new_folder(folder.name, default_name(folder.name))
                 for number, segment in enumerate(segments, start=1):
@@ -198,12 +205,11 @@ class TakesFolder:
     def read(self, source: str, name: str, offset: int) -> TakePiece:
         """Return a part of a take; its files are read as one. Raises OSError, QueryError."""
         check_name(name)
-        path = self.directory / source / name
-        log = path.with_name(f"{name}{SUFFIX}")
-        paths = [log] if log.is_file() else log_paths_or_none(path)
-        if not paths:
+        entries = _source_entries(self.directory / source, name)
+        if not entries:
             raise QueryError(f"source {source!r} has no take {name!r}; take list shows which there are")
-        sizes = [each.stat().st_size for each in paths]
+        paths = [path for path, _ in entries[0].logs]
+        sizes = [status.st_size for _, status in entries[0].logs]
         pieces, rest = [], MAX_PIECE_BYTES
         start = offset
         for each, size in zip(paths, sizes, strict=True):
@@ -235,9 +241,9 @@ class TakesFolder:
             for file in entry.sizes:
                 users[file] = users.get(file, 0) + 1
         total = sum(sizes.values())
-        now_s = time.time()
+        ages_s = self._ages_s(entries)
         for entry in entries:
-            age_s = now_s - entry.end_s
+            age_s = ages_s[entry.path]
             if entry.path in protected or age_s < _FRESH_S:
                 continue
             if max_age_s is not None and age_s > max_age_s:
@@ -254,6 +260,23 @@ class TakesFolder:
                     total -= size
         return max(0, total - max_bytes)
 
+    def _ages_s(self, entries: Sequence[TakeEntry]) -> dict[Path, float]:
+        """Return how long ago each take was written last.
+
+        The clock of the computer may have been corrected by years since then, so it counts only for takes
+        from before the first call.
+        """
+        now_s, monotonic_s = time.time(), self._monotonic()
+        former, self._noticed = self._noticed, {}
+        ages_s = {}
+        for entry in entries:
+            end_s, noticed_s = (former or {}).get(entry.path, (None, None))
+            if end_s != entry.end_s:
+                noticed_s = None if former is None else monotonic_s
+            self._noticed[entry.path] = entry.end_s, noticed_s
+            ages_s[entry.path] = now_s - entry.end_s if noticed_s is None else monotonic_s - noticed_s
+        return ages_s
+
     def _rolling_sizes(self) -> dict[FileId, int]:
         sizes: dict[FileId, int] = {}
         with contextlib.suppress(FileNotFoundError):
@@ -265,9 +288,10 @@ class TakesFolder:
 
 def add_c3d(take: Path, c3d_file: Path) -> Path:
     """Link or copy a C3D file beside a take, under its name, and return its path. Raises TakeError."""
-    number = 1
-    while (path := take.with_name(f"{numbered(take.name, number)}{C3D_SUFFIX}")).exists():
+    path, number = take.with_name(f"{take.name}{C3D_SUFFIX}"), 1
+    while path.exists():
         number += 1
+        path = take.with_name(f"{take.name} ({number}){C3D_SUFFIX}")  # no take can have this name
     try:
         os.link(c3d_file, path)
     except OSError:  # on another file system
@@ -286,20 +310,15 @@ def check_directory(directory: Path) -> None:
         raise PermissionError(errno.EACCES, "no permission to write in it")
 
 
-def log_paths_or_none(folder: Path) -> list[Path]:
-    """Return the logs in a folder, none if it is no folder of logs."""
-    try:
-        return log_paths(folder) if folder.is_dir() else []
-    except TakeError:
-        return []
-
-
 def _source_entries(folder: Path, only: str = "") -> list[TakeEntry]:
-    """Return the takes in the folder of a source, or only the one of this name. Raises OSError."""
+    """Return the takes in the folder of a source, or only the one of this name. Raises OSError.
+
+    Symbolic links are left out, because a peer that reads a take must not get any other file.
+    """
     takes: dict[str, TakeEntry] = {}
     c3d_files = []
     try:
-        children = [*os.scandir(folder)]
+        children = [] if folder.is_symlink() else [*os.scandir(folder)]
     except FileNotFoundError:
         return []
     for child in children:
@@ -317,28 +336,28 @@ def _source_entries(folder: Path, only: str = "") -> list[TakeEntry]:
             elif path.suffix == C3D_SUFFIX and child.is_file(follow_symlinks=False):
                 c3d_files.append((path, child.stat(follow_symlinks=False)))
     for path, status in c3d_files:
-        base, _, number = path.stem.rpartition("-")
-        name = path.stem if path.stem in takes or not number.isdecimal() else base
+        name = path.stem if path.stem in takes else _FURTHER_C3D.sub("", path.stem)
         if name in takes:
             takes[name].c3d_files.append((path, status))
     return [take for name, take in takes.items() if only in {"", name}]
 
 
 def _files(folder: Path) -> list[tuple[Path, os.stat_result]]:
-    files = []
+    files: list[tuple[Path, os.stat_result]] = []
+    if folder.is_symlink() or not folder.is_dir():
+        return files
     for entry in [*os.scandir(folder)]:
         with contextlib.suppress(FileNotFoundError):
             if entry.is_file(follow_symlinks=False):
                 files.append((Path(entry.path), entry.stat(follow_symlinks=False)))
-    return sorted(files, key=lambda file: file[0].name)
+    return sorted(files, key=lambda file: by_number(file[0]))
 
 
 def _times(entry: TakeEntry) -> tuple[int, float]:
     """Read when a take begins, and how long it is; 0, 0.0 if it has no messages."""
-    logs = sorted(entry.logs, key=lambda log: log[0].name)
     try:
-        first = next(EventLogReader(logs[0][0]).events())
-        path, status = logs[-1]
+        first = next(EventLogReader(entry.logs[0][0]).events())
+        path, status = entry.logs[-1]
         newest = first
         for event in EventLogReader(path).events(max(0, status.st_size - _TAIL_BYTES)):
             newest = event

@@ -25,7 +25,7 @@ class FolderWatch:
 
     def __init__(self, settings: TakesSettings, host: Host) -> None:
         self._monotonic = host.monotonic
-        self.folder = TakesFolder(settings.effective_directory)
+        self.folder = TakesFolder(settings.effective_directory, host.monotonic)
         self.is_checked = False
         """Whether it has been checked once."""
         self.excess_bytes = 0

@@ -195,8 +195,55 @@ def test_a_c3d_file_gets_the_next_free_number(takes: TakesFolder) -> None:
     take = stored(takes.directory / "lab/walk.lcmlog", 1).with_suffix("")
     file = stored(takes.directory / "spool.c3d", b"c3d")
     names = [add_c3d(take, file).name for _ in range(3)]
-    assert names == ["walk.c3d", "walk-2.c3d", "walk-3.c3d"]
-    assert (takes.directory / "lab/walk-3.c3d").samefile(file)
+    assert names == ["walk.c3d", "walk (2).c3d", "walk (3).c3d"]
+    assert (takes.directory / "lab/walk (3).c3d").samefile(file)
+
+
+def test_a_further_c3d_file_is_not_that_of_another_take(takes: TakesFolder) -> None:
+    """It would be deleted with take walk-2."""
+    for name in ("walk", "walk-2"):
+        stored(takes.directory / f"lab/{name}.lcmlog", 1)
+        for _ in range(2):
+            add_c3d(takes.directory / "lab" / name, stored(takes.directory / "spool.c3d", b"c3d"))
+    files = {entry.path.name: [path.name for path, _ in entry.c3d_files] for entry in takes.entries()}
+    assert {name: sorted(each) for name, each in files.items()} == {
+        "walk": ["walk (2).c3d", "walk.c3d"],
+        "walk-2": ["walk-2 (2).c3d", "walk-2.c3d"],
+    }
+
+
+@pytest.mark.parametrize("link", ["lab/evil.lcmlog", "lab/evil/1.lcmlog", "lab/evil", "lab"])
+def test_no_peer_gets_a_file_outside_the_folder(takes: TakesFolder, tmp_path: Path, link: str) -> None:
+    """Whoever can write into the folder could have the gateway send any file that it can read."""
+    secret = stored(tmp_path.with_name("secret") / "lab/evil/1.lcmlog", log(1)).parents[2]
+    stored(secret / "lab/evil.lcmlog", log(1))
+    (takes.directory / link).parent.mkdir(parents=True, exist_ok=True)
+    (takes.directory / link).symlink_to(secret / link)
+    with pytest.raises(QueryError, match="has no take 'evil'"):
+        takes.read("lab", "evil", 0)
+    assert takes.entries("lab") == takes.entries() == []
+
+
+def test_a_take_of_more_than_999_files_is_read_in_their_order(takes: TakesFolder) -> None:
+    """As text, fall-1000 comes before fall-101."""
+    for number in (1000, 101, 999):
+        stored(takes.directory / f"lab/fall/fall-{number:03}.lcmlog", log(number))
+    assert takes.read("lab", "fall", 0).content == log(101) + log(999) + log(1000)
+
+
+def test_a_corrected_clock_makes_no_take_old(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A computer without a battery writes takes in 1970 until it has found a time server."""
+    now_s, clock = 1000.0, Clock()
+    monkeypatch.setattr(folder_module, "time", SimpleNamespace(time=lambda: now_s))
+    takes = TakesFolder(tmp_path, clock)
+    assert left(takes, 1000, max_age_s=DAY_S) == []
+    stored(tmp_path / "lab/walk.lcmlog", 1, NOW_S - now_s)
+    assert left(takes, 1000, max_age_s=DAY_S) == ["lab/walk"]
+    now_s = NOW_S
+    clock.now_s += DAY_S - 1
+    assert left(takes, 1000, max_age_s=DAY_S) == ["lab/walk"]
+    clock.now_s += 2
+    assert left(takes, 1000, max_age_s=DAY_S) == []
 
 
 def test_what_a_killed_gateway_has_left_behind_becomes_a_take(takes: TakesFolder) -> None:
