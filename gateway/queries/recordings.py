@@ -58,7 +58,8 @@ class Recordings:
             return await (self._start(name) if start else self._stop())
 
     async def _start(self, name: str) -> dict[str, Any]:
-        followed = await self._access.follow(True, name)  # first, so that nothing of the recording is missing
+        following = asyncio.ensure_future(self._access.follow(True, name))
+        await asyncio.sleep(0)  # takes begin before the recording, which does not wait for their disk
         try:
             self._is_named = bool(name) and await self._is_accepted(
                 ControlRecording(start=True, options=f",file={name}.c3d")
@@ -66,10 +67,11 @@ class Recordings:
             if not self._is_named:
                 self._send(start=True)
         except QueryError:
+            await following
             await self._access.follow(False, "")
             raise
         named = {"name": name, "is_named": self._is_named} if name else {}
-        return {"source": self._source, "sent": "start", **named, **followed}
+        return {"source": self._source, "sent": "start", **named, **await following}
 
     async def _stop(self) -> dict[str, Any]:
         if not (self._is_named and await self._is_accepted(ControlRecording(start=False))):

@@ -77,7 +77,7 @@ class TakeFollower:
         try:
             if start:
                 return {"take": (await self._begin(name)).name}
-            if self._is_running:
+            if self.is_running:
                 return {"take": (await self._takes.end(self._source)).name}
         except QueryError as error:
             logger.warning("%s: no take follows the recording: %s", self._source, error)
@@ -109,14 +109,14 @@ class TakeFollower:
     def receive_event(self, event_id: int) -> None:
         """Start or stop a take at an event of the server. The same event can do both."""
         settings = self._takes.settings
-        if self._is_running:
+        if self.is_running:
             if event_id == settings.stop_event_id:
                 self._end_soon()
         elif event_id == settings.start_event_id:
             self._begin_soon()
 
     @property
-    def _is_running(self) -> bool:
+    def is_running(self) -> bool:
         """Whether the take that was started here is still running."""
         return self._take is not None and self._takes.running(self._source) is self._take
 
@@ -127,7 +127,7 @@ class TakeFollower:
         return take
 
     def _begin_soon(self) -> None:
-        if self._is_running:
+        if self.is_running:
             return
         running = self._takes.running(self._source)
         if running is not None:
@@ -145,7 +145,7 @@ class TakeFollower:
         self._run(take)
 
     def _end_soon(self) -> None:
-        if self._is_running:
+        if self.is_running:
             try:
                 self._run(self._takes.end(self._source))
             except QueryError as error:
@@ -167,7 +167,7 @@ class TakeFollower:
 
 
 class EventPublisher:
-    """Shows events to the follower before ``publisher`` publishes them, so that they are in the take."""
+    """Shows events to the follower. Those that start and stop a take are in the take."""
 
     def __init__(self, publisher: Publisher, follower: TakeFollower) -> None:
         self._publisher = publisher
@@ -180,10 +180,14 @@ class EventPublisher:
 
     def publish(self, message: bytes) -> None:
         """See Publisher."""
-        if self._follower.needs_events:
-            for event_id in event_ids(message):
-                self._follower.receive_event(event_id)
-        self._publisher.publish(message)
+        is_published = False
+        for event_id in event_ids(message) if self._follower.needs_events else ():
+            if self._follower.is_running and not is_published:
+                is_published = True
+                self._publisher.publish(message)  # before one of these events stops the take
+            self._follower.receive_event(event_id)
+        if not is_published:
+            self._publisher.publish(message)
 
     def close(self) -> None:
         """See Publisher."""

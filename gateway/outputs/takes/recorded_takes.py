@@ -155,7 +155,13 @@ class RecordedTakes:
         folder = self._folder.directory / source / (name or default_name(source))
         since_s = now_s - last_s
         call = partial(segments.save, folder, since_s, has_free_name=not name, goes_on=after_s > 0)
-        save = await disk_result(recorder.call(call), folder, self.disk)
+        saved = recorder.call(call)
+        try:
+            save = await disk_result(saved, folder, self.disk)
+        except BaseException:  # nobody waits for it any more, or knows it
+            saved.cancel()
+            recorder.call(partial(segments.undo, saved))
+            raise
         if after_s > 0:
             loop = asyncio.get_running_loop()
             delay_s = max(0.0, now_s + after_s - self._host.monotonic())

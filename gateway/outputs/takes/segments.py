@@ -7,6 +7,7 @@ import shutil
 import time
 from collections import deque
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
@@ -177,6 +178,18 @@ class RollingSegments(LogSink):
         if not goes_on:
             self.end_save(save)
         return save
+
+    def undo(self, saved: Future[Save]) -> None:
+        """End and delete the take of a call of ``save``, unless that was cancelled or has failed."""
+        if saved.cancelled() or saved.exception() is not None:
+            return
+        save = saved.result()
+        if save in self._saves:
+            self._saves.remove(save)
+        shutil.rmtree(save.folder, ignore_errors=True)
+        logger.warning(
+            "takes: %s is deleted, because saving it took so long that its peer got an error", save.folder
+        )
 
     def _add_to_save(self, save: Save) -> None:
         """Add the present segment to a take."""

@@ -89,6 +89,9 @@ class FakeSource:
         self.num_file_reads = 0
         self.recorded: list[bool] = []
         self.followed: list[tuple[bool, str]] = []
+        self.disk = asyncio.Event()
+        """Whether the disk of the takes that follow responds."""
+        self.disk.set()
         # The configuration does not accept 0. It sends every fresh query to the server.
         source_settings = SourceSettings(name="lab", host="192.0.2.1").model_copy(
             update={"fresh_interval_s": 0.0} | settings
@@ -137,6 +140,7 @@ class FakeSource:
 
     async def _follow_recording(self, start: bool, name: str) -> dict[str, Any]:
         self.followed.append((start, name))
+        await self.disk.wait()
         return {"take": name} if start else {}
 
     def disconnect(self) -> None:

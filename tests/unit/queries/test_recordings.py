@@ -81,6 +81,18 @@ async def test_a_recording_that_cannot_start_is_followed_to_its_end() -> None:
     assert source.followed == [(True, "walk-1"), (False, "")]
 
 
+async def test_a_disk_that_does_not_respond_does_not_delay_the_server() -> None:
+    """The take begins before the recording, so that nothing is missing; its file may come later."""
+    source = FakeSource()
+    source.disk.clear()
+    recording = asyncio.ensure_future(record(source, "start"))
+    for _ in range(10):
+        await asyncio.sleep(0)
+    assert (source.followed, source.recorded, recording.done()) == ([(True, "")], [True], False)
+    source.disk.set()
+    assert (await recording)["take"] == ""
+
+
 async def test_start_and_stop_are_carried_out_in_their_order() -> None:
     source = FakeSource()
     start = asyncio.ensure_future(record(source, "start", "walk-1"))

@@ -1,11 +1,14 @@
 """Takes on a disk that is full, slow, gone, or not what it should be."""
 
+import asyncio
 import contextlib
 import logging
 import os
 import resource
+import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,6 +16,7 @@ from gateway.errors import OutputError, QueryError
 from gateway.losses import Losses
 from gateway.outputs.takes import disk_calls
 from gateway.outputs.takes.folder import ROLLING
+from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.takes.event_log import encode_event
 from tests.losses import amounts
 from tests.recording_output import RecordingLab, frames, recording_lab
@@ -50,6 +54,43 @@ async def test_what_waits_for_a_full_disk_is_written_when_there_is_room(
     assert frames(lab.path("walk.lcmlog")) == published
     assert stopped.num_lost == 0
     assert len([each for each in caplog.messages if "cannot be written" in each]) == 1
+
+
+@pytest.mark.parametrize("has_begun", [False, True])
+async def test_a_save_that_nobody_waits_for_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, has_begun: bool
+) -> None:
+    """Nobody would ever end such a take: it would grow until the disk is full."""
+    begun, free = threading.Event(), threading.Event()
+
+    def save(*arguments: Any, **options: Any) -> Save:
+        begun.set()
+        free.wait()
+        return saving(*arguments, **options)
+
+    saving = RollingSegments.save
+    monkeypatch.setattr(RollingSegments, "save", save)
+    async with recording_lab(tmp_path, keep_last_s=60) as lab:
+        lab.publish()
+        await lab.takes.written()
+        if has_begun:
+            task = asyncio.create_task(lab.takes.save("lab", 60, 600, "fall"))
+            await wait_until_async(begun.is_set)
+            task.cancel()
+            with pytest.raises(asyncio.CancelledError):
+                await task
+        else:
+            lab.takes._started_recorder().call(free.wait)
+            monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.01)
+            with pytest.raises(QueryError, match="did not respond"):
+                await lab.takes.save("lab", 60, 600, "fall")
+        free.set()
+        await lab.takes.written()
+        assert begun.is_set() is has_begun
+        assert [*lab.directory.glob("lab/*")] == []
+        segments = lab.takes.recording("lab").segments
+        assert segments is not None
+        assert segments._saves == []
 
 
 async def test_what_does_not_fit_into_the_queue_is_refused_and_a_gap_in_the_take(tmp_path: Path) -> None:

@@ -192,7 +192,7 @@ def event_message(*ids: int) -> bytes:
 
 
 async def test_events_start_and_stop_takes(tmp_path: Path, clock: Clock) -> None:
-    """The event that starts a take is in it; the ids are unsigned."""
+    """The events that start and stop a take are in it; the ids are unsigned."""
     settings: dict[str, Any] = {"follow": "events", "start_event_id": 5, "stop_event_id": 0xFFFF_FFFE}
     async with still_lab(tmp_path, clock, **settings) as lab:
         followed = Followed(lab, clock)
@@ -205,10 +205,23 @@ async def test_events_start_and_stop_takes(tmp_path: Path, clock: Clock) -> None
         publisher.publish(start)
         publisher.publish(both)
         assert followed.running
-        publisher.publish(event_message(-2))
+        stop = event_message(9, -2)
+        publisher.publish(stop)
+        publisher.publish(event_message(7))
         assert followed.running == ""
         [name] = await followed.names()
-        assert frames_of(lab, name) == [start, both]
+        assert frames_of(lab, name) == [start, both, stop]
+
+
+async def test_a_message_with_both_events_is_a_take_by_itself(tmp_path: Path, clock: Clock) -> None:
+    """Two events in one frame must not be lost between two takes."""
+    async with still_lab(tmp_path, clock, follow="events", start_event_id=5, stop_event_id=6) as lab:
+        followed = Followed(lab, clock)
+        message = event_message(5, 6)
+        lab.publishers["event"].publish(message)
+        assert followed.running == ""
+        [name] = await followed.names()
+        assert frames_of(lab, name) == [message]
 
 
 async def test_one_event_can_start_and_stop_in_turns(tmp_path: Path, clock: Clock) -> None:

@@ -1,7 +1,5 @@
 """The limits of the folder of takes, its checks, and settings that change; the disk answers at once."""
 
-import os
-import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
