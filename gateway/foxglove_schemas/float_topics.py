@@ -4,6 +4,7 @@ They are protobuf. With 69 channels, they need a fifth of the space of JSON, and
 Live, they are CDR with the message definition of ROS 2 as well: PlotJuggler 3.17 takes nothing else.
 """
 
+import re
 import unicodedata
 from collections import Counter
 from collections.abc import Sequence
@@ -22,6 +23,8 @@ from gateway.foxglove_schemas.topics import Topic
 from gateway.rtc3d.components import Items
 
 _MAX_NAME_BYTES: Final = 100
+_MAX_ROS_NAME_BYTES: Final = 90
+"""What is left of a label in ROS 2, so that a number fits, too."""
 
 MAX_FIELDS: Final = 10_000
 """Protobuf for Python reads no message of more than 64 KiB in fields."""
@@ -84,8 +87,7 @@ class CdrRecord:
     """A FloatRecord in CDR, little-endian, described as a message of ROS 2."""
 
     def __init__(self, topic_name: str, schema_name: str, names: Sequence[str]) -> None:
-        # PlotJuggler needs a letter at the beginning.
-        names = field_names([f"n{name}" if name.startswith("_") else name for name in names], "number")
+        names = fitting_labels(names, _ros_field, _MAX_NAME_BYTES, "number")
         schema = "".join(f"float32 {name}\n" for name in names).encode()
         self.topic = Topic(topic_name, "cdr", schema_name, "ros2msg", schema)
 
@@ -133,6 +135,12 @@ def _identifier(text: str) -> str:
     if not name.strip("_"):
         return ""
     return f"_{name}" if name[0].isdigit() else name
+
+
+def _ros_field(name: str) -> str:
+    """Return a name of a protobuf field as ROS 2 has them: analog_1, as viewers check it, too."""
+    words = re.sub("_+", "_", _identifier(name)).lower()[:_MAX_ROS_NAME_BYTES].strip("_")
+    return f"n{words}" if words[:1].isdigit() else words
 
 
 def _schema(schema_name: str, names: Sequence[str]) -> bytes:
