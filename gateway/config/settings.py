@@ -335,24 +335,27 @@ class Settings(Section):
         sections = {name: getattr(self, name) for name in type(self).model_fields}
         return {name: section for name, section in sections.items() if isinstance(section, OutputSettings)}
 
-    @field_validator("sources")
-    @classmethod
-    def _check_names_have_different_channels(
-        cls, sources: tuple[SourceSettings, ...]
-    ) -> tuple[SourceSettings, ...]:
+    @model_validator(mode="after")
+    def _check_names_differ(self) -> Self:
+        lcm = self.outputs.get("lcm")
+        has_channels = lcm is not None and lcm.enabled
         owners: dict[str, int] = {}
-        for index, source in enumerate(sources):
+        for index, source in enumerate(self.sources):
             # gateway.messages.topics builds channels in the same way: upper case, and one '_' for the rest.
-            channel = "_".join(re.findall("[A-Z0-9]+", source.name.upper()))
-            if channel in owners:
-                other = owners[channel]
-                raise validation_error(
-                    f"found {source.name!r}, which has the same LCM channels as {sources[other].name!r} "
-                    f"(sources[{other}]); expected a name that differs in letters or digits, ignoring case",
-                    *(index, "name"),
+            identity = "_".join(re.findall("[A-Z0-9]+", source.name.upper())) if has_channels else source.name
+            other = owners.setdefault(identity, index)
+            if other == index:
+                continue
+            if source.name == self.sources[other].name:
+                text = f"found {source.name!r}, the name of sources[{other}], too; expected another one"
+            else:
+                text = (
+                    f"found {source.name!r}, which has the same LCM channels as {self.sources[other].name!r} "
+                    f"(sources[{other}]); expected a name that differs in letters or digits, ignoring case, "
+                    "or lcm.enabled: false"
                 )
-            owners[channel] = index
-        return sources
+            raise validation_error(text, "sources", index, "name")
+        return self
 
     @model_validator(mode="after")
     def _check_any_output_is_enabled(self) -> Self:

@@ -152,14 +152,24 @@ def test_any_file_gives_settings_or_lines_with_its_path(file: Path, content: byt
         assert settings.sources
 
 
-@given(first=st.from_regex(r"\A[ABab_-]{1,4}\Z"), second=st.from_regex(r"\A[ABab_-]{1,4}\Z"))
-def test_two_names_are_rejected_exactly_if_they_share_channels(first: str, second: str) -> None:
+@given(
+    first=st.from_regex(r"\A[ABab_-]{1,4}\Z"),
+    second=st.from_regex(r"\A[ABab_-]{1,4}\Z"),
+    has_lcm=st.booleans(),
+)
+def test_names_are_refused_exactly_if_they_are_the_same_or_share_channels(
+    first: str, second: str, has_lcm: bool
+) -> None:
     sources = tuple(SourceSettings(name=name, host="lab") for name in (first, second))
-    if topics.lcm_channel("MOCAP", first) == topics.lcm_channel("MOCAP", second):
-        with pytest.raises(ValidationError, match="has the same LCM channels"):
-            make_settings(sources=sources)
+    share_channels = topics.lcm_channel("MOCAP", first) == topics.lcm_channel("MOCAP", second)
+    problem = (
+        "the name of" if first == second else "the same LCM channels" if has_lcm and share_channels else ""
+    )
+    if problem:
+        with pytest.raises(ValidationError, match=problem):
+            make_settings(sources=sources, lcm={"enabled": has_lcm})
     else:
-        assert make_settings(sources=sources).sources == sources
+        assert make_settings(sources=sources, lcm={"enabled": has_lcm}).sources == sources
 
 
 @given(st.text(st.sampled_from("ab/*$#? @é\n\x07"), max_size=6) | st.text())

@@ -167,7 +167,8 @@ MISTAKES: list[tuple[str, str]] = [
     (
         "  - {name: LAB, host: lab-2}",
         "lab.yaml:4:12: sources[1].name: found 'LAB', which has the same LCM channels as 'lab' (sources[0]); "
-        "expected a name that differs in letters or digits, ignoring case",
+        "expected a name that differs in letters or digits, ignoring case, "
+        "or lcm.enabled: false",
     ),
     (
         "    name: lab-2",
