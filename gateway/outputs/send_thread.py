@@ -35,11 +35,17 @@ class SendThread:
         self._is_running = False
 
     def submit(self, call: Callable[[], None]) -> Future[None]:
-        """Queue ``call`` before those that were offered; the future has its result or exception."""
+        """Queue ``call`` before those that were offered.
+
+        The future has its result or exception; it is cancelled if the thread is closed before.
+        """
         done: Future[None] = Future()
         with self._changed:
-            self._first.append((done, call))
-            self._wake()
+            if self._is_closed:
+                done.cancel()
+            else:
+                self._first.append((done, call))
+                self._wake()
         return done
 
     def offer(self, call: Callable[[], None], num_bytes: int = 0) -> bool:
@@ -74,6 +80,8 @@ class SendThread:
             call()
             del call  # or it would keep its data alive until the next one
         self._last()
+        for done, _ in self._first:
+            done.cancel()
         # What the other calls hold is freed here, because to free a query of Zenoh can block.
         self._first.clear()
         self._offered.clear()

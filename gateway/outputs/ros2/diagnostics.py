@@ -12,10 +12,10 @@ from gateway.log import DefectLog
 from gateway.messages.decode import decode
 from gateway.outputs.ros2 import cdr
 from gateway.outputs.ros2.messages import DiagnosticStatus, diagnostic_array
-from gateway.outputs.ros2.router import RouterSession
 from gateway.outputs.ros2.source import Sender
 from gateway.outputs.ros2.topic import RosTopic
 from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.outputs.zenoh.session import SessionHolder
 
 OK: Final = 0
 WARN: Final = 1
@@ -45,7 +45,7 @@ class DiagnosticsPublisher:
     """
 
     def __init__(
-        self, topic: RosTopic, names: Callable[[], Names], router: RouterSession, sender: Sender
+        self, topic: RosTopic, names: Callable[[], Names], router: SessionHolder, sender: Sender
     ) -> None:
         self._topic = topic
         self._names = names

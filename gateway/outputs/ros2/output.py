@@ -7,6 +7,7 @@ import asyncio
 import contextlib
 import functools
 from collections.abc import Callable, Mapping
+from concurrent.futures import CancelledError
 from typing import Final
 
 import zenoh
@@ -19,7 +20,7 @@ from gateway.outputs.no_topics import IgnoringPublisher
 from gateway.outputs.ros2.diagnostics import DiagnosticsPublisher
 from gateway.outputs.ros2.message_types import DIAGNOSTIC_ARRAY, TF_MESSAGE
 from gateway.outputs.ros2.names import MAX_PART_CHARS, ros_name
-from gateway.outputs.ros2.router import RouterSession
+from gateway.outputs.ros2.router import router_session
 from gateway.outputs.ros2.settings import Ros2Settings
 from gateway.outputs.ros2.source import RosSource
 from gateway.outputs.ros2.topic import RosNode, RosTopic
@@ -37,7 +38,7 @@ class Ros2Output(Output):
 
     def __init__(self, settings: Ros2Settings) -> None:
         self.settings = settings
-        self._router = RouterSession(settings.connect, self._on_open)
+        self._router = router_session(settings.connect, self._declare_in_thread)
         self._sender: SendThread | None = None  # from start to close
         self._tf = RosTopic("/tf", TF_MESSAGE, self._on_tf_wanted)
         self._diagnostics = RosTopic("/diagnostics", DIAGNOSTIC_ARRAY, self._on_diagnostics_wanted)
@@ -51,17 +52,19 @@ class Ros2Output(Output):
         self._sender = SendThread("ros2-send")
         self._router.start()
 
-    def _on_open(self, session: zenoh.Session) -> None:
-        self.submit(functools.partial(self._declare_all, session))
+    def _declare_in_thread(self, session: zenoh.Session) -> None:
+        sender = self._sender
+        if sender is not None:
+            with contextlib.suppress(CancelledError):  # the output has just been closed
+                sender.submit(functools.partial(self._declare_all, session)).result()
 
     def _declare_all(self, session: zenoh.Session) -> None:
         """Declare everything on the new session, in the sending thread."""
-        with contextlib.suppress(zenoh.ZError):  # the session has just been closed
-            self._node = node = RosNode(session, self.settings)
-            for topic in (self._tf, self._diagnostics):
-                topic.declare(node)
-            for source in list(self._sources.values()):
-                source.declare(node)
+        self._node = node = RosNode(session, self.settings)
+        for topic in (self._tf, self._diagnostics):
+            topic.declare(node)
+        for source in list(self._sources.values()):
+            source.declare(node)
 
     # The sending thread.
 

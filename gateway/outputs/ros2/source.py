@@ -13,10 +13,10 @@ from gateway.log import DefectLog
 from gateway.losses import Losses
 from gateway.messages.stamp import Stamp
 from gateway.outputs.contract import ServerParameters
-from gateway.outputs.ros2.router import RouterSession
 from gateway.outputs.ros2.source_topics import NOT_YET, SourceTopics
 from gateway.outputs.ros2.topic import RosNode, RosTopic
 from gateway.outputs.zenoh.config import zenoh_reason
+from gateway.outputs.zenoh.session import SessionHolder
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.frames import Frame, FrameLayout
 
@@ -40,7 +40,7 @@ class RosSource:
     beginning of its topics.
     """
 
-    def __init__(self, name: str, base: str, tf: RosTopic, router: RouterSession, sender: Sender) -> None:
+    def __init__(self, name: str, base: str, tf: RosTopic, router: SessionHolder, sender: Sender) -> None:
         self.name = name
         self.on_wanted_changed: Callable[[], None] = lambda: None
         """Called in any thread."""

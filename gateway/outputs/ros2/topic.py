@@ -75,12 +75,13 @@ class RosTopic:
         """Whether there is a subscriber."""
         self._on_wanted_changed = on_wanted_changed
         self._declared: Declared | None = None
+        self._node: RosNode | None = None  # on which it is, or was, declared
         self._sequence = 0  # of the last message; ROS counts from 1
 
     def declare(self, node: RosNode) -> None:
         """Declare the topic on an open session, unless that has been done."""
-        if self._declared is None:
-            self._declared = node.declare(self, self._on_matching)
+        if self._declared is None or self._node is not node:
+            self._declared, self._node = node.declare(self, self._on_matching), node
 
     def _on_matching(self, is_matching: bool) -> None:
         if is_matching is not self.wanted:

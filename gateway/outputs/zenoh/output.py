@@ -1,43 +1,30 @@
-"""The Zenoh output: one session, its publishers, liveliness tokens and queryables.
-
-The session opens in its own thread, because ``zenoh.open`` blocks; docs/design.md has the measurements.
-"""
+"""The Zenoh output: one session, its publishers, liveliness tokens and queryables."""
 
 import asyncio
-import json
-import logging
-import threading
 from collections.abc import Mapping
 from typing import Final
 
 import zenoh
 
-from gateway.errors import OutputError
-from gateway.log import FailureLog
 from gateway.losses import Losses
 from gateway.messages.topics import Topic, zenoh_key
 from gateway.outputs.contract import Output, QueryService, ServerFile, ServerParameters
 from gateway.outputs.status import OutputHealth
-from gateway.outputs.zenoh.closing import close_session
-from gateway.outputs.zenoh.config import prepare_threads, zenoh_config, zenoh_reason
+from gateway.outputs.zenoh.config import zenoh_config
 from gateway.outputs.zenoh.json_keys import JsonKeys
 from gateway.outputs.zenoh.publisher import ZenohLink, ZenohPublisher
 from gateway.outputs.zenoh.queries import ZenohQueries
+from gateway.outputs.zenoh.session import SessionHolder, SessionTexts
 from gateway.outputs.zenoh.settings import ZenohSettings
 
 _REMEDY: Final = "is the router running, are zenoh.config's endpoints right and free?"
-_NO_ROUTER: Final = OutputHealth(
-    False, "no Zenoh router is connected: start zenohd, or correct zenoh.config's connect/endpoints"
+_TEXTS: Final = SessionTexts(
+    "zenoh",
+    not_open=f"the Zenoh session is not open yet; {_REMEDY}",
+    cannot_open=f"the Zenoh session does not open: {{reason}}; {_REMEDY}",
+    no_router="no Zenoh router is connected: start zenohd, or correct zenoh.config's connect/endpoints",
+    opened="the session is open",
 )
-_HEALTHY: Final = OutputHealth(True)
-_RETRY_S: Final = 1.0
-_JOIN_S: Final = 0.5
-"""How long to wait for the session to close.
-
-A peer that does not read delays this by 10 s; the thread then continues without the gateway.
-"""
-
-logger = logging.getLogger(__name__)
 
 
 class ZenohOutput(Output):
@@ -55,57 +42,29 @@ class ZenohOutput(Output):
         self.max_rate_hz = settings.max_rate_hz
         self.has_tool_poses = settings.tool_poses
         self.config = zenoh_config(settings.config) if config is None else config
-        self._is_client = json.loads(self.config.get_json("mode") or "null") == "client"
-        self._link = ZenohLink(self._refusal)
+        self._holder = SessionHolder(_TEXTS, self.config, self._declare_all, self._update_link)
+        self._link = ZenohLink(lambda: self._holder.refusal)
         self._json = JsonKeys(settings.json_max_rate_hz)
-        # Protects what the opening thread shares: session, publishers, tokens and queries.
-        self._lock = threading.Lock()
-        self._session: zenoh.Session | None = None
+        # The lock of the session protects what the opening thread shares: publishers, tokens and queries.
+        self._lock = self._holder.lock
         self._publishers: list[ZenohPublisher] = []
         # By the source's name; None while the session is not open.
         self._alive: dict[str, zenoh.LivelinessToken | None] = {}
         self._streaming: dict[str, zenoh.LivelinessToken | None] = {}
         self._queries: ZenohQueries | None = None
-        self._num_transports = 0
-        self._problem = f"the Zenoh session is not open yet; {_REMEDY}"
-        self._closing = threading.Event()
-        self._opener = threading.Thread(target=self._open, name="zenoh-open", daemon=True)
-        self._failures = FailureLog(logger, self.name)
-        self._router_failures = FailureLog(logger, self.name)
 
     @property
     def session(self) -> zenoh.Session | None:
         """The open session; None before it opens and after ``close``."""
-        return self._session
-
-    @property
-    def lacks_router(self) -> bool:
-        """Whether this is a Zenoh client, which needs a router, and none is connected."""
-        return self._is_client and self._num_transports == 0
+        return self._holder.session
 
     def start(self) -> None:
         """Start the thread that opens the session and retries until it succeeds or ``close`` is called."""
-        self._opener.start()
+        self._holder.start()
 
-    def _open(self) -> None:
-        prepare_threads()
-        while not self._closing.is_set():
-            try:
-                session = zenoh.open(self.config)
-            except zenoh.ZError as error:
-                self._problem = f"the Zenoh session does not open: {zenoh_reason(error)}; {_REMEDY}"
-                self._failures.failed(self._problem)
-                self._closing.wait(_RETRY_S)
-                continue
-            session.info.declare_transport_events_listener(self._on_transport, history=True)
-            with self._lock:
-                if self._closing.is_set():
-                    session.close()
-                    return
-                self._declare_all(session)
-            self._problem = ""
-            self._failures.succeeded("the session is open")
-            return
+    def wait_until_open(self, timeout_s: float) -> None:
+        """Wait until the session is open, with everything declared on it."""
+        self._holder.wait(timeout_s)
 
     def _declare_all(self, session: zenoh.Session) -> None:
         """Declare on a new session everything that was requested before it opened."""
@@ -116,16 +75,9 @@ class ZenohOutput(Output):
                 tokens[source] = self._token(session, source, name)
         if self._queries is not None:
             self._queries.open(session, list(self._alive))  # the parameters, before the first frame
-        self._session = session
-        self._update_link()
-
-    def _on_transport(self, event: zenoh.TransportEvent) -> None:
-        self._num_transports += 1 if event.kind == zenoh.SampleKind.PUT else -1
-        self._update_link()
 
     def _update_link(self) -> None:
-        """Update whether messages can be sent. ``maintain`` repeats it, in case two threads do it at once."""
-        self._link.is_cut_off = self._session is None or self.lacks_router
+        self._link.is_cut_off = self._holder.is_cut_off
 
     def _token(self, session: zenoh.Session, source: str, name: str) -> zenoh.LivelinessToken:
         return session.liveliness().declare_token(zenoh_key(self.settings.prefix, source, name))
@@ -137,8 +89,8 @@ class ZenohOutput(Output):
         publisher.json = self._json.publisher(topic, key, publisher.update_wanted)
         with self._lock:
             self._publishers.append(publisher)
-            if self._session is not None:
-                publisher.declare(self._session)
+            if self.session is not None:
+                publisher.declare(self.session)
         return publisher
 
     def _forget(self, publisher: ZenohPublisher) -> None:
@@ -146,32 +98,17 @@ class ZenohOutput(Output):
             if publisher in self._publishers:
                 self._publishers.remove(publisher)
 
-    def _refusal(self) -> OutputError:
-        if self._session is not None and self.lacks_router:
-            return OutputError(_NO_ROUTER.problem, cause="no router")
-        # The session may be there already, and what is declared on it not yet.
-        return OutputError(self._problem, cause="not open")
-
     def health(self) -> OutputHealth:
         """Return whether messages can be sent."""
-        if self._session is None:
-            return OutputHealth(False, self._problem)
-        if self.lacks_router:
-            return _NO_ROUTER
-        return _HEALTHY
+        return self._holder.health
 
     def maintain(self) -> None:
         """Log whether a client has its router, and check for subscribers. Zenoh itself reconnects."""
-        self._update_link()
-        if self._session is None:
-            return
-        with self._lock:
-            for publisher in self._publishers:
-                publisher.check_subscribers()
-        if self.lacks_router:
-            self._router_failures.failed(self.health().problem)
-        elif self._router_failures.failing:
-            self._router_failures.recovered("connected to the router")
+        self._holder.maintain()
+        if self.session is not None:
+            with self._lock:
+                for publisher in self._publishers:
+                    publisher.check_subscribers()
 
     def is_configured_like(self, other: Output) -> bool:
         """Return whether the settings and the content of Zenoh's configuration file are the same."""
@@ -214,11 +151,11 @@ class ZenohOutput(Output):
                 if token is not None:
                     token.undeclare()
             elif source not in tokens:
-                tokens[source] = None if self._session is None else self._token(self._session, source, name)
+                tokens[source] = None if self.session is None else self._token(self.session, source, name)
 
     def _serve_source(self, source: str) -> None:
         with self._lock:
-            if self._queries is not None and self._session is not None:
+            if self._queries is not None and self.session is not None:
                 self._queries.add(source)
 
     def publish_parameters(self, source: str, parameters: ServerParameters) -> asyncio.Future[None] | None:
@@ -247,15 +184,8 @@ class ZenohOutput(Output):
 
     def close(self) -> None:
         """Close the session. Otherwise a process with Zenoh callbacks never ends."""
-        self._closing.set()
         self._json.close()
-        if self._opener.is_alive():
-            self._opener.join(_JOIN_S)  # If zenoh.open blocks longer, the thread closes what it opens.
+        self._holder.close()
         with self._lock:
-            session, self._session = self._session, None
-            self._update_link()
             self._alive.clear()
             self._streaming.clear()
-            self._problem = "the Zenoh session is closed; start the gateway again"
-        if session is not None:
-            close_session(session, "zenoh")

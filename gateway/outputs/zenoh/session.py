@@ -1,0 +1,185 @@
+"""The Zenoh session of an output: it opens in a thread, and everything is declared on it there.
+
+``zenoh.open`` blocks; docs/design.md has the measurements.
+"""
+
+import json
+import logging
+import threading
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import zenoh
+
+from gateway.errors import OutputError
+from gateway.log import DefectLog, FailureLog, defect_text
+from gateway.outputs.status import OutputHealth
+from gateway.outputs.zenoh.config import in_zenoh_thread, prepare_threads, zenoh_reason
+
+_RETRY_S: Final = 1.0
+_JOIN_S: Final = 0.5
+_CLOSE_S: Final = 0.5
+"""How long to wait for the opening thread and for the session to close.
+
+A peer that does not read delays closing by 10 s; a thread then continues without the gateway.
+"""
+
+_HEALTHY: Final = OutputHealth(True)
+
+logger = logging.getLogger(__name__)
+
+
+class SessionTexts(NamedTuple):
+    """What users read about the session of an output."""
+
+    output: str
+    """The name of the output."""
+    not_open: str
+    cannot_open: str
+    """With {reason}."""
+    no_router: str
+    """The session is a client, and its router is gone."""
+    opened: str
+    """What succeeded."""
+
+
+class SessionHolder:
+    """Opens a session, and tries again until it succeeds. Zenoh itself reconnects afterwards.
+
+    ``declare`` declares everything on the new session, in the thread that opens it and with ``lock`` held. If
+    it raises, the session is closed, and the next one gets everything. ``on_link`` is called in any thread
+    when ``is_cut_off`` may have changed.
+    """
+
+    def __init__(
+        self,
+        texts: SessionTexts,
+        config: zenoh.Config,
+        declare: Callable[[zenoh.Session], None],
+        on_link: Callable[[], None] = lambda: None,
+    ) -> None:
+        self.session: zenoh.Session | None = None
+        """The open session, with everything declared on it; None before that, and after ``close``."""
+        self.is_cut_off = True
+        """Whether nothing can be sent; read for every message."""
+        self.lock = threading.Lock()
+        """Protects ``session`` and what the owner declares on it."""
+        self._texts = texts
+        self._config = config
+        self._is_client = json.loads(config.get_json("mode") or "null") == "client"
+        self._declare = declare
+        self._on_link = on_link
+        self._num_transports = 0
+        self._counting = threading.Lock()  # of _num_transports, which several threads of Zenoh change
+        self._problem = texts.not_open
+        self._closing = threading.Event()
+        self._opener = threading.Thread(target=self._run, name=f"{texts.output}-open", daemon=True)
+        self._failures = FailureLog(logger, texts.output)
+        self._router_failures = FailureLog(logger, texts.output)
+        self._defects = DefectLog(logger, texts.output)
+
+    def start(self) -> None:
+        """Start the thread that opens the session."""
+        self._opener.start()
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait until the thread has opened the session and declared everything."""
+        self._opener.join(timeout_s)
+
+    def _run(self) -> None:
+        prepare_threads()
+        while not self._closing.is_set():
+            try:
+                self._open()
+            except zenoh.ZError as error:
+                self._problem = self._texts.cannot_open.format(reason=zenoh_reason(error))
+                self._failures.failed(self._problem)
+            except Exception as defect:  # noqa: BLE001 - the next try may succeed
+                self._problem = defect_text(defect)
+                self._defects.log(defect)
+            else:
+                return
+            self._closing.wait(_RETRY_S)
+
+    def _open(self) -> None:
+        session = zenoh.open(self._config)
+        try:
+            self._num_transports = 0
+            session.info.declare_transport_events_listener(in_zenoh_thread(self._on_transport), history=True)
+            with self.lock:
+                if self._closing.is_set():
+                    session.close()
+                    return
+                self._declare(session)
+                self.session = session
+        except Exception:
+            close_session(session, self._texts.output)
+            raise
+        self._problem = ""
+        self._update()
+        self._failures.succeeded(self._texts.opened)
+
+    def _on_transport(self, event: zenoh.TransportEvent) -> None:
+        with self._counting:
+            self._num_transports += 1 if event.kind == zenoh.SampleKind.PUT else -1
+        self._update()
+
+    def _update(self) -> None:
+        self.is_cut_off = self.session is None or self.lacks_router
+        self._on_link()
+
+    @property
+    def lacks_router(self) -> bool:
+        """Whether the session is that of a client, which needs a router, and none is connected."""
+        return self._is_client and not self._num_transports
+
+    @property
+    def health(self) -> OutputHealth:
+        """Whether messages can be sent, and if not, what to do."""
+        if self.session is None:
+            return OutputHealth(False, self._problem)
+        return OutputHealth(False, self._texts.no_router) if self.lacks_router else _HEALTHY
+
+    @property
+    def refusal(self) -> OutputError:
+        """The error for a message that cannot be sent."""
+        if self.session is not None and self.lacks_router:
+            return OutputError(self._texts.no_router, cause="no router")
+        # The session may be there already, and what is declared on it not yet.
+        return OutputError(self._problem, cause="not open")
+
+    def maintain(self) -> None:
+        """Log when the router goes and comes back. Called once a second."""
+        self._update()  # in case two threads did it at once
+        if self.session is None:
+            return
+        if self.lacks_router:
+            self._router_failures.failed(self._texts.no_router)
+        else:
+            self._router_failures.recovered("connected to the router")
+
+    def close(self) -> None:
+        """Close the session, so that all that it has declared disappears."""
+        self._closing.set()
+        if self._opener.is_alive():
+            self._opener.join(_JOIN_S)  # If zenoh.open blocks longer, the thread closes what it opens.
+        with self.lock:
+            session, self.session = self.session, None
+            self._problem = "the Zenoh session is closed; start the gateway again"
+            self._update()
+        if session is not None:
+            close_session(session, self._texts.output)
+
+
+def close_session(session: zenoh.Session, output: str) -> None:
+    """Close the session of an output; return when it is closed, or after _CLOSE_S."""
+    closer = threading.Thread(target=_close, args=(session, output), name=f"{output}-close", daemon=True)
+    closer.start()
+    closer.join(_CLOSE_S)
+
+
+def _close(session: zenoh.Session, output: str) -> None:
+    try:
+        session.close()
+    except zenoh.ZError as error:
+        logger.debug("%s: closing the session: %s", output, zenoh_reason(error))
