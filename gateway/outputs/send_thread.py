@@ -2,6 +2,7 @@
 
 import functools
 import threading
+import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -33,6 +34,7 @@ class SendThread:
         self._is_closed = False
         self._last: Callable[[], None]
         self._is_running = False
+        self._began_s: float | None = None  # the present call, on the monotonic clock
 
     def submit(self, call: Callable[[], None]) -> Future[None]:
         """Queue ``call`` before those that were offered.
@@ -62,6 +64,12 @@ class SendThread:
             self._wake()
         return True
 
+    @property
+    def call_age_s(self) -> float:
+        """How long the present call takes already; 0.0 if there is none."""
+        began_s = self._began_s
+        return 0.0 if began_s is None else time.monotonic() - began_s
+
     def close(self, last: Callable[[], None] = lambda: None) -> None:
         """Make no further calls but ``last``; a call in progress continues."""
         with self._changed:
@@ -77,7 +85,9 @@ class SendThread:
 
     def _run(self) -> None:
         while (call := self._next()) is not None:
+            self._began_s = time.monotonic()
             call()
+            self._began_s = None
             del call  # or it would keep its data alive until the next one
         self._last()
         for done, _ in self._first:

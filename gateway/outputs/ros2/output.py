@@ -28,6 +28,8 @@ from gateway.outputs.send_thread import SendThread
 from gateway.outputs.status import OutputHealth
 
 _STATUS: Final = ("status",)
+_HUNG_S: Final = 2.0
+"""A router that takes no message for this long does not read. Its connection counts as up for up to 60 s."""
 
 
 class Ros2Output(Output):
@@ -149,8 +151,14 @@ class Ros2Output(Output):
     # Life cycle.
 
     def health(self) -> OutputHealth:
-        """Return whether the router is connected."""
-        return self._router.health
+        """Return whether the router is connected, and reads."""
+        silent_s = 0.0 if self._sender is None else self._sender.call_age_s
+        if silent_s < _HUNG_S:
+            return self._router.health
+        problem = (
+            f"the Zenoh router at {self.settings.connect} has read nothing for {silent_s:.0f} s; restart it"
+        )
+        return OutputHealth(False, problem)
 
     def maintain(self) -> None:
         """Log whether the router is connected, and check for subscribers."""

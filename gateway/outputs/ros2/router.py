@@ -10,11 +10,11 @@ from gateway.outputs.zenoh.session import SessionHolder, SessionTexts
 
 REMEDY: Final = "start it with `ros2 run rmw_zenoh_cpp rmw_zenohd`, or correct ros2.connect"
 
-_WAIT_BEFORE_DROP_US: Final = 11_000_000
+_WAIT_BEFORE_DROP_US: Final = 70_000_000
 """How long Zenoh waits for a router that does not read, before it drops messages, which it does not count.
 
 Until then, only the sending thread waits, and what finds no place in its queue is counted. This is longer
-than the 10 s without a sign of life after which Zenoh gives a connection up.
+than the 60 s without a sign of life after which Zenoh gives a connection to rmw_zenohd up.
 """
 
 
