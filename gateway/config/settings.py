@@ -73,6 +73,11 @@ class StreamSettings(Section):
     idle_after_s: Seconds = 5.0
     """How long an on-demand stream continues without subscribers before it stops."""
 
+    @property
+    def has_only_events(self) -> bool:
+        """Whether nothing but events is requested, which are sporadic."""
+        return set(self.components) == {ComponentType.EVENT}
+
 
 _StreamList = Annotated[
     tuple[StreamSettings, ...],

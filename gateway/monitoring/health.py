@@ -3,7 +3,7 @@
 import json
 from collections.abc import Iterator, Sequence
 from http import HTTPStatus
-from typing import Any, Final, NamedTuple
+from typing import Any, NamedTuple
 
 from gateway.config.settings import StreamSettings
 from gateway.gateway import Gateway
@@ -11,15 +11,12 @@ from gateway.losses import Loss, last_minute_text, route_name
 from gateway.monitoring.http_pages import Page
 from gateway.outputs.contract import Output
 from gateway.outputs.guard import health as output_health
-from gateway.rtc3d.components import ComponentType
 from gateway.safe_text import safe_json
 from gateway.source import Source
 from gateway.stream.running_clock import running_clock
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from gateway.stream.status_text import unusable_frames
-
-_ONLY_EVENTS: Final = {ComponentType.EVENT}
 
 
 class _Route(NamedTuple):
@@ -109,14 +106,13 @@ def _losses_json(route: _Route) -> list[dict[str, Any]]:
 def _stream_problem(source: Source, stream: StreamSettings, status: StreamStatus, age_s: float | None) -> str:
     """Return what is wrong with a stream and what to check; "" if frames arrive or none are needed."""
     max_age_s = source.settings.stall_timeout_s
-    only_events = set(stream.components) == _ONLY_EVENTS  # events are sporadic
     problem = unusable_frames(status, max_age_s)
     if problem:
         return problem
     if age_s is not None and age_s < max_age_s:
         return ""
     silence = "no frame so far" if age_s is None else f"no frame for {age_s:.1f} s (limit {max_age_s:g} s)"
-    if _needs_no_frames(source, stream, status.state, only_events):
+    if _needs_no_frames(source, stream, status.state):
         return ""
     if status.state is StreamState.IDLE:
         return f"{silence}: {source.settings.host} is connected but sends nothing; is a measurement running?"
@@ -124,11 +120,11 @@ def _stream_problem(source: Source, stream: StreamSettings, status: StreamStatus
     return f"{silence}: {reason}"
 
 
-def _needs_no_frames(source: Source, stream: StreamSettings, state: StreamState, only_events: bool) -> bool:
+def _needs_no_frames(source: Source, stream: StreamSettings, state: StreamState) -> bool:
     match state:
         case StreamState.NO_MEASUREMENT:
             return True
-        case StreamState.IDLE | StreamState.STREAMING if only_events:
+        case StreamState.IDLE | StreamState.STREAMING if stream.has_only_events:
             return True
         case StreamState.IDLE:
             return stream.on_demand and not source.fan_out.has_subscribers(stream.components)

@@ -159,7 +159,9 @@ class SourceQueries:
     async def _component(self, question: Question, output: str) -> Answer:
         """Return the newest message of the stream; while it does not run, ask for the current frame."""
         component = COMPONENTS_BY_KEY[question.name]
-        stream = next(stream for stream in self._streams() if component in stream.components)
+        stream = next((stream for stream in self._streams() if component in stream.components), None)
+        if stream is None:  # since the question was checked
+            raise QueryError(f"no stream of source {self.settings.name!r} has {component.key} any more")
         session = stream.status.session
         if stream.connection is None:
             raise self._requests.no_connection_error()

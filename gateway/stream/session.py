@@ -78,7 +78,7 @@ class Session:
     ) -> None:
         self.server = f"{source.host}:{source.port}"
         self._source = source
-        self._only_events = set(stream.components) == {ComponentType.EVENT}
+        self._only_events = stream.has_only_events
         self._status = status
         speed = stream.backlog_speed if stream.backlog == "all" else None
         backlog = Backlog(on_frames, status.clock, speed, read_clocks)

@@ -52,7 +52,7 @@ class StreamControl:
         choose_components: Callable[[Parameters | None], Sequence[ComponentType]] | None = None,
     ) -> None:
         self._source = source
-        self._only_events = set(stream.components) == {ComponentType.EVENT}
+        self._only_events = stream.has_only_events
         self._stream = stream
         self._status = status
         self._session = session
