@@ -16,7 +16,6 @@ def declared(encoding: str) -> str:
 @pytest.mark.parametrize("encoding", ["ISO-8859-1", "latin1", "windows-1252", "UTF-8", "utf8"])
 def test_xml_returns_to_the_encoding_that_it_declares(encoding: str) -> None:
     xml = declared(encoding).encode(encoding)
-
     assert xml_bytes(xml_text(xml)) == xml
 
 
@@ -26,7 +25,6 @@ def test_xml_without_a_declaration_is_utf_8() -> None:
 
 def test_text_that_does_not_fit_its_declared_encoding_is_utf_8() -> None:
     text = declared("ISO-8859-1").replace("Fuß", "足")
-
     assert xml_bytes(text) == text.encode()
 
 
@@ -38,5 +36,4 @@ def test_the_summary_gives_the_size_of_the_xml_as_the_server_sent_it() -> None:
     xml = declared("ISO-8859-1").encode("iso-8859-1")
     reply = rtc3d.parameters_reply_t()
     reply.xml = xml_text(xml)
-
     assert f"{len(xml)} bytes of XML" in summarise(reply)

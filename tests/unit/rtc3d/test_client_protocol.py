@@ -102,10 +102,7 @@ STOP_OK = ok("OK-StreamFrames Stop")
             [STREAM, ok("OK"), FRAME, StopStreaming(), "give up", FRAME],
             "requested, requested, streaming, streaming, idle, streaming",
         ),
-        (
-            [STREAM, FRAME, StreamFrames(), error("no")],
-            "requested, streaming, streaming, streaming",
-        ),
+        ([STREAM, FRAME, StreamFrames(), error("no")], "requested, streaming, streaming, streaming"),
         ([SendCurrentFrame(), FRAME], "idle, idle"),
         (
             [STREAM, "give up", Version(), error("Error-Version?")],

@@ -5,14 +5,7 @@ from typing import Any
 
 import pytest
 
-from gateway.rtc3d.parameters import (
-    Marker,
-    Parameters,
-    Parameters3D,
-    Parameters6D,
-    Tool,
-    without_statistics,
-)
+from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D, Parameters6D, Tool, without_statistics
 from gateway.rtc3d.parameters_changes import (
     changed_sections,
     describe_renames,

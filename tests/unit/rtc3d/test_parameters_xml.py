@@ -32,16 +32,7 @@ from gateway.rtc3d.parameters_xml import (
     extract_sections,
     parse_parameters,
 )
-from tests.spec_parameters import (
-    ALL,
-    BY_SECTION,
-    MARKERS,
-    PLATE,
-    in_root,
-    markers_of,
-    spec_body,
-    spec_xml,
-)
+from tests.spec_parameters import ALL, BY_SECTION, MARKERS, PLATE, in_root, markers_of, spec_body, spec_xml
 
 
 class TestExamplesOfTheSpecification:
@@ -81,9 +72,7 @@ class TestBrokenNesting:
             + spec_body("3d")
             + b"</RT_Parameters>"
         )
-
         parameters = parse_parameters(xml).parameters
-
         assert parameters.force is not None
         assert [plate.id for plate in parameters.force.plates] == [str(n) for n in range(20)]
         assert {plate.channels for plate in parameters.force.plates} == {PLATE.channels}

@@ -32,9 +32,7 @@ def client() -> ScriptedClient:
 @pytest.mark.parametrize("sent", ["StreamFrames", "StreamFrames AllFrames", "StreamFrames All"])
 def test_a_stream_has_all_components_in_every_frame_by_default(client: ScriptedClient, sent: str) -> None:
     client.send(sent)
-
     frames = client.frames_until(60_000)
-
     assert [[component.type for component in frame] for frame in frames] == [[MARKERS, TOOLS, ANALOG]] * 7
     assert [frame[0].frame_number for frame in frames] == [1, 2, 3, 4, 5, 6, 7]
     assert [frame[2].frame_number for frame in frames] == [1, 11, 21, 31, 41, 51, 61]
@@ -73,7 +71,6 @@ def test_any_frequency_is_exact_on_average_with_even_gaps(
         due_us = client.session.due_us
         assert due_us is not None
         numbers += client.numbers_until(due_us)
-
     gaps = {after - before for before, after in pairwise(numbers)}
     assert gaps <= {math.floor(stride), math.ceil(stride)}
     assert numbers[-1] - numbers[0] == pytest.approx(199 * stride, abs=1)
@@ -84,9 +81,7 @@ def test_a_new_stream_replaces_the_old_one(client: ScriptedClient) -> None:
     client.send("StreamFrames 3D")
     client.frames_until(20_000)
     client.send("StreamFrames FrequencyDivisor:2 6D")
-
     frames = client.frames_until(60_000)
-
     assert [(component.type, component.frame_number) for frame in frames for component in frame] == [
         (TOOLS, 4),
         (TOOLS, 6),
@@ -104,7 +99,6 @@ def test_a_new_stream_sends_the_overdue_frames_of_the_old_one(client: ScriptedCl
 def test_stop_ends_the_stream_for_later_measurements_too(client: ScriptedClient) -> None:
     client.send("StreamFrames")
     client.send("StreamFrames Stop")
-
     assert client.frames_until(50_000) == []
     assert client.session.measurement_stopped() == []
     client.session.measurement_started()
@@ -116,15 +110,12 @@ def test_a_new_byte_order_applies_from_the_next_frame_on(client: ScriptedClient)
     big = client.frames_until(0)
     client.send("SetByteOrder LittleEndian")
     little = client.frames_until(10_000, "little")
-
     assert [frame[0].items[0][0] for frame in big + little] == [0, 1]
 
 
 def test_frames_more_than_a_second_late_are_dropped(client: ScriptedClient) -> None:
     client.send("StreamFrames 3D Events")
-
     frames = client.frames_until(10 * SECOND_US)
-
     numbers = [frame[0].frame_number for frame in frames]
     assert numbers == list(range(902, 1002))
     assert client.session.frames_dropped == 901
@@ -133,9 +124,7 @@ def test_frames_more_than_a_second_late_are_dropped(client: ScriptedClient) -> N
 
 def test_a_frame_that_is_not_taken_stays_due(client: ScriptedClient) -> None:
     client.send("StreamFrames 3D")
-
     next(client.session.due_frames(50_000))
-
     assert client.session.due_us == 10_000
     assert client.numbers_until(20_000) == [2, 3]
 
@@ -156,7 +145,6 @@ def test_every_event_is_sent_once_with_the_next_frame(
         for component in frame
     ]
     events = [component for component in frame_components if component.type == EVENT]
-
     sent = [event[0] for component in events for event in component.items]
     assert sent == list(range(1, len(sent) + 1))
     assert len(sent) >= 130
@@ -167,9 +155,7 @@ def test_every_event_is_sent_once_with_the_next_frame(
 def test_events_before_the_request_are_not_sent(client: ScriptedClient) -> None:
     client.elapsed_us = 10 * SECOND_US
     client.send("StreamFrames Events")
-
     [[events]] = client.frames_until(10 * SECOND_US + 70_000)
-
     assert [event[0] for event in events.items] == [143]
 
 
@@ -279,7 +265,6 @@ def test_polling_gets_each_event_once(client: ScriptedClient) -> None:
         client.send("SendCurrentFrame Events")
         [components] = client.frames_until(elapsed_us)
         events += [event[0] for component in components for event in component.items]
-
     assert events == list(range(1, 14))
 
 
@@ -289,7 +274,6 @@ def test_polling_gets_each_event_once(client: ScriptedClient) -> None:
 @pytest.mark.parametrize("sent", ["StreamFrames", "SendCurrentFrame 3D"])
 def test_without_a_measurement_requests_get_no_data(client: ScriptedClient, sent: str) -> None:
     client.elapsed_us = None
-
     assert client.send(sent) == [(COMMAND, f"OK-{sent}".encode()), (NO_DATA, b"")]
 
 
@@ -298,7 +282,6 @@ def test_clients_that_wait_for_frames_get_no_data_when_the_measurement_ends(clie
     client.send("StreamFrames")
     client.frames_until(0)
     client.send("SendCurrentFrame")
-
     assert packets_in(b"".join(client.session.measurement_stopped())) == [(NO_DATA, b""), (NO_DATA, b"")]
     assert client.frames_until(50_000) == []
 
@@ -307,9 +290,7 @@ def test_a_stream_continues_with_the_first_frame_of_the_next_measurement(client:
     client.elapsed_us = None
     client.send("StreamFrames 3D Events")
     client.session.measurement_started()
-
     frames = client.frames_until(70_000)
-
     assert [frame[0].frame_number for frame in frames] == [1, 2, 3, 4, 5, 6, 7, 8]
     assert frames[-1][1] == WireComponent(EVENT, 8, 70_000, [(1, 70_000, -1, -1, -1)])
     client.session.measurement_stopped()

@@ -27,7 +27,6 @@ def built_components(builder: FrameBuilder, tick: int, *, with_events: bool = Fa
 
 def test_a_frame_has_the_bytes_of_the_specification() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.MARKERS,))
-
     assert builder.packet("big", 3).packet == bytes.fromhex(
         "00000044 00000003"  # size 68, data frame
         "00000001"  # one component
@@ -48,7 +47,6 @@ def test_a_frame_has_the_bytes_of_the_specification() -> None:
 
 def test_by_default_a_frame_has_all_components_of_the_scene_in_wire_order() -> None:
     builder = FrameBuilder(CountingScene(), ())
-
     assert [component.type for component in built_components(builder, 7, with_events=True)] == [
         MARKERS,
         TOOLS,
@@ -59,15 +57,12 @@ def test_by_default_a_frame_has_all_components_of_the_scene_in_wire_order() -> N
 
 def test_components_the_scene_lacks_are_left_out() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.FORCE, ComponentType.ANALOG))
-
     assert [component.type for component in built_components(builder, 0)] == [ANALOG]
 
 
 def test_the_rate_is_that_of_the_slowest_component_and_each_has_its_own_sample() -> None:
     builder = FrameBuilder(CountingScene(rate_hz=200), (ComponentType.MARKERS, ComponentType.ANALOG))
-
     markers, analog = built_components(builder, 20)
-
     assert builder.rate == 200
     assert (markers.frame_number, analog.frame_number) == (21, 201)
     assert markers.timestamp_us == analog.timestamp_us == 100_000
@@ -76,15 +71,12 @@ def test_the_rate_is_that_of_the_slowest_component_and_each_has_its_own_sample()
 
 def test_samples_are_consecutive_across_blocks_of_frames() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.ANALOG,))
-
     samples = [built_components(builder, tick)[0].items[0][0] for tick in range(300)]
-
     assert samples == list(range(300))
 
 
 def test_frames_of_events_alone_are_numbered_at_the_measurement_rate() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.EVENT,))
-
     assert built_components(builder, 14, with_events=True) == [
         WireComponent(EVENT, 15, 140_000, [(1, 70_000, -1, -1, -1), (2, 140_000, -1, -1, -1)])
     ]
@@ -101,7 +93,6 @@ def test_events_are_numbered_at_the_measurement_rate_in_frames_of_any_rate() -> 
 def test_events_can_have_the_16_bytes_of_the_specification() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.EVENT,), event_bytes=16)
     data = builder.packet("little", 7, 0)
-
     assert components_in(data.packet[8:], "little", event_bytes=16) == [
         WireComponent(EVENT, 8, 70_000, [(1, -1, -1, -1)])
     ]
@@ -109,13 +100,11 @@ def test_events_can_have_the_16_bytes_of_the_specification() -> None:
 
 def test_events_that_were_not_requested_are_left_out() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.MARKERS,))
-
     assert [component.type for component in built_components(builder, 100, with_events=True)] == [MARKERS]
 
 
 def test_frame_numbers_stay_within_a_signed_32_bit_field() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.MARKERS,))
-
     assert built_components(builder, 2**31 - 2)[0].frame_number == 2**31 - 1
     assert built_components(builder, 2**31 - 1)[0].frame_number == 0
 
@@ -134,12 +123,9 @@ def test_a_rounded_rate_becomes_an_exact_fraction(rate_hz: float, exact: Fractio
 
 
 @given(
-    rate_hz=st.one_of(st.integers(1, 5000).map(float), st.floats(1, 5000)),
-    elapsed_us=st.integers(0, 10**13),
+    rate_hz=st.one_of(st.integers(1, 5000).map(float), st.floats(1, 5000)), elapsed_us=st.integers(0, 10**13)
 )
 def test_the_tick_after_a_time_is_the_first_one_later(rate_hz: float, elapsed_us: int) -> None:
     builder = FrameBuilder(CountingScene(rate_hz), (ComponentType.MARKERS,))
-
     tick = builder.tick_after(elapsed_us)
-
     assert builder.time_us(tick - 1) <= elapsed_us < builder.time_us(tick)

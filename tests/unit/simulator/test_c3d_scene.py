@@ -80,7 +80,6 @@ def test_values_equal_what_ezc3d_reads(path: Path) -> None:
 
 def test_a_marker_of_nan_or_of_residual_minus_one_is_missing(path: Path) -> None:
     markers = C3dScene(path).items(ComponentType.MARKERS, np.arange(5))
-
     missing = {(f, m) for f in range(5) for m in range(2) if markers[f, m].tobytes() == MISSING}
     assert missing == {(1, 0), (3, 1)}
     assert np.isnan(markers["x"]).sum() == 2
@@ -88,13 +87,11 @@ def test_a_marker_of_nan_or_of_residual_minus_one_is_missing(path: Path) -> None
 
 def test_a_marker_with_a_position_and_a_residual_of_minus_one_is_missing() -> None:
     markers = _markers(np.ones((4, 2, 1)), np.array([[[0.5], [-1.0]]]))
-
     assert [item.tobytes() for item in markers[0]] == [bytes.fromhex("3F800000" * 3 + "3F000000"), MISSING]
 
 
 def test_each_component_has_its_own_rate(path: Path) -> None:
     take = C3dScene(path)
-
     assert take.rates_hz == {
         ComponentType.MARKERS: 100.0,
         ComponentType.ANALOG: 1000.0,
@@ -106,7 +103,6 @@ def test_each_component_has_its_own_rate(path: Path) -> None:
 
 def test_a_take_repeats_after_its_last_sample(path: Path) -> None:
     take = C3dScene(path)
-
     for component, length in (
         (ComponentType.MARKERS, 5),
         (ComponentType.ANALOG, 50),
@@ -140,9 +136,7 @@ def test_parameters_are_those_of_the_file(path: Path) -> None:
 def test_markers_without_labels_are_numbered(tmp_path: Path) -> None:
     content = new_recording()
     content["parameters"]["POINT"]["LABELS"]["value"] = ["heel", ""]
-
     markers = C3dScene(written(content, tmp_path)).parameters.markers
-
     assert markers is not None
     assert [marker.label for marker in markers.markers] == ["heel", "Marker 2"]
 
@@ -153,9 +147,7 @@ def test_a_recording_without_markers_plays_at_its_analog_rate(tmp_path: Path) ->
     content["data"]["points"] = np.zeros((4, 0, 5))
     content["data"]["meta_points"]["residuals"] = np.zeros((1, 0, 5))
     content["data"]["meta_points"]["camera_masks"] = np.zeros((7, 0, 5), bool)
-
     take = C3dScene(written(content, tmp_path))
-
     assert ComponentType.MARKERS not in take.rates_hz
     assert (take.measurement_rate_hz, take.num_frames) == (1000.0, 50)
 
@@ -166,10 +158,8 @@ def test_force_plates_of_an_unknown_type_are_left_out_with_a_warning(
     content = new_recording()
     content["parameters"]["FORCE_PLATFORM"]["TYPE"]["value"] = [77]
     path = written(content, tmp_path)
-
     with caplog.at_level(logging.WARNING):
         take = C3dScene(path)
-
     assert set(take.rates_hz) == {ComponentType.MARKERS, ComponentType.ANALOG}
     assert str(path) in caplog.text
     assert "force plates" in caplog.text
@@ -196,7 +186,6 @@ def test_a_file_cut_short_before_its_data_is_refused(path: Path) -> None:
 
 def test_a_file_cut_short_in_its_data_plays_up_to_there(path: Path) -> None:
     path.write_bytes(path.read_bytes()[:-600])
-
     assert C3dScene(path).num_frames == 4
 
 
@@ -210,7 +199,6 @@ def test_a_path_that_is_not_a_file_is_refused(tmp_path: Path, name: str, problem
 
 def test_without_ezc3d_the_error_says_how_to_install_it(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ezc3d", None)  # then importing it raises ImportError
-
     with pytest.raises(TakeError, match=r"pip install 'rtc3d-gateway\[c3d\]'"):
         C3dScene(path)
 

@@ -59,10 +59,7 @@ def test_every_shipped_scenario_loads(path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "expected"),
     [
-        (
-            "faults: [{fault: dely}]",
-            "1:18: faults[0].fault: found 'dely' (did you mean 'delay'?); expected ",
-        ),
+        ("faults: [{fault: dely}]", "1:18: faults[0].fault: found 'dely' (did you mean 'delay'?); expected "),
         (
             "faults: [{delay_ms: 3}]",
             "1:10: faults[0]: found a mapping; expected a mapping with the key fault",
@@ -71,19 +68,13 @@ def test_every_shipped_scenario_loads(path: Path) -> None:
             "faults: [{fault: cut, at: 3}]",
             "1:23: faults[0].at: unknown key (did you mean 'at_s'?); known keys: at_s,",
         ),
-        (
-            "faults: [{fault: cut, at_s: x}]",
-            "1:29: faults[0].at_s: found 'x'; expected a number of seconds",
-        ),
+        ("faults: [{fault: cut, at_s: x}]", "1:29: faults[0].at_s: found 'x'; expected a number of seconds"),
         (
             "faults: [{fault: restart, scene: {marker: 3}}]",
             "1:35: faults[0].scene.marker: unknown key (did you mean 'markers'?)",
         ),
         ("faults: delay", "1:9: faults: found 'delay'; expected a list of faults"),
-        (
-            "scene: {markers: -1}\nfaults: []",
-            "1:18: scene.markers: found -1; expected a whole number from 0",
-        ),
+        ("scene: {markers: -1}\nfaults: []", "1:18: scene.markers: found -1; expected a whole number from 0"),
         ("seed: 1", "1:1: faults: missing; this key is required"),
         ("", "empty; expected a mapping with at least the key faults"),
     ],
@@ -106,11 +97,7 @@ def test_a_scene_has_the_sizes_rates_and_labels_of_its_settings() -> None:
     scene = SceneSettings(
         markers=3, tools=1, analog=2, plates=0, rate_hz=50, analog_rate_hz=500, marker_label="M"
     ).build()
-    assert scene.rates_hz == {
-        ComponentType.MARKERS: 50,
-        ComponentType.TOOLS: 50,
-        ComponentType.ANALOG: 500,
-    }
+    assert scene.rates_hz == {ComponentType.MARKERS: 50, ComponentType.TOOLS: 50, ComponentType.ANALOG: 500}
     assert scene.parameters.markers is not None
     assert [marker.label for marker in scene.parameters.markers.markers] == ["M 1", "M 2", "M 3"]
 

@@ -72,7 +72,6 @@ def local_mm_of(poses: Floats, markers: Floats) -> Floats:
 def test_a_tools_markers_are_rigid_in_its_own_coordinates(scene: SyntheticScene, tool: int) -> None:
     poses, markers = tool_and_markers(scene, tool)
     local_mm = local_mm_of(poses, markers)
-
     assert np.nanstd(local_mm, axis=0) == pytest.approx(NOISE_MM, rel=0.15)
     in_view = poses[~np.isnan(poses[:, 0])]
     assert np.linalg.norm(in_view[:, :4], axis=1) == pytest.approx(1.0, abs=1e-6)
@@ -92,7 +91,6 @@ def test_a_fit_of_the_visible_markers_gives_the_tools_pose_and_error(
         visible = ~np.isnan(measured[:, 0])
         turn, origin_mm = fitted(local_mm[visible], measured[visible, :3])
         expected = rotation(pose[None, :4])[0]
-
         assert origin_mm == pytest.approx(pose[4:7], abs=5 * NOISE_MM)
         assert turn == pytest.approx(expected, abs=0.01)
         off_mm = measured[visible, :3] - (local_mm[visible] @ expected.T + pose[4:7])
@@ -111,7 +109,6 @@ def test_a_tool_is_out_of_view_exactly_when_fewer_than_three_of_its_markers_are_
 def test_missing_markers_and_tools_have_the_bytes_of_the_specification(scene: SyntheticScene) -> None:
     markers = scene.items(ComponentType.MARKERS, MINUTE)
     tools = scene.items(ComponentType.TOOLS, MINUTE)
-
     missing_markers = {item.tobytes() for item in markers[np.isnan(markers["x"])]}
     assert missing_markers == {b"\xff" * 12 + bytes.fromhex("4479C000")}  # 999.0
     assert {item.tobytes() for item in tools[np.isnan(tools["x"])]} == {b"\xff" * 32}
@@ -129,7 +126,6 @@ def test_a_sample_does_not_depend_on_the_others_in_one_call(first: int, cut: int
 
 def test_channels_are_sines_of_different_frequencies(scene: SyntheticScene) -> None:
     voltages = table(scene.items(ComponentType.ANALOG, np.arange(10_000)))[..., 0]  # 20 s at 500 Hz
-
     spectrum = np.abs(np.fft.rfft(voltages, axis=0))
     assert (np.argmax(spectrum, axis=0) / 20).tolist() == [0.5, 1.25, 2.0, 2.75, 3.5]
     assert np.all(np.max(np.abs(voltages), axis=0) > 100)  # mV
@@ -145,7 +141,6 @@ def steps_on(scene: SyntheticScene, plate: int) -> list[Floats]:
 @pytest.mark.parametrize("plate", [0, 1])
 def test_a_step_has_two_peaks_of_about_the_weight_of_the_body(scene: SyntheticScene, plate: int) -> None:
     steps = steps_on(scene, plate)
-
     assert len(steps) >= 3
     for step in steps:
         third = len(step) // 3
@@ -182,7 +177,6 @@ def test_moments_put_the_centre_of_pressure_on_the_plate_from_heel_to_toe(
 
 def test_a_button_is_pressed_and_released_every_second(scene: SyntheticScene) -> None:
     events = scene.events(0, 3_000_000)
-
     assert [tuple(event) for event in events.tolist()] == [
         (BUTTON_EVENT, 500_000, 1, 1, -1),
         (BUTTON_EVENT, 800_000, 1, 0, -1),
@@ -202,9 +196,7 @@ def test_a_button_is_pressed_and_released_every_second(scene: SyntheticScene) ->
 )
 def test_events_do_not_depend_on_how_the_time_is_divided(times_us: list[int]) -> None:
     scene = SyntheticScene(markers=0, tools=0, analog=0, plates=0)
-
     parts = [scene.events(a, b).tolist() for a, b in pairwise(times_us)]
-
     whole = scene.events(times_us[0], times_us[-1]).tolist()
     assert [event for part in parts for event in part] == whole
     assert all(times_us[0] <= event[1] < times_us[-1] for event in whole)

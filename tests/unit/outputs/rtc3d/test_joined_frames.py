@@ -4,16 +4,7 @@ import pytest
 
 from gateway.outputs.rtc3d.live_frames import WAIT_US
 from gateway.rtc3d.components import ComponentType
-from tests.unit.outputs.rtc3d.live_client import (
-    FAST,
-    SLOW,
-    LiveSource,
-    analog,
-    body,
-    event,
-    markers,
-    play,
-)
+from tests.unit.outputs.rtc3d.live_client import FAST, SLOW, LiveSource, analog, body, event, markers, play
 
 
 @pytest.mark.parametrize("fast_first", [False, True])

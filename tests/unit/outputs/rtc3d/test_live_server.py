@@ -128,7 +128,6 @@ async def test_a_measurement_ends_when_no_frame_has_come_for_a_moment() -> None:
     assert [number_in(data) for _, data in client.receive()] == [2, 3]
     await asyncio.sleep(0.2)
     assert client.receive() == [NO_FRAMES]
-
     server.arrive(4)
     await settle()
     assert [number_in(data) for _, data in client.receive()] == [4]

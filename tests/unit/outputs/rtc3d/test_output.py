@@ -203,11 +203,7 @@ async def test_a_reload_touches_only_what_has_changed() -> None:
     await asyncio.sleep(1)
     assert take_over(output, {"lab": LAB})
     await asyncio.sleep(1)
-    assert Server.events[2:] == [
-        f"close 127.0.0.1 {HALL}",
-        "open 127.0.0.1 3122",
-        "close 127.0.0.1 3122",
-    ]
+    assert Server.events[2:] == [f"close 127.0.0.1 {HALL}", "open 127.0.0.1 3122", "close 127.0.0.1 3122"]
     assert output.is_configured_like(Rtc3dOutput(Rtc3dSettings()))
 
 

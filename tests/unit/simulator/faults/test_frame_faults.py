@@ -27,7 +27,6 @@ MISSING = b"\xff" * 4
 @pytest.mark.parametrize(("fraction", "hidden"), [(0.0, 0), (0.01, 1), (0.5, 4), (0.51, 5), (1.0, 8)])
 def test_occlusion_hides_a_fraction_of_the_markers(fraction: float, hidden: int) -> None:
     [component] = components_in_packet(changed(Occlusion(markers=fraction), frame(markers(count=8))))
-
     seen = [item for item in component.items if not math.isnan(item[0])]
     assert len(seen) == 8 - hidden
     assert all(item == (item[0], 1.5, -2.0, 0.25) for item in seen)
@@ -35,18 +34,13 @@ def test_occlusion_hides_a_fraction_of_the_markers(fraction: float, hidden: int)
 
 def test_hidden_markers_and_tools_have_the_bytes_of_field_note_7() -> None:
     tool = struct.pack(">IIiqI8f", 24 + 32, TOOLS, 7, 9000, 1, 1, 0, 0, 0, 10, 20, 30, 0.5)
-
     data = changed(Occlusion(), frame(markers(count=1), tool))
-
     assert data[8 + 4 + 24 : 8 + 4 + 40] == MISSING * 3 + struct.pack(">f", 999.0)
     assert data[-32:] == MISSING * 8
     assert [
         (component.type, component.frame_number, component.timestamp_us)
         for component in components_in_packet(data)
-    ] == [
-        (MARKERS, 7, 9000),
-        (TOOLS, 7, 9000),
-    ]
+    ] == [(MARKERS, 7, 9000), (TOOLS, 7, 9000)]
 
 
 def test_occlusion_hides_the_same_markers_until_it_begins_again() -> None:
@@ -56,7 +50,6 @@ def test_occlusion_hides_the_same_markers_until_it_begins_again() -> None:
     first, second = (changed(fault, frame(markers(count=100)), occlusion) for _ in range(2))
     occlusion.begin()
     third = changed(fault, frame(markers(count=100)), occlusion)
-
     assert first == second
     assert first != third
 
@@ -105,11 +98,9 @@ def test_frames_can_have_another_byte_order(order: str, requested: ByteOrder, se
 def test_an_unknown_component_comes_last_with_a_header_like_any_other(byte_order: ByteOrder) -> None:
     sign = ">" if byte_order == "big" else "<"
     unknown = struct.pack(sign + "IIiq", 20 + 5, 99, 0, 0) + bytes(5)
-
     data = changed(
         UnknownComponent(component_type=99, data_bytes=5), frame(markers(byte_order), byte_order=byte_order)
     )
-
     assert data == frame(markers(byte_order), unknown, byte_order=byte_order)
 
 
@@ -118,7 +109,6 @@ def test_an_unknown_component_comes_last_with_a_header_like_any_other(byte_order
 def test_wrong_counts_are_invalid_in_either_byte_order(field: str, byte_order: ByteOrder) -> None:
     good = frame(markers(byte_order), markers(byte_order), byte_order=byte_order)
     [(_, body)] = packets_in(changed(WrongCounts.model_validate({"field": field}), good))
-
     assert len(body) == len(good) - 8
     for order in ("big", "little"):
         with pytest.raises(FrameError):

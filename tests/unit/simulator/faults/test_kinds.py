@@ -63,10 +63,7 @@ def test_a_fault_is_parsed_from_the_form_in_which_it_is_printed(text: str, fault
         ("cut,reset", "found 'reset'; expected NAME=VALUE, each name once"),
         ("cut,at_s=1,at_s=2", "found 'at_s=2'; expected NAME=VALUE, each name once"),
         ("cut,fault=delay", "found 'fault=delay'; expected NAME=VALUE, each name once"),
-        (
-            "delay,delay_ms=-1",
-            "delay_ms: found -1; expected a number of milliseconds above 0, up to 600000",
-        ),
+        ("delay,delay_ms=-1", "delay_ms: found -1; expected a number of milliseconds above 0, up to 600000"),
         ("delay,delay_ms=[", r"delay_ms: found '\['; expected a number"),
         ("delay,delay_ms=.nan", "delay_ms: found nan; expected a number"),
         ("delay,every_s=2", "every_s: found every_s without for_s; expected both"),
