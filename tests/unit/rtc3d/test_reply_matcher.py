@@ -16,7 +16,7 @@ from gateway.rtc3d.commands import (
     Version,
 )
 from tests.servers import error, ok
-from tests.unit.rtc3d.protocols import FRAME, NO_DATA, STREAM, xml
+from tests.unit.rtc3d.protocols import FRAME, STREAM, xml
 
 GIVE_UP: Final = "give up"
 ASSUME: Final = "assume"
@@ -90,6 +90,10 @@ DUPLICATES: Final = {
 }
 
 LATE: Final = {
+    "that name the later command by its verb": (
+        [Version(), GIVE_UP, LITTLE, ok("ok-setbyteorder")],
+        [f"{LITTLE}: answered"],
+    ),
     "that name the earlier command": (
         [Version(), GIVE_UP, LITTLE, ok("OK-Version 1.0"), OK_LITTLE],
         ["unexpected", f"{LITTLE}: answered"],
@@ -101,14 +105,6 @@ LATE: Final = {
     "that name the later command first": (
         [Version(), GIVE_UP, LITTLE, OK_LITTLE, STREAM, ok("OK")],
         [f"{LITTLE}: answered", f"{STREAM}: answered"],
-    ),
-    "that name the later command by its verb": (
-        [Version(), GIVE_UP, LITTLE, ok("ok-setbyteorder")],
-        [f"{LITTLE}: answered"],
-    ),
-    "that never come": (
-        [Version(), GIVE_UP, LITTLE, OK_LITTLE, STREAM, ok(f"OK-{STREAM}"), STOP, ok("OK-StreamFrames Stop")],
-        [f"{command}: answered" for command in (LITTLE, STREAM, STOP)],
     ),
     "that are refusals, while XML answers": (
         [Version(), GIVE_UP, ALL, error("err-unknown command"), xml("The_3D"), ASSUME],
@@ -125,10 +121,6 @@ LATE: Final = {
     "from a server that ignored the first command": (
         [Version(), GIVE_UP, STREAM, error("what?"), ASSUME, StreamFrames(), error("what?")],
         [f"{STREAM}: maybe", f"{STREAM}: refused", "StreamFrames: refused"],
-    ),
-    "as many as there are commands": (
-        [Version(), GIVE_UP, ALL, GIVE_UP, STREAM, error("what?") * 2, ok("fine")],
-        [f"{STREAM}: maybe", f"{STREAM}: maybe", f"{STREAM}: answered"],
     ),
     "that name a command without its parameters": (
         [
@@ -164,17 +156,9 @@ PARAMETERS: Final = {
         [ONLY_3D, GIVE_UP, ONLY_6D, xml("The_3D"), xml("The_6D")],
         ["unexpected", f"{ONLY_6D}: answered"],
     ),
-    "with more sections than requested": (
-        [ALL, xml("The_3D", "The_6D"), SendParameters(("general",)), xml("The_3D", "The_6D")],
-        [f"{ALL}: answered", "SendParameters General: answered"],
-    ),
     "without a section that the server lacks": (
         [ONLY_6D, GIVE_UP, SendParameters(("general", "3d")), xml("The_3D")],
         ["SendParameters General 3D: answered"],
-    ),
-    "without those that were given up": (
-        [ONLY_3D, GIVE_UP, ONLY_6D, xml("The_6D")],
-        [f"{ONLY_6D}: answered"],
     ),
     "late, to the same request sent again": ([ALL, GIVE_UP, ALL, xml("The_6D")], [f"{ALL}: answered"]),
     "late, while nothing is pending": (
@@ -189,8 +173,6 @@ FRAMES: Final = {
         [CURRENT, ok("OK-SendCurrentFrame"), FRAME],
         ["unexpected", f"{CURRENT}: answered"],
     ),
-    "without an acknowledgement": ([CURRENT, FRAME], [f"{CURRENT}: answered"]),
-    "that do not exist": ([CURRENT, NO_DATA], [f"{CURRENT}: answered"]),
     "that stream at the former rate": (
         [STREAM, FRAME, ok(f"OK-{STREAM}"), StreamFrames(), FRAME, error("err-no")],
         [f"{STREAM}: answered", "unexpected", "StreamFrames: refused"],
