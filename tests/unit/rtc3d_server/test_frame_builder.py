@@ -1,3 +1,5 @@
+"""Frames of computed scenes: their bytes, rates, numbers and events."""
+
 from fractions import Fraction
 
 import pytest
@@ -45,19 +47,19 @@ def test_a_frame_has_the_bytes_of_the_specification() -> None:
     )
 
 
-def test_by_default_a_frame_has_all_components_of_the_scene_in_wire_order() -> None:
-    builder = FrameBuilder(CountingScene(), ())
-    assert [component.type for component in built_components(builder, 7, with_events=True)] == [
-        MARKERS,
-        TOOLS,
-        ANALOG,
-        EVENT,
-    ]
-
-
-def test_components_the_scene_lacks_are_left_out() -> None:
-    builder = FrameBuilder(CountingScene(), (ComponentType.FORCE, ComponentType.ANALOG))
-    assert [component.type for component in built_components(builder, 0)] == [ANALOG]
+@pytest.mark.parametrize(
+    ("requested", "built"),
+    [
+        ((), [MARKERS, TOOLS, ANALOG, EVENT]),
+        ((ComponentType.FORCE, ComponentType.ANALOG), [ANALOG]),  # the scene lacks force plates
+        ((ComponentType.MARKERS,), [MARKERS]),
+    ],
+)
+def test_a_frame_has_the_requested_components_of_the_scene_in_wire_order(
+    requested: tuple[ComponentType, ...], built: list[int]
+) -> None:
+    components = built_components(FrameBuilder(CountingScene(), requested), 100, with_events=True)
+    assert [component.type for component in components] == built
 
 
 def test_the_rate_is_that_of_the_slowest_component_and_each_has_its_own_sample() -> None:
@@ -75,16 +77,12 @@ def test_samples_are_consecutive_across_blocks_of_frames() -> None:
     assert samples == list(range(300))
 
 
-def test_frames_of_events_alone_are_numbered_at_the_measurement_rate() -> None:
-    builder = FrameBuilder(CountingScene(), (ComponentType.EVENT,))
-    assert built_components(builder, 14, with_events=True) == [
-        WireComponent(EVENT, 15, 140_000, [(1, 70_000, -1, -1, -1), (2, 140_000, -1, -1, -1)])
-    ]
-    assert built_components(builder, 14) == []
-
-
-def test_events_are_numbered_at_the_measurement_rate_in_frames_of_any_rate() -> None:
+def test_events_are_numbered_at_the_measurement_rate_alone_and_in_frames_of_any_rate() -> None:
     """An event's number tells to which frame of the measurement it belongs, not to which of the stream."""
+    builder = FrameBuilder(CountingScene(), (ComponentType.EVENT,))
+    events = WireComponent(EVENT, 15, 140_000, [(1, 70_000, -1, -1, -1), (2, 140_000, -1, -1, -1)])
+    assert built_components(builder, 14, with_events=True) == [events]
+    assert built_components(builder, 14) == []
     builder = FrameBuilder(CountingScene(), (ComponentType.ANALOG, ComponentType.EVENT))
     analog, event = built_components(builder, 75, with_events=True)
     assert (analog.frame_number, event.frame_number) == (76, 8)
@@ -98,11 +96,6 @@ def test_events_can_have_the_16_bytes_of_the_specification() -> None:
     ]
 
 
-def test_events_that_were_not_requested_are_left_out() -> None:
-    builder = FrameBuilder(CountingScene(), (ComponentType.MARKERS,))
-    assert [component.type for component in built_components(builder, 100, with_events=True)] == [MARKERS]
-
-
 def test_frame_numbers_stay_within_a_signed_32_bit_field() -> None:
     builder = FrameBuilder(CountingScene(), (ComponentType.MARKERS,))
     assert built_components(builder, 2**31 - 2)[0].frame_number == 2**31 - 1
@@ -112,19 +105,15 @@ def test_frame_numbers_stay_within_a_signed_32_bit_field() -> None:
 @pytest.mark.parametrize(
     ("rate_hz", "exact"),
     [
-        (100.0, Fraction(100)),
-        (59.94006, Fraction(60000, 1001)),
-        (29.97, Fraction(2997, 100)),
-        (0.5, Fraction(1, 2)),
+        *((100.0, Fraction(100)), (59.94006, Fraction(60000, 1001))),
+        *((29.97, Fraction(2997, 100)), (0.5, Fraction(1, 2))),
     ],
 )
 def test_a_rounded_rate_becomes_an_exact_fraction(rate_hz: float, exact: Fraction) -> None:
     assert exact_rate(rate_hz) == exact
 
 
-@given(
-    rate_hz=st.one_of(st.integers(1, 5000).map(float), st.floats(1, 5000)), elapsed_us=st.integers(0, 10**13)
-)
+@given(rate_hz=st.integers(1, 5000).map(float) | st.floats(1, 5000), elapsed_us=st.integers(0, 10**13))
 def test_the_tick_after_a_time_is_the_first_one_later(rate_hz: float, elapsed_us: int) -> None:
     builder = FrameBuilder(CountingScene(rate_hz), (ComponentType.MARKERS,))
     tick = builder.tick_after(elapsed_us)

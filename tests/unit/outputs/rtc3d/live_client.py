@@ -126,3 +126,16 @@ def play(source: LiveSource, first: int, last: int, *, fast_first: bool, base_us
             source.wait(1000)
             source.arrive(body(analog(10 * number + step, timestamp_us + 1000 * step)), FAST)
         source.wait(1000)
+
+
+def streaming(command: str, *, is_new: bool = False) -> tuple[LiveSource, LiveClient]:
+    """Return a source and a client of it that has sent a command."""
+    source = LiveSource(is_new=is_new)
+    client = source.client()
+    client.send(command)
+    return source, client
+
+
+def pair(number: int) -> bytes:
+    """Return a frame with markers and an event of the same number."""
+    return body(markers(number, 10_000 * number), event(number, 10_000 * number, number))

@@ -12,17 +12,17 @@ from tests.unit.outputs.rtc3d.live_client import (
     body,
     event,
     markers,
+    pair,
     play,
+    streaming,
 )
 from tests.unit.rtc3d_server.wire import EVENT, MARKERS
 
 
 def test_no_event_is_lost_at_a_low_rate() -> None:
-    source = LiveSource()
-    client = source.client()
-    client.send("StreamFrames FrequencyDivisor:4 3D Events")
+    source, client = streaming("StreamFrames FrequencyDivisor:4 3D Events")
     for number in range(1, 10):
-        source.arrive(body(markers(number, 10_000 * number), event(number, 10_000 * number, number)))
+        source.arrive(pair(number))
     frames = client.take()
     assert [frame[0].frame_number for frame in frames] == [1, 5, 9]
     events = [each for frame in frames for each in frame if each.type == EVENT]
@@ -40,7 +40,7 @@ def test_a_client_that_lacks_events_is_counted() -> None:
     slow.send("StreamFrames FrequencyDivisor:5000 3D Events")
     other.send("StreamFrames 3D Events")
     for number in range(1, 5002):
-        source.arrive(body(markers(number, 10_000 * number), event(number, 10_000 * number, number)))
+        source.arrive(pair(number))
     _, frame = slow.take()
     assert [item[0] for item in frame[1].items] == list(range(5002 - KEPT_EVENTS, 5002))
     assert (slow.session.frames_without_events, other.session.frames_without_events) == (1, 0)
@@ -89,9 +89,7 @@ def test_an_event_on_a_faster_stream_does_not_wait_for_the_slower_one() -> None:
 
 
 def test_a_request_for_events_does_not_wait_for_one() -> None:
-    source = LiveSource()
-    client = source.client()
-    client.send("SendCurrentFrame Events")
+    source, client = streaming("SendCurrentFrame Events")
     source.arrive(body(markers(1, 10_000)))
     assert client.bodies == [body()]
     client.send("SendCurrentFrame Events")
@@ -129,9 +127,7 @@ def test_a_request_for_components_that_a_new_server_lacks_gets_an_empty_frame() 
 
 
 def test_events_in_frames_of_their_own_do_not_shift_a_divisor() -> None:
-    source = LiveSource()
-    client = source.client()
-    client.send("StreamFrames FrequencyDivisor:2 3D Events")
+    source, client = streaming("StreamFrames FrequencyDivisor:2 3D Events")
     for number in range(1, 7):
         source.arrive(body(markers(number, 10_000 * number)))
         source.arrive(body(event(number, 10_000 * number, number)))
