@@ -4,7 +4,7 @@ import struct
 from collections.abc import Sequence
 
 from gateway.outputs.rtc3d.live_scene import LiveScene
-from gateway.rtc3d.components import WIRE_ORDER, ByteOrder
+from gateway.rtc3d.components import WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.frames import split_frame
 from gateway.rtc3d.packets import Packet
 from gateway.rtc3d.parameters import General
@@ -42,21 +42,49 @@ def event(number: int, timestamp_us: int, event_id: int) -> bytes:
     return component(EVENT, number, timestamp_us, [(event_id, timestamp_us, -1, -1, -1)])
 
 
+def frame_of_markers(number: int, *others: bytes) -> bytes:
+    """Return the body of frame ``number`` of 100 Hz."""
+    return body(markers(number, 10_000 * number), *others)
+
+
+def event_of(number: int) -> bytes:
+    return event(number, 10_000 * number, number)
+
+
 class LiveSource:
     """A live source with clients; time passes only by ``wait``."""
 
-    def __init__(self, *, is_new: bool = False) -> None:
-        """With ``is_new``, nothing is known of its streams, so frames wait at first."""
+    def __init__(
+        self, *, is_new: bool = False, played: int = 0, fast_first: bool = False, **announced_hz: float
+    ) -> None:
+        """With ``is_new``, nothing is known of its streams, so frames wait at first; see ``play``."""
         self.scene = LiveScene("lab")
+        self.scene._announced_hz = {ComponentType[name]: rate_hz for name, rate_hz in announced_hz.items()}
         if not is_new:
             self.scene._arrivals.began_us = -1_000_000_000
         self.now_us = 0
         self._clients: list[LiveClient] = []
         self.scene.start()
+        self.play(1, played, fast_first=fast_first)
 
-    def client(self) -> "LiveClient":
+    def client(self, *commands: str) -> "LiveClient":
         self._clients.append(LiveClient(self))
+        for command in commands:
+            self._clients[-1].send(command)
         return self._clients[-1]
+
+    def play(self, first: int, last: int, *, fast_first: bool = False, base_us: int = 0) -> None:
+        """Let frames of 100 Hz markers and 1000 Hz analog arrive on two streams."""
+        for number in range(first, last + 1):
+            timestamp_us = base_us + 10_000 * number
+            slow = (body(markers(number, timestamp_us), event(number, timestamp_us, number)), SLOW)
+            fast = (body(analog(10 * number, timestamp_us)), FAST)
+            for each in (fast, slow) if fast_first else (slow, fast):
+                self.arrive(*each)
+            for step in range(1, 10):
+                self.wait(1000)
+                self.arrive(body(analog(10 * number + step, timestamp_us + 1000 * step)), FAST)
+            self.wait(1000)
 
     def arrive(
         self,
@@ -109,33 +137,10 @@ class LiveClient:
         bodies, self.bodies = self.bodies, []
         return [components_in(each, byte_order) for each in bodies]
 
+    def event_ids(self) -> list[list[int]]:
+        """Return the ids of the events in each of these frames."""
+        return [[int(item[0]) for c in frame if c.type == EVENT for item in c.items] for frame in self.take()]
+
     def numbers(self) -> list[list[int]]:
         """Return the frame numbers of the components of each of these frames."""
         return [[each.frame_number for each in frame] for frame in self.take()]
-
-
-def play(source: LiveSource, first: int, last: int, *, fast_first: bool, base_us: int = 0) -> None:
-    """Let frames of 100 Hz markers and 1000 Hz analog arrive on two streams."""
-    for number in range(first, last + 1):
-        timestamp_us = base_us + 10_000 * number
-        slow = (body(markers(number, timestamp_us), event(number, timestamp_us, number)), SLOW)
-        fast = (body(analog(10 * number, timestamp_us)), FAST)
-        for each in (fast, slow) if fast_first else (slow, fast):
-            source.arrive(*each)
-        for step in range(1, 10):
-            source.wait(1000)
-            source.arrive(body(analog(10 * number + step, timestamp_us + 1000 * step)), FAST)
-        source.wait(1000)
-
-
-def streaming(command: str, *, is_new: bool = False) -> tuple[LiveSource, LiveClient]:
-    """Return a source and a client of it that has sent a command."""
-    source = LiveSource(is_new=is_new)
-    client = source.client()
-    client.send(command)
-    return source, client
-
-
-def pair(number: int) -> bytes:
-    """Return a frame with markers and an event of the same number."""
-    return body(markers(number, 10_000 * number), event(number, 10_000 * number, number))

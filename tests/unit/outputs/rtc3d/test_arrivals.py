@@ -1,7 +1,7 @@
 """What is kept of a live source, the rates of its streams, and the limits of both."""
 
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fractions import Fraction
 from typing import Any
 
@@ -37,11 +37,13 @@ class Source:
         announced_hz: dict[ComponentType, float] | None = None,
         *,
         is_new: bool = False,
+        played: int = 0,
     ) -> None:
         self.arrivals = Arrivals()
         if not is_new:
             self.arrivals.began_us = -1_000_000_000  # frames do not wait until rates are known
         self.frames = LiveFrames(requested, self.arrivals, announced_hz or {})
+        self.play(played)
 
     def add(self, at_us: int, *components: bytes, stream: int = SLOW) -> Arrival:
         arrival = self.arrivals.add(
@@ -54,8 +56,10 @@ class Source:
         self.add(at_us, *components, stream=stream)
         return self.frames.update(at_us)
 
-    def play(self, count: int = 3, period_us: int = 10_000) -> None:
+    def play(self, count: int, period_us: int = 10_000) -> None:
         """Let pairs of markers and analog channels arrive on two streams whose rates are known."""
+        if not count:
+            return
         for kind, stream in ((MARKERS, SLOW), (ANALOG, FAST)):
             self.arrivals.stream_of[kind] = stream
             self.arrivals.rates[stream] = rate = StreamRate()
@@ -70,6 +74,14 @@ class Source:
 
     def numbers(self) -> list[list[int]]:
         return [[each.frame_number for each in components_in(packet.packet[8:])] for packet in self.packets()]
+
+    def arrive_regularly(
+        self, numbers: Iterable[int], *, with_events: bool = False, period_us: int = 10
+    ) -> None:
+        """Let markers arrive, whose number is also their time stamp."""
+        for number in numbers:
+            events = [event(number, number, number)] if with_events else []
+            self.arrive(number * period_us, markers(number, number), *events)
 
     def forget(self) -> None:
         self.arrivals.frames.clear()
@@ -152,8 +164,7 @@ def test_a_pause_without_frames_is_left_out_of_the_age_of_streams() -> None:
 
 def test_a_new_connection_takes_over_the_rate_and_the_old_one_is_forgotten() -> None:
     """A source that reconnects for days must not leave traces."""
-    source = Source()
-    source.play(3)
+    source = Source(played=3)
     source.add(40_000, markers(4, 40_000), stream=7)
     assert source.arrivals.rates[7].period_us == 10_000
     assert set(source.arrivals.rates) == {7, FAST}
@@ -169,11 +180,9 @@ def test_a_new_connection_takes_over_the_rate_and_the_old_one_is_forgotten() -> 
 def test_frames_are_found_by_time_after_older_ones_were_forgotten() -> None:
     """Clients keep the numbers of frames over a pause."""
     source = Source([MARKERS])
-    for at_us in (10, 20):
-        source.arrive(at_us, markers(1, at_us))
+    source.arrive_regularly([1, 2])
     source.forget()
-    for at_us in (30, 40, 50):
-        source.arrive(at_us, markers(1, at_us))
+    source.arrive_regularly([3, 4, 5])
     frames = source.frames
     assert [frames.tick_after(at_us) for at_us in (0, 29, 30, 39, 40, 49, 50, 60)] == [2, 2, 3, 3, 4, 4, 5, 5]
     assert [frames.time_us(tick) for tick in (1, 2, 4)] == [-1, 30, 50]
@@ -200,8 +209,7 @@ def test_the_announced_rate_of_the_slowest_component_counts_until_it_is_measured
 def test_the_packets_that_clients_share_are_bounded() -> None:
     """Clients with different choices of events would fill the memory."""
     source = Source([MARKERS])
-    for number in range(1, 201):
-        source.arrive(number * 10, markers(number, number * 10))
+    source.arrive_regularly(range(1, 201))
     assert source.numbers()[-1] == [200]
     assert len(source.frames._packets) == 64
     source.forget()
@@ -212,16 +220,14 @@ def test_the_packets_that_clients_share_are_bounded() -> None:
 
 
 def events_in(packet: Any) -> list[int]:
-    return [
-        int(item[0]) for each in components_in(packet.packet[8:]) if each.type == EVENT for item in each.items
-    ]
+    events = [each for each in components_in(packet.packet[8:]) if each.type == EVENT]
+    return [int(item[0]) for each in events for item in each.items]
 
 
 def test_a_frame_has_the_events_from_a_time_up_to_its_own() -> None:
     """No event is sent twice, and none is left out."""
     source = Source([MARKERS, ComponentType.EVENT])
-    for number in range(1, 5):
-        source.arrive(number * 10, markers(number, number), event(number, number, number))
+    source.arrive_regularly(range(1, 5), with_events=True)
     found = [events_in(source.frames.packet("big", 2, from_us)) for from_us in (0, 10, 11, 20, 30, 31)]
     assert found == [[1, 2, 3], [1, 2, 3], [2, 3], [2, 3], [3], []]
     assert source.frames.packet("big", 2, 20).components == (MARKERS, ComponentType.EVENT)
@@ -231,8 +237,7 @@ def test_a_frame_has_the_events_from_a_time_up_to_its_own() -> None:
 def test_a_frame_lacks_events_only_if_one_of_its_own_was_dropped() -> None:
     """Clients are told of their losses exactly."""
     source = Source([MARKERS, ComponentType.EVENT])
-    for number in range(1, KEPT_EVENTS + 2):
-        source.arrive(number * 10, markers(number, number), event(number, number, number))
+    source.arrive_regularly(range(1, KEPT_EVENTS + 2), with_events=True)
     newest = source.frames.next_frame - 1
     assert source.frames.packet("big", newest, 10).lacks_events
     assert not source.frames.packet("big", newest, 11).lacks_events
@@ -262,8 +267,7 @@ def test_events_of_several_frames_become_one_component_of_each_size() -> None:
 
 def test_a_joined_packet_names_the_components_of_all_its_streams() -> None:
     """What was sent is counted by component."""
-    source = Source()
-    source.play()
+    source = Source(played=3)
     assert source.packets()[-1].components == (MARKERS, ANALOG)
     assert source.numbers() == [[1, 1], [2, 2], [3, 3]]
 
@@ -284,8 +288,7 @@ def test_time_stamps_of_one_moment_can_differ_by_rounding(
     analog_us: int, is_joined: bool, waits: bool
 ) -> None:
     """By 2 µs and not more: a later sample belongs to the next frame, an earlier one may not be the last."""
-    source = Source()
-    source.play()
+    source = Source(played=3)
     source.arrive(40_000, analog(4, analog_us), stream=FAST)
     due_us = source.arrive(40_001, markers(4, 40_000))
     assert due_us == (40_001 + 250_000 if waits else None)
@@ -295,10 +298,8 @@ def test_time_stamps_of_one_moment_can_differ_by_rounding(
 
 def test_a_frame_waits_exactly_a_quarter_of_a_second_for_its_samples() -> None:
     """A connection can stand still for a moment; after that the frame goes without."""
-    source = Source()
-    source.play()
-    assert source.arrive(40_000, markers(4, 40_000)) == 290_000
-    assert source.frames.update(289_999) == 290_000
+    source = Source(played=3)
+    assert source.arrive(40_000, markers(4, 40_000)) == source.frames.update(289_999) == 290_000
     assert len(source.numbers()) == 3
     assert source.frames.update(290_000) is None
     assert source.numbers()[3:] == [[4]]
@@ -307,8 +308,7 @@ def test_a_frame_waits_exactly_a_quarter_of_a_second_for_its_samples() -> None:
 def test_a_stream_without_times_is_not_waited_for_and_gives_its_newest_sample() -> None:
     """Its time stamps say nothing: neither how far it is, nor where its samples belong."""
     for stuck_us in (0, 900_000):
-        source = Source()
-        source.play()
+        source = Source(played=3)
         for number in range(4, 8):
             source.arrive(number * 10_000, analog(number, stuck_us), stream=FAST)
             source.arrive(number * 10_000 + 1, markers(number, number * 10_000))
@@ -317,8 +317,7 @@ def test_a_stream_without_times_is_not_waited_for_and_gives_its_newest_sample() 
 
 def test_a_stream_with_another_clock_is_not_waited_for() -> None:
     """More than a second behind is another time base."""
-    source = Source()
-    source.play()
+    source = Source(played=3)
     source.arrive(40_000, analog(4, 40_000), stream=FAST)
     assert source.arrive(40_001, markers(4, 5_000_000)) is None
     assert source.numbers()[3:] == [[4, 4]]
@@ -347,7 +346,7 @@ def test_a_stream_of_one_frame_in_a_second_goes_on_setting_the_rate() -> None:
 def test_frames_that_wait_are_bounded() -> None:
     """Frames can arrive faster than time passes."""
     source = Source()
-    source.play(period_us=900)
+    source.play(3, 900)
     for number in range(4, 4 + 1024 + 2):
         source.arrive(4_000 + number, markers(number, 900 * number))
     assert source.numbers()[3:] == [[4], [5]]
@@ -355,8 +354,7 @@ def test_frames_that_wait_are_bounded() -> None:
 
 def test_frames_get_later_times_even_if_they_have_waited() -> None:
     """Clients look for frames by time, so a frame that comes later must not be earlier."""
-    source = Source((*BOTH, ComponentType.EVENT))
-    source.play()
+    source = Source((*BOTH, ComponentType.EVENT), played=3)
     source.arrive(40_000, markers(4, 40_000))
     source.arrive(2_000_000, event(5, 50_000, 5))
     times_us = [source.frames.time_us(tick) for tick in range(source.frames.next_frame)]
@@ -366,27 +364,20 @@ def test_frames_get_later_times_even_if_they_have_waited() -> None:
 def test_the_first_frame_that_begins_before_its_samples_is_left_out() -> None:
     """It is from before the client asked; a stream of another clock or without frames is no reason."""
     for analog_us, sent in ((45_000, []), (1_039_999, []), (1_040_000, [[4]])):
-        source = Source()
-        source.play()
+        source = Source(played=3)
         source.forget()
         source.arrive(41_000, analog(9, analog_us), stream=FAST)
         source.arrive(41_001, markers(4, 40_000))
         assert source.numbers() == sent
 
 
-def test_a_frame_is_not_left_out_for_a_stream_that_is_silent() -> None:
-    """Nobody knows whether it begins again."""
-    source = Source()
-    source.play()
+def test_a_frame_is_sent_without_a_stream_that_is_silent_or_skips_it() -> None:
+    """Nobody knows whether the stream begins again; lost samples do not cost the frame."""
+    source = Source(played=3)
     source.frames.forget()
     source.arrive(30_000 + 250_000, markers(4, 280_000))
     assert source.numbers() == [[4]]
-
-
-def test_a_stream_that_has_begun_may_skip_a_frame() -> None:
-    """Lost samples do not cost the frame."""
-    source = Source()
-    source.play()
+    source = Source(played=3)
     source.arrive(40_000, markers(4, 40_000))
     source.arrive(41_000, analog(5, 50_000), stream=FAST)
     assert source.numbers()[3:] == [[4]]
@@ -394,14 +385,12 @@ def test_a_stream_that_has_begun_may_skip_a_frame() -> None:
 
 def test_nothing_from_before_a_pause_is_sent_after_it() -> None:
     """The present frame of a client that asks now is a new one, with new samples."""
-    source = Source()
-    source.play()
+    source = Source(played=3)
     source.arrive(40_000, analog(4, 40_000), stream=FAST)  # a sample that no frame has taken
     source.arrive(40_001, markers(5, 50_000))  # a frame that waits
     source.add(40_002, analog(6, 60_000), stream=FAST)  # not looked at yet
     source.frames.forget()
-    assert source.frames.update(40_003) is None
-    assert source.frames.update(400_000) is None
+    assert source.frames.update(40_003) is source.frames.update(400_000) is None  # no timer is set any more
     assert source.numbers() == []
     source.arrivals.frames.clear()
     source.arrive(500_000, markers(7, 70_000))
@@ -410,15 +399,6 @@ def test_nothing_from_before_a_pause_is_sent_after_it() -> None:
     source.arrive(800_001, analog(8, 80_000), stream=FAST)
     source.arrive(800_002, markers(8, 80_000))
     assert source.numbers() == [[8, 8]]
-
-
-def test_a_frame_that_waits_is_forgotten_in_a_pause() -> None:
-    """No timer is set for it any more."""
-    source = Source()
-    source.play()
-    assert source.arrive(40_000, markers(4, 40_000)) is not None
-    source.frames.forget()
-    assert source.frames.update(40_001) is None
 
 
 # What is not known yet ----------------------------------------------------------------------
@@ -439,7 +419,6 @@ def test_frames_of_a_new_source_wait_until_its_streams_are_known(
 
 
 def test_frames_that_wait_for_a_new_source_are_forgotten_with_the_others() -> None:
-    """Nobody asks for them any more."""
     source = Source(is_new=True)
     source.arrive(10_000, markers(1, 10_000))
     source.forget()

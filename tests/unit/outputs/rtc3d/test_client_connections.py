@@ -11,8 +11,14 @@ from gateway.outputs.rtc3d.client_filter import MAX_HELD_PACKETS
 from gateway.outputs.rtc3d.live_server import FILE, SLOW_CLIENT
 from gateway.rtc3d_server.client_session import MAX_FRAME_REQUESTS
 from tests.losses import amounts
-from tests.unit.outputs.rtc3d.scripted_server import Client, ScriptedServer, settle, write_file
-from tests.unit.outputs.rtc3d.test_live_server import NO_FRAMES, STREAM, in_virtual_time, streaming
+from tests.unit.outputs.rtc3d.scripted_server import (
+    Client,
+    ScriptedServer,
+    in_virtual_time,
+    settle,
+    write_file,
+)
+from tests.unit.outputs.rtc3d.test_live_server import NO_FRAMES, STREAM, streaming
 from tests.unit.rtc3d_server.wire import COMMAND, DATA, ERROR, command, packet
 
 C3D = 5
