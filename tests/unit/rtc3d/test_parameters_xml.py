@@ -230,16 +230,12 @@ def test_utf_8_and_declared_encodings_are_read(start: str, encoding: str) -> Non
     assert markers_of((start + MICRO).encode(encoding)).unit == "µm"
 
 
-@pytest.mark.parametrize("declaration", ["", "<?xml version='1.0' encoding='utf-8'?>"])
-def test_bytes_that_are_not_utf_8_are_read_as_latin_1_and_reported(declaration: str) -> None:
-    markers, recovered = recovered_markers((declaration + MICRO).encode("latin-1"))
-    assert (markers.unit, recovered) == ("µm", ("bytes that are not UTF-8 were read as Latin-1",))
-
-
-def test_an_unknown_declared_encoding_is_reported() -> None:
-    markers, recovered = recovered_markers(b"<?xml version='1.0' encoding='klingon'?>" + spec_xml("3d"))
-    assert markers == MARKERS
-    assert "klingon" in recovered[0]
+def test_bytes_that_are_not_of_the_declared_encoding_are_read_and_reported() -> None:
+    for declaration in ("", "<?xml version='1.0' encoding='utf-8'?>"):
+        markers, recovered = recovered_markers((declaration + MICRO).encode("latin-1"))
+        assert (markers.unit, recovered) == ("µm", ("bytes that are not UTF-8 were read as Latin-1",))
+    markers, [fault, *_] = recovered_markers(b"<?xml version='1.0' encoding='klingon'?>" + spec_xml("3d"))
+    assert (markers, "klingon" in fault) == (MARKERS, True)
 
 
 # Attacks --------------------------------------------------------------------------------------
@@ -300,17 +296,6 @@ def test_deep_nesting_is_bounded(tag: bytes) -> None:
     xml = b"<RT_Parameters><The_3D><Unit>m</Unit><Markers>" + b"<%b>" % tag * 50_000
     markers, _ = recovered_markers(xml)
     assert (markers.unit, len(markers.markers) < 300) == ("m", True)
-
-
-def test_the_number_of_reported_faults_is_bounded() -> None:
-    cells = "<Col/>" * 5_000 + "<Col>a</Col>" * 5_000
-    matrix = f"<Calibration_Matrix><Row>{cells}</Row></Calibration_Matrix>"
-    parameters, recovered = parse_parameters(
-        in_root(f"<Force><Plates><Plate>{matrix}</Plate></Plates></Force>")
-    )
-    assert parameters.force is not None
-    assert len(parameters.force.plates[0].calibration_matrix[0]) == 10_000
-    assert len(recovered) == MAX_RECOVERED
 
 
 @pytest.mark.parametrize("reference", ["&#xD800;", "&#xdfff;", "&#56320;"])
