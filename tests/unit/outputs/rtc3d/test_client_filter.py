@@ -35,9 +35,8 @@ _CHUNK = 256 * 1024
 
 
 @in_virtual_time
-async def test_a_client_without_a_command_is_disconnected_after_ten_seconds() -> None:
+async def test_a_client_without_a_command_is_disconnected_after_ten_seconds(server: ScriptedServer) -> None:
     """Programs of other protocols must not occupy places; errors are no commands."""
-    server = ScriptedServer()
     good, wrong, silent = await server.greeted(), server.client(), server.client()
     assert [kind for kind, _ in await wrong.ask("Fly", "Fly higher")] == [ERROR, ERROR]
     await asyncio.sleep(9.9)
@@ -64,10 +63,10 @@ async def test_the_system_is_asked_to_notice_vanished_clients() -> None:
 
 
 @in_virtual_time
-async def test_a_recording_is_acknowledged_once_the_server_has_done_it() -> None:
+async def test_a_recording_is_acknowledged_once_the_server_has_done_it(
+    server: ScriptedServer, client: Client
+) -> None:
     """Commands after it wait, so that a client sees the replies in order."""
-    server = ScriptedServer()
-    client = server.client()
     start, stop = "Recording Start,file=walk.c3d", "Recording Stop"
     assert await client.ask(start, stop, "Version 1.0") == []
     assert server.asked == [("lab", True, "walk")]
@@ -84,10 +83,10 @@ async def test_a_recording_is_acknowledged_once_the_server_has_done_it() -> None
 
 @pytest.mark.parametrize(("sent", "done"), [("Recording Start", b"started"), ("Recording Stop", b"stopped")])
 @in_virtual_time
-async def test_why_a_recording_was_not_made_is_said(sent: str, done: bytes) -> None:
+async def test_why_a_recording_was_not_made_is_said(
+    server: ScriptedServer, client: Client, sent: str, done: bytes
+) -> None:
     """A defect is no reason to leave the client without an answer; it waits for 30 s at most."""
-    server = ScriptedServer()
-    client = server.client()
     for error, reason in (
         (QueryError("remote control is off"), b"remote control is off"),
         (KeyError(), b"a defect"),
@@ -105,10 +104,8 @@ async def test_why_a_recording_was_not_made_is_said(sent: str, done: bytes) -> N
 
 
 @in_virtual_time
-async def test_a_client_that_goes_ends_what_waits_for_it() -> None:
+async def test_a_client_that_goes_ends_what_waits_for_it(client: Client) -> None:
     """Nothing is left behind: no timer, no task."""
-    server = ScriptedServer()
-    client = server.client()
     await client.ask("Recording Start")
     client.line.abort()
     await settle()
@@ -146,9 +143,8 @@ async def test_files_go_whole_and_in_order_to_clients_that_have_greeted(tmp_path
 
 
 @in_virtual_time
-async def test_a_file_is_read_no_faster_than_the_client_reads(tmp_path: Path) -> None:
+async def test_a_file_is_read_no_faster_than_the_client_reads(server: ScriptedServer, tmp_path: Path) -> None:
     """A long file must not fill the memory."""
-    server = ScriptedServer()
     content = bytes(5 * _CHUNK)
     client = await stalled(server, tmp_path, content)
     client.line.num_unread = 1024 * 1024 + 1
@@ -160,9 +156,8 @@ async def test_a_file_is_read_no_faster_than_the_client_reads(tmp_path: Path) ->
 
 
 @in_virtual_time
-async def test_at_most_four_files_wait_for_a_client(tmp_path: Path) -> None:
+async def test_at_most_four_files_wait_for_a_client(server: ScriptedServer, tmp_path: Path) -> None:
     """Further ones are counted as lost."""
-    server = ScriptedServer()
     await server.greeted()
     for number in range(6):
         server.send_file(write_file(tmp_path, f"{number}.c3d", b"x"))
@@ -182,9 +177,8 @@ async def test_a_file_that_is_gone_is_counted_and_the_next_one_comes(tmp_path: P
 
 
 @in_virtual_time
-async def test_a_file_that_became_shorter_ends_the_connection(tmp_path: Path) -> None:
+async def test_a_file_that_became_shorter_ends_the_connection(server: ScriptedServer, tmp_path: Path) -> None:
     """The client expects the rest, and would take further packets for it."""
-    server = ScriptedServer()
     client = await stalled(server, tmp_path, bytes(2 * _CHUNK))
     write_file(tmp_path, "walk.c3d", b"short")
     client.line.num_unread = 0

@@ -44,10 +44,10 @@ async def streaming(server: ScriptedServer) -> Client:
 
 
 @in_virtual_time
-async def test_a_client_waits_two_seconds_for_frames_of_a_source_that_is_not_known() -> None:
+async def test_a_client_waits_two_seconds_for_frames_of_a_source_that_is_not_known(
+    server: ScriptedServer, client: Client
+) -> None:
     """The gateway may have to start its own stream first, so No Data at once would be wrong."""
-    server = ScriptedServer()
-    client = server.client()
     assert await client.ask(STREAM) == [OK_STREAM]
     await asyncio.sleep(0.5)
     server.state.parameters = parameters("m")
@@ -62,9 +62,8 @@ async def test_a_client_waits_two_seconds_for_frames_of_a_source_that_is_not_kno
 
 
 @in_virtual_time
-async def test_without_a_measurement_no_data_comes_at_once_or_ends_the_wait() -> None:
+async def test_without_a_measurement_no_data_comes_at_once_or_ends_the_wait(server: ScriptedServer) -> None:
     """As a server answers."""
-    server = ScriptedServer()
     client = await server.greeted(STREAM)
     server.state.is_measuring = False
     server.apply_state()
@@ -74,10 +73,8 @@ async def test_without_a_measurement_no_data_comes_at_once_or_ends_the_wait() ->
 
 
 @in_virtual_time
-async def test_a_frame_ends_the_wait() -> None:
+async def test_a_frame_ends_the_wait(server: ScriptedServer, client: Client) -> None:
     """The time-out of the request must not end the measurement that has begun."""
-    server = ScriptedServer()
-    client = server.client()
     await client.ask(STREAM)
     server.arrive(1)
     await asyncio.sleep(10)
@@ -86,9 +83,8 @@ async def test_a_frame_ends_the_wait() -> None:
 
 
 @in_virtual_time
-async def test_while_a_source_streams_a_request_waits_for_its_frames() -> None:
+async def test_while_a_source_streams_a_request_waits_for_its_frames(server: ScriptedServer) -> None:
     """Gaps in a stream are not its end."""
-    server = ScriptedServer()
     server.state.is_streaming = True
     client = server.client()
     await client.ask(STREAM)
@@ -100,9 +96,8 @@ async def test_while_a_source_streams_a_request_waits_for_its_frames() -> None:
 
 
 @in_virtual_time
-async def test_a_measurement_ends_when_no_frame_has_come_for_a_moment() -> None:
+async def test_a_measurement_ends_when_no_frame_has_come_for_a_moment(server: ScriptedServer) -> None:
     """Frames of a backlog come after the source has ended; each of them postpones No Data."""
-    server = ScriptedServer()
     client = await streaming(server)
     server.state.is_streaming = False
     server.apply_state()
@@ -123,9 +118,8 @@ async def test_a_measurement_ends_when_no_frame_has_come_for_a_moment() -> None:
 
 
 @in_virtual_time
-async def test_a_source_that_has_been_silent_ends_at_once() -> None:
+async def test_a_source_that_has_been_silent_ends_at_once(server: ScriptedServer) -> None:
     """Clients must not wait for what is known."""
-    server = ScriptedServer()
     client = await streaming(server)
     await asyncio.sleep(0.11)
     server.state.is_streaming = False
@@ -134,9 +128,8 @@ async def test_a_source_that_has_been_silent_ends_at_once() -> None:
 
 
 @in_virtual_time
-async def test_closing_ends_everything_and_nobody_wants_frames() -> None:
+async def test_closing_ends_everything_and_nobody_wants_frames(server: ScriptedServer) -> None:
     """A source must not go on sending for clients that are gone."""
-    server = ScriptedServer()
     await server.listen()
     client = await streaming(server)
     await server.close()
@@ -149,10 +142,10 @@ async def test_closing_ends_everything_and_nobody_wants_frames() -> None:
 
 
 @in_virtual_time
-async def test_a_request_for_parameters_waits_until_they_are_there() -> None:
+async def test_a_request_for_parameters_waits_until_they_are_there(
+    server: ScriptedServer, client: Client
+) -> None:
     """A client that comes with the gateway's start would otherwise get an error."""
-    server = ScriptedServer()
-    client = server.client()
     assert await client.ask("SendParameters 3D", "Version 1.0") == []
     await asyncio.sleep(0.9)
     server.state.parameters = parameters("heel")
@@ -164,10 +157,10 @@ async def test_a_request_for_parameters_waits_until_they_are_there() -> None:
 
 
 @in_virtual_time
-async def test_a_request_for_parameters_does_not_wait_for_ever() -> None:
+async def test_a_request_for_parameters_does_not_wait_for_ever(
+    server: ScriptedServer, client: Client
+) -> None:
     """Anything that is known of the source ends the wait: it answers, and will give none later."""
-    server = ScriptedServer()
-    client = server.client()
     assert await client.ask("SendParameters") == []
     await asyncio.sleep(1)
     assert client.receive() == [(ERROR, b"Error-The server of source lab has given no parameters")]
@@ -178,10 +171,10 @@ async def test_a_request_for_parameters_does_not_wait_for_ever() -> None:
 
 
 @in_virtual_time
-async def test_the_newest_parameters_are_served_even_before_the_next_maintenance() -> None:
+async def test_the_newest_parameters_are_served_even_before_the_next_maintenance(
+    server: ScriptedServer, client: Client
+) -> None:
     """Parameters and frames of one moment belong together."""
-    server = ScriptedServer()
-    client = server.client()
     for label in ("heel", "toe"):
         server.state.parameters = parameters(label)
         [(_, xml)] = await client.ask("SendParameters 3D")
@@ -196,9 +189,8 @@ async def test_the_newest_parameters_are_served_even_before_the_next_maintenance
 
 
 @in_virtual_time
-async def test_frames_are_wanted_while_any_client_asks_for_some() -> None:
+async def test_frames_are_wanted_while_any_client_asks_for_some(server: ScriptedServer) -> None:
     """The gateway's own stream depends on it; each change is reported once."""
-    server = ScriptedServer()
     first, second = server.client(), server.client()
     await first.ask("Version 1.0")
     assert server.changes == []
@@ -212,10 +204,10 @@ async def test_frames_are_wanted_while_any_client_asks_for_some() -> None:
 
 
 @in_virtual_time
-async def test_a_request_for_one_frame_is_wanted_until_it_is_answered() -> None:
+async def test_a_request_for_one_frame_is_wanted_until_it_is_answered(
+    server: ScriptedServer, client: Client
+) -> None:
     """Otherwise the source would send for nobody."""
-    server = ScriptedServer()
-    client = server.client()
     await client.ask("SendCurrentFrame 3D")
     assert server.changes == [True]
     server.arrive(1)
@@ -230,9 +222,8 @@ async def test_a_request_for_one_frame_is_wanted_until_it_is_answered() -> None:
 
 
 @in_virtual_time
-async def test_maintenance_corrects_what_another_server_of_the_source_said() -> None:
+async def test_maintenance_corrects_what_another_server_of_the_source_said(server: ScriptedServer) -> None:
     """After a change of the port, the former server says last that nothing is wanted."""
-    server = ScriptedServer()
     await streaming(server)
     server.state.wanted = False
     server.maintain()
@@ -344,9 +335,8 @@ async def test_what_waits_for_all_clients_together_has_a_limit(max_clients: int,
 
 
 @in_virtual_time
-async def test_each_lost_frame_of_a_client_is_counted_once() -> None:
+async def test_each_lost_frame_of_a_client_is_counted_once(server: ScriptedServer) -> None:
     """Losses are per source: those of its clients add up, whether they are still there or not."""
-    server = ScriptedServer()
     first, second = await server.greeted(), await server.greeted()
     first.connection.session.frames_dropped = 5
     server.maintain()
