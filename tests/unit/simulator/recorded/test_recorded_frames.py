@@ -180,10 +180,7 @@ def test_frames_that_nobody_takes_for_three_seconds_are_dropped_but_not_their_ev
     frames = client.frames_until(10)
     assert (only("3d", frames)[0], client.session.frames_dropped) == (702, 701)
     assert [event[0] for event in frames[0][1].items] == list(range(1, 71))
-
-
-def test_forgotten_frames_count_as_dropped() -> None:
-    """Only some seconds of a take are in memory, and a client that sleeps longer is told its loss."""
+    # Only some seconds of a take are in memory, and a client that sleeps longer is told its loss.
     client = Client(lab(20))
     client.send("StreamFrames Analog")
     client.sources[0].forget(10 * SECOND_US)
