@@ -49,15 +49,15 @@ def test_a_plate_needs_four_corners_that_span_a_surface(corners: tuple[Point, ..
 
 def test_positions_have_the_unit_of_the_points() -> None:
     """A plate may be in any unit that markers have."""
-    for origin, unit, expected in (
-        (Point(0.1, 0.2, -0.3, "m"), "mm", [100, 200, -300]),
-        (Point(1, 2, -3, "Feet"), "dm", [3.048, 6.096, -9.144]),
-        (None, "m", [0, 0, 0]),
+    for origin, unit, expected, corner in (
+        (Point(0.1, 0.2, -0.3, "m"), "mm", [100, 200, -300], [508, 464, 0]),
+        (Point(1, 2, -3, "Feet"), "dm", [3.048, 6.096, -9.144], [5.08, 4.64, 0]),
+        (None, "m", [0, 0, 0], [0.508, 0.464, 0]),
     ):
         geometry = geometry_of(replace(PLATE, origin=origin), unit)
         assert geometry
         assert geometry.origin.tolist() == pytest.approx(expected)
-    assert geometry.corners[0].tolist() == pytest.approx([0.508, 0.464, 0])
+        assert geometry.corners[0].tolist() == pytest.approx(corner)
 
 
 @pytest.mark.parametrize(

@@ -102,7 +102,7 @@ def test_only_the_values_that_are_set_change_a_scene() -> None:
 
 
 def simulate(*arguments: str) -> Result:
-    return CliRunner().invoke(app, ["simulate", "--port", "0", "--seconds", "0.3", *arguments])
+    return CliRunner().invoke(app, ["simulate", *arguments], env={"COLUMNS": "200"})
 
 
 def test_a_scenarios_faults_and_those_of_the_command_line_are_played(
@@ -110,35 +110,27 @@ def test_a_scenarios_faults_and_those_of_the_command_line_are_played(
 ) -> None:
     caplog.set_level(logging.INFO)
     file.write_text("faults: [{fault: undersize, at_s: 0}]")
-    result = simulate("--scenario", str(file), "--fault", "cut", "--fault", "delay,delay_ms=3", "--seed", "3")
+    faults = ("--fault", "cut", "--fault", "delay,delay_ms=3", "--seed", "3")
+    result = simulate("--port", "0", "--seconds", "0.3", "--scenario", str(file), *faults)
     assert result.exit_code == 0, result.output
-    assert [message for message in caplog.messages if message.startswith("Fault")] == [
-        "Fault: undersize,at_s=0",
-        "Fault: cut",
-        "Fault begins: delay,delay_ms=3",
-    ]
+    logged = [message for message in caplog.messages if message.startswith("Fault")]
+    assert logged == ["Fault: undersize,at_s=0", "Fault: cut", "Fault begins: delay,delay_ms=3"]
 
 
 def test_options_override_the_scenarios_scene() -> None:
     scenario = Scenario(scene=SceneSettings(markers=3, tools=1), faults=(Cut(),), seed=5)
     changed = scenario.with_overrides({"markers": 9, "rate_hz": 50.0}, [Delay()], None)
-    assert changed == Scenario(
-        scene=SceneSettings(markers=9, tools=1, rate_hz=50), faults=(Cut(), Delay()), seed=5
-    )
+    scene = SceneSettings(markers=9, tools=1, rate_hz=50)
+    assert changed == Scenario(scene=scene, faults=(Cut(), Delay()), seed=5)
     assert scenario.with_overrides({}, [], 0).seed == 0
 
 
-def test_the_defaults_of_options_and_scenarios_are_the_same() -> None:
-    defaults = SceneSettings().model_dump(exclude={"seed", "marker_label"})
-    help_text = CliRunner().invoke(app, ["simulate", "--help"], env={"COLUMNS": "200"}).output
-    for name, value in defaults.items():
+def test_the_command_has_the_defaults_of_scenarios_and_lists_all_kinds_of_faults() -> None:
+    help_text = simulate("--help").output
+    for name, value in SceneSettings().model_dump(exclude={"seed", "marker_label"}).items():
         option = name.removesuffix("_hz").replace("_", "-")
         assert re.search(rf"--{option}\s.*\[default: {value}\]", help_text), name
-
-
-def test_the_command_lists_all_kinds_of_faults() -> None:
-    result = CliRunner().invoke(app, ["simulate", "--list-faults"])
-    assert (result.exit_code, result.output) == (0, describe_kinds() + "\n")
+    assert simulate("--list-faults").output == describe_kinds() + "\n"
 
 
 # The reference ------------------------------------------------------------------------------

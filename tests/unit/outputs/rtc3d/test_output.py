@@ -161,13 +161,10 @@ async def test_closing_closes_every_port_for_good() -> None:
     assert never_started._thread is None
 
 
-def test_a_port_for_an_unknown_source_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+@in_virtual_time
+async def test_a_port_for_an_unknown_source_is_logged(caplog: pytest.LogCaptureFixture) -> None:
     """Nobody could connect, and the name is probably mistyped."""
-
-    async def start() -> None:
-        await started({"lab": LAB, "lap": HALL}, "lab")
-
-    in_virtual_time(start)()
+    await started({"lab": LAB, "lap": HALL}, "lab")
     assert [each.args for each in caplog.records if each.levelno == logging.WARNING] == [("lap",)]
 
 
