@@ -31,9 +31,7 @@ def test_labels_are_those_of_the_keys_of_tools(labels: list[str]) -> None:
     assert found.labels == tuple(names)
 
 
-def test_items_beyond_the_parameters_are_called_by_their_position_and_labels_beyond_the_items_left_out() -> (
-    None
-):
+def test_items_without_labels_are_called_by_their_position_and_other_labels_left_out() -> None:
     channels = (AnalogChannel("1", "EMG", unit="V", frequency_hz=1000.0),)
     found = describe(ComponentType.ANALOG, Parameters(analog=ParametersAnalog(channels)), 2)
     assert (found.labels, found.units) == (("EMG", "channel 2"), ("V", "mV"))

@@ -75,9 +75,7 @@ def test_the_values_of_a_vector_are_its_bytes(vector: MessageVector) -> None:
         (LONG_EVENTS, "two events that the server sent with 24 bytes"),
     ],
 )
-def test_the_gateway_publishes_the_bytes_for_the_components_of_tests_vectors(
-    component: ComponentVector, name: str
-) -> None:
+def test_the_gateway_publishes_the_bytes_of_the_vectors(component: ComponentVector, name: str) -> None:
     """Fingerprint, prefix and big-endian component, whatever the byte order and form of the server's."""
     type_name = MESSAGE_TYPES[ComponentType(component.type)].__name__
     [vector] = [vector for vector in VECTORS if (vector.type_name, vector.name) == (type_name, name)]

@@ -30,9 +30,7 @@ def test_a_reading_has_both_clocks_and_utime_is_in_microseconds_since_the_epoch(
 
 
 @pytest.mark.interpreted
-def test_the_offset_is_that_of_the_reading_that_was_interrupted_least(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_the_offset_is_that_of_the_reading_interrupted_least(monkeypatch: pytest.MonkeyPatch) -> None:
     """The process may be stopped between the two clocks; such a reading would look like a step."""
     delays_us = iter([500, 40_000, 2, 900, 70])
     now_us = 1_000_000

@@ -155,7 +155,7 @@ def test_the_current_frame_is_the_answer_alone_while_nothing_is_streamed() -> No
         ((), [True, False]),
     ],
 )
-def test_a_streamed_frame_answers_if_it_has_a_requested_component_or_none(
+def test_a_streamed_frame_answers_if_it_fits(
     requested: tuple[ComponentType, ...], answers: list[bool]
 ) -> None:
     """Frames of a running stream arrive between the request and its answer, which may be an empty frame."""
@@ -177,9 +177,7 @@ def test_a_streamed_frame_answers_if_it_has_a_requested_component_or_none(
         *((error("no"), "big", False), (error("no"), "little", True)),
     ],
 )
-def test_the_first_frame_with_components_decides_the_byte_order(
-    reply: bytes, sent: ByteOrder, is_mismatch: bool
-) -> None:
+def test_the_first_components_decide_the_byte_order(reply: bytes, sent: ByteOrder, is_mismatch: bool) -> None:
     """A server may acknowledge a byte order and ignore it (field note 4); an empty frame shows neither."""
     protocol = protocol_after(SetByteOrder("little"))
     protocol.receive(reply)
@@ -242,9 +240,7 @@ def test_frames_are_received_in_parts_while_there_are_more() -> None:
         (StreamFrames(), 4, b""),
     ],
 )
-def test_an_answer_carries_the_command_and_the_whole_packet(
-    command: Command, packet_type: int, body: bytes
-) -> None:
+def test_an_answer_has_the_command_and_the_packet(command: Command, packet_type: int, body: bytes) -> None:
     _, events = protocol_after(command).receive(packet(packet_type, body))
     assert events == [Answered(command, Packet(packet_type, body))]
 

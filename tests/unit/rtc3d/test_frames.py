@@ -164,9 +164,7 @@ def test_a_layout_has_the_most_items_of_a_component_and_the_type_of_the_first_kn
 @pytest.mark.parametrize(
     ("packet", "order", "event_id"), [(START_RECORDING, "little", 1), (STOP_RECORDING, "big", 0)]
 )
-def test_the_frame_that_controls_wavefronts_recording_is_split_and_encoded(
-    packet: bytes, order: ByteOrder, event_id: int
-) -> None:
+def test_wavefronts_control_of_recording_is_a_frame(packet: bytes, order: ByteOrder, event_id: int) -> None:
     """Field note 16 was captured from NDI's own client."""
     body, event = packet[8:], (event_id, 0, -1, -1, -1)
     assert detect_byte_order(body, "big") == order
@@ -211,9 +209,7 @@ def assert_rejected(body: bytes, order: ByteOrder, *numbers: int) -> None:
 
 @both_orders
 @each_component
-def test_sizes_and_counts_of_a_known_component_that_contradict_each_other(
-    vector: ComponentVector, order: ByteOrder
-) -> None:
+def test_sizes_and_counts_that_contradict_each_other(vector: ComponentVector, order: ByteOrder) -> None:
     """No value of such a frame can be trusted, so none may reach a robot."""
     wire = vector.wire[order]
     size = len(wire)
@@ -300,7 +296,7 @@ def reader_after(*bodies: bytes) -> FrameReader:
 
 @both_orders
 @pytest.mark.parametrize("frames", [FULL_FRAME, FRAME_WITH_UNKNOWN, EMPTY_FRAME])
-def test_all_frames_of_a_layout_are_read_alike_and_share_it(
+def test_frames_of_a_layout_are_read_alike_and_share_it(
     frames: dict[ByteOrder, bytes], order: ByteOrder
 ) -> None:
     """Other connections have layouts of their own, so layouts are forgotten with the connection."""

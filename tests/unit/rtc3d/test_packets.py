@@ -101,9 +101,7 @@ def test_the_default_limits_are_16_mib_and_256_mib() -> None:
         (0x5353482D, 5, "limit 200"),  # "SSH-", the greeting of another protocol
     ],
 )
-def test_the_error_says_what_is_wrong_with_the_size_and_where(
-    size: int, packet_type: int, bound: str
-) -> None:
+def test_the_error_says_what_is_wrong_with_the_size_where(size: int, packet_type: int, bound: str) -> None:
     """The user of a wrong port sees which program answers there; nothing more is read."""
     wrong = header(size, packet_type) + bytes(range(92))
     reader = reader_after()

@@ -114,9 +114,7 @@ def scene(markers: str = "", tools: str = "", unit: str = "mm", **section: Any) 
         ),
     ],
 )
-def test_renamed_items_are_described_in_short_and_printable(
-    before: Parameters, after: Parameters, expected: str
-) -> None:
+def test_renamed_items_are_described_in_short(before: Parameters, after: Parameters, expected: str) -> None:
     assert describe_renames(before, after) == expected
 
 
@@ -134,9 +132,7 @@ OTHER_STATISTICS = replace(ALL, general=replace(GENERAL, frames_sent=7, frames_p
         (scene("AB"), replace(scene("AB", unit="m"), tools=None), ["3d", "6d"]),
     ],
 )
-def test_other_changes_are_named_by_section(
-    before: Parameters, after: Parameters, expected: list[str]
-) -> None:
+def test_other_changes_name_the_section(before: Parameters, after: Parameters, expected: list[str]) -> None:
     assert changed_sections(before, after) == expected
 
 
@@ -159,7 +155,5 @@ def test_statistics_are_left_out_or_read_alone() -> None:
         (b"<b/>", False),
     ],
 )
-def test_replies_that_differ_in_their_statistics_are_recognised_unparsed(
-    after: bytes, expected: bool
-) -> None:
+def test_replies_that_differ_in_their_statistics_are_recognised(after: bytes, expected: bool) -> None:
     assert differ_in_statistics_only(b"<a><Stats>1</Stats></a>", after) is expected

@@ -48,9 +48,7 @@ def test_a_command_is_acknowledged_as_it_was_sent(client: ScriptedClient) -> Non
         (b"Recording Started", b"Recording takes Start or Stop"),
     ],
 )
-def test_a_bad_command_gets_an_error_that_says_why(
-    client: ScriptedClient, sent: bytes, message: bytes
-) -> None:
+def test_a_bad_command_gets_an_error_with_why(client: ScriptedClient, sent: bytes, message: bytes) -> None:
     """The text is ASCII, and nothing has changed: a stream goes on with its rate."""
     client.send("StreamFrames 3D")
     [(packet_type, text)] = client.send(sent)
@@ -70,7 +68,7 @@ def test_packets_that_only_servers_send_get_an_error(client: ScriptedClient) -> 
 
 @pytest.mark.parametrize("extra", [b"", b"\n", b"\r\n\0"])
 @pytest.mark.parametrize(("start", "stop"), [(START_BIG, STOP_BIG), (START_LITTLE, STOP_LITTLE)])
-def test_the_recording_control_of_wavefront_gets_no_reply(
+def test_wavefronts_recording_gets_no_reply(
     client: ScriptedClient, start: bytes, stop: bytes, extra: bytes
 ) -> None:
     """Field notes 16 and 17: in any byte order, with anything after it."""

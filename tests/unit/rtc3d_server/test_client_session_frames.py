@@ -50,7 +50,7 @@ def test_a_stream_has_all_components_in_every_frame_by_default(client: ScriptedC
         ("Force", 50_000, []),  # which the scene lacks
     ],
 )
-def test_a_stream_has_the_requested_rate(
+def test_a_stream_has_its_rate(
     client: ScriptedClient, requested: str, until_us: int, numbers: list[int]
 ) -> None:
     """§5.3.5: the slowest component of a request is the limit."""
@@ -59,9 +59,7 @@ def test_a_stream_has_the_requested_rate(
 
 
 @given(rate_hz=st.integers(1, 2000), frequency_hz=st.floats(0.1, 2500), start=st.integers(0, 10**6))
-def test_any_frequency_is_exact_on_average_with_even_gaps(
-    rate_hz: int, frequency_hz: float, start: int
-) -> None:
+def test_any_frequency_is_exact_and_has_even_gaps(rate_hz: int, frequency_hz: float, start: int) -> None:
     client = ScriptedClient(rate_hz)
     client.elapsed_us = start
     text = f"{frequency_hz:.6f}"
@@ -131,9 +129,7 @@ def test_dropped_frames_are_counted_once_and_never_before_they_are_due(client: S
 
 @pytest.mark.parametrize("rate", ["AllFrames", "Frequency:7", "FrequencyDivisor:33"])
 @pytest.mark.parametrize("components", ["All", "3D Events", "Events", "Analog Event"])
-def test_every_event_is_sent_once_with_the_next_frame(
-    client: ScriptedClient, rate: str, components: str
-) -> None:
+def test_each_event_is_sent_once_with_a_frame(client: ScriptedClient, rate: str, components: str) -> None:
     client.send(f"StreamFrames {rate} {components}")
     frames = [frame for t in range(0, 10 * SECOND_US, 500_000) for frame in client.frames_until(t)]
     events = [component for frame in frames for component in frame if component.type == EVENT]
@@ -151,9 +147,7 @@ def test_events_before_the_request_are_not_sent(client: ScriptedClient) -> None:
     assert [event[0] for event in events.items] == [143]
 
 
-def test_a_stream_of_events_alone_loses_no_frames_while_the_client_does_not_read(
-    client: ScriptedClient,
-) -> None:
+def test_a_stream_of_events_alone_loses_none_while_the_client_does_not_read(client: ScriptedClient) -> None:
     """Its frames exist only if there are events, and these come with the next frame."""
     client.send("StreamFrames Events")
     client.session.drop_due_frames(100_000)
@@ -175,9 +169,7 @@ def test_polling_gets_each_event_once(client: ScriptedClient) -> None:
 # SendCurrentFrame ---------------------------------------------------------------------------
 
 
-def test_the_current_frame_is_sent_at_once_if_it_is_new_and_else_when_there_is_a_newer_one(
-    client: ScriptedClient,
-) -> None:
+def test_the_current_frame_is_sent_at_once_or_when_there_is_a_newer_one(client: ScriptedClient) -> None:
     """§5.3.4: no client gets the same frame twice."""
     client.elapsed_us = 123_456
     client.send("SendCurrentFrame 3D")
@@ -189,9 +181,7 @@ def test_the_current_frame_is_sent_at_once_if_it_is_new_and_else_when_there_is_a
     assert client.numbers_until(130_000) == [14]
 
 
-def test_all_requests_are_answered_in_order_even_if_the_scene_lacks_their_components(
-    client: ScriptedClient,
-) -> None:
+def test_all_requests_are_answered_in_order_even_without_their_components(client: ScriptedClient) -> None:
     """A client counts its answers; what is missing is an empty frame."""
     for components in ("3D", "Force", "6D"):
         client.send(f"SendCurrentFrame {components}")
@@ -213,9 +203,7 @@ def test_a_frame_of_a_slow_stream_does_not_make_older_frames_current(client: Scr
     assert client.session.due_us == 100_000
 
 
-def test_the_next_frame_is_due_for_the_stream_or_for_a_request_whichever_is_first(
-    client: ScriptedClient,
-) -> None:
+def test_the_next_frame_is_due_for_the_stream_or_for_an_earlier_request(client: ScriptedClient) -> None:
     """The server's timer waits for this time, so a later one would delay frames."""
     client.send("StreamFrames Analog")
     client.frames_until(0)
@@ -266,9 +254,7 @@ def test_clients_that_wait_for_frames_get_no_data_when_the_measurement_ends(clie
     assert client.frames_until(50_000) == []
 
 
-def test_a_stream_continues_with_the_first_frames_of_the_next_measurement_and_loses_no_events(
-    client: ScriptedClient,
-) -> None:
+def test_a_stream_goes_on_in_the_next_measurement_and_loses_no_events(client: ScriptedClient) -> None:
     """Frame numbers start again, and the first frame in time has the events of those that were late."""
     client.elapsed_us = None
     client.send("StreamFrames 3D Events")

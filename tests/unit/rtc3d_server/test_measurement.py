@@ -140,9 +140,7 @@ def test_clients_share_frames_until_the_scene_or_the_measurement_changes() -> No
 @pytest.mark.parametrize(
     ("delay_us", "delay_s"), [(-1500, 0), (0, 0), (0.5, 0.001), (1000, 0.001), (1001, 0.002), (29_000, 0.029)]
 )
-def test_a_delay_is_rounded_up_to_whole_milliseconds(
-    delay_us: float, delay_s: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_delay_is_rounded_up(delay_us: float, delay_s: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """uvloop counts whole milliseconds: a timer that is early finds nothing due, many times over."""
     called: list[float] = []
 
@@ -192,9 +190,7 @@ def test_a_frame_has_the_bytes_of_the_specification() -> None:
         ((ComponentType.MARKERS,), [MARKERS]),
     ],
 )
-def test_a_frame_has_the_requested_components_of_the_scene_in_wire_order(
-    requested: tuple[ComponentType, ...], built: list[int]
-) -> None:
+def test_a_frame_has_components_in_wire_order(requested: tuple[ComponentType, ...], built: list[int]) -> None:
     components = built_components(FrameBuilder(CountingScene(), requested), 100, with_events=True)
     assert [component.type for component in components] == built
 

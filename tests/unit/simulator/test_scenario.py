@@ -105,9 +105,7 @@ def simulate(*arguments: str) -> Result:
     return CliRunner().invoke(app, ["simulate", *arguments], env={"COLUMNS": "200"})
 
 
-def test_a_scenarios_faults_and_those_of_the_command_line_are_played(
-    file: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_faults_of_scenario_and_command_line_are_played(file: Path, caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO)
     file.write_text("faults: [{fault: undersize, at_s: 0}]")
     faults = ("--fault", "cut", "--fault", "delay,delay_ms=3", "--seed", "3")

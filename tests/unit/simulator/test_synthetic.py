@@ -62,9 +62,7 @@ def local_mm_of(poses: Floats, markers: Floats) -> Floats:
 
 
 @pytest.mark.parametrize("tool", range(7))
-def test_a_tools_markers_are_rigid_in_its_own_coordinates_and_fit_its_pose(
-    scene: SyntheticScene, tool: int
-) -> None:
+def test_a_tools_markers_are_rigid_in_its_coordinates_and_fit(scene: SyntheticScene, tool: int) -> None:
     poses, markers = tool_and_markers(scene, tool)
     all_local_mm = local_mm_of(poses, markers)
     assert np.nanstd(all_local_mm, axis=0) == pytest.approx(NOISE_MM, rel=0.15)
@@ -116,9 +114,7 @@ def steps_on(scene: SyntheticScene, plate: int) -> list[Floats]:
 
 
 @pytest.mark.parametrize("plate", [0, 1])
-def test_steps_have_two_peaks_of_about_the_weight_and_roll_from_heel_to_toe(
-    scene: SyntheticScene, plate: int
-) -> None:
+def test_steps_have_two_peaks_and_roll_from_heel_to_toe(scene: SyntheticScene, plate: int) -> None:
     force = scene.parameters.force
     assert force is not None
     described = force.plates[plate]

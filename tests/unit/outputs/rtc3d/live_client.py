@@ -12,6 +12,8 @@ from gateway.rtc3d_server.client_session import ClientSession, SessionCallbacks
 from tests.unit.rtc3d_server.wire import COMMAND, EVENT, WireComponent, components_in, packets_in
 
 _ITEM = {1: "4f", 2: "f", 3: "6f", 4: "8f", EVENT: "iqiii"}
+Kinds = frozenset[ComponentType]
+ALL_KINDS: Kinds = frozenset(WIRE_ORDER)
 SLOW, FAST = 1, 2  # the numbers of streams
 TOOL_OUT_OF_VIEW = bytes.fromhex("00000038 00000004 00000007 0000000000002710 00000001" + "ff" * 32)
 
@@ -87,14 +89,10 @@ class LiveSource:
             self.wait(1000)
 
     def arrive(
-        self,
-        frame: bytes,
-        stream: int = SLOW,
-        byte_order: ByteOrder = "big",
-        wanted: frozenset[object] = frozenset(WIRE_ORDER),
+        self, frame: bytes, stream: int = SLOW, byte_order: ByteOrder = "big", wanted: Kinds = ALL_KINDS
     ) -> None:
         """Let a frame arrive, and send what is due then."""
-        self.scene.add(split_frame(frame, byte_order), stream, wanted, self.now_us)  # type: ignore[arg-type]
+        self.scene.add(split_frame(frame, byte_order), stream, wanted, self.now_us)
         self.send()
 
     def wait(self, us: int) -> None:

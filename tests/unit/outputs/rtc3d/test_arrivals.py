@@ -24,25 +24,22 @@ from tests.unit.outputs.rtc3d.live_client import (
 )
 from tests.unit.rtc3d_server.wire import EVENT, components_in
 
-MARKERS, ANALOG, TOOLS = ComponentType.MARKERS, ComponentType.ANALOG, ComponentType.TOOLS
+MARKERS, ANALOG = ComponentType.MARKERS, ComponentType.ANALOG
 BOTH = (MARKERS, ANALOG)
+Kinds = Sequence[ComponentType]
 
 
 class Source:
     """Frames that arrive at chosen times, and the frames of a client's choice of components."""
 
     def __init__(
-        self,
-        requested: Sequence[ComponentType] = BOTH,
-        announced_hz: dict[ComponentType, float] | None = None,
-        *,
-        is_new: bool = False,
-        played: int = 0,
+        self, requested: Kinds = BOTH, *, is_new: bool = False, played: int = 0, **announced_hz: float
     ) -> None:
         self.arrivals = Arrivals()
         if not is_new:
             self.arrivals.began_us = -1_000_000_000  # frames do not wait until rates are known
-        self.frames = LiveFrames(requested, self.arrivals, announced_hz or {})
+        rates_hz = {ComponentType[name]: rate_hz for name, rate_hz in announced_hz.items()}
+        self.frames = LiveFrames(requested, self.arrivals, rates_hz)
         self.play(played)
 
     def add(self, at_us: int, *components: bytes, stream: int = SLOW) -> Arrival:
@@ -75,13 +72,11 @@ class Source:
     def numbers(self) -> list[list[int]]:
         return [[each.frame_number for each in components_in(packet.packet[8:])] for packet in self.packets()]
 
-    def arrive_regularly(
-        self, numbers: Iterable[int], *, with_events: bool = False, period_us: int = 10
-    ) -> None:
+    def arrive_regularly(self, numbers: Iterable[int], *, with_events: bool = False) -> None:
         """Let markers arrive, whose number is also their time stamp."""
         for number in numbers:
             events = [event(number, number, number)] if with_events else []
-            self.arrive(number * period_us, markers(number, number), *events)
+            self.arrive(number * 10, markers(number, number), *events)
 
     def forget(self) -> None:
         self.arrivals.frames.clear()
@@ -190,11 +185,11 @@ def test_frames_are_found_by_time_after_older_ones_were_forgotten() -> None:
 
 def test_the_announced_rate_of_the_slowest_component_counts_until_it_is_measured() -> None:
     """Joined frames have the rate of the slowest component."""
-    announced: dict[ComponentType, float] = {MARKERS: 200.0, TOOLS: 50.0, ANALOG: 1000.0}
-    assert Source([], announced).frames.rate == 50
-    assert Source(BOTH, announced).frames.rate == 200
+    announced = {"MARKERS": 200.0, "TOOLS": 50.0, "ANALOG": 1000.0}
+    assert Source([], **announced).frames.rate == 50
+    assert Source(BOTH, **announced).frames.rate == 200
     assert Source().frames.rate == Fraction(100)
-    source = Source([], announced)
+    source = Source([], **announced)
     source.arrive(1, markers(1, 10), TOOL_OUT_OF_VIEW)
     assert source.frames.rate == 50
     for number in range(2, 9):
@@ -280,9 +275,7 @@ def test_of_a_component_in_two_frames_the_first_counts() -> None:
     ("analog_us", "is_joined", "waits"),
     [(39_997, True, True), (39_998, True, False), (40_002, True, False), (40_003, False, False)],
 )
-def test_time_stamps_of_one_moment_can_differ_by_rounding(
-    analog_us: int, is_joined: bool, waits: bool
-) -> None:
+def test_time_stamps_of_a_moment_differ_by_rounding(analog_us: int, is_joined: bool, waits: bool) -> None:
     """By 2 µs and not more: a later sample belongs to the next frame, an earlier one may not be the last."""
     source = Source(played=3)
     source.arrive(40_000, analog(4, analog_us), stream=FAST)
@@ -398,12 +391,10 @@ def test_nothing_from_before_a_pause_is_sent_after_it() -> None:
 # What is not known yet ----------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("announced_hz", "until_us"), [({}, 110_000), ({ANALOG: 1000.0}, 310_000)])
-def test_frames_of_a_new_source_wait_until_its_streams_are_known(
-    announced_hz: dict[ComponentType, float], until_us: int
-) -> None:
+@pytest.mark.parametrize(("announced_hz", "until_us"), [({}, 110_000), ({"ANALOG": 1000.0}, 310_000)])
+def test_frames_wait_until_streams_are_known(announced_hz: dict[str, float], until_us: int) -> None:
     """For 0.1 s, or for 0.3 s if the server announces more than has come."""
-    source = Source(BOTH, announced_hz, is_new=True)
+    source = Source(is_new=True, **announced_hz)
     assert source.frames.update(5) is None  # nothing waits
     assert source.arrive(10_000, markers(1, 10_000)) == until_us
     assert source.frames.update(until_us - 1) == until_us

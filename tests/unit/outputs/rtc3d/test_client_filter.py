@@ -63,9 +63,7 @@ async def test_the_system_is_asked_to_notice_vanished_clients() -> None:
 
 
 @in_virtual_time
-async def test_a_recording_is_acknowledged_once_the_server_has_done_it(
-    server: ScriptedServer, client: Client
-) -> None:
+async def test_a_recording_is_acknowledged_once_it_is_done(server: ScriptedServer, client: Client) -> None:
     """Commands after it wait, so that a client sees the replies in order."""
     start, stop = "Recording Start,file=walk.c3d", "Recording Stop"
     assert await client.ask(start, stop, "Version 1.0") == []
@@ -83,9 +81,7 @@ async def test_a_recording_is_acknowledged_once_the_server_has_done_it(
 
 @pytest.mark.parametrize(("sent", "done"), [("Recording Start", b"started"), ("Recording Stop", b"stopped")])
 @in_virtual_time
-async def test_why_a_recording_was_not_made_is_said(
-    server: ScriptedServer, client: Client, sent: str, done: bytes
-) -> None:
+async def test_a_refusal_says_why(server: ScriptedServer, client: Client, sent: str, done: bytes) -> None:
     """A defect is no reason to leave the client without an answer; it waits for 30 s at most."""
     for error, reason in (
         (QueryError("remote control is off"), b"remote control is off"),
@@ -255,9 +251,7 @@ def test_the_recording_packet_starts_and_stops(sign: str, ending: bytes) -> None
         (Packet(77, switch(1)), None),
     ],
 )
-def test_the_recording_commands_and_no_other_packets_start_and_stop(
-    sent: Packet, control: ControlRecording | None
-) -> None:
+def test_only_recording_commands_start_and_stop(sent: Packet, control: ControlRecording | None) -> None:
     assert recording_control(sent) == control
 
 

@@ -41,9 +41,7 @@ each_order = pytest.mark.parametrize("fast_first", [False, True])
         ("", body(), []),
     ],
 )
-def test_components_are_passed_on_unchanged_or_cut_out(
-    requested: str, arrived: bytes, sent: list[bytes]
-) -> None:
+def test_components_are_passed_on_or_cut_out(requested: str, arrived: bytes, sent: list[bytes]) -> None:
     source = LiveSource()
     client = source.client(f"StreamFrames {requested}")
     source.arrive(arrived)

@@ -44,7 +44,7 @@ async def streaming(server: ScriptedServer) -> Client:
 
 
 @in_virtual_time
-async def test_a_client_waits_two_seconds_for_frames_of_a_source_that_is_not_known(
+async def test_a_client_waits_two_seconds_for_an_unknown_source(
     server: ScriptedServer, client: Client
 ) -> None:
     """The gateway may have to start its own stream first, so No Data at once would be wrong."""
@@ -73,7 +73,7 @@ async def test_without_a_measurement_no_data_comes_at_once_or_ends_the_wait(serv
 
 
 @in_virtual_time
-async def test_a_frame_ends_the_wait_and_while_a_source_streams_there_is_none(
+async def test_a_frame_or_a_stream_of_the_source_ends_the_wait(
     server: ScriptedServer, client: Client
 ) -> None:
     """The time-out of the request must not end the measurement, nor do gaps in a stream."""
@@ -138,9 +138,7 @@ async def test_closing_ends_everything_and_nobody_wants_frames(server: ScriptedS
 
 
 @in_virtual_time
-async def test_a_request_for_parameters_waits_until_they_are_there(
-    server: ScriptedServer, client: Client
-) -> None:
+async def test_a_request_waits_for_parameters(server: ScriptedServer, client: Client) -> None:
     """A client that comes with the gateway's start would otherwise get an error."""
     assert await client.ask("SendParameters 3D", "Version 1.0") == []
     await asyncio.sleep(0.9)
@@ -153,9 +151,7 @@ async def test_a_request_for_parameters_waits_until_they_are_there(
 
 
 @in_virtual_time
-async def test_a_request_for_parameters_does_not_wait_for_ever(
-    server: ScriptedServer, client: Client
-) -> None:
+async def test_a_request_for_parameters_waits_for_one_second(server: ScriptedServer, client: Client) -> None:
     """Anything that is known of the source ends the wait: it answers, and will give none later."""
     assert await client.ask("SendParameters") == []
     await asyncio.sleep(1)
@@ -167,9 +163,7 @@ async def test_a_request_for_parameters_does_not_wait_for_ever(
 
 
 @in_virtual_time
-async def test_the_newest_parameters_are_served_even_before_the_next_maintenance(
-    server: ScriptedServer, client: Client
-) -> None:
+async def test_the_newest_parameters_are_served_at_once(server: ScriptedServer, client: Client) -> None:
     """Parameters and frames of one moment belong together."""
     for label in ("heel", "toe"):
         server.state.parameters = parameters(label)
@@ -200,9 +194,7 @@ async def test_frames_are_wanted_while_any_client_asks_for_some(server: Scripted
 
 
 @in_virtual_time
-async def test_a_request_for_one_frame_is_wanted_until_it_is_answered(
-    server: ScriptedServer, client: Client
-) -> None:
+async def test_a_request_is_wanted_until_it_is_answered(server: ScriptedServer, client: Client) -> None:
     """Otherwise the source would send for nobody."""
     await client.ask("SendCurrentFrame 3D")
     assert server.changes == [True]

@@ -265,9 +265,7 @@ MISSING = b"\xff" * 4
 
 
 @pytest.mark.parametrize(("fraction", "hidden"), [(0.0, 0), (0.01, 1), (0.5, 4), (0.51, 5), (1.0, 8)])
-def test_occlusion_hides_a_fraction_of_the_markers_until_it_begins_again(
-    fraction: float, hidden: int
-) -> None:
+def test_occlusion_hides_a_fraction_of_the_markers_while_it_lasts(fraction: float, hidden: int) -> None:
     [component] = components_in_packet(changed(Occlusion(markers=fraction), frame(markers(count=8))))
     seen = [item for item in component.items if not math.isnan(item[0])]
     assert len(seen) == 8 - hidden
@@ -354,7 +352,5 @@ FRAME_KINDS = [kind for kind in KINDS.values() if kind.__module__.endswith("fram
     "data",
     [packet(COMMAND, b"OK-Version 1.0"), packet(4), packet(DATA, b"no frame"), packet(2, b"<x/>"), b"half"],
 )
-def test_faults_of_frames_do_not_change_other_packets(
-    kind: type[LastingConnectionFault], data: bytes
-) -> None:
+def test_faults_of_frames_change_no_other_packets(kind: type[LastingConnectionFault], data: bytes) -> None:
     assert changed(kind(), data) == data

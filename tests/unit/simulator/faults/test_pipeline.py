@@ -81,9 +81,7 @@ async def test_faults_of_replies(
 
 
 @played
-async def test_late_acknowledgements_are_overtaken_by_everything_and_sent_after_their_delay(
-    client: FaultyClient,
-) -> None:
+async def test_late_acknowledgements_are_overtaken_by_everything_else(client: FaultyClient) -> None:
     """Field note 3: clients must not take the next reply for the missing one."""
     client.begin(LateAcknowledgements(delay_ms=200, times=2))
     client.ask("Version 1.0", "StreamFrames 3D", "SendParameters", "SetByteOrder BigEndian")
@@ -166,9 +164,7 @@ async def test_jitter_split_and_merge_together_keep_all_packets_in_order(client:
 
 
 @played
-async def test_the_number_of_waiting_bytes_is_limited(
-    client: FaultyClient, caplog: pytest.LogCaptureFixture
-) -> None:
+async def test_the_waiting_bytes_are_limited(client: FaultyClient, caplog: pytest.LogCaptureFixture) -> None:
     """A delay must not fill the memory; once the bytes are sent, there is room again."""
     large = packet(DATA, bytes(MAX_WAITING_BYTES // 4 - 8))
     client.begin(Delay(delay_ms=1000))

@@ -22,16 +22,11 @@ class Take:
         self._number = 0
 
     def add(
-        self,
-        kind: ComponentType,
-        timestamp_us: int,
-        capture_us: int = -1,
-        session: int = 1,
-        stamp: bytes = b"",
+        self, kind: ComponentType, time_us: int, capture_us: int = -1, session: int = 1, stamp: bytes = b""
     ) -> None:
-        captured = START + (timestamp_us if capture_us == -1 else capture_us)
+        captured = START + (time_us if capture_us == -1 else capture_us)
         self._number += 1
-        content = struct.pack(">iqi", self._number, timestamp_us, 0)
+        content = struct.pack(">iqi", self._number, time_us, 0)
         stamp = stamp or self._number.to_bytes(4, "big")
         self.moments += self.builder.add(Recorded(kind, captured, session, stamp, content, PARAMETERS))
 

@@ -151,9 +151,7 @@ def test_a_pass_is_played_to_its_end_and_not_into_the_next_one() -> None:
         ("Frequency:60", [1, 3, 5, 6, 8]),
     ],
 )
-def test_a_rate_chooses_among_recorded_frames_and_does_not_exceed_them(
-    requested: str, first: list[int]
-) -> None:
+def test_a_rate_chooses_among_recorded_frames_and_adds_none(requested: str, first: list[int]) -> None:
     assert only("3d", streamed(lab(1), f"{requested} 3D"))[:5] == first
 
 
@@ -205,7 +203,7 @@ def test_old_events_are_forgotten_except_for_some_thousands() -> None:
 
 
 @pytest.mark.parametrize("requested", ["All", "Frequency:7 3D Events", "FrequencyDivisor:33 Events"])
-def test_every_event_is_sent_once_with_the_next_frame(requested: str) -> None:
+def test_each_event_is_sent_once_with_a_frame(requested: str) -> None:
     frames = streamed(lab(10), requested, 10)
     sent = [event[0] for frame in frames for each in frame if each.type == 5 for event in each.items]
     assert sent == list(range(1, len(sent) + 1))

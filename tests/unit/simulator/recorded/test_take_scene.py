@@ -122,9 +122,7 @@ def at(number: int, period_us: int = 1000) -> dict[str, int]:
     return {"timestamp_us": number * period_us, "utime": START_UTIME + number * period_us}
 
 
-def test_without_parameters_they_are_derived_from_the_frames(
-    path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_parameters_they_are_those_of_frames(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     messages = [frame(ComponentType.ANALOG, [0.0, 1.0], number, **at(number)) for number in range(500)]
     for number in range(49, -1, -1):
         messages.insert(10 * number, markers(3, number, **at(number, 10_000)))
@@ -214,9 +212,7 @@ def test_damage_is_left_out_and_reported_once(path: Path, caplog: pytest.LogCapt
     assert "1 messages of an unknown type, and 1 malformed messages" in caplog.text
 
 
-def test_a_file_that_cannot_be_read_any_more_ends_the_take(
-    path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_file_that_cannot_be_read_on_ends_the_take(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     player = Player(path, take_of(5))
     player.scene.stop()
     path.unlink()
