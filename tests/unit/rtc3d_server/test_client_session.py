@@ -66,26 +66,25 @@ def test_packets_that_only_servers_send_get_an_error(client: ScriptedClient) -> 
         assert client.send(b"", packet_type) == [(ERROR, text)]
 
 
-@pytest.mark.parametrize("extra", [b"", b"\n", b"\r\n\0"])
-@pytest.mark.parametrize(("start", "stop"), [(START_BIG, STOP_BIG), (START_LITTLE, STOP_LITTLE)])
-def test_wavefronts_recording_gets_no_reply(
-    client: ScriptedClient, start: bytes, stop: bytes, extra: bytes
+RECORDING = b"Recording Start,file=C:\\My takes\\A b.c3d"
+
+
+@pytest.mark.parametrize("extra", [b"", b"\n", b"\0", b"\r\n\0"])
+@pytest.mark.parametrize(
+    ("start", "stop", "packet_type"),
+    [
+        *((START_BIG, STOP_BIG, DATA), (START_LITTLE, STOP_LITTLE, DATA)),
+        *((RECORDING, b"Recording Stop", COMMAND), (b"recording start", b"recording stop", COMMAND)),
+    ],
+)
+def test_a_recording_is_started_and_stopped(
+    client: ScriptedClient, start: bytes, stop: bytes, packet_type: int, extra: bytes
 ) -> None:
-    """Field notes 16 and 17: in any byte order, with anything after it."""
-    assert client.send(start + extra, DATA) == []
-    assert client.session.is_recording
-    assert client.send(stop + extra, DATA) == []
-    assert not client.session.is_recording
-
-
-@pytest.mark.parametrize("start", [b"Recording Start,file=C:\\My takes\\A b.c3d", b"recording start"])
-def test_a_recording_is_started_and_stopped_by_commands(client: ScriptedClient, start: bytes) -> None:
-    """Field note 18: another client of NDI does it this way."""
-    for end in (b"", b"\n", b"\0"):
-        assert client.send(start + end) == [(COMMAND, b"OK-" + start)]
-        assert client.session.is_recording
-        assert client.send(b"Recording Stop" + end) == [(COMMAND, b"OK-Recording Stop")]
-        assert not client.session.is_recording
+    """Field notes 16 to 18: by WaveFront's data frame, which gets no reply, or by commands."""
+    for sent, is_recording in ((start, True), (stop, False)):
+        replies = [(COMMAND, b"OK-" + sent)] if packet_type == COMMAND else []
+        assert client.send(sent + extra, packet_type) == replies
+        assert client.session.is_recording is is_recording
 
 
 @pytest.mark.parametrize(

@@ -256,19 +256,13 @@ def test_events_of_several_frames_become_one_component_of_each_size() -> None:
 # Joining ------------------------------------------------------------------------------------
 
 
-def test_a_joined_packet_names_the_components_of_all_its_streams() -> None:
-    """What was sent is counted by component."""
+def test_a_joined_packet_has_and_names_the_components_of_all_its_streams() -> None:
+    """Of a component in two frames the first counts: it sets the rate, and its time stamp is the frame's."""
     source = Source(played=3)
     assert source.packets()[-1].components == (MARKERS, ANALOG)
     assert source.numbers() == [[1, 1], [2, 2], [3, 3]]
-
-
-def test_of_a_component_in_two_frames_the_first_counts() -> None:
-    """The frame that sets the rate comes first, and its markers belong to its time stamp."""
-    source = Source()
     arrivals = [source.add(1, markers(1, 10)), source.add(2, markers(2, 20), analog(2, 20), stream=FAST)]
-    joined = encode_joined(arrivals, frozenset(BOTH), [], "big")
-    assert joined == body(markers(1, 10), analog(2, 20))
+    assert encode_joined(arrivals, frozenset(BOTH), [], "big") == body(markers(1, 10), analog(2, 20))
 
 
 @pytest.mark.parametrize(
@@ -401,11 +395,8 @@ def test_frames_wait_until_streams_are_known(announced_hz: dict[str, float], unt
     assert source.numbers() == []
     assert source.frames.update(until_us) is None
     assert source.numbers() == [[1]]
-
-
-def test_frames_that_wait_for_a_new_source_are_forgotten_with_the_others() -> None:
-    source = Source(is_new=True)
-    source.arrive(10_000, markers(1, 10_000))
-    source.forget()
-    source.frames.update(500_000)
-    assert source.numbers() == []
+    forgotten = Source(is_new=True, **announced_hz)
+    forgotten.arrive(10_000, markers(1, 10_000))
+    forgotten.forget()
+    forgotten.frames.update(500_000)
+    assert forgotten.numbers() == []

@@ -178,17 +178,6 @@ def test_the_second_frame_of_a_new_source_waits_for_its_sample() -> None:
     assert client.numbers() == [[1, 1], [2, 2], [3, 3]]
 
 
-def test_components_that_are_announced_and_never_come_are_not_waited_for_long() -> None:
-    source = LiveSource(is_new=True, MARKERS=100.0, ANALOG=1000.0)
-    client = source.client(BOTH)
-    for step in range(250):
-        source.arrive(body(analog(step, 1000 * step)), FAST)
-        source.wait(1000)
-    assert client.take() == []
-    source.wait(50_000)
-    assert client.numbers() == [[step] for step in range(250)]
-
-
 def test_a_client_that_asks_between_two_samples_gets_complete_frames_only() -> None:
     source = LiveSource(played=3, fast_first=True)
     source.scene.forget_frames()
