@@ -87,7 +87,8 @@ def test_a_new_stream_replaces_the_old_one_from_its_overdue_frames_on(client: Sc
 def test_stop_ends_the_stream_for_later_measurements_too(client: ScriptedClient) -> None:
     client.send("StreamFrames")
     client.send("StreamFrames Stop")
-    assert client.frames_until(50_000) == client.session.measurement_stopped() == []
+    assert client.frames_until(50_000) == []
+    assert client.session.measurement_stopped() == []
     client.session.measurement_started()
     assert client.session.due_us is None
 

@@ -33,7 +33,7 @@ class Source:
     """Frames that arrive at chosen times, and the frames of a client's choice of components."""
 
     def __init__(
-        self, requested: Kinds = BOTH, *, is_new: bool = False, played: int = 0, **announced_hz: float
+        self, requested: Kinds = BOTH, *, is_new: bool = False, played: int = 0, **announced_hz: Any
     ) -> None:
         self.arrivals = Arrivals()
         if not is_new:
@@ -185,7 +185,7 @@ def test_frames_are_found_by_time_after_older_ones_were_forgotten() -> None:
 
 def test_the_announced_rate_of_the_slowest_component_counts_until_it_is_measured() -> None:
     """Joined frames have the rate of the slowest component."""
-    announced = {"MARKERS": 200.0, "TOOLS": 50.0, "ANALOG": 1000.0}
+    announced: dict[str, Any] = {"MARKERS": 200.0, "TOOLS": 50.0, "ANALOG": 1000.0}
     assert Source([], **announced).frames.rate == 50
     assert Source(BOTH, **announced).frames.rate == 200
     assert Source().frames.rate == Fraction(100)
@@ -386,7 +386,7 @@ def test_nothing_from_before_a_pause_is_sent_after_it() -> None:
 
 
 @pytest.mark.parametrize(("announced_hz", "until_us"), [({}, 110_000), ({"ANALOG": 1000.0}, 310_000)])
-def test_frames_wait_until_streams_are_known(announced_hz: dict[str, float], until_us: int) -> None:
+def test_frames_wait_until_streams_are_known(announced_hz: dict[str, Any], until_us: int) -> None:
     """For 0.1 s, or for 0.3 s if the server announces more than has come."""
     source = Source(is_new=True, **announced_hz)
     assert source.frames.update(5) is None  # nothing waits

@@ -294,7 +294,7 @@ def test_no_event_is_lost_at_a_low_rate() -> None:
         source.arrive(frame_of_markers(number, event_of(number)))
     frames = client.take()
     assert [frame[0].frame_number for frame in frames] == [1, 5, 9]
-    items = [(number, 10_000 * number, -1, -1, -1) for number in range(1, 10)]
+    items: list[tuple[float, ...]] = [(number, 10_000 * number, -1, -1, -1) for number in range(1, 10)]
     expected = [(1, items[:1]), (5, items[1:5]), (9, items[5:])]
     assert [frame[1] for frame in frames] == [
         WireComponent(EVENT, number, 10_000 * number, found) for number, found in expected

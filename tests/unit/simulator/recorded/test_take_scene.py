@@ -4,6 +4,7 @@ import random
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -97,8 +98,8 @@ def test_a_take_that_is_read_late_begins_late_and_loses_nothing(path: Path) -> N
 
 def test_parameters_and_their_sections_are_those_of_the_server(path: Path) -> None:
     scene = TakeScene(write_take(path, take_of(5)))
-    for sections in ((), ("general", "3d", "6d", "analog", "force", "events")):
-        assert scene.parameters_xml(sections, GENERAL) == XML
+    for all_sections in ((), ("general", "3d", "6d", "analog", "force", "events")):
+        assert scene.parameters_xml(all_sections, GENERAL) == XML
     for sections in (("3d",), ("general", "3d"), ("3d", "force")):
         found = parse_parameters(scene.parameters_xml(sections, GENERAL)).parameters
         assert found.markers == scene.parameters.markers
@@ -118,7 +119,7 @@ def test_clients_get_the_parameters_of_the_present_frame(path: Path) -> None:
     player.scene.stop()
 
 
-def at(number: int, period_us: int = 1000) -> dict[str, int]:
+def at(number: int, period_us: int = 1000) -> dict[str, Any]:
     return {"timestamp_us": number * period_us, "utime": START_UTIME + number * period_us}
 
 
@@ -190,7 +191,7 @@ def test_a_damaged_channel_is_no_source(path: Path) -> None:
     ],
 )
 def test_what_is_no_take_is_an_error(
-    path: Path, content: bytes | None, options: dict[str, float], problem: str
+    path: Path, content: bytes | None, options: dict[str, Any], problem: str
 ) -> None:
     if content is not None:
         path.write_bytes(content)
