@@ -3,8 +3,9 @@
 import asyncio
 import logging
 from collections.abc import Callable, Coroutine, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import pytest
 
@@ -48,28 +49,25 @@ class Thread:
         self.run(last())
 
 
+@dataclass(eq=False)
 class Server:
     """A LiveServer that opens no port; ``events`` says when ports are opened and closed."""
 
-    events: list[str]
-    busy: set[int]
-    attempts_s: list[float]
-    opened: dict[str, "Server"]
+    events: ClassVar[list[str]]
+    busy: ClassVar[set[int]]
+    attempts_s: ClassVar[list[float]]
+    opened: ClassVar[dict[str, "Server"]]
 
-    def __init__(
-        self,
-        state: SourceState,
-        host: str,
-        port: int,
-        max_clients: int,
-        wanted_changed: Callable[[], None],
-        control: Callable[[str, bool, str], Coroutine[Any, Any, None]],
-    ) -> None:
-        self.state, self.host, self.port, self.max_clients = state, host, port, max_clients
-        self.wanted_changed, self.control = wanted_changed, control
-        self.taken: list[tuple[int, frozenset[ComponentType]]] = []
-        self.files: list[Path] = []
-        self.num_applied = self.num_maintained = 0
+    state: SourceState
+    host: str
+    port: int
+    max_clients: int
+    wanted_changed: Callable[[], None]
+    control: Callable[[str, bool, str], Coroutine[Any, Any, None]]
+    taken: list[tuple[int, frozenset[ComponentType]]] = field(default_factory=list)
+    files: list[Path] = field(default_factory=list)
+    num_applied: int = 0
+    num_maintained: int = 0
 
     async def listen(self) -> None:
         self.attempts_s.append(asyncio.get_running_loop().time())
