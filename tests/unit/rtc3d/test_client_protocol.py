@@ -76,7 +76,7 @@ def test_a_command_that_cannot_be_sent_is_named_with_the_reason() -> None:
 
 # States ---------------------------------------------------------------------------------------
 
-STOP_OK = ok("OK-StreamFrames Stop")
+STOP, STOP_OK = StopStreaming(), ok("OK-StreamFrames Stop")
 
 
 @pytest.mark.parametrize(
@@ -87,26 +87,17 @@ STOP_OK = ok("OK-StreamFrames Stop")
             "requested, requested, no, streaming, no, streaming",
         ),
         (
-            [STREAM, FRAME, StopStreaming(), STOP_OK, FRAME, Bye(), "end"],
+            [STREAM, FRAME, STOP, STOP_OK, FRAME, Bye(), "end"],
             "requested, streaming, streaming, stopped, stopped, closing, closed",
         ),
-        (
-            [STREAM, FRAME, StopStreaming(), STOP_OK, STREAM, FRAME],
-            "requested, streaming, streaming, stopped, requested, streaming",
-        ),
+        ([STREAM, FRAME, STOP, STOP_OK, STREAM], "requested, streaming, streaming, stopped, requested"),
         ([STREAM, error("no"), FRAME], "requested, idle, streaming"),
         ([STREAM, error("no"), NO_DATA], "requested, idle, no"),
-        ([STREAM, FRAME, StopStreaming(), error("no"), FRAME], "requested" + ", streaming" * 4),
-        (
-            [STREAM, FRAME, StopStreaming(), "give up", FRAME],
-            "requested, streaming, streaming, idle, streaming",
-        ),
+        ([STREAM, FRAME, STOP, error("no"), FRAME], "requested" + ", streaming" * 4),
+        ([STREAM, FRAME, STOP, "give up", FRAME], "requested, streaming, streaming, idle, streaming"),
         ([STREAM, FRAME, StreamFrames(), error("no")], "requested, streaming, streaming, streaming"),
         ([SendCurrentFrame(), FRAME], "idle, idle"),
-        (
-            [STREAM, "give up", Version(), error("Error-Version?")],
-            "requested, requested, requested, requested",
-        ),
+        ([STREAM, "give up", Version(), error("Error-Version?")], "requested" + ", requested" * 3),
         ([SendCurrentFrame(), NO_DATA], "idle, idle"),
         ([STREAM, FRAME + ok("OK"), SendCurrentFrame(), NO_DATA], "requested, streaming, streaming, no"),
         ([Bye(), ok("bye"), FRAME, NO_DATA], "closing, closing, closing, closing"),
@@ -165,9 +156,8 @@ def test_a_streamed_frame_answers_if_it_fits(
         protocol.receive(FRAME)
         protocol.send(SendCurrentFrame(requested))
         received = [protocol.receive(body) for body in stream]
-        assert [(len(frames), bool(events)) for frames, events in received] == [
-            (1, each) for each in expected
-        ]
+        assert [len(frames) for frames, _ in received] == [1] * len(stream)
+        assert [bool(events) for _, events in received] == expected
 
 
 @pytest.mark.parametrize(

@@ -73,7 +73,7 @@ def test_the_type_of_a_reply_decides_and_not_its_text(text: str) -> None:
 
 
 # Each row: what happens, and what the client makes of what it receives.
-ROWS: Final[list[tuple[list[Step], str]]] = [
+ROWS: Final[list[tuple[Sequence[object], str]]] = [
     # Duplicates: nothing was asked.
     ([ok("hello")], "unexpected"),
     # Duplicates: that name no command.
