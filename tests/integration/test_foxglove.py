@@ -18,7 +18,6 @@ from gateway.outputs.takes.output import TakesOutput
 from gateway.outputs.takes.settings import TakesSettings
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.stream.state import StreamState
 from tests.configurations import make_settings
 from tests.foxglove_viewer import viewing
 from tests.networks import free_port
@@ -112,29 +111,6 @@ async def test_sources_come_and_go_on_reload_while_viewers_stay() -> None:
                 before = len(viewer.received["/lab/markers"])
                 after = (await viewer.wait_for("/lab/markers", before + 1))[before]
                 assert after.content.frame_id == "world"
-
-
-async def test_streams_on_demand_run_while_a_viewer_is_subscribed() -> None:
-    viewers = FoxgloveOutput(FoxgloveSettings(enabled=True, port=free_port()))
-    streams = [
-        {"components": components, "on_demand": True, "idle_after_s": 0.1}
-        for components in (["3d", "6d"], ["analog", "force"])
-    ]
-    async with Simulator(SCENE) as server:
-        gateway = Gateway(settings(server.port, streams=streams), [viewers])
-        [source] = gateway.sources
-
-        def are_idle() -> bool:
-            return {status.state for status in source.statuses} == {StreamState.IDLE}
-
-        async with running_gateway(gateway):
-            await gateway.opened.wait()
-            async with viewing(viewers.settings.port) as viewer:
-                await viewer.wait_until(lambda: "/lab/analog" in viewer.topics)
-                await wait_until_async(are_idle)
-                viewer.subscribe("/lab/analog")
-                await viewer.wait_for("/lab/analog", 50)
-            await wait_until_async(are_idle)
 
 
 @pytest.mark.netns
