@@ -34,12 +34,12 @@ TIMEOUT_S: Final = 30.0
 class Lab:
     """A gateway with LSL and one source. ``config`` is the file of liblsl."""
 
-    def __init__(self, folder: Path, port: int, **source: Any) -> None:
+    def __init__(self, folder: Path, port: int) -> None:
         self.config = lsl_config(folder)
         self.file = folder / "gateway.yaml"
         self.log_file = folder / "gateway.log"
         self.configuration: dict[str, Any] = {
-            "sources": [{"name": "lab", "host": "127.0.0.1", "port": port, **source}],
+            "sources": [{"name": "lab", "host": "127.0.0.1", "port": port}],
             "zenoh": {"enabled": False},
             "lcm": {"enabled": False},
             "metrics": {"enabled": False},
@@ -68,9 +68,9 @@ class Lab:
 
 
 @contextmanager
-def running(folder: Path, **source: Any) -> Iterator[Lab]:
+def running(folder: Path) -> Iterator[Lab]:
     with simulator(*SCENE) as (port, _):
-        lab = Lab(folder, port, **source)
+        lab = Lab(folder, port)
         lab.start()
         try:
             yield lab
@@ -123,17 +123,6 @@ def test_a_recording_has_labels_units_rates_and_capture_times(tmp_path: Path) ->
     quaternions = found["lab_6d"]["time_series"][:, 3:7]
     lengths = np.linalg.norm(quaternions[~np.isnan(quaternions).any(axis=1)], axis=1)
     assert lengths == pytest.approx(np.ones_like(lengths), abs=1e-3)
-
-
-def test_a_stream_on_demand_runs_only_while_somebody_receives(tmp_path: Path) -> None:
-    stream = {"on_demand": True, "idle_after_s": 0.2}
-    with running(tmp_path, streams=[stream]) as lab:
-        receiver = lab.receive("lab_3d")
-        wait_until(has(receiver, "lab_3d", 50), TIMEOUT_S)
-        receiver.close()
-        wait_until(lambda: "streaming → idle" in lab.log, TIMEOUT_S)
-        again = lab.receive("lab_3d")
-        wait_until(has(again, "lab_3d", 10), TIMEOUT_S)
 
 
 def test_a_step_of_the_wall_clock_does_not_disturb_time_stamps(tmp_path: Path) -> None:

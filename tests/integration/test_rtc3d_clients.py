@@ -4,8 +4,9 @@ import asyncio
 import logging
 import struct
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 
@@ -44,7 +45,8 @@ START, STOP = (
 )
 
 
-class At(NamedTuple):
+@dataclass
+class At:
     """An address."""
 
     port: int

@@ -12,16 +12,14 @@ from typing import Any, NamedTuple
 
 import pytest
 
-from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings, StreamSettings
+from gateway.config.settings import MetricsSettings, ReconnectSettings, SourceSettings
 from gateway.gateway import Gateway
 from gateway.messages.decode import decode
 from gateway.outputs.memory import MemoryOutput
 from gateway.outputs.vrpn.output import VrpnOutput
 from gateway.outputs.vrpn.settings import VrpnSettings
-from gateway.rtc3d.components import ComponentType
 from gateway.simulator.simulator import Simulator
 from gateway.simulator.synthetic import SyntheticScene
-from gateway.stream.state import StreamState
 from tests.configurations import make_settings
 from tests.needs import need
 from tests.networks import free_port
@@ -191,15 +189,3 @@ async def test_every_visible_pose_is_sent_with_its_capture_time() -> None:
             )
             assert pose.sensor == 0
         assert not any(status.losses for _, status in gateway.gateway.sources[0].fan_out.outputs)
-
-
-async def test_frames_flow_on_demand_while_a_client_is_connected() -> None:
-    stream = StreamSettings(components=(ComponentType.TOOLS,), on_demand=True, idle_after_s=0.05)
-    async with ToolServer(["wand"]) as server, served({"lab": server.port}, streams=(stream,)) as gateway:
-        gateway.memory.has_subscriber = False
-        status = gateway.gateway.sources[0].statuses[0]
-        await wait_until_async(lambda: status.state is StreamState.IDLE)
-        async with await VrpnClient.connect(gateway.port) as client:
-            await wait_until_async(lambda: client.poses)
-            assert client.trackers == {0: "wand"}
-        await wait_until_async(lambda: status.state is StreamState.IDLE)

@@ -17,7 +17,7 @@ from gateway.outputs.foxglove import output as output_module
 from gateway.outputs.foxglove.output import FoxgloveOutput
 from gateway.outputs.foxglove.server import FoxgloveServer
 from gateway.outputs.foxglove.settings import FoxgloveSettings
-from gateway.rtc3d.components import MISSING, WIRE_ORDER, ByteOrder
+from gateway.rtc3d.components import MISSING, WIRE_ORDER, ByteOrder, ComponentType
 from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D, Parameters6D, ParametersForce, Tool
 from tests.foxglove_viewer import HandshakeRefusedError, Viewer, viewing
 from tests.networks import free_port
@@ -322,7 +322,7 @@ async def test_positions_and_forces_are_in_the_frame_of_the_source(order: ByteOr
     given = Parameters(tools=Parameters6D(100.0, (Tool("1", "cup"),)), force=PLATES.force)
     async with watching("/lab/markers", "/lab/tools", "/lab/forces") as (lab, viewer):
         lab.set_parameters(given, 1, QUARTER_TURN)
-        items = {
+        items: dict[ComponentType, list[Any]] = {
             MARKERS: [(MISSING,) * 4, (1000, 2000, 3000, 0.5)],
             TOOLS: [(1, 0, 0, 0, 1000, 2000, 3000, 0.1)],
             FORCE: [(300, 0, 400, 0, 0, 0)],

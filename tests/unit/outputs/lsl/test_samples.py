@@ -96,7 +96,8 @@ def test_tools_are_as_the_poses_of_the_frame(frame: CoordinateFrame) -> None:
 
 def test_several_frames_are_several_samples() -> None:
     found = samples(ANALOG, np.arange(6, dtype=np.float32).reshape(3, 2, 1), PLAIN, 2)
-    assert (found.dtype, found.tolist()) == (np.float32, [[0, 1], [2, 3], [4, 5]])
+    assert found.dtype == np.float32
+    assert found.tolist() == [[0, 1], [2, 3], [4, 5]]
 
 
 # Capture times, while somebody sets the wall clock ------------------------------------------------
