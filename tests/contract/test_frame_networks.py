@@ -21,13 +21,7 @@ from tests.contract.frame_lab import (
     names_remedy,
     returns,
 )
-from tests.contract.frame_rigs import (
-    LAB,
-    SOURCES,
-    FrameRig,
-    component,
-    frame_of,
-)
+from tests.contract.frame_rigs import LAB, SOURCES, FrameRig, component, frame_of
 from tests.waiting import wait_until_async
 
 __all__ = ["lab"]

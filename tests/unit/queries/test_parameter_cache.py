@@ -322,12 +322,7 @@ async def test_an_answer_to_a_peer_is_read_again_later() -> None:
 @pytest.mark.parametrize(
     ("before", "after", "level", "text"),
     [
-        (
-            "A B",
-            "A C",
-            logging.WARNING,
-            "lab: markers or tools were renamed on the server: 3d 'B' to 'C';",
-        ),
+        ("A B", "A C", logging.WARNING, "lab: markers or tools were renamed on the server: 3d 'B' to 'C';"),
         ("A B", "A B C", logging.INFO, "lab: the server's parameters changed: 3d (parameters_version 2)"),
     ],
 )

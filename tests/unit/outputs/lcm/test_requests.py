@@ -76,9 +76,7 @@ async def test_a_defect_is_logged_and_reported_in_the_reply(
     assert record.exc_info is not None
 
 
-async def test_a_source_that_is_no_longer_served_gets_no_reply(
-    lab: Lab,
-) -> None:
+async def test_a_source_that_is_no_longer_served_gets_no_reply(lab: Lab) -> None:
     lab.open()
     lab.service.sources.clear()
     lab.send(request(1))

@@ -147,10 +147,7 @@ def test_a_full_queue_is_a_problem_until_the_peer_reads_again(
 
 @pytest.mark.usefixtures("no_hold")
 def test_a_full_queue_and_its_end_are_logged_once(
-    lcm: FakeLcm,
-    sender: LcmThreadSender,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "gateway.outputs")
     monkeypatch.setattr(thread_sender, "MAX_QUEUED_MESSAGES", 1)
@@ -168,10 +165,7 @@ def test_a_full_queue_and_its_end_are_logged_once(
 
 
 def test_a_queue_that_is_often_full_is_logged_once(
-    lcm: FakeLcm,
-    sender: LcmThreadSender,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+    lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "gateway.outputs")
     monkeypatch.setattr(thread_sender, "MAX_QUEUED_MESSAGES", 1)

@@ -83,10 +83,7 @@ def test_a_client_whose_router_does_not_run_fails() -> None:
 def test_a_client_is_connected_to_a_router() -> None:
     endpoint = free_endpoint()
     with session("router", listen=endpoint):
-        assert found(zenoh_keys("client", connect=endpoint)) == (
-            link_passing("a router"),
-            no_gateway("lab"),
-        )
+        assert found(zenoh_keys("client", connect=endpoint)) == (link_passing("a router"), no_gateway("lab"))
 
 
 def test_routers_and_peers_are_counted(gateway: str) -> None:

@@ -232,9 +232,7 @@ def test_sources_are_alive_from_announcement_to_close(lab: Lab) -> None:
         return lab.tokens("mocap/*/alive")
 
     watching = lab.somebody.liveliness().declare_subscriber(
-        "mocap/*/alive",
-        lambda sample: seen.append((str(sample.key_expr), str(sample.kind))),
-        history=True,
+        "mocap/*/alive", lambda sample: seen.append((str(sample.key_expr), str(sample.kind))), history=True
     )
     wait_until(lambda: alive() == ["mocap/lab/alive"])
     lab.output.announce("hall-2")
@@ -405,11 +403,7 @@ def test_what_zenoh_refuses_inline_is_a_config_error_with_its_reason(
 
 @pytest.mark.parametrize(
     ("content", "reason"),
-    [
-        ("{ mod: 'client' }", "unknown field `mod`"),
-        ("{ mode: ", "expected"),
-        (None, "No such file"),
-    ],
+    [("{ mod: 'client' }", "unknown field `mod`"), ("{ mode: ", "expected"), (None, "No such file")],
 )
 def test_what_zenoh_refuses_in_a_file_is_a_config_error_with_its_reason(
     tmp_path: Path, content: str | None, reason: str
