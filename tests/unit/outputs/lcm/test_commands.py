@@ -25,18 +25,15 @@ async def test_a_command_gets_the_answer_of_the_service_as_json(lab: Lab) -> Non
     assert lab.output.query_results == {"lab": {"ok": 1}}
 
 
+ON_ZENOH = "ask on Zenoh (a take: rtc3d-gateway take fetch, without --lcm)"
+
+
 @pytest.mark.parametrize(
     ("command", "text"),
     [
-        *(
-            ((each,), "accepted on LCM: recording, take")
-            for each in ("parameters", "", "c3d", "take/", "x" * 3000)
-        ),
+        *(((name,), "accepted on LCM: recording, take") for name in ("c3d", "", "take/", "x" * 3000)),
         *((("take", option), "accepted: NAME=VALUE") for option in ("start", "", "ä")),
-        (
-            ("take", "read=walk-1", "offset=0"),
-            "ask on Zenoh (a take: rtc3d-gateway take fetch, without --lcm)",
-        ),
+        (("take", "read=walk-1", "offset=0"), ON_ZENOH),
     ],
 )
 async def test_what_is_no_command_on_lcm_is_refused(lab: Lab, command: tuple[str, ...], text: str) -> None:
