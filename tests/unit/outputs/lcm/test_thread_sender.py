@@ -130,33 +130,21 @@ def test_the_queue_is_limited_in_bytes(
     assert refusal(sender, bytes(101)).cause == "queue full"
 
 
-def test_a_full_queue_is_a_problem_until_the_peer_reads_again(
-    lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(thread_sender, "MAX_QUEUED_MESSAGES", 1)
-    block(lcm, sender)
-    assert sender.problem == ""
-    refusal(sender)
-    assert sender.problem == FULL
-    lcm.reads.set()
-    wait_until(lambda: not sender._queue)
-    send(sender, b"second")
-    assert sender.problem == ""
-    wait_until(lambda: messages(lcm) == [b"first", b"second"])
-
-
 @pytest.mark.usefixtures("no_hold")
-def test_a_full_queue_and_its_end_are_logged_once(
+def test_a_full_queue_is_a_problem_until_the_peer_reads_again_and_logged_once(
     lcm: FakeLcm, sender: LcmThreadSender, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "gateway.outputs")
     monkeypatch.setattr(thread_sender, "MAX_QUEUED_MESSAGES", 1)
     block(lcm, sender)
+    assert sender.problem == ""
     for _ in range(3):
         refusal(sender)
+    assert sender.problem == FULL
     lcm.reads.set()
     wait_until(lambda: not sender._queue)
     send(sender, b"second")
+    assert sender.problem == ""
     wait_until(lambda: not sender._queue)
     send(sender, b"third")
     assert [record.levelno for record in caplog.records] == [logging.WARNING, logging.INFO]
