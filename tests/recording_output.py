@@ -21,7 +21,7 @@ from gateway.takes.event_log import Event
 from gateway.takes.reader import TakeReader
 from gateway.takes.recording import MAX_QUEUED_BYTES, Recorder
 from gateway.worker_thread import WorkerThread, make_call
-from tests.settable_clock import Clock
+from tests.settable_clock import Clock as Clock
 from tests.waiting import wait_until_async
 
 _Result = TypeVar("_Result")
