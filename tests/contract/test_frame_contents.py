@@ -9,13 +9,7 @@ import pytest
 from gateway.publish.fan_out import FanOut
 from gateway.rtc3d.components import ITEM_DTYPES, ComponentType
 from gateway.rtc3d.parameters import Parameters
-from tests.contract.frame_lab import (
-    Lab,
-    converts,
-    every_rig,
-    lab,
-    returns,
-)
+from tests.contract.frame_lab import Lab, converts, every_rig, lab, returns
 from tests.contract.frame_rigs import (
     ALL,
     HALL,
