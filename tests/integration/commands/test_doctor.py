@@ -77,7 +77,7 @@ async def cut_while_streaming(client: Client) -> None:
 
 def of(*components: ComponentType, rate: Rate | None = None) -> tuple[StreamSettings, ...]:
     """Return a stream, of all components by default."""
-    given = {"components": components or None, "rate": rate}
+    given: dict[str, Any] = {"components": components or None, "rate": rate}
     return (StreamSettings(**{key: value for key, value in given.items() if value}),)
 
 

@@ -160,7 +160,7 @@ async def test_a_gateway_without_its_server_is_status_4() -> None:
     ids=["the server is silent", "the gateway is silent", "the server refuses"],
 )
 async def test_fresh_parameters_that_do_not_come(
-    settings: dict[str, float], refuses: bool, timeout_s: float, status: int, text: str
+    settings: dict[str, Any], refuses: bool, timeout_s: float, status: int, text: str
 ) -> None:
     async with lab(**settings) as at:
         if refuses:
