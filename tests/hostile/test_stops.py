@@ -272,17 +272,18 @@ async def test_with_a_zenoh_peer_that_has_stopped(site: Site, is_router: bool) -
     )
     code = OPEN + ("" if is_router else SUBSCRIBER_AND_ASKER) + "print(flush=True)\nsys.stdin.read()"
     async with ScriptedServer(flood) as server, contextlib.AsyncExitStack() as stack:
-        if is_router:
+
+        async def start() -> Process:
             process = await stack.enter_async_context(python("-c", code, json.dumps(keys)))
             await printed(process)
-            site.configure([server.port], zenoh={"config": zenoh_keys("client", connect=site.endpoint)})
-        else:
-            site.configure([server.port])
+            return process
+
+        client = {"zenoh": {"config": zenoh_keys("client", connect=site.endpoint)}}
+        site.configure([server.port], **(client if is_router else {}))
+        router = await start() if is_router else None
         async with site.running():
             await site.until_logged("→ streaming")
-            if not is_router:
-                process = await stack.enter_async_context(python("-c", code, json.dumps(keys)))
-                await printed(process)
+            process = router or await start()
             process.send_signal(signal.SIGSTOP)
             await asyncio.sleep(1)
             await site.stop()
