@@ -16,13 +16,7 @@ from gateway.stream.session import Session
 from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from gateway.stream.stream_control import StreamControl
-from tests.unit.stream.scripted_server import (
-    ScriptedServer,
-    obliging,
-    read_parameters,
-    refusing,
-    silent_to,
-)
+from tests.unit.stream.scripted_server import ScriptedServer, obliging, read_parameters, refusing, silent_to
 from tests.virtual_time import settle
 
 START, STOP = "StreamFrames AllFrames", "StreamFrames Stop"
@@ -187,9 +181,7 @@ async def test_a_lag_of_exactly_the_maximum_is_in_time(caplog: pytest.LogCapture
     ]
 
 
-async def test_a_request_for_the_default_rate_is_logged_as_such(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+async def test_a_request_for_the_default_rate_is_logged_as_such(caplog: pytest.LogCaptureFixture) -> None:
     lab = Lab(adapt_rate=True)
     await lab.start()
     lab.server.answer = refusing("StreamFrames")

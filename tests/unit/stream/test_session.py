@@ -12,12 +12,7 @@ from gateway.rtc3d.commands import SendParameters, StopStreaming, StreamFrames, 
 from gateway.stream.state import StreamState
 from tests.losses import amounts
 from tests.servers import markers_frame, ok, packet
-from tests.unit.stream.scripted_server import (
-    obliging,
-    refusing,
-    refusing_without_name,
-    silent_to,
-)
+from tests.unit.stream.scripted_server import obliging, refusing, refusing_without_name, silent_to
 from tests.unit.stream.session_lab import Lab, lab, now_s
 from tests.vectors import STOP_RECORDING
 from tests.virtual_time import settle

@@ -43,13 +43,7 @@ class Lab:
         )
         settings = StreamSettings.model_validate({"components": ["3d"]} | stream)
         self.session = Session(
-            source,
-            settings,
-            self.status,
-            lambda *_: None,
-            IgnoredFiles(),
-            self.server.connect,
-            read_clocks,
+            source, settings, self.status, lambda *_: None, IgnoredFiles(), self.server.connect, read_clocks
         )
         self.control = StreamControl(source, settings, self.status, self.session, self._read_parameters)
 

@@ -202,9 +202,7 @@ async def test_recovery_is_logged_once_with_its_duration_when_it_has_held(
     assert recovered == "lab (3d): streaming again, after 5.0 s and 3 failures"
 
 
-async def test_a_server_that_breaks_again_and_again_is_logged_once(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+async def test_a_server_that_breaks_again_and_again_is_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.set_level(logging.INFO, "gateway.stream")
     lab = Lab()
     async with running(lab):
