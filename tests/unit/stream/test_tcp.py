@@ -14,7 +14,7 @@ from gateway.config.settings import SourceSettings
 from gateway.errors import ConnectError
 from gateway.stream.tcp import open_connection, set_socket_options
 from tests.networks import free_port
-from tests.unit.stream.resolver import Resolver
+from tests.unit.stream.conftest import Resolver
 
 
 @contextmanager
