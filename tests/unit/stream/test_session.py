@@ -3,6 +3,7 @@
 import asyncio
 import socket
 import struct
+from typing import Any
 from unittest.mock import Mock
 
 import pytest
@@ -265,22 +266,22 @@ async def test_the_end_is_raised_by_every_waiting_call_at_once(
     silent: Lab, *, by_gateway: bool, reason: str
 ) -> None:
     silent.server.closes_at_bye = False
-    waiting = [silent.session.ask(Version()), silent.session.monitor(silent.check_silence)]
-    tasks = [asyncio.create_task(each) for each in waiting]  # type: ignore[var-annotated]
+    tasks: list[asyncio.Task[Any]] = [
+        asyncio.create_task(silent.session.ask(Version())),
+        asyncio.create_task(silent.session.monitor(silent.check_silence)),
+    ]
     await settle()
     began_s = now_s()
     if by_gateway:
-        closing = asyncio.create_task(silent.session.close())
+        tasks.append(asyncio.create_task(silent.session.close()))
     else:
-        closing = None
         silent.connection.end()
     await settle()
-    for task in tasks:
+    for task in tasks[:2]:
         assert task.done()
         assert reason in str(task.exception())
     assert (now_s(), silent.session.is_open) == (began_s, False)
-    if closing is not None:
-        await closing
+    await asyncio.gather(*tasks, return_exceptions=True)
 
 
 async def test_the_first_error_wins(lab: Lab) -> None:
