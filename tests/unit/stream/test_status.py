@@ -1,13 +1,23 @@
+"""The status of a stream: its state, errors, limitations and counts, and the texts about them."""
+
 import logging
+from collections.abc import Sequence
 from types import SimpleNamespace
 
 import pytest
+import rtc3d
 
+from gateway.config.settings import SourceSettings
 from gateway.errors import ClosedError
+from gateway.messages.coordinate_frame import CoordinateFrame
+from gateway.messages.decode import decode
 from gateway.messages.host_time import now_utime
+from gateway.monitoring.status_line import source_line
+from gateway.publish.status_messages import status_message
 from gateway.rtc3d.protocol_state import ProtocolState
-from gateway.stream.state import StreamState
+from gateway.stream.state import Phase, StreamState, stream_state
 from gateway.stream.status import MAX_ERROR_LENGTH, MAX_LIMITATIONS, FrameRate, StreamStatus
+from gateway.stream.status_text import message_texts, source_text
 from tests.losses import amounts
 
 SERVER = "192.0.2.20:3020"
@@ -173,3 +183,100 @@ def test_repeated_events_are_added_up() -> None:
         status.reconnecting()
     assert (status.tries, status.session, status.restarts, status.reconnects) == (2, 2, 2, 2)
     assert (status.bytes_in, status.frames_in, status.last_frame_utime) == (700, 7, 4_000)
+
+
+# --- the rule for the state
+
+
+WITHOUT_CONNECTION = {
+    Phase.WAITING: StreamState.WAITING,
+    Phase.CONNECTING: StreamState.CONNECTING,
+    Phase.SILENT: StreamState.STALLED,
+}
+
+
+@pytest.mark.parametrize("protocol_state", ProtocolState)
+@pytest.mark.parametrize("phase", WITHOUT_CONNECTION)
+def test_without_a_usable_connection_the_phase_decides(phase: Phase, protocol_state: ProtocolState) -> None:
+    assert stream_state(phase, protocol_state) is WITHOUT_CONNECTION[phase]
+
+
+@pytest.mark.parametrize("phase", [Phase.HANDSHAKING, Phase.READY])
+def test_what_the_server_sends_decides_during_the_handshake_and_after_it(phase: Phase) -> None:
+    assert stream_state(phase, ProtocolState.STREAMING) is StreamState.STREAMING
+    assert stream_state(phase, ProtocolState.NO_MEASUREMENT) is StreamState.NO_MEASUREMENT
+
+
+@pytest.mark.parametrize(
+    "protocol_state",
+    [ProtocolState.IDLE, ProtocolState.REQUESTED, ProtocolState.CLOSING, ProtocolState.CLOSED],
+)
+def test_a_connection_on_which_nothing_arrives_is_idle_after_its_handshake(
+    protocol_state: ProtocolState,
+) -> None:
+    assert stream_state(Phase.HANDSHAKING, protocol_state) is StreamState.HANDSHAKING
+    assert stream_state(Phase.READY, protocol_state) is StreamState.IDLE
+
+
+def test_every_state_can_be_reached() -> None:
+    assert {stream_state(phase, state) for phase in Phase for state in ProtocolState} == set(StreamState)
+
+
+# --- the texts about a status_t
+
+
+LAB = SourceSettings(name="lab", host="192.0.2.9")
+Streams = Sequence[tuple[StreamStatus, float]]
+
+
+def message_of(streams: Streams) -> rtc3d.status_t:
+    server = f"{LAB.host}:{LAB.port}"
+    message = status_message(
+        source="lab",
+        server=server,
+        sequence=0,
+        streams=streams,
+        outputs=[],
+        stall_timeout_s=2.0,
+        frame=CoordinateFrame("lab"),
+    )
+    decoded: rtc3d.status_t = decode(message.encode())
+    return decoded
+
+
+@pytest.mark.parametrize("state", list(StreamState))
+@pytest.mark.parametrize("tries", [0, 1, 12])
+def test_a_status_message_has_the_words_of_the_status_line(state: StreamState, tries: int) -> None:
+    streams = [(StreamStatus("3d 6d", state=state, tries=tries), 199.96)]
+    assert source_line(LAB, streams) == f"lab: {source_text(message_texts(message_of(streams)))}"
+
+
+def test_different_streams_are_listed_by_components() -> None:
+    streams = [
+        (StreamStatus("3d", state=StreamState.STREAMING), 200.0),
+        (StreamStatus("analog", state=StreamState.STALLED), 0.0),
+    ]
+    text = source_text(message_texts(message_of(streams)))
+    assert text == "3d streaming 200.0 Hz, analog no frames from 192.0.2.9:3020"
+    assert source_line(LAB, streams) == f"lab: {text}"
+
+
+def test_frames_that_are_all_rejected_are_no_streaming() -> None:
+    rejected = StreamStatus("3d", state=StreamState.STREAMING)
+    rejected.frame_rejected("component 7 is too short", 1)
+    [(components, text)] = message_texts(message_of([(rejected, 200.0)]))
+    assert (components, text) == ("3d", "frames come, and all are rejected: component 7 is too short")
+
+
+def test_texts_of_a_hostile_message_are_escaped_and_cut() -> None:
+    message = message_of([(StreamStatus("3d"), 0.0)])
+    message.streams[0].state = "\x1b[2J" + "x" * 100_000
+    message.streams[0].components = "3d\n6d"
+    [(components, text)] = message_texts(message)
+    assert components.isprintable()
+    assert text.isprintable()
+    assert len(text) < 2000
+
+
+def test_a_status_without_streams_has_no_text() -> None:
+    assert source_text(message_texts(message_of([]))) == ""
