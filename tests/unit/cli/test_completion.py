@@ -103,12 +103,7 @@ def test_a_bad_take_offers_nothing(content: bytes, tmp_path: Path, monkeypatch: 
 
 
 @pytest.mark.parametrize(
-    "line",
-    [
-        "rtc3d-gateway --version take sto",
-        "rtc3d-gateway -h take sto",
-        "rtc3d-gateway take -h sto",
-    ],
+    "line", ["rtc3d-gateway --version take sto", "rtc3d-gateway -h take sto", "rtc3d-gateway take -h sto"]
 )
 def test_options_that_print_something_print_nothing(line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     assert offered(line, monkeypatch) == ["stop"]

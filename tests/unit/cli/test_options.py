@@ -192,9 +192,7 @@ def test_contradicting_log_levels_are_a_mistake(command: str, arguments: tuple[s
     assert "give only one of --log-level, --verbose and --quiet" in result.output
 
 
-def test_environment_variables_alone_are_a_configuration(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_environment_variables_alone_are_a_configuration(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(SOURCES, "[{name: lab, host: lab-pc}]")
     assert configuration_from_options(None, None).settings.sources[0].host == "lab-pc"
 

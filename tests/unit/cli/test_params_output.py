@@ -83,13 +83,7 @@ def test_only_requested_sections_are_written() -> None:
 def test_a_request_for_all_sections_gets_those_that_exist() -> None:
     text, problems = written("table", reply("lab", (), EVERYTHING))
     titles = [line.split(",")[0].rstrip() for line in text.splitlines() if line.startswith("lab:")]
-    assert titles == [
-        "lab: general",
-        "lab: 3D",
-        "lab: 6D",
-        "lab: analog",
-        "lab: parameters are 0.0 s old",
-    ]
+    assert titles == ["lab: general", "lab: 3D", "lab: 6D", "lab: analog", "lab: parameters are 0.0 s old"]
     assert problems == []
 
 

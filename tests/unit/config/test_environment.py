@@ -150,11 +150,7 @@ MISTAKES: list[tuple[str, str, str]] = [
         "c",
         "SOURCES__2__NAME: sources: found the index '2'; expected a number from 0 to 1",
     ),
-    (
-        "SOURCES__HOST",
-        "c",
-        "SOURCES__HOST: sources: found the index 'host'; expected a number from 0 to 1",
-    ),
+    ("SOURCES__HOST", "c", "SOURCES__HOST: sources: found the index 'host'; expected a number from 0 to 1"),
     (
         "SOURCES__0__STREAMS__0__RATE__DIVISOR",
         "2",

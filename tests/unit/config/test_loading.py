@@ -123,19 +123,13 @@ def test_demo_yaml_stays_on_this_machine() -> None:
 
 MISTAKES: list[tuple[str, str]] = [
     # One line of YAML after SERVER, and the error's one line.
-    (
-        "    port: abc",
-        "lab.yaml:4:11: sources[0].port: found 'abc'; expected a whole number from 1 to 65535",
-    ),
+    ("    port: abc", "lab.yaml:4:11: sources[0].port: found 'abc'; expected a whole number from 1 to 65535"),
     (
         "    prot: 3030",
         "lab.yaml:4:5: sources[0].prot: unknown key (did you mean 'port'?); known keys: "
         + ", ".join(SourceSettings.model_fields),
     ),
-    (
-        "sorces: 1",
-        f"lab.yaml:4:1: sorces: unknown key (did you mean 'sources'?); known keys: {SECTIONS}",
-    ),
+    ("sorces: 1", f"lab.yaml:4:1: sorces: unknown key (did you mean 'sources'?); known keys: {SECTIONS}"),
     ("on: 1", f"lab.yaml:4:1: on: unknown key; known keys: {SECTIONS}"),
     ("a b: 1", f"lab.yaml:4:1: 'a b': unknown key; known keys: {SECTIONS}"),
     (
@@ -169,10 +163,7 @@ MISTAKES: list[tuple[str, str]] = [
         "lab.yaml:4:12: sources[1].name: found 'LAB', which has the same LCM channels as 'lab' (sources[0]); "
         "expected a name that differs in letters or digits, ignoring case",
     ),
-    (
-        "    name: lab-2",
-        "lab.yaml:4:5: sources[0].name: the same key as in line 2",
-    ),
+    ("    name: lab-2", "lab.yaml:4:5: sources[0].name: the same key as in line 2"),
     ("? [a]\n: 1", "lab.yaml:4:3: found a list or mapping as a key"),
     ("<<: {lcm: {}}", "lab.yaml:4:1: '<<': merge keys are not supported; use an alias as the value of a key"),
     ("lcm: !url memq", "lab.yaml:4:6: lcm: found the tag '!url'; expected a value without a tag"),

@@ -179,11 +179,7 @@ def test_an_output_that_is_not_enabled_has_one_line() -> None:
         report.add(finding)
     assert [
         each["check"] for each in json.loads(report.as_json())["findings"] if each["subject"] == "lcm"
-    ] == [
-        "route",
-        "requests",
-        "buffers",
-    ]
+    ] == ["route", "requests", "buffers"]
 
 
 def test_a_quiet_report_has_only_warnings_and_failures() -> None:

@@ -19,11 +19,7 @@ from gateway.stream.state import StreamState
 from gateway.stream.status import StreamStatus
 from tests.configurations import make_settings
 
-MARKERS, ANALOG, EVENT = (
-    (ComponentType.MARKERS,),
-    (ComponentType.ANALOG,),
-    (ComponentType.EVENT,),
-)
+MARKERS, ANALOG, EVENT = ((ComponentType.MARKERS,), (ComponentType.ANALOG,), (ComponentType.EVENT,))
 STALL_TIMEOUT_S = 3.0
 
 

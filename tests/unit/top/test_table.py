@@ -86,8 +86,7 @@ def test_wide_characters_keep_the_columns() -> None:
 
 
 @pytest.mark.parametrize(
-    ("value", "text"),
-    [(None, ""), (float("nan"), ""), (1e15, "1e+15"), (float("inf"), ""), (-2.25, "-2.2")],
+    ("value", "text"), [(None, ""), (float("nan"), ""), (1e15, "1e+15"), (float("inf"), ""), (-2.25, "-2.2")]
 )
 def test_odd_numbers_do_not_break_the_table(value: float | None, text: str) -> None:
     assert number_cell(value, 1).text == text

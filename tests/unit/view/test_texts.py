@@ -76,8 +76,7 @@ def test_percentiles() -> None:
 
 
 @pytest.mark.parametrize(
-    ("share", "text"),
-    [(0, "0 %"), (1, "100 %"), (0.9999, "99.9 %"), (0.00001, "0.1 %"), (0.5, "50.0 %")],
+    ("share", "text"), [(0, "0 %"), (1, "100 %"), (0.9999, "99.9 %"), (0.00001, "0.1 %"), (0.5, "50.0 %")]
 )
 def test_only_all_frames_are_100_percent(share: float, text: str) -> None:
     assert share_text(share) == text
