@@ -11,8 +11,7 @@ from gateway.rtc3d.components import ComponentType
 from gateway.view import panel as view_panel
 from gateway.view.panel import Panel
 from gateway.view.plots import MAX_PLOTS
-from tests.unit.view.live_lab import Lab
-from tests.unit.view.test_state_text import wait
+from tests.unit.view.live_lab import Lab, wait
 
 
 @pytest.fixture(scope="module")
@@ -25,11 +24,6 @@ def server() -> Iterator[viser.ViserServer]:
 @pytest.fixture
 def is_watched(server: viser.ViserServer, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(server, "get_clients", lambda: {1: None})
-
-
-@pytest.fixture
-def lab() -> Lab:
-    return Lab()
 
 
 @pytest.fixture
