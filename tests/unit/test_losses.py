@@ -46,14 +46,10 @@ def test_the_last_minute_forgets_what_is_older_and_the_total_does_not(
     losses.lost("skipped", "late", messages=2)
     clock.now_s += 30
     losses.lost("skipped", "later", messages=3)
-    [loss] = losses.report()
-    assert (loss.messages_last_minute, loss.frames_last_minute, loss.age_s) == (5, 2, 0.0)
-    clock.now_s += 30
-    [loss] = losses.report()
-    assert (loss.messages_last_minute, loss.frames_last_minute, loss.age_s) == (3, 1, 30.0)
-    clock.now_s += 30
-    [loss] = losses.report()
-    assert (loss.messages_last_minute, loss.frames_last_minute) == (0, 0)
+    for expected in ((5, 2, 0.0), (3, 1, 30.0), (0, 0, 60.0)):
+        [loss] = losses.report()
+        assert (loss.messages_last_minute, loss.frames_last_minute, loss.age_s) == expected
+        clock.now_s += 30
     assert (loss.messages, loss.frames, loss.text) == (5, 2, "later")
 
 
@@ -90,27 +86,18 @@ def test_loss_is_logged_when_it_begins_and_with_the_total_when_it_ends(
 def test_the_next_period_has_a_total_of_its_own(
     losses: Losses, clock: SettableClock, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """Also one that begins while nobody has checked for the end of the former one."""
     for number in (1, 2):
         for _ in range(number):
             losses.lost("no router", "start zenohd", frames=0)
         clock.now_s += 100
-        losses.check()
-    assert logged(caplog) == [
-        "WARNING lab: start zenohd",
-        "INFO lab: lost within 0.0 s: 1 message (no router); nothing lost for 5 s",
-        "WARNING lab: start zenohd",
-        "INFO lab: lost within 0.0 s: 2 messages (no router); nothing lost for 5 s",
-    ]
-    assert amounts(losses.report()) == {"no router": (3, 0)}
-
-
-def test_a_period_that_ended_while_nobody_checked_is_logged_before_the_next(
-    losses: Losses, clock: SettableClock, caplog: pytest.LogCaptureFixture
-) -> None:
-    losses.lost("no router", "start zenohd")
-    clock.now_s += 100
-    losses.lost("no router", "start zenohd")
-    assert [line.split()[0] for line in logged(caplog)] == ["WARNING", "INFO", "WARNING"]
+        if number == 1:
+            losses.check()
+    losses.lost("no router", "start zenohd", frames=0)
+    begin, end = "WARNING lab: start zenohd", "(no router); nothing lost for 5 s"
+    first, second = (f"INFO lab: lost within 0.0 s: {number} {end}" for number in ("1 message", "2 messages"))
+    assert logged(caplog) == [begin, first, begin, second, begin]
+    assert amounts(losses.report()) == {"no router": (4, 0)}
 
 
 def test_causes_that_alternate_are_logged_once_each(

@@ -22,14 +22,11 @@ def test_a_large_amount_is_made_up_for_within_a_second(clock: SettableClock) -> 
     assert bucket.left > 0
 
 
-def test_a_rate_below_one_allows_one_at_once(clock: SettableClock) -> None:
+def test_a_rate_below_one_allows_one_at_once_or_the_capacity(clock: SettableClock) -> None:
     bucket = TokenBucket(0.5, monotonic=clock)
     assert [bucket.try_take(), bucket.try_take()] == [True, False]
     clock.now_s += 2.1
     assert bucket.try_take()
-
-
-def test_a_capacity_is_allowed_at_once(clock: SettableClock) -> None:
     bucket = TokenBucket(10.0, 3, clock)
     assert [bucket.try_take() for _ in range(4)] == [True] * 3 + [False]
     clock.now_s += 3600
