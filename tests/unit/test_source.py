@@ -108,6 +108,20 @@ async def running(lab: Lab) -> AsyncIterator[None]:
         await asyncio.gather(task, return_exceptions=True)
 
 
+def messages_of(caplog: pytest.LogCaptureFixture, level: int) -> list[str]:
+    return [record.message for record in caplog.records if record.levelno == level]
+
+
+async def receive_files(lab: Lab, number: int) -> None:
+    """Run the source until it has received files of 600 bytes."""
+    async with running(lab):
+        await lab.connected()
+        for _ in range(number):
+            lab.server.connection.send(packet(5, c3d_file(b"", 600)))
+            await settle()
+        assert len(lab.server.connections) == 1
+
+
 async def test_status_and_clock_are_numbered_and_queries_get_the_newest_status(new_lab: NewLab) -> None:
     lab = new_lab()
     for sequence in (-1, 0, 1):
@@ -148,9 +162,8 @@ async def test_the_clock_with_the_least_uncertainty_is_published(new_lab: NewLab
     lab = new_lab(streams=TWO_STREAMS)
     for index, num_frames in ((better, 5000), (1 - better, 300)):
         for number in range(num_frames):
-            delay_us = number * 7919 % 1000
             time_us = 10_000 * number
-            lab.source.statuses[index].clock.observe(time_us, number, 10**15 + time_us + delay_us)
+            lab.source.statuses[index].clock.observe(time_us, number, 10**15 + time_us + number * 7919 % 1000)
     clocks = [status.clock for status in lab.source.statuses]
     assert clocks[better].uncertainty_us < clocks[1 - better].uncertainty_us
     lab.source.publish_status()
@@ -177,12 +190,10 @@ async def test_the_source_shows_streaming_while_any_stream_has_frames(new_lab: N
         first.send_frames(1)
         second.send(packet(3, b"\0\0\0\0"))  # a frame without components
         assert lab.output.streaming[-1] is True
-        second.end()
-        await settle()
-        assert lab.output.streaming[-1] is True
-        first.end()
-        await settle()
-        assert lab.output.streaming[-1] is False
+        for connection, is_streaming in ((second, True), (first, False)):
+            connection.end()
+            await settle()
+            assert lab.output.streaming[-1] is is_streaming
 
 
 async def test_a_source_that_replaces_another_continues_its_numbers(new_lab: NewLab) -> None:
@@ -220,11 +231,7 @@ async def test_the_files_that_a_new_one_displaces_are_logged_with_it(
 ) -> None:
     caplog.set_level(logging.INFO)
     lab = new_lab(spool=Spool(tmp_path, max_files=1, max_bytes=1000))
-    async with running(lab):
-        await lab.connected()
-        for _ in range(2):
-            lab.server.connection.send(packet(5, c3d_file(b"", 600)))
-            await settle()
+    await receive_files(lab, 2)
     path = lab.files[1][1].path
     [line] = [message for message in caplog.messages if path.name in message]
     assert line.endswith(f"kept as {path}; deleted the oldest (1)")
@@ -233,22 +240,15 @@ async def test_the_files_that_a_new_one_displaces_are_logged_with_it(
 async def test_a_file_is_announced_although_an_old_one_cannot_be_deleted(
     new_lab: NewLab, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level(logging.INFO)
-    lab = new_lab(spool=Spool(tmp_path, max_files=1, max_bytes=1000))
-
     def refuse(_path: Path, **_options: bool) -> None:
         raise PermissionError(1, "Operation not permitted")
 
-    async with running(lab):
-        await lab.connected()
-        with monkeypatch.context() as disk:
-            disk.setattr(Path, "unlink", refuse)
-            for _ in range(3):
-                lab.server.connection.send(packet(5, c3d_file(b"", 600)))
-                await settle()
-        assert len(lab.files) == 3
-    warnings = [record.message for record in caplog.records if record.levelno == logging.WARNING]
-    [warning] = [text for text in warnings if "C3D" in text]
+    lab = new_lab(spool=Spool(tmp_path, max_files=1, max_bytes=1000))
+    with monkeypatch.context() as disk:
+        disk.setattr(Path, "unlink", refuse)
+        await receive_files(lab, 3)
+    assert len(lab.files) == 3
+    [warning] = [text for text in messages_of(caplog, logging.WARNING) if "C3D" in text]
     assert warning.startswith(f"lab: old C3D files are not deleted: {tmp_path}/lab-")
     assert warning.endswith(" cannot be deleted: Operation not permitted")
 
@@ -259,13 +259,8 @@ async def test_files_that_cannot_be_stored_are_logged_once(
     caplog.set_level(logging.INFO)
     (tmp_path / "c3d").write_text("a file in place of the folder")
     lab = new_lab(spool=Spool(tmp_path / "c3d", max_files=10, max_bytes=1000))
-    async with running(lab):
-        await lab.connected()
-        for _ in range(6):
-            lab.server.connection.send(packet(5, c3d_file(b"", 600)))
-            await settle()
-    errors = [record.message for record in caplog.records if record.levelno == logging.ERROR]
-    assert errors == [
+    await receive_files(lab, 6)
+    assert messages_of(caplog, logging.ERROR) == [
         f"{STREAM}: a C3D file of 600 bytes from lab cannot be stored in {tmp_path / 'c3d'}: File exists; "
         "check spool.directory and the space on it"
     ]
@@ -284,7 +279,7 @@ async def test_a_file_that_breaks_off_with_the_connection_is_logged(
         lab.server.connection.end()
         await settle()
     assert lab.source.spool.newest("lab") is None
-    [error] = [record.message for record in caplog.records if record.levelno == logging.ERROR]
+    [error] = messages_of(caplog, logging.ERROR)
     assert error.startswith(f"{STREAM}: a C3D file of 600 bytes from lab broke off after 599 bytes: the conn")
 
 
@@ -308,11 +303,7 @@ async def test_a_defect_in_announcing_a_file_is_an_error_and_streams_continue(
 ) -> None:
     lab = new_lab()
     monkeypatch.setattr(lab, "files", None)  # what takes the description of a file raises AttributeError
-    async with running(lab):
-        await lab.connected()
-        lab.server.connection.send(packet(5, c3d_file(b"", 600)))
-        await settle()
-        assert len(lab.server.connections) == 1
+    await receive_files(lab, 1)
     [error] = [record for record in caplog.records if record.levelno == logging.ERROR]
     assert error.message.startswith("lab: defect in the gateway: AttributeError: ")
     assert error.exc_info is not None
@@ -327,10 +318,9 @@ async def test_recording_is_controlled_on_the_first_connection_that_works(new_la
     async with running(lab):
         await lab.connected(2)
         first, second = lab.server.connections
-        await lab.source.queries.answer(start)
-        assert (first.num_recording_packets, second.num_recording_packets) == (1, 0)
-        first.end()
-        await settle()
-        answer = await lab.source.queries.answer(start)
-        assert (first.num_recording_packets, second.num_recording_packets) == (1, 1)
+        for expected in ((1, 0), (1, 1)):
+            answer = await lab.source.queries.answer(start)
+            assert (first.num_recording_packets, second.num_recording_packets) == expected
+            first.end()
+            await settle()
         assert answer.payload == b'{"source":"lab","sent":"start"}'

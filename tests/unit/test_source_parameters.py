@@ -165,15 +165,13 @@ async def test_a_new_measurement_requests_the_parameters(new_lab: NewLab) -> Non
     lab = new_lab()
     async with running(lab):
         await lab.connected()
-        lab.server.connection.send_frames(1)
-        await settle()
-        assert lab.count(REQUEST) == 1
-        lab.server.connection.send(NO_DATA)
-        await settle()
-        assert lab.count(REQUEST) == 1
-        lab.server.connection.send_frames(2)
-        await settle()
-        assert lab.count(REQUEST) == 2
+        for sends_data, num_requests in ((True, 1), (False, 1), (True, 2)):
+            if sends_data:
+                lab.server.connection.send_frames(num_requests)
+            else:
+                lab.server.connection.send(NO_DATA)
+            await settle()
+            assert lab.count(REQUEST) == num_requests
 
 
 @pytest.mark.parametrize(("interval_s", "expected"), [(10.0, 11), (0.0, 11), (20.0, 6)])
@@ -188,15 +186,6 @@ async def test_a_server_that_plays_in_a_loop_is_not_asked_at_every_pass(
             lab.server.connection.send_frames(1)
             await asyncio.sleep(1)
         assert lab.count(REQUEST) == pytest.approx(expected, abs=1)
-
-
-async def test_tools_are_named_by_their_labels_in_the_parameters(new_lab: NewLab) -> None:
-    lab = new_lab(output=ToyOutput("toy", "Probe", has_tool_poses=True))
-    lab.server.answer = sending(tools("Probe"))
-    async with running(lab):
-        await lab.connected()
-        lab.server.connection.send(packet(3, tools_frame(IN_VIEW).body))
-        assert lab.output.tool_names() == ["Probe"]
 
 
 @pytest.mark.parametrize("answer", [refusing(REQUEST), silent_to(REQUEST), sending(packet(2, "what?"))])
@@ -247,7 +236,9 @@ async def test_parameters_are_published_before_the_frames_that_have_their_versio
             await settle()
 
 
-async def test_a_reload_continues_the_version(new_lab: NewLab) -> None:
+async def test_a_reload_continues_the_version_and_the_parameters_of_another_server_are_void(
+    new_lab: NewLab,
+) -> None:
     lab = new_lab()
     async with running(lab):
         await lab.connected()
@@ -259,19 +250,13 @@ async def test_a_reload_continues_the_version(new_lab: NewLab) -> None:
     async with running(after):
         await after.connected()
         assert published(after) == [(OTHER_XML[8:], 2, 2)]
-
-
-async def test_the_parameters_of_another_server_are_void_after_a_reload(new_lab: NewLab) -> None:
-    lab = new_lab()
-    async with running(lab):
-        await lab.connected()
-    lab.server.refuses = True
-    after = new_lab(lab.source, port=3021)
-    async with running(after):
+    after.server.refuses = True
+    other = new_lab(after.source, port=3021)
+    async with running(other):
         await settle()
-        assert published(after) == [(b"", 1, 2)]
+        assert published(other) == [(b"", 2, 3)]
         with pytest.raises(QueryError, match="has no connection"):
-            await after.source.queries.answer(Question("parameters", stale_ok=True))
+            await other.source.queries.answer(Question("parameters", stale_ok=True))
 
 
 async def test_every_message_carries_the_version_of_the_parameters(new_lab: NewLab) -> None:
@@ -282,26 +267,22 @@ async def test_every_message_carries_the_version_of_the_parameters(new_lab: NewL
         lab.server.connections[0].send_frames(1)
         lab.source.publish_status()
         await settle()
-        newest = [lab.messages(name)[-1] for name in ("3d", "status", "clock")]
-        assert [message.parameters_version for message in newest] == [version] * 3
-
-    async def change_parameters(xml: bytes) -> None:
-        lab.server.answer = lambda command: (
-            packet(2, xml.decode()) if command.startswith("SendParameters") else obliging(command)
-        )
-        await lab.source.queries.answer(Question("parameters", fresh=True))
-        await settle()
+        newest = [lab.messages(name)[-1].parameters_version for name in ("3d", "status", "clock")]
+        assert newest == [version] * 3
 
     assert [status.parameters_version for status in lab.source.statuses] == [0, 0]
     async with running(lab):
         await lab.connected(2)
         await check_version(1)
+        more_frames = parameters_xml("cm", frames_sent=2)
         for xml, version in (
             (parameters_xml("cm"), 2),
-            (parameters_xml("cm", frames_sent=2), 2),
+            (more_frames, 2),
             (parameters_xml("m"), 3),
             (parameters_xml("cm"), 4),
         ):
-            await change_parameters(xml)
+            lab.server.answer = sending(packet(2, xml.decode()))
+            await lab.source.queries.answer(Question("parameters", fresh=True))
+            await settle()
             await check_version(version)
             assert lab.parameters[-1][1].version == version
