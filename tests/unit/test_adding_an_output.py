@@ -4,7 +4,7 @@ import asyncio
 import dataclasses
 import io
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, closing
 from pathlib import Path
 from typing import Any
@@ -42,8 +42,12 @@ OFF = {"zenoh": {"enabled": False}, "lcm": {"enabled": False}, "metrics": {"enab
 
 
 @pytest.fixture(autouse=True)
-def _registered(monkeypatch: pytest.MonkeyPatch) -> None:
+def _registered(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    before = dict(OUTPUTS)
     monkeypatch.setitem(OUTPUTS, EXAMPLE.name, EXAMPLE)
+    yield
+    OUTPUTS.clear()  # monkeypatch would put back at the end what a test has removed
+    OUTPUTS.update(before)
 
 
 def scene() -> SyntheticScene:
