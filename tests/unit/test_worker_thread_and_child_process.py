@@ -1,4 +1,4 @@
-"""WorkerThread: a thread that the end of the program does not wait for."""
+"""Threads that the end of the program does not wait for, and processes that run a module of this package."""
 
 import asyncio
 import gc
@@ -6,9 +6,11 @@ import subprocess
 import sys
 import threading
 from functools import partial
+from pathlib import Path
 
 import pytest
 
+from gateway.child_process import module_environment
 from gateway.worker_thread import WorkerThread, result_of
 from tests.waiting import wait_until_async
 
@@ -86,3 +88,10 @@ def test_the_program_ends_while_a_call_blocks() -> None:
         "WorkerThread('test').submit(threading.Event().wait)"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=30)
+
+
+def test_modules_in_the_working_directory_are_not_used(tmp_path: Path) -> None:
+    for name in ("gateway.py", "queue.py"):
+        (tmp_path / name).write_text("raise ImportError('this is a program of the user')")
+    command = [sys.executable, "-m", "gateway", "--version"]
+    subprocess.run(command, cwd=tmp_path, env=module_environment(), check=True)
