@@ -28,7 +28,7 @@ from tests.waiting import wait_until_async
 
 __all__ = ["lab"]
 
-NUM_LABELS: Final = 5000
+NUM_LABELS: Final = 2000
 
 WEIRD_LABELS: Final = (
     *("", " ", "/", "//", "a/b", "..", "*", "$*", "#", "?", "@", "%2F", "{}", "~", "-", "0", "7th", "tf"),

@@ -139,7 +139,7 @@ def records() -> Iterator[list[logging.LogRecord]]:
     """Collect the records that a handler with the filter receives."""
     records: list[logging.LogRecord] = []
     handler = logging.Handler()
-    handler.emit = records.append  # type: ignore[method-assign] # shorter than a class
+    handler.emit = records.append  # type: ignore[assignment, method-assign] # shorter than a class
     handler.addFilter(ContextFilter())
     LOGGER.addHandler(handler)
     yield records

@@ -50,6 +50,7 @@ def test_the_last_minute_forgets_what_is_older_and_the_total_does_not(
         [loss] = losses.report()
         assert (loss.messages_last_minute, loss.frames_last_minute, loss.age_s) == expected
         clock.now_s += 30
+    [loss] = losses.report()
     assert (loss.messages, loss.frames, loss.text) == (5, 2, "later")
 
 

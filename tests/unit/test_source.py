@@ -323,4 +323,4 @@ async def test_recording_is_controlled_on_the_first_connection_that_works(new_la
             assert (first.num_recording_packets, second.num_recording_packets) == expected
             first.end()
             await settle()
-        assert answer.payload == b'{"source":"lab","sent":"start"}'
+            assert answer.payload == b'{"source":"lab","sent":"start"}'

@@ -89,7 +89,12 @@ def test_without_a_terminal_there_is_one_line_for_each_source() -> None:
 def test_json_has_the_fields_of_the_reference() -> None:
     found = found_of(status())
     found.add_silent(["hall"])
-    stream = {"components": ["3d", "6d"], "text": "streaming 200.0 Hz", "state": "streaming", "problem": ""}
+    stream: dict[str, Any] = {
+        "components": ["3d", "6d"],
+        "text": "streaming 200.0 Hz",
+        "state": "streaming",
+        "problem": "",
+    }
     stream |= {"rate_hz": 200.0, "tries": 0}
     silent = {"source": "hall", "gateway": None, "problem": "its gateway does not answer", "server": None}
     lab = {"source": "lab", "gateway": None, "problem": "", "server": "192.0.2.20:3020", "host": "mocap-pc"}

@@ -160,18 +160,16 @@ async def test_loss_in_the_last_minute_degrades_the_gateway_which_is_still_200()
     skipped, unsent = body["losses"]
     assert skipped.pop("age_s") >= 0
     assert skipped.pop("text").startswith("frames arrive late and are skipped")
-    expected = {"source": "lab", "stream": "3d", "output": None, "cause": "skipped while behind"}
+    expected: dict[str, Any] = {
+        "source": "lab",
+        "stream": "3d",
+        "output": None,
+        "cause": "skipped while behind",
+    }
     expected |= {"messages": 872, "frames": 436, "messages_last_minute": 872, "frames_last_minute": 436}
     assert skipped == expected
-    expected = {
-        "source": "lab",
-        "stream": None,
-        "output": "memory",
-        "cause": "not open",
-        "messages": 1,
-        "frames": 0,
-    }
-    assert unsent.items() >= expected.items()
+    expected = {"source": "lab", "stream": None, "output": "memory", "cause": "not open"}
+    assert unsent.items() >= (expected | {"messages": 1, "frames": 0}).items()
 
 
 async def test_older_loss_is_in_the_totals_but_does_not_degrade() -> None:

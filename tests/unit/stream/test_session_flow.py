@@ -2,6 +2,7 @@
 
 import asyncio
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 
@@ -40,7 +41,7 @@ async def test_a_few_frames_are_published_at_once() -> None:
 
 @pytest.mark.parametrize(("settings", "takes_s"), [({}, 1.0), ({"backlog_speed": 10.0}, 0.2)])
 async def test_a_backlog_is_published_at_its_speed_while_nothing_is_read(
-    settings: dict[str, float], takes_s: float
+    settings: dict[str, Any], takes_s: float
 ) -> None:
     began_s = now_s()
     lab = await backlog(lab=Lab(**settings))
