@@ -22,13 +22,7 @@ from gateway.outputs.lcm.subscriber import LcmSubscriber
 from gateway.takes.event_log import EventLogReader
 from gateway.takes.reader import TakeReader
 from tests.gateway_process import program, simulator
-from tests.integration.takes.record_process import (
-    by_channel,
-    events,
-    num_recorded,
-    recording,
-    size,
-)
+from tests.integration.takes.record_process import by_channel, events, num_recorded, recording, size
 from tests.networks import free_endpoint, lcm_url, wait_for_zenoh, zenoh_keys
 from tests.waiting import wait_until
 

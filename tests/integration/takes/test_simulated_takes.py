@@ -139,10 +139,7 @@ async def test_a_client_follows_the_order_of_the_specification(take: Path, byte_
             timestamp_us = 7 * SECOND_US + 10_000 * number
             y = float(number)
             assert components[0] == WireComponent(
-                MARKERS,
-                number,
-                timestamp_us,
-                [(0, y, 0.5, float32(0.1)), (1, y, 0.5, float32(0.1))],
+                MARKERS, number, timestamp_us, [(0, y, 0.5, float32(0.1)), (1, y, 0.5, float32(0.1))]
             )
             assert components[1] == WireComponent(
                 ANALOG, 10 * number, timestamp_us, [(float32(10 * number / 7),)]
@@ -193,8 +190,7 @@ async def test_a_gateway_follows_parameters_that_change(tmp_path: Path) -> None:
     after = [markers(3, number, version=2) for number in range(100, 300)]
     renamed = LABELS.replace(b"head", b"hand")
     path = write_take(
-        tmp_path / "lab.lcmlog",
-        [description(), parameters(LABELS), *before, parameters(renamed, 2), *after],
+        tmp_path / "lab.lcmlog", [description(), parameters(LABELS), *before, parameters(renamed, 2), *after]
     )
     async with (
         Simulator(TakeScene(path), once=True) as simulator,

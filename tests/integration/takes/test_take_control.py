@@ -75,11 +75,7 @@ async def lab(
     async with (
         ScriptedServer(server.script) as listening,
         run_gateway(
-            listening.port,
-            listen=endpoint,
-            lcm_url=url,
-            takes=settings,
-            remote_control=remote_control,
+            listening.port, listen=endpoint, lcm_url=url, takes=settings, remote_control=remote_control
         ) as gateway,
     ):
         await wait_until_cached(gateway)

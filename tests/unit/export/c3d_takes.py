@@ -5,11 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from gateway.rtc3d.parameters import (
-    Marker,
-    Parameters,
-    Parameters3D,
-)
+from gateway.rtc3d.parameters import Marker, Parameters, Parameters3D
 from gateway.simulator.synthetic import SyntheticScene
 from tests.takes import Message, parameters
 

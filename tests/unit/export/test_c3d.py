@@ -14,12 +14,7 @@ from gateway.errors import TakeError
 from gateway.export.formats import export_take
 from gateway.export.job import ExportJob
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import (
-    EventDefinition,
-    EventParameter,
-    ExpectedValue,
-    ParametersEvents,
-)
+from gateway.rtc3d.parameters import EventDefinition, EventParameter, ExpectedValue, ParametersEvents
 from gateway.simulator.c3d_scene import C3dScene
 from gateway.simulator.synthetic import SyntheticScene
 from tests.recorded_scenes import record_scene, scene_messages

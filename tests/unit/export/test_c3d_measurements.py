@@ -7,10 +7,7 @@ import numpy as np
 import pytest
 
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import (
-    Marker,
-    Parameters3D,
-)
+from gateway.rtc3d.parameters import Marker, Parameters3D
 from gateway.simulator.synthetic import SyntheticScene
 from tests.recorded_scenes import scene_messages
 from tests.takes import Message, description, frame, parameters

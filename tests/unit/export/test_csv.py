@@ -54,12 +54,7 @@ def test_every_value_of_every_component_is_exported_exactly(tmp_path: Path) -> N
         "walk-force.csv",
     ]
     assert job.notes == []
-    for component in (
-        ComponentType.MARKERS,
-        ComponentType.TOOLS,
-        ComponentType.ANALOG,
-        ComponentType.FORCE,
-    ):
+    for component in (ComponentType.MARKERS, ComponentType.TOOLS, ComponentType.ANALOG, ComponentType.FORCE):
         head, rows = read_csv(tmp_path / f"walk-{component.key}.csv")
         assert head[:7] == HEAD
         recorded = SCENE.items(component, np.arange(len(rows)))
@@ -117,10 +112,7 @@ def test_missing_values_are_empty_and_extreme_ones_exact(tmp_path: Path) -> None
 
 def test_events_have_one_row_each(tmp_path: Path) -> None:
     definition = EventDefinition("0x10", "Button, red", parameters=(EventParameter("1", "string", "Side"),))
-    events = [
-        (16, 5_000_000, int.from_bytes(b"LEFT", "big"), -1, -1),
-        (-3, -1, 1, 2, 3),
-    ]
+    events = [(16, 5_000_000, int.from_bytes(b"LEFT", "big"), -1, -1), (-3, -1, 1, 2, 3)]
     messages = [
         parameters(Parameters(events=ParametersEvents((definition,)))),
         frame(ComponentType.EVENT, events, 3),

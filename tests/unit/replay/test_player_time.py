@@ -64,11 +64,7 @@ class Replay:
     def prepare(self, selection: Selection | None = None, **options: Any) -> Player:
         """Make the player."""
         self.player = Player(
-            TakeReader(self.path),
-            selection or Selection(),
-            self,
-            on_jump=self.jumps.append,
-            **options,
+            TakeReader(self.path), selection or Selection(), self, on_jump=self.jumps.append, **options
         )
         self.player.clock = self.clock
         return self.player

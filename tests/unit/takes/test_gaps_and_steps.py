@@ -24,10 +24,7 @@ def gaps_of(*numbers: int, utimes: list[int] | None = None, pieces: int = 1) -> 
 
 def counts(found: SequenceGaps) -> tuple[int, int, int, int, int, int]:
     """Return missing, gaps, late, repeated, restarts and implausible."""
-    return (
-        *(found.missing, found.num_gaps, found.late, found.repeated, found.restarts),
-        found.implausible,
-    )
+    return (*(found.missing, found.num_gaps, found.late, found.repeated, found.restarts), found.implausible)
 
 
 @pytest.mark.parametrize("pieces", [1, 3, 100])

@@ -6,13 +6,7 @@ from pathlib import Path
 import rtc3d
 
 from gateway.rtc3d.components import ComponentType
-from gateway.rtc3d.parameters import (
-    EventDefinition,
-    Marker,
-    Parameters,
-    Parameters3D,
-    ParametersEvents,
-)
+from gateway.rtc3d.parameters import EventDefinition, Marker, Parameters, Parameters3D, ParametersEvents
 from gateway.takes.component_statistics import ComponentStatistics
 from gateway.takes.source_statistics import SourceStatistics
 from gateway.takes.statistics import take_statistics

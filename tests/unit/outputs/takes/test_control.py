@@ -56,10 +56,7 @@ class FakeTakes:
         ({"set": "start", "name": "walk-1"}, ("start", "lab", "walk-1")),
         ({"set": "stop"}, ("stop", "lab")),
         ({"set": "save"}, ("save", "lab", MAX_SAVED_S, 0.0, "")),
-        (
-            {"set": "save", "last": "120", "after": "1.5", "name": "fall"},
-            ("save", "lab", 120.0, 1.5, "fall"),
-        ),
+        ({"set": "save", "last": "120", "after": "1.5", "name": "fall"}, ("save", "lab", 120.0, 1.5, "fall")),
     ],
 )
 async def test_takes_are_started_stopped_and_saved(options: dict[str, str], call: tuple[Any, ...]) -> None:
@@ -110,10 +107,7 @@ async def test_a_piece_is_read_with_its_place_in_the_attachment(options: dict[st
         ({"set": "pause"}, "set='pause' is not accepted; accepted: start, stop, save"),
         ({"set": ""}, "set='' is not accepted"),
         ({"set": "s" * 1_000_000}, "…' is not accepted"),
-        (
-            {"set": "stop", "name": "walk-1"},
-            "unknown option 'name' of take with set=stop; accepted: none",
-        ),
+        ({"set": "stop", "name": "walk-1"}, "unknown option 'name' of take with set=stop; accepted: none"),
         ({"set": "start", "last": "5"}, "unknown option 'last' of take with set=start"),
         ({"set": "start", "read": "walk-1"}, "unknown option 'read' of take with set=start"),
         ({"name": "walk-1"}, "unknown option 'name' of take; accepted"),
@@ -125,10 +119,7 @@ async def test_a_piece_is_read_with_its_place_in_the_attachment(options: dict[st
         ({"read": "walk-1", "offset": "9" * 19}, "is not accepted"),
         ({"read": "walk-1", "offset": "٣"}, "is not accepted"),
         ({"read": "walk-1", "offset": "1\n"}, "is not accepted"),
-        (
-            {"set": "save", "last": "nan"},
-            "last='nan' is not accepted; accepted: a number of seconds up to",
-        ),
+        ({"set": "save", "last": "nan"}, "last='nan' is not accepted; accepted: a number of seconds up to"),
         ({"set": "save", "last": "inf"}, "last='inf' is not accepted"),
         ({"set": "save", "last": "-1"}, "last='-1' is not accepted"),
         ({"set": "save", "last": "3601"}, "last='3601' is not accepted"),

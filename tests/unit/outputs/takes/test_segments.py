@@ -115,7 +115,7 @@ def test_a_saved_take_ends_at_once_and_its_segments_are_shared(rolling: Rolling)
     assert [path.name for path in logs] == [f"fall-00{number}.lcmlog" for number in (1, 2, 3)]
     assert [path.stat().st_ino for path in logs] == [path.stat().st_ino for path in rolling.files[:3]]
     assert [numbers(path) for path in rolling.files] == [
-        *([*range(10)], [*range(10, 20)], [*range(20, 25)], [25]),
+        *([*range(10)], [*range(10, 20)], [*range(20, 25)], [25])
     ]
     for log in logs:
         assert next(EventLogReader(log).events()).channel == "MOCAP_LAB_TAKE"

@@ -19,13 +19,7 @@ from gateway.outputs.takes.folder import TakesFolder
 from gateway.outputs.takes.recorded_takes import MAX_SAVES
 from gateway.outputs.takes.segments import RollingSegments, Save
 from gateway.outputs.takes.stored import StoredTake
-from tests.recording_output import (
-    Clock,
-    RecordingLab,
-    events,
-    frames,
-    still_lab,
-)
+from tests.recording_output import Clock, RecordingLab, events, frames, still_lab
 from tests.virtual_time import run_in_virtual_time
 
 MIB = 1024 * 1024
