@@ -7,11 +7,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import lcm
 import numpy as np
 import pytest
 
-from gateway.errors import TakeError
 from gateway.export.formats import export_take
 from gateway.export.job import ExportJob
 from gateway.rtc3d.components import ComponentType
@@ -201,25 +199,6 @@ def test_analog_without_markers(tmp_path: Path) -> None:
     assert found.points.shape == (4, 0, 200)
     assert found("ANALOG", "RATE").tolist() == [1000]
     assert np.array_equal(found.analog, samples(0, 200))
-
-
-def test_a_take_without_anything_for_c3d_is_an_error(tmp_path: Path) -> None:
-    event = frame(ComponentType.EVENT, [(1, 2, -1, -1, -1)])
-    with pytest.raises(TakeError, match=r"no markers, analog channels or forces, and \.c3d holds nothing"):
-        export_c3d(tmp_path, [event])
-    assert not list(tmp_path.glob("*.c3d"))
-
-
-def test_a_take_of_lcm_logger_and_one_in_a_folder(tmp_path: Path) -> None:
-    messages, folder = scene(40), tmp_path / "folder"
-    folder.mkdir()
-    for number, part in enumerate((messages[:500], messages[500:])):
-        log = lcm.EventLog(str(folder / f"take-{number}.lcmlog"), "w")
-        for place, (channel, data) in enumerate(part):
-            log.write_event(1_800_000_000_000_000 + place, channel, data)
-        log.close()
-    export_take(ExportJob(folder, tmp_path / "out.c3d"))
-    assert np.array_equal(C3d(tmp_path / "out.c3d").analog[:3], samples(0, 400))
 
 
 # Force plates --------------------------------------------------------------------------------

@@ -109,17 +109,6 @@ def test_each_set_of_labels_is_a_file(tmp_path: Path) -> None:
     assert np.array_equal(np.concatenate([found.analog for found in files], axis=1)[:3], samples(0, 400))
 
 
-def test_each_source_is_a_file(tmp_path: Path) -> None:
-    messages = [description("left"), description("right")]
-    for source, count in (("left", 10), ("right", 12)):
-        messages.append(parameters(SCENE.parameters, source=source))
-        messages += scene_messages(SCENE, count, source=source)
-    job, _ = export_all(tmp_path, messages)
-    assert [path.name for path in job.files.paths] == ["walk-left.c3d", "walk-right.c3d"]
-    only, _ = export_c3d(tmp_path, messages, source="right")
-    assert only.points.shape[2] == 12
-
-
 def test_from_and_to_choose_a_part(tmp_path: Path) -> None:
     found, _ = export_c3d(tmp_path, scene(100), from_s=0.2, to_s=0.5)
     assert found.points.shape[2] in {29, 30, 31}
