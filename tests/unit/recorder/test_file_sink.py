@@ -36,7 +36,7 @@ def disk_of(num_bytes: int) -> Iterator[None]:
 
 
 @contextmanager
-def writing(sink: FileSink, sent: list[tuple[bytes, bytes]], num_bytes: int) -> Iterator[threading.Thread]:
+def writing(sink: FileSink, sent: list[tuple[bytes, bytes]]) -> Iterator[threading.Thread]:
     """Write in a thread to a disk with room for 700 kB in the block, and for all afterwards."""
     thread = threading.Thread(target=sink.write, args=(sent,))
     with disk_of(sink.num_bytes + 700_000):
