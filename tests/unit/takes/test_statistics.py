@@ -43,24 +43,16 @@ def status(sequence: int, lost: int) -> Message:
 
 def test_a_complete_take(tmp_path: Path) -> None:
     messages = [description(), parameters(labelled("a", "b"))]
-    messages += [
-        frame(
-            ComponentType.MARKERS,
-            [(1, 2, 3, 0.5), (NAN, NAN, NAN, 999) if number % 4 else (1, 2, 3, 0)],
-            number,
-        )
-        for number in range(201)
-    ]
+    for number in range(201):
+        second = (NAN, NAN, NAN, 999) if number % 4 else (1, 2, 3, 0)
+        messages.append(frame(ComponentType.MARKERS, [(1, 2, 3, 0.5), second], number))
     statistics = take_statistics(write_take(tmp_path / "take.lcmlog", messages))
     source = statistics.sources["lab"]
     found = source.components["3d"]
     assert statistics.is_complete
     assert (statistics.seconds, statistics.num_messages) == (2.0, 203)
-    assert (source.servers, source.gateway_versions, source.take_name) == (
-        ["192.0.2.20:3020"],
-        ["1.0"],
-        "take",
-    )
+    assert (source.servers, source.gateway_versions) == (["192.0.2.20:3020"], ["1.0"])
+    assert source.take_name == "take"
     assert (source.sessions, source.server_restarts, source.gateway_restarts) == (1, 0, 0)
     assert (found.num_messages, found.min_items, found.max_items, found.rate_hz) == (201, 2, 2, 100.0)
     assert source.announced_hz("3d") == 100.0
@@ -92,15 +84,9 @@ def test_restarts_of_server_and_gateway(tmp_path: Path) -> None:
 
 
 def test_changes_of_parameters_say_what_changed(tmp_path: Path) -> None:
-    messages = [
-        parameters(labelled("a", "b")),
-        markers(2, 0),
-        parameters(labelled("a", "c"), 2),
-        parameters(labelled("a", "c"), 2),
-        markers(2, 1, version=2),
-        parameters(b"", 3),
-        markers(1, 2, version=3),
-    ]
+    renamed = parameters(labelled("a", "c"), 2)
+    messages = [parameters(labelled("a", "b")), markers(2, 0), renamed, renamed, markers(2, 1, version=2)]
+    messages += [parameters(b"", 3), markers(1, 2, version=3)]
     source = lab(tmp_path, messages)
     texts = [(change.version, change.text) for change in source.parameters_changes]
     assert texts == [(1, "first: 3d"), (2, "3d 'b' to 'c'"), (3, "the server gives no parameters now")]
@@ -147,10 +133,8 @@ def test_damage_and_foreign_messages_are_reported(tmp_path: Path) -> None:
     path.write_bytes(log[:size] + b"garbage" + log[size:-1])
     statistics = take_statistics(path)
     assert statistics.unknown == {"OTHER": 1}
-    assert [(place.offset, place.num_bytes) for place in statistics.damage] == [
-        (size, 7),
-        (len(log) + 7 - 28 - 5 - 1, 33),
-    ]
+    places = [(size, 7), (len(log) + 7 - 28 - 5 - 1, 33)]
+    assert [(place.offset, place.num_bytes) for place in statistics.damage] == places
     assert (statistics.num_damaged, statistics.damaged_bytes, statistics.is_complete) == (2, 40, False)
 
 
