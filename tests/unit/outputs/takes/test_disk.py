@@ -2,8 +2,8 @@
 
 import contextlib
 import logging
-import os
 import resource
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -99,30 +99,21 @@ async def test_a_take_that_ends_on_a_full_disk_counts_what_is_missing(tmp_path: 
 
 async def test_a_folder_that_does_not_exist_is_created_at_the_start_only(tmp_path: Path) -> None:
     """A folder that is missing later is a disk that is not mounted: its mount point must stay empty."""
-    lab = RecordingLab(tmp_path / "disk" / "takes")
-    lab.output.start()
-    try:
-        await until_problem(lab, "")
+    async with recording_lab(tmp_path / "disk" / "takes") as lab:
         (tmp_path / "disk").rename(tmp_path / "unmounted")
         await until_problem(lab, "No such file or directory; is the disk mounted?")
         with pytest.raises(QueryError, match="is the disk mounted") as refused:
             await lab.takes.start("lab", "walk")
         assert refused.value.code == "disk"
+        (tmp_path / "disk").mkdir()
+        (tmp_path / "disk/takes").write_text("no folder")
+        await until_problem(lab, "it is not a folder; choose a folder as takes.directory")
+        (tmp_path / "disk/takes").unlink()
+        (tmp_path / "disk").rmdir()
         (tmp_path / "unmounted").rename(tmp_path / "disk")
-        await until_problem(lab, "")
+        await wait_until_async(lambda: not lab.output.health().problem)
         await lab.takes.start("lab", "walk")
-    finally:
-        lab.output.close()
     assert lab.path("walk.lcmlog").is_file()
-
-
-async def test_a_file_instead_of_the_folder_is_reported(tmp_path: Path) -> None:
-    """The problem says what to choose instead."""
-    (tmp_path / "takes").write_text("no folder")
-    lab = RecordingLab(tmp_path / "takes")
-    lab.output.start()
-    await until_problem(lab, "it is not a folder; choose a folder as takes.directory")
-    lab.output.close()
 
 
 async def test_the_folder_of_the_user_is_created(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,44 +168,20 @@ async def test_a_disk_that_does_not_respond_is_reported_and_delays_nobody(
     monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.2)
     async with recording_lab(tmp_path) as lab:
         lab.path("").mkdir()
-        os.mkfifo(lab.path("walk.lcmlog.x"))
-        with _stopped_disk(lab):
-            with pytest.raises(QueryError, match="did not respond") as refused:
-                await lab.takes.start("lab", "walk")
-            assert refused.value.code == "disk"
-            assert not lab.publishers["3d"].wanted
+        responds = threading.Event()
+        lab.takes._started_recorder().call(responds.wait)
+        with pytest.raises(QueryError, match="did not respond") as refused:
+            await lab.takes.start("lab", "walk")
+        assert refused.value.code == "disk"
+        assert not lab.publishers["3d"].wanted
+        responds.set()
         await lab.takes.written()
         await lab.takes.start("lab", "run")
     assert [path.name for path in lab.path("").glob("*.lcmlog")] == ["run.lcmlog"]
 
 
-@contextlib.contextmanager
-def _stopped_disk(lab: RecordingLab) -> Iterator[None]:
-    """Have the thread that writes wait for a pipe that nobody opens, as for a disk that does not respond."""
-    pipe = lab.path("walk.lcmlog.x")
-    recorder = lab.takes._recorder
-    assert recorder is not None
-    recorder.call(lambda: pipe.open("rb").close())
-    yield
-    os.close(os.open(pipe, os.O_WRONLY))
-
-
 async def until_problem(lab: RecordingLab, text: str) -> None:
-    def has_it() -> bool:
-        lab.output.maintain()
-        problem = lab.output.health().problem
-        return text in problem if text else not problem
-
-    await wait_until_async(has_it)
-
-
-async def test_two_gateways_do_not_share_a_folder(tmp_path: Path) -> None:
-    """Each would delete the segments of the other one as left behind."""
-    async with recording_lab(tmp_path):
-        other = RecordingLab(tmp_path)
-        other.output.start()
-        await until_problem(other, "another gateway records in")
-        other.output.close()
+    await wait_until_async(lambda: text in lab.output.health().problem)
 
 
 async def test_the_end_of_the_output_ends_the_take(tmp_path: Path) -> None:

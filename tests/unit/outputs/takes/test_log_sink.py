@@ -3,6 +3,7 @@
 import errno
 import logging
 import os
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import cast
@@ -54,19 +55,16 @@ class ScriptedLog:
         return step
 
 
-class Waits:
-    """The event by which a sink gives up; it notes how long the sink waits for it."""
+class Waits(threading.Event):
+    """The event by which a sink gives up; it notes how long the sink waits for it, and does not wait."""
 
     def __init__(self) -> None:
-        self.seconds: list[float] = []
-        self.is_over = False
+        super().__init__()
+        self.seconds: list[float | None] = []
 
-    def wait(self, timeout_s: float) -> bool:
-        self.seconds.append(timeout_s)
-        return self.is_over
-
-    def set(self) -> None:
-        self.is_over = True
+    def wait(self, timeout: float | None = None) -> bool:
+        self.seconds.append(timeout)
+        return self.is_set()
 
 
 class Sink(LogSink):
@@ -78,7 +76,7 @@ class Sink(LogSink):
         self.log = log
         self.utimes: list[int] = []
         self.waits = Waits()
-        self._gives_up = self.waits  # type: ignore[assignment]
+        self._gives_up = self.waits
         self.newest_version: list[int | None] = []
 
     @property

@@ -2,7 +2,6 @@
 
 import logging
 import os
-from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
@@ -230,28 +229,18 @@ def test_a_segment_that_cannot_be_linked_or_deleted_is_a_problem_of_the_disk(
     assert numbers(save.folder) == [*range(10), *range(20, 30)]
 
 
-def remove_oldest(rolling: Rolling) -> list[int]:
-    rolling.files[0].unlink()
-    return list(range(10, 25))
-
-
-def remove_present(rolling: Rolling) -> list[int]:
-    rolling.segments.sync()
-    rolling.files[-1].unlink()
-    rolling.segments.sync()  # finds that it is gone
-    return [*range(20), *range(22, 25)]
-
-
-@pytest.mark.parametrize("remove", [remove_oldest, remove_present])
+@pytest.mark.parametrize(("place", "left"), [(0, [*range(10, 25)]), (-1, [*range(20), *range(22, 25)])])
 def test_a_segment_that_somebody_removes_costs_only_itself(
-    rolling: Rolling, remove: Callable[[Rolling], list[int]]
+    rolling: Rolling, place: int, left: list[int]
 ) -> None:
     """The others are saved, and messages do not go on into a file that has no name."""
     rolling.write(22)
-    expected = remove(rolling)
+    rolling.segments.sync()
+    rolling.files[place].unlink()
+    rolling.segments.sync()  # finds that the present one is gone
     rolling.write(3)
     rolling.save(60)
-    assert numbers(rolling.takes / "fall") == expected
+    assert numbers(rolling.takes / "fall") == left
 
 
 def test_a_name_that_is_taken_gets_a_number_or_is_refused(rolling: Rolling) -> None:
