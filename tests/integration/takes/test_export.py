@@ -59,7 +59,7 @@ def test_it_prints_the_files_and_what_was_left_out(take: Path, tmp_path: Path) -
         ("a.trc", ("--from", "3000"), "has no markers"),
     ],
 )
-def test_what_cannot_be_exported_is_a_sentence_and_leaves_no_file(
+def test_what_cannot_be_exported_leaves_no_file(
     take: Path, tmp_path: Path, name: str, options: tuple[str, ...], problem: str
 ) -> None:
     existing = [f"walk{extension}" for extension in ("-analog.csv", ".c3d", ".mcap", ".trc")]

@@ -36,9 +36,7 @@ def frame_numbers(path: Path) -> list[int]:
     return [decode(message.message).frame_number for message in messages if message.key == "3d"]
 
 
-async def test_each_measurement_has_a_take_that_a_lost_connection_does_not_split(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_each_measurement_has_one_take(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(follow, "END_S", 0.01)
     server, endpoint = ParameterServer(), free_endpoint()
     server.has_measurement = False

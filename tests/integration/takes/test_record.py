@@ -172,9 +172,7 @@ def assert_same_bytes(path: Path, published: dict[str, list[bytes]]) -> None:
 
 
 @pytest.mark.parametrize("side", ["zenoh", "lcm"])
-def test_a_recording_has_what_was_published_and_the_parameters_before_their_frames(
-    tmp_path: Path, side: str
-) -> None:
+def test_a_recording_has_what_was_published_with_parameters_first(tmp_path: Path, side: str) -> None:
     """It begins with its description; the parameters, which LCM repeats every 5 s, are there once each."""
     path = tmp_path / "walk.lcmlog"
     renames = ("--fault", "rename,every_s=3,for_s=1.5")
@@ -363,7 +361,7 @@ def test_a_terminal_shows_the_progress_on_one_line(tmp_path: Path, publisher: Pu
         ("", "no Zenoh session to tcp/"),
     ],
 )
-def test_without_a_gateway_it_says_so_and_leaves_no_file(
+def test_without_a_gateway_there_is_no_file(
     tmp_path: Path, publisher: Publisher, side: str, problem: str
 ) -> None:
     options = ("--lcm", "--url", lcm_url()) if side == "lcm" else ("--connect", free_endpoint())

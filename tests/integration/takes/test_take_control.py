@@ -96,9 +96,7 @@ def markers(path: Path) -> int:
 
 
 @pytest.mark.parametrize("side", ["zenoh", "lcm"])
-async def test_takes_are_started_listed_and_stopped_and_errors_say_what_to_do(
-    tmp_path: Path, side: str
-) -> None:
+async def test_takes_are_started_listed_and_stopped_or_errors_say_why(tmp_path: Path, side: str) -> None:
     async with lab(tmp_path / "takes") as at:
         options = at.options(side)
         assert "no take of source 'lab' is running" in await error("stop", *options)
@@ -149,7 +147,7 @@ async def recorded(tmp_path: Path) -> AsyncIterator[tuple[Lab, bytes]]:
         yield at, content
 
 
-async def test_a_fetched_take_has_the_same_bytes_and_replaces_nothing(
+async def test_a_fetched_take_has_the_same_bytes_and_a_new_file(
     tmp_path: Path, recorded: tuple[Lab, bytes]
 ) -> None:
     at, content = recorded

@@ -131,9 +131,7 @@ async def test_a_file_that_breaks_off_is_deleted_and_its_rest_is_no_other_file(t
     assert lab.contents == [FILE, FILE]
 
 
-async def test_a_file_that_cannot_be_written_is_lost_once_and_later_ones_are_stored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_file_on_a_full_disk_is_lost_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lab = Lab(tmp_path)
 
     def fail(_descriptor: int, _data: memoryview) -> int:

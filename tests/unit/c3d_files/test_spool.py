@@ -207,9 +207,7 @@ def test_a_device_that_is_full_is_an_error(spool: Spool) -> None:
     assert files_in(spool) == []
 
 
-def test_what_cannot_be_deleted_or_listed_is_a_problem_and_the_new_file_is_stored(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_with_problems_stores_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     spool = spool_in(tmp_path, max_files=1)
     old = store(spool, "lab", b"old").path
     with monkeypatch.context() as patch:
@@ -235,9 +233,7 @@ def test_a_file_is_locked_while_it_is_written(tmp_path: Path) -> None:
     assert [*tmp_path.iterdir()] == []
 
 
-def test_a_drive_without_locks_stores_files_and_deletes_no_unfinished_ones(
-    spool: Spool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_drive_without_locks_stores_files(spool: Spool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fcntl, "flock", RefusedCall(errno.ENOLCK))
     in_progress = spool.begin()
     assert store(spool, "lab", b"x").path.read_bytes() == b"x"
@@ -264,9 +260,7 @@ def test_a_drive_without_locks_stores_files_and_deletes_no_unfinished_ones(
         (b"\x04\x50", 1024, "parameters"),
     ],
 )
-def test_files_without_the_key_or_with_parameters_outside_are_refused_with_a_reason(
-    head: bytes, file_bytes: int, problem: str
-) -> None:
+def test_what_is_no_c3d_file_is_refused_with_a_reason(head: bytes, file_bytes: int, problem: str) -> None:
     found = problem_of_c3d(head, file_bytes)
     assert problem in found
     assert bool(found) == bool(problem)

@@ -182,9 +182,7 @@ def test_a_later_source_is_described_then_and_delays_no_other(recorded: Recorded
 
 
 @pytest.mark.parametrize("after_s", [0.0, 1.5, 1.6])
-def test_a_source_without_answers_is_recorded_after_a_moment(
-    recorded: Recorded, clock: Clock, after_s: float
-) -> None:
+def test_a_source_without_answers_is_recorded_soon(recorded: Recorded, clock: Clock, after_s: float) -> None:
     """An old gateway answers no query, and its messages must not wait for ever."""
     recorded.receive("lab", "3d", *map(markers, range(3)))
     clock.now_s += after_s
@@ -206,9 +204,7 @@ def test_the_file_is_created_after_the_time_in_which_sources_are_found(tmp_path:
     recorded.events()
 
 
-def test_what_waits_for_descriptions_is_bounded_and_makes_room(
-    recorded: Recorded, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_waits_for_descriptions_is_bounded(recorded: Recorded, monkeypatch: pytest.MonkeyPatch) -> None:
     """A source that is never described must not take all memory; what is refused is counted."""
     monkeypatch.setattr(take_recording, "MAX_QUEUED_BYTES", 3 * len(markers(0)))
     recorded.receive("lab", "3d", *map(markers, range(5)))

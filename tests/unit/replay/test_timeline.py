@@ -55,9 +55,7 @@ BACK_AND_FORTH = [Jump(5000, "lab", HOUR - 5000, True), Jump(5000, "lab", 10_000
         ),
     ],
 )
-def test_messages_are_placed_by_time_unless_the_clock_was_set(
-    utimes: list[int], positions: list[int], jumps: list[Jump]
-) -> None:
+def test_messages_are_placed_by_time(utimes: list[int], positions: list[int], jumps: list[Jump]) -> None:
     placed = Placed()
     assert placed.place(*utimes) == positions
     assert placed.jumps == jumps
@@ -67,9 +65,7 @@ def test_messages_are_placed_by_time_unless_the_clock_was_set(
     ("max_gap_s", "gap", "after", "is_skipped"),
     [(2 * HOUR / 1e6, HOUR, HOUR, False), (0, 3_000_000, 0, True)],
 )
-def test_long_gaps_are_skipped_if_that_is_wanted(
-    max_gap_s: float, gap: int, after: int, is_skipped: bool
-) -> None:
+def test_long_gaps_are_skipped_if_wanted(max_gap_s: float, gap: int, after: int, is_skipped: bool) -> None:
     placed = Placed(max_gap_s)
     assert placed.place(0, gap, gap + 5000) == [0, after, after + 5000]
     assert placed.jumps == [Jump(0, "lab", gap, is_skipped)]

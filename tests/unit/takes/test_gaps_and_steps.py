@@ -103,7 +103,7 @@ def steps_of(delays_us: list[int], per_window: int = 4) -> ClockSteps:
         ([0] * 5 + [2 * SECOND_US] * 6 + [0] * 6, [(7, 2 * SECOND_US), (11, -2 * SECOND_US)]),
     ],
 )
-def test_a_step_of_the_clock_is_told_from_a_slow_network(
+def test_a_step_of_the_clock_is_told_from_a_stall(
     delays_us: list[int], expected: list[tuple[int, int]]
 ) -> None:
     """A clock that was set bends every time in the take; a stall only looks like it."""

@@ -3,10 +3,12 @@
 import math
 from pathlib import Path
 
+import pytest
 import rtc3d
 
 from gateway.rtc3d.components import ComponentType
 from gateway.rtc3d.parameters import EventDefinition, Marker, Parameters, Parameters3D, ParametersEvents
+from gateway.takes import reader
 from gateway.takes.component_statistics import ComponentStatistics
 from gateway.takes.source_statistics import SourceStatistics
 from gateway.takes.statistics import take_statistics
@@ -44,7 +46,7 @@ def status(sequence: int, lost: int) -> Message:
 def test_a_complete_take(tmp_path: Path) -> None:
     messages = [description(), parameters(labelled("a", "b"))]
     for number in range(201):
-        second = (NAN, NAN, NAN, 999) if number % 4 else (1, 2, 3, 0)
+        second = (1, NAN, 3, 999) if number % 4 else (1, 2, 3, 0)
         messages.append(frame(ComponentType.MARKERS, [(1, 2, 3, 0.5), second], number))
     statistics = take_statistics(write_take(tmp_path / "take.lcmlog", messages))
     source = statistics.sources["lab"]
@@ -70,7 +72,12 @@ def test_damaged_numbers_are_neither_gaps_nor_restarts(tmp_path: Path) -> None:
     assert (gaps.missing, gaps.num_gaps, gaps.implausible, gaps.restarts) == (1, 1, 3, 0)
 
 
-def test_restarts_of_server_and_gateway(tmp_path: Path) -> None:
+@pytest.mark.parametrize("batch_bytes", [1, 1_000_000])
+def test_restarts_of_server_and_gateway(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, batch_bytes: int
+) -> None:
+    """They count between two parts that are read at once, too."""
+    monkeypatch.setattr(reader, "_BATCH_BYTES", batch_bytes)
     messages = [
         markers(1, 0),
         markers(1, 1),

@@ -252,7 +252,7 @@ def of(source: str) -> Message:
         ),
     ],
 )
-def test_messages_belong_to_the_source_of_their_channel(
+def test_messages_have_the_source_of_a_channel(
     tmp_path: Path, messages: list[Message], keys: list[str]
 ) -> None:
     reader = TakeReader(write_take(tmp_path / "take.lcmlog", messages))

@@ -107,9 +107,7 @@ ACCEPTED = "is not accepted"
         *(({"set": "save", "after": after}, ACCEPTED) for after in ("1e3", "9" * 1_000_000)),
     ],
 )
-async def test_a_wrong_option_is_an_error_that_says_what_is_accepted(
-    options: dict[str, str], text: str
-) -> None:
+async def test_a_wrong_option_is_an_error_with_what_is_accepted(options: dict[str, str], text: str) -> None:
     """Nothing is done by mistake, and a long option is not sent back."""
     takes = FakeTakes()
     with pytest.raises(QueryError) as caught:

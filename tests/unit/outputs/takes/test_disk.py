@@ -32,7 +32,7 @@ def files_of_at_most(num_bytes: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-async def test_what_waits_for_a_full_disk_is_written_when_there_is_room(
+async def test_a_full_disk_costs_nothing_if_it_has_room_again(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A full disk costs nothing if somebody makes room, and is logged once."""
@@ -124,7 +124,7 @@ async def test_the_folder_of_the_user_is_created(tmp_path: Path, monkeypatch: py
     assert (tmp_path / "state" / "takes" / "lab" / "walk.lcmlog").is_file()
 
 
-async def test_a_take_whose_file_is_removed_continues_in_a_new_one(
+async def test_a_take_without_its_file_gets_a_new_one(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Messages must not go on into a file that has no name any more."""
@@ -145,9 +145,7 @@ async def test_a_take_whose_file_is_removed_continues_in_a_new_one(
     assert any("was removed while it was recorded" in each for each in caplog.messages)
 
 
-async def test_stopping_a_take_while_segments_wait_for_a_full_disk_says_so(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_stopping_on_a_full_disk_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The segments wait before the take does; the peer learns the reason instead of "no answer"."""
     monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.2)
     async with recording_lab(tmp_path, keep_last_s=60) as lab:
@@ -161,9 +159,7 @@ async def test_stopping_a_take_while_segments_wait_for_a_full_disk_says_so(
         await wait_until_async(lambda: lab.output.health().connected)
 
 
-async def test_a_disk_that_does_not_respond_is_reported_and_delays_nobody(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_disk_that_hangs_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The event loop goes on, and the take that was not started does not appear later."""
     monkeypatch.setattr(disk_calls, "_TIMEOUT_S", 0.2)
     async with recording_lab(tmp_path) as lab:

@@ -54,9 +54,7 @@ def left(takes: TakesFolder, max_bytes: int, *protected: str, max_age_s: float |
         (0, ["hall/c", "lab/d"]),  # the newest of each source stays
     ],
 )
-def test_the_oldest_takes_of_all_sources_are_deleted_until_the_rest_fits(
-    takes: TakesFolder, max_bytes: int, expected: list[str]
-) -> None:
+def test_the_oldest_takes_are_deleted_first(takes: TakesFolder, max_bytes: int, expected: list[str]) -> None:
     """Deleting too much, or the newest take, would lose what the user has just recorded."""
     for name, age_s in (("lab/a", 300), ("lab/b", 400), ("hall/c", 200), ("lab/d", 100)):
         stored(takes.directory / f"{name}.lcmlog", 1000, age_s)
@@ -120,9 +118,7 @@ def test_deleting_a_take_whose_segments_are_still_kept_makes_no_room(takes: Take
     assert kept.exists()
 
 
-def test_c3d_files_belong_to_their_take_and_other_files_to_nobody(
-    takes: TakesFolder, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_c3d_files_go_with_their_take_only(takes: TakesFolder, caplog: pytest.LogCaptureFixture) -> None:
     """The C3D files count and go with the take; what a user has put there stays."""
     caplog.set_level(logging.INFO)
     lab = takes.directory / "lab"

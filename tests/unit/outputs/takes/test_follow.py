@@ -87,9 +87,7 @@ async def test_each_measurement_has_a_take_from_its_first_frame_on(measured: Fol
 
 
 @pytest.mark.parametrize(("gap", "gap_s"), [(None, LOST_S - 1), (False, END_S - 0.1)])
-async def test_a_stall_a_reconnection_or_a_short_no_data_does_not_split_a_take(
-    measured: Followed, gap: bool | None, gap_s: float
-) -> None:
+async def test_a_short_gap_does_not_split_a_take(measured: Followed, gap: bool | None, gap_s: float) -> None:
     """One movement in two files is hard to use."""
     measured.show(True)
     for _ in range(5):
@@ -125,7 +123,7 @@ async def test_the_take_of_a_peer_goes_on(measured: Followed, caplog: pytest.Log
     assert measured.running == "of a peer"
 
 
-async def test_a_take_that_cannot_start_is_tried_again_and_logged_once(
+async def test_a_take_that_cannot_start_is_tried_again(
     measured: Followed, caplog: pytest.LogCaptureFixture
 ) -> None:
     """It begins as soon as the disk allows; the log does not fill meanwhile."""

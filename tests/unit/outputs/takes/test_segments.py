@@ -96,7 +96,7 @@ def test_for_hours_what_is_kept_is_the_last_minute_rounded_up_to_a_segment(rolli
     ("last_s", "first"),
     [(0.5, 30), (4.9, 30), (5, 20), (5.1, 20), (14.9, 20), (15.1, 10), (25.1, 0), (1e9, 0)],
 )
-def test_a_saved_take_begins_with_the_segment_in_which_its_time_lies(
+def test_a_saved_take_begins_with_the_segment_of_its_time(
     rolling: Rolling, last_s: float, first: int
 ) -> None:
     """A segment that ends after the beginning has wanted messages, even if it begins long before."""
@@ -209,7 +209,7 @@ def test_a_save_that_fails_leaves_nothing(rolling: Rolling, monkeypatch: pytest.
     assert numbers(rolling.takes / "fall") == list(range(15))
 
 
-def test_a_segment_that_cannot_be_linked_or_deleted_is_a_problem_of_the_disk(
+def test_a_segment_that_cannot_be_linked_is_a_problem(
     rolling: Rolling, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The recording goes on without it, and the user learns why a part is missing."""
@@ -230,9 +230,7 @@ def test_a_segment_that_cannot_be_linked_or_deleted_is_a_problem_of_the_disk(
 
 
 @pytest.mark.parametrize(("place", "left"), [(0, [*range(10, 25)]), (-1, [*range(20), *range(22, 25)])])
-def test_a_segment_that_somebody_removes_costs_only_itself(
-    rolling: Rolling, place: int, left: list[int]
-) -> None:
+def test_a_segment_that_is_removed_costs_only_itself(rolling: Rolling, place: int, left: list[int]) -> None:
     """The others are saved, and messages do not go on into a file that has no name."""
     rolling.write(22)
     rolling.segments.sync()

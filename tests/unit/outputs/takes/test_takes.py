@@ -168,7 +168,7 @@ async def test_takes_are_listed_and_read(tmp_path: Path) -> None:
         await refused(lab.takes.read("lab", "walk", -1), "an offset of 0 or more")
 
 
-async def test_a_take_that_ends_while_it_is_listed_is_not_running(
+async def test_a_take_that_ends_while_listed_has_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The disk is read without blocking the event loop, so anything may have changed since."""
@@ -187,7 +187,7 @@ async def test_a_take_that_ends_while_it_is_listed_is_not_running(
         assert (await ends[0]).name == "walk"
 
 
-async def test_a_take_that_could_not_start_in_time_leaves_no_file(
+async def test_a_take_that_starts_too_late_has_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The peer was told that there is none; it would be recorded for ever, as nobody knows of it."""
@@ -235,7 +235,7 @@ async def test_components_and_the_prefix_can_be_chosen(tmp_path: Path) -> None:
         ("saved", 60.1, False),
     ],
 )
-async def test_a_file_of_the_server_gets_the_name_of_its_take(
+async def test_a_c3d_file_gets_the_name_of_its_take(
     tmp_path: Path, before: str, after_s: float, is_named: bool
 ) -> None:
     """It arrives some seconds after the take has ended; later, it belongs to something else."""
@@ -277,9 +277,7 @@ async def test_withdrawing_a_source_ends_its_take(tmp_path: Path) -> None:
 # Saving --------------------------------------------------------------------------------------
 
 
-def test_a_saved_take_goes_on_for_some_seconds_from_the_command_on(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_saved_take_goes_on_from_the_command_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The time that the disk needs is part of the seconds, not added to them."""
 
     async def save() -> None:
