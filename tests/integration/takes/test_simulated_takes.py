@@ -247,16 +247,11 @@ def test_the_command_plays_the_folder_of_a_saved_take(take: Path) -> None:
         ("--source lab", "need --take"),
         ("--take TAKE --from 2 --to 1", "--to 1 is not after --from 2"),
         ("--once", "--once needs --c3d or --take"),
-        ("--take TAKE --from 60", "has no frames of lab from 60 s to its end"),
         ("--take TAKE --source gym", "has no source 'gym'; its sources are: lab"),
-        ("--take /no/such/take", "/no/such/take cannot be read: No such file"),
-        ("--take FOLDER", "has no recordings (.lcmlog)"),
     ],
 )
 def test_the_command_says_why_a_take_cannot_be_played(take: Path, options: str, problem: str) -> None:
-    (take.parent / "empty").mkdir()
-    paths = {"TAKE": str(take), "FOLDER": str(take.parent / "empty")}
-    arguments = (paths.get(option, option) for option in options.split())
+    arguments = options.replace("TAKE", str(take)).split()
     ended = run_in_process("simulate", "--port", "0", *arguments)
     assert ended.returncode != 0
     assert problem in " ".join(ended.stderr.replace("│", " ").split())

@@ -109,11 +109,6 @@ def test_each_set_of_labels_is_a_file(tmp_path: Path) -> None:
     assert np.array_equal(np.concatenate([found.analog for found in files], axis=1)[:3], samples(0, 400))
 
 
-def test_from_and_to_choose_a_part(tmp_path: Path) -> None:
-    found, _ = export_c3d(tmp_path, scene(100), from_s=0.2, to_s=0.5)
-    assert found.points.shape[2] in {29, 30, 31}
-
-
 def test_frames_without_items_begin_no_new_measurement(tmp_path: Path) -> None:
     frames = [frame(ComponentType.MARKERS, [] if n % 5 == 2 else [(n, 2, 3, 0)], n) for n in range(20)]
     _, notes = export_c3d(tmp_path, [labelled("a"), *frames])

@@ -66,11 +66,10 @@ class Replayed:
         """Write a take of these messages, or use the present one; make its player."""
         if messages is not None:
             write_take(self.path, messages)
-        is_repeated = selection.pop("is_repeated", False)
         self.output.keys.clear()
         self.publication = Publication(self.outputs, {}, asyncio.get_running_loop())
-        options: dict[str, Any] = {"rate": None, "on_jump": lambda _: None, "is_repeated": is_repeated}
-        self.player = Player(TakeReader(self.path), Selection(**selection), self.publication, **options)
+        reader, chosen = TakeReader(self.path), Selection(**selection)
+        self.player = Player(reader, chosen, self.publication, rate=None, on_jump=lambda _: None)
         return self.player
 
     async def play(
@@ -158,14 +157,6 @@ async def test_what_an_output_refuses_is_counted_and_the_other_gets_it(replayed:
     replayed.output.error = ZeroDivisionError()  # a defect
     with pytest.raises(ZeroDivisionError):
         await replayed.play()
-
-
-async def test_the_take_may_be_repeated_until_it_is_stopped(replayed: Replayed) -> None:
-    messages = some_messages()
-    player = replayed.prepare(messages, is_repeated=True)
-    async with playing(player):
-        await wait_until_async(lambda: player.num_passes >= 3)
-    assert replayed.output.keys[: 3 * len(keyed(messages))] == 3 * keyed(messages)
 
 
 async def test_bad_input_is_left_out_and_counted(replayed: Replayed) -> None:
