@@ -88,7 +88,7 @@ def test_an_export_that_is_stopped_or_whose_disk_is_full_leaves_no_file(tmp_path
     """Half a file would be taken for the whole one."""
     scene = SyntheticScene(markers=300, tools=0, analog=200, plates=0, rate_hz=100, analog_rate_hz=1000)
     record_scene(tmp_path / "long.lcmlog", scene, 1000)
-    command = [*PROGRAM, "export", tmp_path / "long.lcmlog", tmp_path / "long.csv"]
+    command = [*PROGRAM, "export", str(tmp_path / "long.lcmlog"), str(tmp_path / "long.csv")]
     with subprocess.Popen(command) as process:
         wait_until(lambda: len(names(tmp_path)) > 1)
         process.send_signal(signal.SIGINT)
@@ -157,5 +157,5 @@ def test_a_c3d_file_keeps_its_values_through_simulator_gateway_record_and_export
             values = (each["parameters"][group][name]["value"] for each in (found, expected))
             assert np.array_equal(*values), name
     for key in ("points", "analogs"):
-        values = (np.float32(each["data"][key]) for each in (found, expected))
-        assert np.array_equal(*values, equal_nan=True)
+        ours, theirs = (np.float32(each["data"][key]) for each in (found, expected))
+        assert np.array_equal(ours, theirs, equal_nan=True)

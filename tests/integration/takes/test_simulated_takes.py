@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -109,7 +110,10 @@ def take(tmp_path: Path) -> Path:
     """A take of two markers at 100 Hz, a channel at 1000 Hz and an event; time stamps begin at 7 s."""
     messages = []
     for number in range(500):
-        options = {"timestamp_us": 7 * SECOND_US + 1000 * number, "utime": START_UTIME + 1000 * number}
+        options: dict[str, Any] = {
+            "timestamp_us": 7 * SECOND_US + 1000 * number,
+            "utime": START_UTIME + 1000 * number,
+        }
         if number % 10 == 0:
             messages.append(markers(2, number // 10, **options))
         messages.append(frame(ComponentType.ANALOG, [number / 7], number, **options))

@@ -3,7 +3,7 @@
 import json
 from collections import defaultdict
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -59,9 +59,14 @@ def points_of(cloud: Any) -> npt.NDArray[Any]:
     """Return the points of a PointCloud as its own fields describe them."""
     formats = {7: "<f4", 5: "<u4"}  # FLOAT32, UINT32
     fields = cloud.fields
-    dtype = {"names": [field.name for field in fields], "formats": [formats[field.type] for field in fields]}
+    dtype: dict[str, Any] = {
+        "names": [field.name for field in fields],
+        "formats": [formats[field.type] for field in fields],
+    }
     offsets = [field.offset for field in fields]
-    return np.frombuffer(cloud.data, np.dtype({**dtype, "offsets": offsets, "itemsize": cloud.point_stride}))
+    return np.frombuffer(
+        cloud.data, np.dtype(cast(Any, {**dtype, "offsets": offsets, "itemsize": cloud.point_stride}))
+    )
 
 
 def floats_of(record: Any) -> dict[str, float]:

@@ -3,6 +3,7 @@
 import math
 import os
 import warnings
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,7 @@ from tests.unit.export.exported import (
 )
 
 
-def points(*rows: list[tuple[float, ...]]) -> list[Message]:
+def points(*rows: Sequence[tuple[float, ...]]) -> list[Message]:
     """Return frames of markers with these coordinates and residuals."""
     return [frame(ComponentType.MARKERS, row, number) for number, row in enumerate(rows)]
 
@@ -176,7 +177,7 @@ def test_a_take_without_parameters(tmp_path: Path) -> None:
 @pytest.mark.parametrize("rate_hz", [59.94, 119.88, 29.97, 1000 / 3])
 @pytest.mark.parametrize("ratio", [7, 10, 20])
 def test_readers_find_the_exact_ratio_of_odd_rates(tmp_path: Path, rate_hz: float, ratio: int) -> None:
-    rates_hz = {"rate_hz": rate_hz, "analog_rate_hz": rate_hz * ratio}
+    rates_hz: dict[str, Any] = {"rate_hz": rate_hz, "analog_rate_hz": rate_hz * ratio}
     found, _ = export_c3d(
         tmp_path, scene(30, SyntheticScene(markers=1, tools=0, analog=1, plates=0, **rates_hz))
     )

@@ -92,7 +92,7 @@ def sequence(take: Take) -> list[int]:
     """Return the sequence numbers of the markers."""
     found = take.sources["lab"].markers
     assert found
-    return found.sequence.tolist()
+    return [*map(int, found.sequence)]
 
 
 def test_a_folder_is_read_without_its_empty_files(tmp_path: Path) -> None:
