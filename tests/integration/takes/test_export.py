@@ -94,10 +94,10 @@ def test_an_export_that_is_stopped_or_whose_disk_is_full_leaves_no_file(tmp_path
         process.send_signal(signal.SIGINT)
     assert process.returncode == 130
     assert names(tmp_path) == ["long.lcmlog"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (50_000, 50_000))
-        _, stderr = process.communicate(timeout=60)
-    assert process.returncode == 1
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as full:
+        resource.prlimit(full.pid, resource.RLIMIT_FSIZE, (50_000, 50_000))
+        _, stderr = full.communicate(timeout=60)
+    assert full.returncode == 1
     assert stderr.endswith("cannot be written: File too large; nothing was written\n")
     assert names(tmp_path) == ["long.lcmlog"]
 
