@@ -248,3 +248,16 @@ async def test_a_folder_is_replayed_as_fast_as_possible(tmp_path: Path, subscrib
         for key in RECORDED:
             payloads = expected[lcm_channel("REPLAY", source, key)]
             await subscribers.wait_for(f"replay/{source}/{key}", payloads)
+
+
+async def test_lcm_logplayer_plays_a_take(tmp_path: Path, subscribers: Subscribers) -> None:
+    """LCM's own program: it must find nothing in our files that it does not understand."""
+    messages = some_messages()
+    path = write_take(tmp_path / "take.lcmlog", messages)
+    program = Path(lcm.__file__).parents[1] / "bin/lcm-logplayer"  # .venv/bin has a script that starts it
+    player = await asyncio.create_subprocess_exec(
+        *(program, f"--lcm-url={subscribers.url}", "--speed=2", path), stdout=DEVNULL, stderr=DEVNULL
+    )
+    assert await player.wait() == 0
+    expected = by_channel(messages, "MOCAP")
+    await wait_until_async(lambda: by_channel(subscribers.messages, "MOCAP") == expected)
